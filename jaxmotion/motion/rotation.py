@@ -1,0 +1,223 @@
+"""Rotations: 6D, matrix, quaternion and yaw.
+
+Conventions: column vectors (`v' = R v`), right-handed axes, y up. A 6D rotation is two
+orthonormal 3-vectors of the matrix (Zhou et al. 2019). The library stores the first two
+*columns*, `[c1, c2]`; CAMDM, MDM, EMDM and AMDM store the first two *rows*, which are
+the columns of the inverse: `rot6d_rows_to_columns` converts. Quaternions are wxyz. Yaw
+is the angle about +y that turns +z towards +x.
+
+Gradients stay finite at the singularities (a zero vector, the identity, a half turn):
+each uses the double `where`, because the gradient of the branch that is not taken must
+be finite as well.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_TINY = 1e-12
+
+
+def safe_normalize(
+    x: Float[Array, "*batch n"], fallback: Float[Array, " n"]
+) -> Float[Array, "*batch n"]:
+    """Unit vector along x; `fallback`, with zero gradient, where x is zero.
+
+    Args:
+      x: Vectors of any length.
+      fallback: Unit vector to return where the length is below 1e-6.
+
+    Returns:
+      Unit vectors.
+    """
+    square = jnp.sum(x * x, axis=-1, keepdims=True)
+    is_zero = square < _TINY
+    length = jnp.sqrt(jnp.where(is_zero, 1.0, square))
+    return jnp.where(is_zero, fallback, x / length)
+
+
+@jax.jit
+def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
+    """Rotation matrix whose first two columns are Gram-Schmidt of the six numbers.
+
+    Any finite input gives a rotation: where the first vector is zero it becomes
+    +x, and where the second is parallel to the first another axis takes its place.
+
+    Args:
+      rot6d: Two columns, not necessarily orthonormal.
+
+    Returns:
+      Rotation matrices.
+
+    Source: Zhou et al. 2019, eq. 15.
+    """
+    first, second = rot6d[..., :3], rot6d[..., 3:]
+    x = safe_normalize(first, jnp.array([1.0, 0.0, 0.0], rot6d.dtype))
+    y = second - jnp.sum(x * second, axis=-1, keepdims=True) * x
+    # A fallback orthogonal to x: the coordinate axis that x is least aligned with.
+    axis = jnp.eye(3, dtype=rot6d.dtype)[jnp.argmin(jnp.abs(x), axis=-1)]
+    other = axis - jnp.sum(x * axis, axis=-1, keepdims=True) * x
+    other = other / jnp.linalg.norm(other, axis=-1, keepdims=True)
+    square = jnp.sum(y * y, axis=-1, keepdims=True)
+    is_zero = square < _TINY
+    y = jnp.where(is_zero, other, y / jnp.sqrt(jnp.where(is_zero, 1.0, square)))
+    return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)
+
+
+@jax.jit
+def rot6d_from_matrix(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 6"]:
+    """First two columns of a rotation matrix.
+
+    Args:
+      matrix: Rotation matrices.
+
+    Returns:
+      `[c1, c2]`, six numbers.
+
+    Source: Zhou et al. 2019, eq. 14.
+    """
+    return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
+
+
+@jax.jit
+def rot6d_rows_to_columns(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 6"]:
+    """Converts between the two-row and the two-column layout; its own inverse.
+
+    The six numbers are Gram-Schmidted on the way, so they may come from a network.
+
+    Args:
+      rot6d: Two rows (or two columns) of a rotation matrix.
+
+    Returns:
+      The first two columns (or rows) of the same matrix.
+
+    Source: rows as in the released code of CAMDM, MDM, EMDM and AMDM.
+    """
+    return rot6d_from_matrix(jnp.swapaxes(matrix_from_rot6d(rot6d), -1, -2))
+
+
+@jax.jit
+def matrix_from_quaternion(
+    quaternion: Float[Array, "*batch 4"],
+) -> Float[Array, "*batch 3 3"]:
+    """Rotation matrix of a quaternion.
+
+    Args:
+      quaternion: wxyz of any non-zero length; zero gives the identity.
+
+    Returns:
+      Rotation matrices.
+    """
+    identity = jnp.array([1.0, 0.0, 0.0, 0.0], quaternion.dtype)
+    w, x, y, z = jnp.moveaxis(safe_normalize(quaternion, identity), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+@jax.jit
+def quaternion_from_matrix(
+    matrix: Float[Array, "*batch 3 3"],
+) -> Float[Array, "*batch 4"]:
+    """Quaternion of a rotation matrix, with w >= 0.
+
+    Of the four algebraically equal forms the best conditioned one is taken, so the
+    result and its gradient are finite everywhere, half turns included.
+
+    Args:
+      matrix: Rotation matrices.
+
+    Returns:
+      Unit quaternions, wxyz.
+
+    Source: Shepperd 1978.
+    """
+    m = matrix
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    diagonal = jnp.stack(
+        [trace, m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], axis=-1
+    )
+    wx, wy, wz = (
+        m[..., 2, 1] - m[..., 1, 2],
+        m[..., 0, 2] - m[..., 2, 0],
+        m[..., 1, 0] - m[..., 0, 1],
+    )
+    xy, xz, yz = (
+        m[..., 0, 1] + m[..., 1, 0],
+        m[..., 0, 2] + m[..., 2, 0],
+        m[..., 1, 2] + m[..., 2, 1],
+    )
+    # Row k is 4 q_k q; its own entry is 1 + 2 d_k - trace >= 1 for the largest d_k.
+    own = 1.0 + 2.0 * diagonal - trace[..., None]
+    own = own.at[..., 0].set(1.0 + trace)
+    rows = jnp.stack(
+        [
+            jnp.stack([own[..., 0], wx, wy, wz], axis=-1),
+            jnp.stack([wx, own[..., 1], xy, xz], axis=-1),
+            jnp.stack([wy, xy, own[..., 2], yz], axis=-1),
+            jnp.stack([wz, xz, yz, own[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = jnp.argmax(own, axis=-1)[..., None, None]
+    row = jnp.take_along_axis(rows, best, axis=-2)[..., 0, :]
+    quaternion = row / jnp.linalg.norm(row, axis=-1, keepdims=True)
+    return jnp.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+@jax.jit
+def matrix_from_yaw(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
+    """Rotation about +y; positive yaw turns +z towards +x.
+
+    Args:
+      yaw: Angle in radians.
+
+    Returns:
+      Rotation matrices.
+    """
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
+    rows = [[c, zero, s], [zero, one, zero], [-s, zero, c]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+@jax.jit
+def matrix_from_facing(facing: Float[Array, "*batch 2"]) -> Float[Array, "*batch 3 3"]:
+    """Rotation about +y that turns +z onto a ground direction.
+
+    Args:
+      facing: Direction (x, z), unit length.
+
+    Returns:
+      Rotation matrices.
+    """
+    x, z = facing[..., 0], facing[..., 1]
+    zero, one = jnp.zeros_like(x), jnp.ones_like(x)
+    rows = [[z, zero, x], [zero, one, zero], [-x, zero, z]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+@jax.jit
+def geodesic_distance(
+    a: Float[Array, "*batch 3 3"], b: Float[Array, "*batch 3 3"]
+) -> Float[Array, "*batch"]:
+    """Angle of the rotation that turns a into b.
+
+    Exact near zero and near a half turn, where arccos of the trace is not; the
+    gradient is finite (zero) at both.
+
+    Args:
+      a: Rotation matrices.
+      b: Rotation matrices.
+
+    Returns:
+      Angle in [0, pi] radians.
+    """
+    q = quaternion_from_matrix(jnp.swapaxes(a, -1, -2) @ b)
+    square = jnp.sum(q[..., 1:] ** 2, axis=-1)
+    is_zero = square < _TINY
+    sine = jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, square)))
+    return 2.0 * jnp.arctan2(sine, q[..., 0])
