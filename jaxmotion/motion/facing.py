@@ -1,0 +1,104 @@
+"""Which way a pose faces on the ground.
+
+CAMDM takes the facing from the hips alone: with across = left hip - right hip in the
+world, forward = across x up. Only the chain from the root to the hips is needed.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.motion import ground, rotation
+from jaxmotion.motion.skeleton import Skeleton
+
+# Left and right hip joint in lower case, without separators and rig prefix.
+_HIPS = (
+    ("leftupleg", "rightupleg"),  # Mixamo, LaFAN1, CMU
+    ("upperlegl", "upperlegr"),  # Bandai Namco Research
+    ("lefthip", "righthip"),  # 100STYLE
+)
+
+
+def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
+    """Finds the hip joints by their names.
+
+    Knows LeftUpLeg/RightUpLeg (Mixamo, LaFAN1), UpperLeg_L/UpperLeg_R (Bandai Namco)
+    and LeftHip/RightHip (100STYLE), in any case and after a prefix like "mixamorig:".
+
+    Args:
+      skeleton: The bones.
+
+    Returns:
+      Indices of the left and the right hip joint.
+
+    Raises:
+      ValueError: if no pair is found; names the pairs it knows and the joints.
+
+    Source: the joints that CAMDM's code takes the facing from.
+    """
+    plain = [name.lower().split(":")[-1].replace("_", "") for name in skeleton.names]
+    for left, right in _HIPS:
+        if left in plain and right in plain:
+            return plain.index(left), plain.index(right)
+    raise ValueError(
+        "no hip joints: expected LeftUpLeg/RightUpLeg, UpperLeg_L/UpperLeg_R or "
+        f"LeftHip/RightHip among the joint names {', '.join(skeleton.names)}"
+    )
+
+
+@jax.jit
+def facing_from_across(across: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
+    """Facing of a body from the vector that points from its right to its left.
+
+    Args:
+      across: World vectors of any length; a vertical one gives +z.
+
+    Returns:
+      Unit directions (x, z): across x up, on the ground.
+
+    Source: Chen et al. 2024 (CAMDM), released code.
+    """
+    return ground.unit(jnp.stack([-across[..., 2], across[..., 0]], axis=-1))
+
+
+def _from_root(
+    skeleton: Skeleton, joint_rotation: Float[Array, "*batch joints 6"], joint: int
+) -> Float[Array, "*batch 3"]:
+    """World vector from the root to a joint: kinematics of its own chain only."""
+    chain = [joint]
+    while skeleton.parents[chain[0]] > 0:
+        chain.insert(0, skeleton.parents[chain[0]])
+    turn = rotation.matrix_from_rot6d(joint_rotation[..., 0, :])
+    vector = turn @ skeleton.offsets[chain[0]]
+    for parent, child in zip(chain[:-1], chain[1:], strict=True):
+        turn = turn @ rotation.matrix_from_rot6d(joint_rotation[..., parent, :])
+        vector = vector + turn @ skeleton.offsets[child]
+    return vector
+
+
+def hip_facing(
+    skeleton: Skeleton,
+    joint_rotation: Float[Array, "*batch joints 6"],
+    *,
+    hips: tuple[int, int] | None = None,
+) -> Float[Array, "*batch 2"]:
+    """Facing of poses from their hips.
+
+    Args:
+      skeleton: The bones.
+      joint_rotation: Parent-local rotations, two columns each; the root's is global.
+      hips: Left and right hip joint; found by name if not given.
+
+    Returns:
+      Unit directions (x, z), world; +z where the hips lie above each other.
+
+    Raises:
+      ValueError: if `hips` is not given and the names are unknown.
+
+    Source: Chen et al. 2024 (CAMDM), released code.
+    """
+    left, right = hip_joints(skeleton) if hips is None else hips
+    return facing_from_across(
+        _from_root(skeleton, joint_rotation, left)
+        - _from_root(skeleton, joint_rotation, right)
+    )

@@ -1,0 +1,113 @@
+"""Directions on the ground plane as unit vectors (x, z), never as stored angles.
+
+An angle here is a yaw: it turns +z towards +x, so the direction of yaw a is
+(sin a, cos a). Differences of directions come from atan2 of their cross and dot
+products, which wraps by itself; nothing needs to be unwrapped.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+_TINY = 1e-12
+
+
+def unit(
+    vector: Float[Array, "*batch 2"], fallback: Float[Array, "*batch 2"] | None = None
+) -> Float[Array, "*batch 2"]:
+    """Unit vector along a ground vector; `fallback` where that is zero.
+
+    The gradient is finite everywhere: at a zero vector it is zero.
+
+    Args:
+      vector: Ground vectors (x, z) of any length.
+      fallback: Unit vectors for lengths below 1e-6; +z by default.
+
+    Returns:
+      Unit vectors.
+
+    Source: own.
+    """
+    if fallback is None:
+        fallback = jnp.broadcast_to(jnp.array([0.0, 1.0], vector.dtype), vector.shape)
+    square = jnp.sum(vector * vector, axis=-1, keepdims=True)
+    is_zero = square < _TINY
+    # The branch that is not taken must have a finite gradient as well.
+    length = jnp.sqrt(jnp.where(is_zero, 1.0, square))
+    return jnp.where(is_zero, fallback, vector / length)
+
+
+def turn(
+    vector: Float[Array, "*batch 2"], yaw: Float[Array, "*batch"]
+) -> Float[Array, "*batch 2"]:
+    """Turns ground vectors about +y.
+
+    Args:
+      vector: Ground vectors (x, z).
+      yaw: Angle in radians; positive turns +z towards +x.
+
+    Returns:
+      Vectors of the same length.
+
+    Source: own.
+    """
+    x, z = vector[..., 0], vector[..., 1]
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return jnp.stack([cos * x + sin * z, cos * z - sin * x], axis=-1)
+
+
+def angle_from_to(
+    start: Float[Array, "*batch 2"], end: Float[Array, "*batch 2"]
+) -> Float[Array, "*batch"]:
+    """Yaw that turns one direction into another, by the shorter way.
+
+    Args:
+      start: Directions (x, z) of any length; a zero vector counts as +z.
+      end: Directions of any length; a zero vector counts as +z.
+
+    Returns:
+      Angle in [-pi, pi] radians, positive from +z towards +x.
+
+    Source: own.
+    """
+    # Unit vectors never have both products zero, where atan2 has no gradient.
+    a, b = unit(start), unit(end)
+    cross = b[..., 0] * a[..., 1] - b[..., 1] * a[..., 0]
+    return jnp.arctan2(cross, jnp.sum(a * b, axis=-1))
+
+
+def into_frame(
+    vector: Float[Array, "*batch 2"], facing: Float[Array, "*batch 2"]
+) -> Float[Array, "*batch 2"]:
+    """World ground vectors in the axes of a frame whose +z is `facing`.
+
+    Args:
+      vector: World vectors (x, z).
+      facing: Unit vectors, world.
+
+    Returns:
+      Vectors in the frame's axes.
+
+    Source: own.
+    """
+    x, z = vector[..., 0], vector[..., 1]
+    fx, fz = facing[..., 0], facing[..., 1]
+    return jnp.stack([fz * x - fx * z, fx * x + fz * z], axis=-1)
+
+
+def out_of_frame(
+    vector: Float[Array, "*batch 2"], facing: Float[Array, "*batch 2"]
+) -> Float[Array, "*batch 2"]:
+    """Inverse of `into_frame`.
+
+    Args:
+      vector: Vectors in the axes of a frame whose +z is `facing`.
+      facing: Unit vectors, world.
+
+    Returns:
+      World vectors (x, z).
+
+    Source: own.
+    """
+    x, z = vector[..., 0], vector[..., 1]
+    fx, fz = facing[..., 0], facing[..., 1]
+    return jnp.stack([fz * x + fx * z, fz * z - fx * x], axis=-1)

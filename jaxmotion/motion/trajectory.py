@@ -1,0 +1,274 @@
+"""Paths of a character's root on the ground, and what a controller does with them.
+
+A path is a position and a facing a frame: both (x, z), facing a unit vector, so that no
+angle ever wraps. The facing of a pose comes from its hips (`facing`).
+
+Heuristic future trajectory extension (HFTE) continues a path p_0 .. p_{F-1} by point
+reflection of its last K points about its end,
+
+    e_j = 2 p_{F-1} - p_{F-2-j},   j = 0 .. K-1                               (1)
+
+and repeats that about each new end. "Flipping in the local frame of the last point" is
+a half turn, hence a point reflection, whatever that frame's orientation. Position and
+tangent are continuous; the curvature changes its sign at every block.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.motion import ground
+from jaxmotion.motion.facing import hip_facing, hip_joints
+from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.spring import Scalar, facing_spring, velocity_spring
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PlanarFrame:
+    """A frame on the ground.
+
+    Attributes:
+      origin: World position (x, z), metres.
+      facing: World direction (x, z) of the frame's +z, unit length.
+    """
+
+    origin: Float[Array, "*batch 2"]
+    facing: Float[Array, "*batch 2"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory:
+    """A path on the ground.
+
+    Attributes:
+      position: Root position (x, z) of each frame, metres.
+      facing: Facing (x, z) of each frame, unit length.
+    """
+
+    position: Float[Array, "*batch frames 2"]
+    facing: Float[Array, "*batch frames 2"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Command:
+    """What the user asks for in one tick.
+
+    Attributes:
+      velocity: Wanted velocity (x, z), metres a second, world.
+      facing: Wanted facing (x, z), unit length, world.
+      label: Style or skill.
+    """
+
+    velocity: Float[Array, "*batch 2"]
+    facing: Float[Array, "*batch 2"]
+    label: Int[Array, "*batch"]
+
+
+def root_trajectory(
+    skeleton: Skeleton, motion: Motion, *, hips: tuple[int, int] | None = None
+) -> Trajectory:
+    """Path of the root and the facing of the hips in every frame.
+
+    Args:
+      skeleton: The bones.
+      motion: Frames of that skeleton, world.
+      hips: Left and right hip joint; found by name if not given.
+
+    Returns:
+      The path, one point a frame, world.
+
+    Raises:
+      ValueError: if `hips` is not given and the names are unknown.
+
+    Source: Chen et al. 2024 (CAMDM), released code: facing from the hips only.
+    """
+    hips = hip_joints(skeleton) if hips is None else hips
+    facing = hip_facing(skeleton, motion.joint_rotation, hips=hips)
+    return Trajectory(position=motion.root_position[..., ::2], facing=facing)
+
+
+@functools.partial(jax.jit, static_argnames=("num_frames", "fps"))
+def desired_trajectory(
+    frame: PlanarFrame,
+    velocity: Float[Array, "*batch 2"],
+    command: Command,
+    *,
+    num_frames: int,
+    fps: float,
+    half_life: Scalar = 0.27,
+    acceleration: Float[Array, "*batch 2"] | None = None,
+    turn_rate: Float[Array, "*batch"] | None = None,
+) -> Trajectory:
+    """Path that a user's command asks for, from where the character is now.
+
+    Position follows the goal-velocity spring, facing the spring on the circle. All
+    times are evaluated at once, in closed form.
+
+    Args:
+      frame: Where the character is and faces, world.
+      velocity: Its velocity, metres a second, world.
+      command: Wanted velocity and facing.
+      num_frames: Length of the path; frame i is (i + 1) / fps seconds ahead.
+      fps: Frames a second.
+      half_life: Of both springs, seconds.
+      acceleration: Metres a second squared, world; zero if not given.
+      turn_rate: Of the facing, radians a second; zero if not given.
+
+    Returns:
+      The path, world.
+
+    Source: Chen et al. 2024 (CAMDM), sec. 3.2; Büttner and Clavet 2015.
+    """
+    times = jnp.arange(1, num_frames + 1, dtype=velocity.dtype) / fps
+    batch = velocity.shape[:-1]
+    times = jnp.broadcast_to(times, (*batch, num_frames))
+
+    def over_time(x: Array) -> Array:
+        return jnp.repeat(jnp.expand_dims(x, len(batch)), num_frames, axis=len(batch))
+
+    acceleration = jnp.zeros_like(velocity) if acceleration is None else acceleration
+    turn_rate = jnp.zeros(batch, velocity.dtype) if turn_rate is None else turn_rate
+    position, _, _ = velocity_spring(
+        over_time(frame.origin),
+        over_time(velocity),
+        over_time(acceleration),
+        over_time(command.velocity),
+        half_life=half_life,
+        dt=times[..., None],
+    )
+    facing, _ = facing_spring(
+        over_time(frame.facing),
+        over_time(turn_rate),
+        over_time(command.facing),
+        half_life=half_life,
+        dt=times,
+    )
+    return Trajectory(position=position, facing=facing)
+
+
+@functools.partial(jax.jit, static_argnames=("num_frames", "reuse", "mirror_facing"))
+def extend(
+    trajectory: Trajectory, num_frames: int, *, reuse: int, mirror_facing: bool = False
+) -> Trajectory:
+    """Heuristic future trajectory extension: (1) of this module, block by block.
+
+    Args:
+      trajectory: The predicted path, F frames.
+      num_frames: Frames to add (zero returns the path as it is).
+      reuse: K, how many points are reflected at a time, 1 .. F-1. The paper uses 15,
+        the released code 23 of 45.
+      mirror_facing: Copy the facing of each reflected point, as the paper says;
+        else the last facing is held, as the released code does.
+
+    Returns:
+      The path followed by its extension, F + num_frames frames.
+
+    Raises:
+      ValueError: if `reuse` is not in 1 .. F-1, or `num_frames` is negative.
+
+    Source: Chen et al. 2024 (CAMDM), sec. 3.2 and fig. 3.
+    """
+    position, facing = trajectory.position, trajectory.facing
+    frames = position.shape[-2]
+    if not 1 <= reuse <= frames - 1:
+        raise ValueError(
+            f"reuse is {reuse}, expected 1..{frames - 1} ({frames} frames)"
+        )
+    if num_frames < 0:
+        raise ValueError(f"num_frames is {num_frames}, expected 0 or more")
+    while position.shape[-2] < frames + num_frames:
+        end = position[..., -1:, :]
+        back = slice(-2, -2 - reuse, -1)
+        position = jnp.concatenate([position, 2 * end - position[..., back, :]], -2)
+        last = facing[..., back, :]
+        held = jnp.broadcast_to(facing[..., -1:, :], last.shape)
+        facing = jnp.concatenate([facing, last if mirror_facing else held], axis=-2)
+    total = frames + num_frames
+    return Trajectory(position=position[..., :total, :], facing=facing[..., :total, :])
+
+
+@jax.jit
+def blend(
+    predicted: Trajectory,
+    desired: Trajectory,
+    *,
+    bias_position: Scalar,
+    bias_facing: Scalar,
+) -> Trajectory:
+    """Blends from the predicted path (now) to the desired one (at the end).
+
+    The weight of the desired path at frame i of F, counted from 1, is
+    1 - (1 - i/F)^bias: the greater the bias, the more responsive.
+
+    Args:
+      predicted: The model's own future path.
+      desired: The path that the user asks for, of the same length.
+      bias_position: Exponent for positions (released scene 0.7, its code 0.4).
+      bias_facing: Exponent for facings (released code 2.2).
+
+    Returns:
+      The path to condition the model on. Where the blend of two opposite facings is
+      zero, it faces as desired.
+
+    Source: Holden et al. 2017 (PFNN); Chen et al. 2024 (CAMDM), released code.
+    """
+    frames = desired.position.shape[-2]
+    # 1 - i/F counted down, so that the last is exactly zero.
+    left = jnp.arange(frames - 1, -1, -1, dtype=desired.position.dtype) / frames
+
+    def mix(bias: Scalar, a: Array, b: Array) -> Array:
+        weight = (1.0 - left**bias)[:, None]
+        return a + weight.reshape((1,) * (b.ndim - 2) + weight.shape) * (b - a)
+
+    position = mix(bias_position, predicted.position, desired.position)
+    facing = mix(bias_facing, predicted.facing, desired.facing)
+    return Trajectory(position=position, facing=ground.unit(facing, desired.facing))
+
+
+@jax.jit
+def to_local(trajectory: Trajectory, frame: PlanarFrame) -> Trajectory:
+    """A world path in a frame: the frame's origin at zero, its facing along +z.
+
+    Args:
+      trajectory: World path.
+      frame: Frame, one for the whole path.
+
+    Returns:
+      The path in that frame.
+
+    Source: own.
+    """
+    moved = trajectory.position - frame.origin[..., None, :]
+    facing = jnp.broadcast_to(frame.facing[..., None, :], moved.shape)
+    return Trajectory(
+        position=ground.into_frame(moved, facing),
+        facing=ground.into_frame(trajectory.facing, facing),
+    )
+
+
+@jax.jit
+def to_world(trajectory: Trajectory, frame: PlanarFrame) -> Trajectory:
+    """Inverse of `to_local`.
+
+    Args:
+      trajectory: Path in the frame.
+      frame: Frame, one for the whole path.
+
+    Returns:
+      World path.
+
+    Source: own.
+    """
+    shape = trajectory.position.shape
+    facing = jnp.broadcast_to(frame.facing[..., None, :], shape)
+    position = ground.out_of_frame(trajectory.position, facing)
+    return Trajectory(
+        position=position + frame.origin[..., None, :],
+        facing=ground.out_of_frame(trajectory.facing, facing),
+    )

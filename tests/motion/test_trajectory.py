@@ -1,0 +1,359 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxmotion.motion import facing as facing_module
+from jaxmotion.motion import ground, rotation, skeleton, spring, trajectory
+from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
+from tests.reference import trajectory as oracle
+
+
+def directions(angles):
+    angles = np.asarray(angles)
+    return np.stack([np.sin(angles), np.cos(angles)], -1).astype(np.float32)
+
+
+def path(position, angles=None):
+    position = jnp.asarray(position, jnp.float32)
+    if angles is None:
+        angles = np.linspace(0.0, 1.0, position.shape[-2])
+    return Trajectory(position=position, facing=jnp.asarray(directions(angles)))
+
+
+def biped(names):
+    return skeleton.Skeleton(
+        offsets=jnp.array(
+            [[0, 0, 0], [0, 0.1, 0], [0.1, 0, 0.02], [-0.1, 0, 0.02]], jnp.float32
+        ),
+        parents=(-1, 0, 1, 1),
+        names=names,
+    )
+
+
+# --- springs ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("half_life", [0.05, 0.27, 1.155])
+@pytest.mark.parametrize("t", [1 / 60, 0.5, 3.0])
+def test_springs_solve_their_differential_equations(half_life, t):
+    x, v, a, goal = 0.3, -1.2, 2.5, 1.7
+    want = oracle.integrate_spring(x, v, goal, half_life, t)
+    x_, v_, a_, goal_ = (jnp.float32(n) for n in (x, v, a, goal))
+    got = spring.spring(x_, v_, goal_, half_life=half_life, dt=t)
+    np.testing.assert_allclose(got, want, atol=2e-5)
+    want = oracle.integrate_velocity_spring(x, v, a, goal, half_life, t)
+    got = spring.velocity_spring(x_, v_, a_, goal_, half_life=half_life, dt=t)
+    np.testing.assert_allclose(got, want, rtol=1e-4, atol=5e-5)
+
+
+def test_springs_are_semigroups():
+    x, v, a, goal = (jnp.float32(n) for n in (0.3, -1.2, 2.5, 1.7))
+    for dt1, dt2 in [(0.1, 0.25), (0.01, 1.0)]:
+        for state, call in [
+            ((x, v), lambda s, dt: spring.spring(*s, goal, half_life=0.3, dt=dt)),
+            (
+                (x, v, a),
+                lambda s, dt: spring.velocity_spring(*s, goal, half_life=0.3, dt=dt),
+            ),
+        ]:
+            once, twice = call(state, dt1 + dt2), call(call(state, dt1), dt2)
+            np.testing.assert_allclose(once, twice, rtol=1e-4, atol=1e-5)
+
+
+def test_velocity_spring_at_its_goal_velocity_moves_by_velocity_times_time():
+    v = jnp.array([1.5, -0.5])
+    x, v_new, a = spring.velocity_spring(
+        jnp.zeros(2), v, jnp.zeros(2), v, half_life=0.27, dt=0.4
+    )
+    np.testing.assert_array_equal(x, v * jnp.float32(0.4))
+    np.testing.assert_array_equal(v_new, v)
+    np.testing.assert_array_equal(a, jnp.zeros(2))
+
+
+def test_half_life_is_nominal():
+    zero, one = jnp.float32(0), jnp.float32(1)
+    _, v, _ = spring.velocity_spring(zero, zero, zero, one, half_life=0.27, dt=0.27)
+    np.testing.assert_allclose(1 - v, (1 + 2 * np.log(2)) / 4, rtol=1e-5)
+
+
+def test_springs_of_no_half_life_arrive_at_once_and_finitely():
+    zero, one = jnp.float32(0), jnp.float32(1)
+    x, v = spring.spring(zero, zero, one, half_life=0.0, dt=0.1)
+    np.testing.assert_array_equal([x, v], [1.0, 0.0])
+    x, v, a = spring.velocity_spring(zero, zero, zero, one, half_life=0.0, dt=0.1)
+    np.testing.assert_allclose([x, v, a], [0.1, 1.0, 0.0], atol=1e-4)
+
+
+def test_facing_spring_takes_the_shorter_arc_across_pi():
+    start, goal = jnp.asarray(directions(3.0)), jnp.asarray(directions(-3.0))
+    angles = []
+    for dt in (0.0, 0.1, 0.3, 5.0):
+        facing, _ = spring.facing_spring(
+            start, jnp.float32(0.5), goal, half_life=0.27, dt=dt
+        )
+        np.testing.assert_allclose(np.linalg.norm(facing), 1.0, atol=1e-6)
+        # The oracle integrates the angle itself, unwrapped to the near side.
+        want, _ = oracle.integrate_spring(3.0, 0.5, 2 * np.pi - 3.0, 0.27, dt or 1e-9)
+        angles.append(oracle.wrap(oracle.yaw(np.asarray(facing)) - want))
+    np.testing.assert_allclose(angles, 0.0, atol=1e-5)
+
+
+# --- desired trajectory ----------------------------------------------------------
+
+
+def test_desired_trajectory_follows_the_equations_at_every_frame():
+    frame = PlanarFrame(
+        origin=jnp.array([1.0, 2.0]), facing=jnp.asarray(directions(2.9))
+    )
+    velocity, acceleration = jnp.array([0.4, -0.2]), jnp.array([1.0, 0.5])
+    command = Command(
+        velocity=jnp.array([-1.0, 1.5]),
+        facing=jnp.asarray(directions(-2.5)),
+        label=jnp.int32(0),
+    )
+    got = trajectory.desired_trajectory(
+        frame,
+        velocity,
+        command,
+        num_frames=45,
+        fps=30.0,
+        half_life=0.3,
+        acceleration=acceleration,
+        turn_rate=jnp.float32(-0.3),
+    )
+    assert got.position.shape == (45, 2)
+    for i in (0, 14, 44):
+        t = (i + 1) / 30.0
+        for axis in range(2):
+            want = oracle.integrate_velocity_spring(
+                float(frame.origin[axis]),
+                float(velocity[axis]),
+                float(acceleration[axis]),
+                float(command.velocity[axis]),
+                0.3,
+                t,
+            )[0]
+            np.testing.assert_allclose(got.position[i, axis], want, atol=1e-5)
+        angle, _ = oracle.integrate_spring(2.9, -0.3, 2 * np.pi - 2.5, 0.3, t)
+        error = oracle.wrap(oracle.yaw(np.asarray(got.facing[i])) - angle)
+        np.testing.assert_allclose(error, 0.0, atol=1e-5)
+
+
+def test_desired_trajectory_of_a_batch_is_that_of_each():
+    key_v, key_c = jax.random.split(jax.random.key(0))
+    velocity = jax.random.normal(key_v, (3, 2))
+    wanted = jax.random.normal(key_c, (3, 2))
+    facing = ground.unit(wanted)
+
+    def plan(velocity, wanted, facing):
+        frame = PlanarFrame(origin=velocity * 2, facing=facing[..., ::-1])
+        label = jnp.zeros(velocity.shape[:-1], jnp.int32)
+        command = Command(velocity=wanted, facing=facing, label=label)
+        return trajectory.desired_trajectory(
+            frame, velocity, command, num_frames=5, fps=30.0
+        )
+
+    batched = plan(velocity, wanted, facing)
+    mapped = jax.vmap(plan)(velocity, wanted, facing)
+    for a, b in zip(jax.tree.leaves(batched), jax.tree.leaves(mapped), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+# --- extension -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "frames, added, reuse", [(45, 44, 23), (45, 15, 15), (10, 25, 4), (3, 4, 2)]
+)
+def test_extension_is_the_half_turn_of_the_last_points(frames, added, reuse):
+    points = np.random.default_rng(0).normal(size=(frames, 2))
+    got = trajectory.extend(path(points), added, reuse=reuse)
+    want = oracle.extend(points, added, reuse)
+    assert got.position.shape == (frames + added, 2)
+    np.testing.assert_allclose(got.position, want, atol=2e-4)
+
+
+def test_extension_of_45_by_44_with_23_is_two_blocks():
+    points = np.random.default_rng(1).normal(size=(45, 2))
+    e = np.asarray(trajectory.extend(path(points), 44, reuse=23).position)[45:]
+    p = points
+    np.testing.assert_allclose(e[:23], 2 * p[44] - p[43:20:-1], atol=1e-5)
+    behind = np.concatenate([p[44:45], e[:22]])[::-1][:21]
+    np.testing.assert_allclose(e[23:], 2 * e[22] - behind, atol=1e-5)
+
+
+def test_straight_walk_extends_straight():
+    points = np.arange(10)[:, None] * np.array([0.03, 0.04])
+    got = trajectory.extend(path(points), 20, reuse=4)
+    want = np.arange(30)[:, None] * np.array([0.03, 0.04])
+    np.testing.assert_allclose(got.position, want, atol=1e-5)
+
+
+def test_curvature_of_an_arc_flips_at_each_block():
+    angle = np.arange(12) * 0.1
+    points = np.stack([1 - np.cos(angle), np.sin(angle)], -1)
+    got = np.asarray(trajectory.extend(path(points), 10, reuse=5).position)
+    step = np.diff(got, axis=0)
+    bend = step[:-1, 0] * step[1:, 1] - step[:-1, 1] * step[1:, 0]
+    sign = np.sign(np.round(bend, 5))
+    # Frames 0..11 are given; blocks begin after 11 and 16, where the bend is zero.
+    np.testing.assert_array_equal(sign[:10], -1)
+    np.testing.assert_array_equal(sign[[10, 15]], 0)
+    np.testing.assert_array_equal(sign[11:15], 1)
+    np.testing.assert_array_equal(sign[16:], -1)
+    np.testing.assert_allclose(
+        np.linalg.norm(step, axis=-1), 2 * np.sin(0.05), atol=1e-5
+    )
+
+
+def test_extension_holds_or_mirrors_the_facing():
+    angles = np.linspace(-1.0, 1.0, 6)
+    given = path(np.zeros((6, 2)), angles)
+    held = trajectory.extend(given, 4, reuse=4)
+    np.testing.assert_allclose(held.facing[6:], directions([1.0] * 4), atol=1e-6)
+    mirrored = trajectory.extend(given, 4, reuse=4, mirror_facing=True)
+    np.testing.assert_allclose(
+        mirrored.facing[6:], directions(angles[4:0:-1]), atol=1e-6
+    )
+
+
+def test_extension_refuses_impossible_lengths():
+    given = path(np.zeros((5, 2)))
+    with pytest.raises(ValueError, match=r"reuse is 5, expected 1\.\.4"):
+        trajectory.extend(given, 3, reuse=5)
+    with pytest.raises(ValueError, match="num_frames is -1"):
+        trajectory.extend(given, -1, reuse=2)
+
+
+# --- blending --------------------------------------------------------------------
+
+
+def test_blend_weights_are_those_published():
+    zero, one = path(np.zeros((45, 2)), np.zeros(45)), path(np.ones((45, 2)))
+    got = trajectory.blend(zero, one, bias_position=0.7, bias_facing=2.2)
+    at = [0, 4, 14, 29, 44]
+    np.testing.assert_allclose(
+        got.position[at, 0], [0.016, 0.079, 0.247, 0.537, 1.0], atol=5.1e-4
+    )
+    got = trajectory.blend(zero, one, bias_position=2.2, bias_facing=2.2)
+    np.testing.assert_allclose(
+        got.position[at, 0], [0.048, 0.228, 0.590, 0.911, 1.0], atol=5.1e-4
+    )
+
+
+def test_blended_facing_is_unit_and_between():
+    left, right = (path(np.zeros((9, 2)), np.full(9, a)) for a in (3.0, -2.8))
+    got = trajectory.blend(left, right, bias_position=1.0, bias_facing=1.0)
+    np.testing.assert_allclose(np.linalg.norm(got.facing, axis=-1), 1.0, atol=1e-6)
+    turned = oracle.wrap(oracle.yaw(np.asarray(got.facing)) - 3.0)
+    assert np.all(np.diff(turned) > 0) and turned[0] > 0
+    np.testing.assert_allclose(turned[-1], 2 * np.pi - 5.8, atol=1e-6)
+
+
+def test_blend_of_opposite_facings_and_its_gradient_are_finite():
+    ahead, back = (path(np.zeros((4, 2)), np.full(4, a)) for a in (0.0, np.pi))
+
+    def total(bias, facing):
+        given = Trajectory(position=ahead.position, facing=facing)
+        out = trajectory.blend(given, back, bias_position=bias, bias_facing=bias)
+        return jnp.sum(out.facing[..., 0] + out.position[..., 0])
+
+    # Bias 1 and frame 2 of 4: half and half, so the sum is zero.
+    value, grads = jax.value_and_grad(total, (0, 1))(jnp.float32(1), ahead.facing)
+    assert np.isfinite(value) and all(np.isfinite(g).all() for g in grads)
+
+
+# --- frames ----------------------------------------------------------------------
+
+
+def test_frames_are_rigid_and_invert():
+    angles = np.tile(np.linspace(-3, 3, 7), (4, 1))
+    given = path(np.random.default_rng(2).normal(size=(4, 7, 2)), angles)
+    yaw = np.array([0.3, -2.0, 3.1, 1.5])
+    frame = PlanarFrame(
+        origin=jnp.asarray(np.arange(8.0).reshape(4, 2), jnp.float32),
+        facing=jnp.asarray(directions(yaw)),
+    )
+    local = trajectory.to_local(given, frame)
+    # SciPy's rotation about +y is the oracle for the sense of the turn.
+    turn = Rotation.from_rotvec(np.outer(yaw, [0, 1, 0])).inv()
+    for b in range(4):
+        moved = np.asarray(given.position)[b] - np.asarray(frame.origin)[b]
+        world = np.stack([moved[:, 0], np.zeros(7), moved[:, 1]], -1)
+        np.testing.assert_allclose(
+            local.position[b], turn[b].apply(world)[:, ::2], atol=1e-5
+        )
+    back = trajectory.to_world(local, frame)
+    np.testing.assert_allclose(back.position, given.position, atol=1e-5)
+    np.testing.assert_allclose(back.facing, given.facing, atol=1e-6)
+    own = Trajectory(position=frame.origin[:, None], facing=frame.facing[:, None])
+    seen = trajectory.to_local(own, frame)
+    np.testing.assert_allclose(seen.position, 0.0, atol=1e-6)
+    np.testing.assert_allclose(seen.facing[:, 0], [[0, 1]] * 4, atol=1e-6)
+
+
+# --- facing of a body ------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("Hips", "Spine", "LeftUpLeg", "RightUpLeg"),
+        ("mixamorig:Hips", "a", "mixamorig:LeftUpLeg", "mixamorig:RightUpLeg"),
+        ("joint_Root", "Hips", "UpperLeg_L", "UpperLeg_R"),
+        ("Hips", "Chest", "LeftHip", "RightHip"),
+    ],
+)
+def test_hips_are_found_by_name(names):
+    assert facing_module.hip_joints(biped(names)) == (2, 3)
+
+
+def test_unknown_hips_name_what_was_expected():
+    with pytest.raises(ValueError, match=r"LeftUpLeg/RightUpLeg.*a, b, c, d"):
+        facing_module.hip_joints(biped(("a", "b", "c", "d")))
+
+
+def test_root_trajectory_is_that_of_full_kinematics():
+    bones = biped(("Root", "Hips", "UpperLeg_L", "UpperLeg_R"))
+    key_p, key_r = jax.random.split(jax.random.key(1))
+    rot6d = jax.random.normal(key_r, (2, 5, 4, 6))
+    motion = skeleton.Motion(
+        root_position=jax.random.normal(key_p, (2, 5, 3)), joint_rotation=rot6d
+    )
+    got = trajectory.root_trajectory(bones, motion)
+    joints = np.asarray(skeleton.joint_positions(bones, motion))
+    forward = np.cross(joints[..., 2, :] - joints[..., 3, :], [0, 1, 0])[..., ::2]
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
+    np.testing.assert_allclose(got.facing, forward, atol=1e-5)
+    np.testing.assert_array_equal(got.position, motion.root_position[..., ::2])
+
+
+def test_facing_turns_with_the_root():
+    bones = biped(("Root", "Hips", "LeftUpLeg", "RightUpLeg"))
+    yaw = np.array([0.0, 0.5, 3.1, -3.1], np.float32)
+    rest = rotation.rot6d_from_matrix(jnp.broadcast_to(jnp.eye(3), (4, 4, 3, 3)))
+    turned = rotation.rot6d_from_matrix(rotation.matrix_from_yaw(jnp.asarray(yaw)))
+    motion = skeleton.Motion(
+        root_position=jnp.zeros((4, 3)), joint_rotation=rest.at[:, 0].set(turned)
+    )
+    facing = trajectory.root_trajectory(bones, motion).facing
+    np.testing.assert_allclose(facing, directions(yaw), atol=1e-6)
+
+
+def test_everything_is_finite_at_zero_vectors():
+    zero = jnp.zeros(2)
+
+    def total(facing, velocity, across):
+        frame = PlanarFrame(origin=zero, facing=facing)
+        command = Command(velocity=velocity, facing=facing, label=jnp.int32(0))
+        plan = trajectory.desired_trajectory(
+            frame, velocity, command, num_frames=3, fps=30.0
+        )
+        longer = trajectory.extend(plan, 2, reuse=2)
+        front = facing_module.facing_from_across(across)
+        return jnp.sum(longer.position) + jnp.sum(longer.facing) + jnp.sum(front)
+
+    value, grads = jax.value_and_grad(total, (0, 1, 2))(zero, zero, jnp.zeros(3))
+    assert np.isfinite(value) and all(np.isfinite(g).all() for g in grads)
