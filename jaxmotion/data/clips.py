@@ -6,11 +6,14 @@ are gathered inside jit.
 """
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton
 
 
 @jax.tree_util.register_dataclass
@@ -68,3 +71,183 @@ class Clips:
                 f"unknown label field {field!r}: the clips have {', '.join(fields)}"
             )
         return fields[field]
+
+
+def _check_skeletons(
+    skeletons: Sequence[Skeleton], names: Sequence[str], tolerance: float
+) -> None:
+    """Raises unless all skeletons have the first one's joints and bones."""
+    first = skeletons[0]
+    offsets = np.asarray(first.offsets)
+    for name, other in zip(names, skeletons, strict=True):
+        pair = f"clips {names[0]!r} and {name!r} have different skeletons"
+        for field in ("names", "parents", "feet"):
+            expected, found = getattr(first, field), getattr(other, field)
+            if expected != found:
+                raise ValueError(f"{pair}: {field} {expected} and {found}")
+        change = np.abs(np.asarray(other.offsets) - offsets).max(axis=-1)
+        if change.max() > tolerance:
+            joint = int(change.argmax())
+            raise ValueError(
+                f"{pair}: the offset of joint {first.names[joint]!r} differs by "
+                f"{change[joint]:.4g} m, more than {tolerance:g} m"
+            )
+
+
+def _check_motions(
+    motions: Sequence[Motion], names: Sequence[str], num_joints: int
+) -> None:
+    """Raises unless all motions have frames, finite values and the first's rate."""
+    for name, motion in zip(names, motions, strict=True):
+        shape = motion.joint_rotation.shape
+        if motion.root_position.ndim != 2 or shape[0] == 0:
+            raise ValueError(f"clip {name!r} is not one clip with frames: {shape}")
+        if shape[1] != num_joints:
+            raise ValueError(
+                f"clip {name!r} has {shape[1]} joints, the skeleton {num_joints}"
+            )
+        if motion.fps != motions[0].fps:
+            raise ValueError(
+                f"clips {names[0]!r} and {name!r} have different rates: "
+                f"{motions[0].fps:g} and {motion.fps:g} frames a second"
+            )
+        for field in ("root_position", "joint_rotation"):
+            finite = np.isfinite(np.asarray(getattr(motion, field)))
+            if not finite.all():
+                frame = int(np.argwhere(~finite)[0, 0])
+                raise ValueError(f"clip {name!r}: {field} of frame {frame} is NaN")
+
+
+def clips_from_motions(
+    motions: Sequence[Motion],
+    skeletons: Skeleton | Sequence[Skeleton],
+    *,
+    names: Sequence[str],
+    labels: Mapping[str, Sequence[str]],
+    label_names: Mapping[str, Sequence[str]] | None = None,
+    source: str = "",
+    tolerance: float = 1e-3,
+) -> Clips:
+    """Puts motions of one skeleton behind each other.
+
+    Args:
+      motions: One motion a clip, all at the same rate.
+      skeletons: The skeleton of all clips, or one a clip; then their mean is kept.
+      names: One name a clip.
+      labels: For each label field, the label of each clip in words.
+      label_names: Order of the words of a field; by default those that occur, sorted.
+      source: Where the data came from and its licence.
+      tolerance: Largest difference between the offsets of two skeletons, metres.
+
+    Returns:
+      The clips.
+
+    Raises:
+      ValueError: if there is no clip, the numbers of clips, names and labels differ,
+        two skeletons or rates differ (names both clips), a value is not finite, or a
+        label is not among `label_names`.
+    """
+    if not motions:
+        raise ValueError("no clips: at least one motion is needed")
+    per_clip = [skeletons] if isinstance(skeletons, Skeleton) else list(skeletons)
+    if isinstance(skeletons, Skeleton):
+        per_clip = per_clip * len(motions)
+    for what, values in {"skeletons": per_clip, "names": names, **labels}.items():
+        if len(values) != len(motions):
+            raise ValueError(f"{len(values)} {what} for {len(motions)} motions")
+    _check_skeletons(per_clip, names, tolerance)
+    _check_motions(motions, names, per_clip[0].num_joints)
+    words = {
+        field: tuple((label_names or {}).get(field, sorted(set(values))))
+        for field, values in labels.items()
+    }
+    for field, values in labels.items():
+        for name, value in zip(names, values, strict=True):
+            if value not in words[field]:
+                raise ValueError(
+                    f"clip {name!r}: unknown {field} {value!r}, expected one of "
+                    f"{', '.join(words[field])}"
+                )
+    lengths = [motion.root_position.shape[0] for motion in motions]
+    mean_offsets = np.mean([np.asarray(s.offsets, np.float64) for s in per_clip], 0)
+    return Clips(
+        root_position=_join([motion.root_position for motion in motions]),
+        joint_rotation=_join([motion.joint_rotation for motion in motions]),
+        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
+        labels={
+            field: jnp.asarray([words[field].index(v) for v in values], jnp.int32)
+            for field, values in labels.items()
+        },
+        skeleton=dataclasses.replace(
+            per_clip[0], offsets=jnp.asarray(mean_offsets, jnp.float32)
+        ),
+        fps=float(motions[0].fps),
+        label_names=tuple(words.items()),
+        clip_names=tuple(names),
+        source=source,
+    )
+
+
+def _join(arrays: Sequence[Array]) -> Array:
+    """Concatenates on the host: thousands of device arrays would compile for ever."""
+    return jnp.asarray(np.concatenate([np.asarray(array) for array in arrays]))
+
+
+def clip_motion(clips: Clips, index: int) -> Motion:
+    """One clip as a motion.
+
+    Args:
+      clips: The clips.
+      index: Number of the clip.
+
+    Returns:
+      Its frames.
+
+    Raises:
+      ValueError: if there is no such clip.
+    """
+    if not 0 <= index < clips.num_clips:
+        raise ValueError(f"clip {index} of {clips.num_clips}: expected 0 <= index")
+    start, stop = (int(frame) for frame in clips.offsets[index : index + 2])
+    return Motion(
+        root_position=clips.root_position[start:stop],
+        joint_rotation=clips.joint_rotation[start:stop],
+        fps=clips.fps,
+    )
+
+
+def take_clips(clips: Clips, indices: Sequence[int] | np.ndarray) -> Clips:
+    """The clips of those numbers, in that order; label names are kept.
+
+    Args:
+      clips: The clips.
+      indices: Numbers of clips.
+
+    Returns:
+      Those clips alone.
+
+    Raises:
+      ValueError: if there is no such clip, or none is asked for.
+    """
+    indices = np.asarray(indices, np.int64)
+    if indices.size == 0:
+        raise ValueError("no clips are left: the selection is empty")
+    if indices.min() < 0 or indices.max() >= clips.num_clips:
+        raise ValueError(
+            f"clip numbers {indices.min()}..{indices.max()} are not all in "
+            f"0..{clips.num_clips - 1}"
+        )
+    offsets = np.asarray(clips.offsets)
+    frames = np.concatenate([np.arange(offsets[i], offsets[i + 1]) for i in indices])
+    lengths = np.diff(offsets)[indices]
+    return dataclasses.replace(
+        clips,
+        root_position=jnp.asarray(np.asarray(clips.root_position)[frames]),
+        joint_rotation=jnp.asarray(np.asarray(clips.joint_rotation)[frames]),
+        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
+        labels={
+            field: jnp.asarray(np.asarray(values)[indices])
+            for field, values in clips.labels.items()
+        },
+        clip_names=tuple(clips.clip_names[i] for i in indices),
+    )

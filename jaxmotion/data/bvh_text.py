@@ -1,0 +1,263 @@
+"""The BVH text format: parse it, read it, write it; no motion mathematics.
+
+A file is a HIERARCHY of joints (OFFSET, CHANNELS, children, End Sites) and a MOTION
+block of one row of channel values a frame. Files of the wild differ in channel order,
+in which joints have position channels, in line ends and spacing, and in frame rate:
+all of that is kept as it is. Units are the file's own (mostly centimetres, degrees).
+"""
+
+import dataclasses
+import os
+import re
+import warnings
+from typing import IO
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxmotion.data.bvh_hierarchy import BvhError, Hierarchy
+
+_MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.IGNORECASE | re.MULTILINE)
+_FRAMES = re.compile(r"\s*Frames\s*:?\s*(\S+)\s*", re.IGNORECASE)
+_FRAME_TIME = re.compile(r"\s*Frame\s+Time\s*:?\s*(\S+)\s*", re.IGNORECASE)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Bvh:
+    """What a BVH file says, in the file's own units and joint order.
+
+    Attributes:
+      names: One name a joint.
+      parents: Parent of each joint; -1 for the root, else smaller than the joint.
+      offsets: OFFSET of each joint, in its parent's frame.
+      channels: For each joint its channels in file order, such as "Zrotation".
+      end_sites: For each joint the offsets of its End Sites (none, one or several).
+      values: Channel values, one row a frame; angles in degrees.
+      frame_time: Seconds a frame.
+      name: File name (or another name) for messages.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: Float[np.ndarray, "joints 3"]
+    channels: tuple[tuple[str, ...], ...]
+    end_sites: tuple[tuple[tuple[float, float, float], ...], ...]
+    values: Float[np.ndarray, "frames channels"]
+    frame_time: float
+    name: str = "bvh"
+
+    @property
+    def num_joints(self) -> int:
+        """Number of joints."""
+        return len(self.names)
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return self.values.shape[0]
+
+
+def _header_number(lines: list[str], number: int, pattern, name: str, what: str):
+    """The number behind 'Frames:' or 'Frame Time:'; returns it and the next index."""
+    while number < len(lines) and not lines[number].strip():
+        number += 1
+    if number >= len(lines):
+        raise BvhError(f"{name}: the file ends where '{what}' was expected (truncated)")
+    match = pattern.fullmatch(lines[number])
+    try:
+        value = float(match.group(1)) if match else np.nan
+    except ValueError:
+        value = np.nan
+    if not (np.isfinite(value) and value > 0):
+        raise BvhError(
+            f"{name}, line {number + 1}: expected '{what} <positive number>', "
+            f"found {lines[number].strip()!r}"
+        )
+    return value, number + 1
+
+
+def _rows(lines: list[str], start: int, shape: tuple[int, int], name: str):
+    """Frame rows from line `start` on, each checked for width and finite values."""
+    num_frames, width = shape
+    values = np.empty(shape)
+    row = 0
+    with warnings.catch_warnings():
+        # NumPy warns, and stops, at a word that is no number.
+        warnings.simplefilter("error", DeprecationWarning)
+        for number in range(start, len(lines)):
+            line = lines[number].strip()
+            if not line:
+                continue
+            where = f"{name}, line {number + 1}"
+            if row == num_frames:
+                raise BvhError(f"{where}: more rows than the {num_frames} of 'Frames:'")
+            try:
+                parsed = np.fromstring(line, sep=" ")
+            except (DeprecationWarning, ValueError):
+                raise BvhError(
+                    f"{where}: frame {row} has a value that is no number"
+                ) from None
+            if parsed.size != width:
+                raise BvhError(
+                    f"{where}: frame {row} has {parsed.size} values, the channels "
+                    f"need {width} (truncated or malformed)"
+                )
+            if not np.isfinite(parsed).all():
+                raise BvhError(f"{where}: frame {row} has a NaN or infinite value")
+            values[row] = parsed
+            row += 1
+    if row != num_frames:
+        raise BvhError(
+            f"{name}: 'Frames:' says {num_frames}, the file has {row} rows (truncated)"
+        )
+    return values
+
+
+def parse_bvh(text: str, *, name: str = "bvh") -> Bvh:
+    r"""Parses BVH text.
+
+    Args:
+      text: Content of a file; line ends may be \n, \r\n or \r.
+      name: File name for messages.
+
+    Returns:
+      What the file says, in its own units.
+
+    Raises:
+      BvhError: for anything malformed; names the file and the line.
+
+    Source: Biovision's BVH format (Meredith and Maddock 2001).
+    """
+    text = text.replace("\r\n", "\n").replace("\r", "\n").removeprefix("\ufeff")
+    motion = _MOTION.search(text)
+    hierarchy = Hierarchy(text[: motion.start()] if motion else text, name)
+    hierarchy.read()
+    if motion is None:
+        raise BvhError(f"{name}: no MOTION block after the hierarchy (truncated)")
+    lines = text.split("\n")
+    start = text.count("\n", 0, motion.end()) + 1
+    count, start = _header_number(lines, start, _FRAMES, name, "Frames:")
+    if count != int(count):
+        raise BvhError(f"{name}, line {start}: 'Frames:' is no whole number: {count}")
+    frame_time, start = _header_number(lines, start, _FRAME_TIME, name, "Frame Time:")
+    width = sum(len(channels) for channels in hierarchy.channels)
+    # The number of lines bounds the rows: a wild 'Frames:' must not allocate memory.
+    if count > len(lines):
+        raise BvhError(
+            f"{name}: 'Frames:' says {int(count)}, the file has only "
+            f"{len(lines) - start} more lines (truncated)"
+        )
+    return Bvh(
+        names=tuple(hierarchy.names),
+        parents=tuple(hierarchy.parents),
+        offsets=np.array(hierarchy.offsets, np.float64),
+        channels=tuple(hierarchy.channels),
+        end_sites=tuple(tuple(sites) for sites in hierarchy.end_sites),
+        values=_rows(lines, start, (int(count), width), name),
+        frame_time=frame_time,
+        name=name,
+    )
+
+
+def read_bvh(
+    source: str | os.PathLike | bytes | IO[bytes], *, name: str | None = None
+) -> Bvh:
+    """Reads a BVH file.
+
+    Args:
+      source: Path, the bytes of a file, or an open binary file (such as a zip member).
+      name: Name for messages; by default the path.
+
+    Returns:
+      What the file says, in its own units.
+
+    Raises:
+      BvhError: for anything malformed; names the file and the line.
+      OSError: if the file cannot be read.
+    """
+    if isinstance(source, bytes):
+        data, default = source, "bvh"
+    elif hasattr(source, "read"):
+        data, default = source.read(), str(getattr(source, "name", "bvh"))
+    else:
+        with open(source, "rb") as file:
+            data, default = file.read(), os.fspath(source)
+    name = default if name is None else name
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise BvhError(f"{name}: not a text file (byte {error.start})") from None
+    return parse_bvh(text, name=name)
+
+
+def _joint_lines(bvh: Bvh, joint: int, depth: int, order: list[int]) -> list[str]:
+    """Lines of one joint and those below it; appends them to `order`."""
+    order.append(joint)
+    indent = "\t" * depth
+    kind = "ROOT" if bvh.parents[joint] < 0 else "JOINT"
+    lines = [f"{indent}{kind} {bvh.names[joint]}", f"{indent}{{"]
+    lines.append(f"{indent}\tOFFSET {_numbers(bvh.offsets[joint])}")
+    channels = bvh.channels[joint]
+    lines.append(" ".join([f"{indent}\tCHANNELS", str(len(channels)), *channels]))
+    for child in (j for j, parent in enumerate(bvh.parents) if parent == joint):
+        lines += _joint_lines(bvh, child, depth + 1, order)
+    for site in bvh.end_sites[joint]:
+        inner = [f"End Site\n{indent}\t{{", f"\tOFFSET {_numbers(site)}", "}"]
+        lines += [f"{indent}\t{line}" for line in inner]
+    return [*lines, f"{indent}}}"]
+
+
+def _numbers(values) -> str:
+    """Numbers with up to nine decimals and no negative zeros."""
+    # Positional, because some readers know no exponents.
+    return " ".join(
+        np.format_float_positional(float(value) + 0.0, precision=9, trim="-")
+        for value in values
+    )
+
+
+def format_bvh(bvh: Bvh, *, decimals: int = 6) -> str:
+    """BVH text of a file's content.
+
+    Joints are written depth first, so the channels of a skeleton that is ordered
+    otherwise are permuted with them.
+
+    Args:
+      bvh: What to write.
+      decimals: Digits after the point of a channel value.
+
+    Returns:
+      The text, with Unix line ends.
+    """
+    order: list[int] = []
+    lines = ["HIERARCHY", *_joint_lines(bvh, 0, 0, order), "MOTION"]
+    lines += [f"Frames: {bvh.num_frames}", f"Frame Time: {bvh.frame_time:.9g}"]
+    first = np.cumsum([0] + [len(channels) for channels in bvh.channels])
+    columns = [c for joint in order for c in range(first[joint], first[joint + 1])]
+    # Adding zero after rounding turns -0.0 into 0.0, which some readers reject.
+    rows = np.round(bvh.values[:, columns], decimals) + 0.0
+    form = " ".join([f"%.{decimals}f"] * len(columns))
+    lines += [form % tuple(row) for row in rows.tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def write_bvh(path: str | os.PathLike, bvh: Bvh, *, decimals: int = 6) -> None:
+    """Writes a BVH file, whole or not at all.
+
+    Args:
+      path: File to write.
+      bvh: What to write.
+      decimals: Digits after the point of a channel value.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    text = format_bvh(bvh, decimals=decimals)
+    temporary = f"{os.fspath(path)}.{os.getpid()}.partial"
+    try:
+        with open(temporary, "w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+        os.replace(temporary, path)
+    finally:
+        if os.path.exists(temporary):
+            os.remove(temporary)
