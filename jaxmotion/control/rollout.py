@@ -1,0 +1,169 @@
+"""Autoregression as one program: many characters, many ticks, one scan.
+
+A controller is three functions for one character:
+
+* `urgency(state, command)` says which plan the tick needs: 0 none, 1 .. n one of the n
+  planners, dearer ones behind.
+* `plans[i - 1](key, state, command)` makes a new plan (runs a network).
+* `advance(state, command)` displays the next frame.
+
+`tick` composes them for one character: live use. `rollout` scans them over time for a
+batch. There a plain `vmap(tick)` would run every planner in every tick, because under
+vmap a conditional computes all of its branches; so the batch asks once a tick for the
+dearest plan that any of its characters needs, and runs only that one. Characters that
+need none keep theirs, and those that need a cheaper one get the dearer one, which must
+give them the same (as classifier-free guidance with scale 1 does).
+
+Keys: character c draws from `fold_in(key, c)`, tick i of it from `fold_in(that, i)`. So
+neither the number of characters nor their division into chunks changes a result.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int
+
+from jaxmotion.typing import Key
+
+State = Any
+Commands = Any
+Frame = Any
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Controller:
+    """The three functions of the module's docstring; not a pytree.
+
+    Attributes:
+      urgency: `(state, command) -> int32`.
+      plans: Planners in the order of their cost, `(key, state, command) -> state`.
+      advance: `(state, command) -> (state, frame)`.
+    """
+
+    urgency: Callable[[State, Commands], Int[Array, ""]]
+    plans: tuple[Callable[[Key, State, Commands], State], ...]
+    advance: Callable[[State, Commands], tuple[State, Frame]]
+
+
+def tick(
+    controller: Controller, key: Key, state: State, command: Commands
+) -> tuple[State, Frame]:
+    """One tick of one character: plan if needed, then display a frame.
+
+    Args:
+      controller: Its three functions.
+      key: Consumed.
+      state: The character's state.
+      command: What the user wants now.
+
+    Returns:
+      The next state and the displayed frame.
+    """
+    branches = [lambda k, s, c: s, *controller.plans]
+    need = controller.urgency(state, command)
+    state = jax.lax.switch(need, branches, key, state, command)
+    return controller.advance(state, command)
+
+
+def _select(keep: Array, old: State, new: State) -> State:
+    def choose(a: Array, b: Array) -> Array:
+        return jnp.where(keep.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(choose, old, new)
+
+
+def _batch_tick(
+    controller: Controller, keys: Array, states: State, commands: Commands
+) -> tuple[State, Frame]:
+    need = jax.vmap(controller.urgency)(states, commands)
+
+    def run(plan) -> Callable:
+        def planned(keys: Array, states: State, commands: Commands) -> State:
+            new = jax.vmap(plan)(keys, states, commands)
+            return _select(need == 0, states, new)
+
+        return planned
+
+    branches = [lambda k, s, c: s, *(run(plan) for plan in controller.plans)]
+    states = jax.lax.switch(jnp.max(need), branches, keys, states, commands)
+    return jax.vmap(controller.advance)(states, commands)
+
+
+def rollout(
+    controller: Controller,
+    key: Key,
+    states: State,
+    commands: Commands,
+    *,
+    chunk: int | None = None,
+    mesh: Mesh | None = None,
+) -> tuple[State, Frame]:
+    """Displays one frame a tick for many characters; jit it as a whole.
+
+    Args:
+      controller: Its three functions.
+      key: Consumed.
+      states: States of the characters, batch axis first.
+      commands: Commands [characters, ticks, ...].
+      chunk: Run so many characters at a time (it must divide their number), which
+        keeps a large batch within a processor's cache; None for all at once.
+      mesh: Split the characters over the mesh's first axis. A chunk is then what
+        each device runs at a time, and must divide each device's share.
+
+    Returns:
+      The states after the last tick, and frames [characters, ticks, ...].
+
+    Raises:
+      ValueError: if chunk or the mesh does not divide the number of characters.
+    """
+    number = jax.tree.leaves(commands)[0].shape[0]
+    devices = 1 if mesh is None else mesh.shape[mesh.axis_names[0]]
+    size = number // devices if chunk is None else chunk
+    if number % devices or (number // devices) % size:
+        raise ValueError(
+            f"{number} characters on {devices} devices in chunks of {size}: "
+            "expected a number that both divide"
+        )
+    keys = jax.vmap(lambda c: jax.random.fold_in(key, c))(jnp.arange(number))
+    run = lambda k, s, c: _scan(controller, k, s, c, size)  # noqa: E731
+    if mesh is None:
+        return run(keys, states, commands)
+    spec = PartitionSpec(mesh.axis_names[0])
+    # shard_map, not a sharding constraint: each device asks only its own characters
+    # whether they need a plan, and no tick waits for the others.
+    split = NamedSharding(mesh, spec)
+    keys, states, commands = jax.lax.with_sharding_constraint(
+        (keys, states, commands), split
+    )
+    return jax.shard_map(
+        run, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+    )(keys, states, commands)
+
+
+def _scan(
+    controller: Controller, keys: Array, states: State, commands: Commands, size: int
+) -> tuple[State, Frame]:
+    def chunk_rollout(args: tuple) -> tuple[State, Frame]:
+        keys, states, commands = args
+
+        def body(states: State, xs: tuple) -> tuple[State, Frame]:
+            i, commands = xs
+            tick_keys = jax.vmap(lambda k: jax.random.fold_in(k, i))(keys)
+            return _batch_tick(controller, tick_keys, states, commands)
+
+        over_time = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), commands)
+        ticks = jax.tree.leaves(over_time)[0].shape[0]
+        states, frames = jax.lax.scan(body, states, (jnp.arange(ticks), over_time))
+        return states, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), frames)
+
+    number = keys.shape[0]
+    if size == number:
+        return chunk_rollout((keys, states, commands))
+    cut = lambda x: x.reshape(number // size, size, *x.shape[1:])  # noqa: E731
+    join = lambda x: x.reshape(number, *x.shape[2:])  # noqa: E731
+    done = jax.lax.map(chunk_rollout, jax.tree.map(cut, (keys, states, commands)))
+    return jax.tree.map(join, done)

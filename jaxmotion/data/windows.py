@@ -1,0 +1,117 @@
+"""Windows of clips, cut on the device inside jit.
+
+`window_index` runs once on the host and lists where windows may start; everything else
+is a gather that jit-compiles, so that data stays on the device for a whole training.
+"""
+
+import dataclasses
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from jaxmotion.data.clips import Clips
+from jaxmotion.motion.skeleton import Motion
+from jaxmotion.typing import Key
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class WindowIndex:
+    """Where windows may start.
+
+    Attributes:
+      starts: First frame of each window, counted over all clips.
+      clips: The clip of each window.
+      length: Frames a window.
+    """
+
+    starts: Int[Array, "windows"]
+    clips: Int[Array, "windows"]
+    length: int = jax.tree.static()
+
+
+def window_index(
+    clips: Clips,
+    length: int,
+    *,
+    stride: int = 1,
+    short: Literal["error", "skip"] = "error",
+) -> WindowIndex:
+    """Lists all windows of a length that lie within one clip.
+
+    Args:
+      clips: The clips.
+      length: Frames a window.
+      stride: Frames between the starts of windows of one clip.
+      short: What to do with clips shorter than a window.
+
+    Returns:
+      The index.
+
+    Raises:
+      ValueError: if a clip is shorter than a window and short is "error" (names the
+        first such clip), or if no clip is long enough.
+    """
+    offsets = np.asarray(clips.offsets)
+    lengths = np.diff(offsets)
+    too_short = np.flatnonzero(lengths < length)
+    if too_short.size and (short == "error" or too_short.size == lengths.size):
+        first = int(too_short[0])
+        name = clips.clip_names[first] if clips.clip_names else f"clip {first}"
+        raise ValueError(
+            f"{name} has {lengths[first]} frames, a window needs {length} "
+            f"({too_short.size} of {lengths.size} clips are too short)"
+        )
+    starts = [
+        np.arange(a, b - length + 1, stride)
+        for a, b in zip(offsets[:-1], offsets[1:], strict=True)
+    ]
+    owner = np.repeat(np.arange(len(starts)), [s.size for s in starts])
+    return WindowIndex(
+        starts=jnp.asarray(np.concatenate(starts), jnp.int32),
+        clips=jnp.asarray(owner, jnp.int32),
+        length=length,
+    )
+
+
+def cut(clips: Clips, start: Int[Array, ""], length: int) -> Motion:
+    """The frames from `start`.
+
+    Args:
+      clips: The clips.
+      start: First frame, counted over all clips.
+      length: Frames.
+
+    Returns:
+      The window.
+    """
+    take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, length)  # noqa: E731
+    return Motion(
+        root_position=take(clips.root_position),
+        joint_rotation=take(clips.joint_rotation),
+        fps=clips.fps,
+    )
+
+
+def sample_windows(
+    key: Key, clips: Clips, index: WindowIndex, *, batch: int
+) -> tuple[Motion, Int[Array, "{batch}"]]:
+    """Draws windows, uniformly over all starts.
+
+    Args:
+      key: Consumed.
+      clips: The clips.
+      index: Where windows may start.
+      batch: Windows to draw.
+
+    Returns:
+      Windows [batch, length, ...] and the clip of each.
+    """
+    chosen = jax.random.randint(key, (batch,), 0, index.starts.shape[0])
+    windows = jax.vmap(lambda start: cut(clips, start, index.length))(
+        index.starts[chosen]
+    )
+    return windows, index.clips[chosen]

@@ -1,0 +1,181 @@
+"""Parts that the denoisers share: positions, time embedding, encoder layers.
+
+The encoder layer is PyTorch's `TransformerEncoderLayer` with its defaults (post-norm,
+epsilon 1e-5) and exact GELU:
+
+    h = norm_1(x + out(softmax(q k^T / sqrt(d)) v))        q, k, v = projections of x
+    y = norm_2(h + W_2 gelu(W_1 h))
+
+It is cut in two, `project` and `attend`, so that a sampler can keep the projections of
+tokens that do not change between steps, and can skip the rows that nobody reads.
+"""
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
+    """Table of sinusoidal position codes: sine on even channels, cosine on odd.
+
+    Args:
+      num: Number of positions.
+      width: Channels; even.
+
+    Returns:
+      The table. It is made in float64, so high positions stay exact.
+
+    Raises:
+      ValueError: if width is odd.
+
+    Source: Vaswani et al. 2017, section 3.5, with base 10000.
+    """
+    if width % 2:
+        raise ValueError(f"width is {width}, expected an even number")
+    rate = np.exp(-np.log(10000.0) * np.arange(0, width, 2) / width)
+    angle = np.arange(num)[:, None] * rate
+    table = np.stack([np.sin(angle), np.cos(angle)], axis=-1).reshape(num, width)
+    return jnp.asarray(table, jnp.float32)
+
+
+class Projections(NamedTuple):
+    """Queries, keys and values of some tokens, split into heads."""
+
+    query: Float[Array, "*batch queries heads channels"]
+    key: Float[Array, "*batch tokens heads channels"]
+    value: Float[Array, "*batch tokens heads channels"]
+
+
+class TimeEmbedding(nn.Module):
+    """Sinusoid of the step, then Linear, SiLU, Linear.
+
+    Attributes:
+      width: Channels.
+    """
+
+    width: int
+
+    def setup(self):
+        """Makes the two layers."""
+        self.hidden = nn.Dense(self.width)
+        self.out = nn.Dense(self.width)
+
+    def __call__(self, num_steps: int) -> Float[Array, "steps width"]:
+        """Embeddings of all steps 0..num_steps, to be indexed by t.
+
+        Step t reads row t - 1 of the sinusoid, as the released weights of CAMDM do
+        (their least noisy step is 0); row 0 (clean data) repeats row 1.
+
+        Args:
+          num_steps: T.
+
+        Returns:
+          One row a step.
+        """
+        codes = sinusoidal_positions(num_steps, self.width)
+        codes = jnp.concatenate([codes[:1], codes])
+        return self.out(nn.silu(self.hidden(codes)))
+
+
+class EncoderLayer(nn.Module):
+    """Post-norm transformer encoder layer without an attention mask.
+
+    Attributes:
+      width: Channels of a token.
+      heads: Attention heads; divides width.
+      hidden: Channels of the feed-forward layer.
+      dropout: Rate on attention weights, and on the three branch outputs.
+    """
+
+    width: int
+    heads: int
+    hidden: int
+    dropout: float
+
+    def setup(self):
+        """Makes projections, feed-forward layers and norms."""
+        xavier = nn.initializers.xavier_uniform()
+        self.query = nn.Dense(self.width, kernel_init=xavier)
+        self.key_value = nn.Dense(2 * self.width, kernel_init=xavier)
+        self.out = nn.Dense(self.width)
+        self.expand = nn.Dense(self.hidden)
+        self.contract = nn.Dense(self.width)
+        self.norm_1 = nn.LayerNorm(epsilon=1e-5)
+        self.norm_2 = nn.LayerNorm(epsilon=1e-5)
+        self.drop = nn.Dropout(self.dropout)
+
+    def _heads(self, x: Float[Array, "*batch tokens width"]) -> Array:
+        return x.reshape(*x.shape[:-1], self.heads, -1)
+
+    def project(
+        self, x: Float[Array, "*batch tokens width"], *, last: int | None = None
+    ) -> Projections:
+        """Queries, keys and values of tokens.
+
+        Args:
+          x: Tokens.
+          last: Make queries of only the last so many tokens; None for all.
+
+        Returns:
+          The projections.
+        """
+        key, value = jnp.split(self.key_value(x), 2, axis=-1)
+        asking = x if last is None else x[..., -last:, :]
+        return Projections(
+            self._heads(self.query(asking)), self._heads(key), self._heads(value)
+        )
+
+    def attend(
+        self,
+        x: Float[Array, "*batch queries width"],
+        projections: Projections,
+        *,
+        train: bool,
+    ) -> Float[Array, "*batch queries width"]:
+        """The rest of the layer for the tokens that the queries came from.
+
+        Args:
+          x: Tokens of the queries.
+          projections: Queries of those tokens, keys and values of all tokens.
+          train: Whether to drop.
+
+        Returns:
+          Tokens of the next layer.
+        """
+        query, key, value = projections
+        drop = lambda y: self.drop(y, deterministic=not train)  # noqa: E731
+        # [heads, tokens, channels] once, so that both products are plain matmuls.
+        query, key, value = (jnp.swapaxes(y, -2, -3) for y in (query, key, value))
+        logits = query @ jnp.swapaxes(key, -1, -2) / np.sqrt(query.shape[-1])
+        weights = drop(jax.nn.softmax(logits, axis=-1))
+        mixed = jnp.swapaxes(weights @ value, -2, -3)
+        x = self.norm_1(x + drop(self.out(mixed.reshape(x.shape))))
+        hidden = drop(jax.nn.gelu(self.expand(x), approximate=False))
+        return self.norm_2(x + drop(self.contract(hidden)))
+
+    def __call__(
+        self,
+        x: Float[Array, "*batch tokens width"],
+        *,
+        train: bool,
+        last: int | None = None,
+    ) -> Float[Array, "*batch out width"]:
+        """The whole layer.
+
+        Args:
+          x: Tokens.
+          train: Whether to drop.
+          last: Return only the last so many tokens; None for all.
+
+        Returns:
+          Tokens of the next layer.
+        """
+        projections = self.project(x, last=last)
+        return self.attend(
+            x if last is None else x[..., -last:, :], projections, train=train
+        )
+

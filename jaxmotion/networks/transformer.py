@@ -1,0 +1,252 @@
+"""CAMDM's denoiser: a transformer encoder with one token per condition and frame.
+
+Tokens in order (147 for 10 past and 45 future frames):
+
+    [time 1] [style 1] [path 45] [facing 45] [past 10] [noisy future 45]
+
+Every stream has its own linear embedding; sinusoidal positions are added to all tokens;
+the last 45 tokens go through a linear layer and are the prediction of x_0.
+
+Sampling runs the network many times under one condition. So it is cut in two:
+`encode` does what does not depend on x_t (condition tokens with their positions, the
+first layer's projections of them, the embeddings of all steps), `denoise` the rest; the
+last layer is computed for the output tokens only. `__call__` composes the two.
+
+With `frames_per_token` = n > 1 (not in the paper) each token of the four frame streams
+holds n neighbouring frames; 5 leaves 31 tokens, for machines without an accelerator.
+
+Source: Chen et al. 2024 (CAMDM), section 3.2 and figure 2; sizes of the released code.
+"""
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.networks import blocks
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Context:
+    """What one condition contributes to all denoising steps.
+
+    Attributes:
+      tokens: Condition tokens with their positions.
+      projections: The first layer's queries, keys and values of them.
+      steps: Embeddings of steps 0..T, with the time token's position.
+    """
+
+    tokens: Float[Array, "*batch condition width"]
+    projections: blocks.Projections
+    steps: Float[Array, "steps width"]
+
+
+def fold_frames(x: Float[Array, "*batch frames features"], n: int) -> Array:
+    """Puts n neighbouring frames into one row.
+
+    Args:
+      x: Frames; their number is a multiple of n.
+      n: Frames a row.
+
+    Returns:
+      Rows of n times as many features.
+
+    Raises:
+      ValueError: if the number of frames is not a multiple of n.
+    """
+    frames, features = x.shape[-2:]
+    if frames % n:
+        raise ValueError(f"{frames} frames are no multiple of frames_per_token {n}")
+    return x.reshape(*x.shape[:-2], frames // n, n * features)
+
+
+class CamdmTransformer(nn.Module):
+    """The denoiser.
+
+    Attributes:
+      features: Channels of a pose.
+      past: Past frames.
+      future: Frames to predict.
+      num_labels: Styles.
+      num_steps: T.
+      width: Channels of a token.
+      depth: Encoder layers.
+      heads: Attention heads.
+      hidden: Channels of the feed-forward layers.
+      dropout: Rate, after the positions and in every layer.
+      frames_per_token: Frames of one token; 1 in the paper.
+    """
+
+    features: int
+    past: int = 10
+    future: int = 45
+    num_labels: int = 100
+    num_steps: int = 8
+    width: int = 256
+    depth: int = 4
+    heads: int = 4
+    hidden: int = 1024
+    dropout: float = 0.2
+    frames_per_token: int = 1
+
+    def setup(self):
+        """Makes embeddings and layers."""
+        self.embed_time = blocks.TimeEmbedding(self.width)
+        self.embed_label = nn.Embed(
+            self.num_labels, self.width, embedding_init=nn.initializers.normal(1.0)
+        )
+        self.embed_path = nn.Dense(self.width)
+        self.embed_facing = nn.Dense(self.width)
+        self.embed_past = nn.Dense(self.width)
+        self.embed_noisy = nn.Dense(self.width)
+        self.layers = [
+            blocks.EncoderLayer(self.width, self.heads, self.hidden, self.dropout)
+            for _ in range(self.depth)
+        ]
+        self.out = nn.Dense(self.features * self.frames_per_token)
+        self.drop = nn.Dropout(self.dropout)
+
+    @property
+    def num_outputs(self) -> int:
+        """Tokens of the predicted frames."""
+        return self.future // self.frames_per_token
+
+    @property
+    def num_tokens(self) -> int:
+        """All tokens of a forward pass."""
+        return 2 + (3 * self.future + self.past) // self.frames_per_token
+
+    def encode(
+        self,
+        past: Float[Array, "*batch past features"],
+        path: Float[Array, "*batch future 2"],
+        facing: Float[Array, "*batch future 6"],
+        label: Int[Array, "*batch"],
+        keep_past: Bool[Array, "*batch"],
+        *,
+        train: bool = False,
+    ) -> Context:
+        """What does not depend on the noisy sample.
+
+        Args:
+          past: Features of the last displayed poses.
+          path: Ground positions (x, z) of the future, metres from the last pose.
+          facing: 6D rotations of the future facings.
+          label: Style.
+          keep_past: Where False the past is zeroed (its token is then the bias),
+            which is the null condition of classifier-free guidance.
+          train: Whether to drop.
+
+        Returns:
+          The context of `denoise`.
+        """
+        n = self.frames_per_token
+        kept = jnp.where(keep_past[..., None, None], past, 0.0)
+        tokens = jnp.concatenate(
+            [
+                self.embed_label(label)[..., None, :],
+                self.embed_path(fold_frames(path, n)),
+                self.embed_facing(fold_frames(facing, n)),
+                self.embed_past(fold_frames(kept, n)),
+            ],
+            axis=-2,
+        )
+        positions = self.positions()
+        tokens = self._drop(tokens + positions[1 : -self.num_outputs], train)
+        return Context(
+            tokens=tokens,
+            projections=self.layers[0].project(tokens),
+            steps=self.embed_time(self.num_steps) + positions[0],
+        )
+
+    def denoise(
+        self,
+        context: Context,
+        x_t: Float[Array, "*batch future features"],
+        t: Int[Array, "*#batch"],
+        *,
+        train: bool = False,
+    ) -> Float[Array, "*batch future features"]:
+        """Prediction of the clean sample.
+
+        Args:
+          context: From `encode`.
+          x_t: Noisy features.
+          t: Step in 1..T, one for all or one a sample.
+          train: Whether to drop.
+
+        Returns:
+          Predicted features x_0.
+        """
+        batch, outputs = x_t.shape[:-2], self.num_outputs
+        step = jnp.broadcast_to(context.steps[t], (*batch, self.width))
+        noisy = self.embed_noisy(fold_frames(x_t, self.frames_per_token))
+        ends = jnp.concatenate(
+            [
+                self._drop(step, train)[..., None, :],
+                self._drop(noisy + self.positions()[-outputs:], train),
+            ],
+            axis=-2,
+        )
+        # Attention does not see the order of its tokens, so the changing ones can
+        # stand together behind the ones whose projections are already there.
+        first = self.layers[0]
+        projections = jax.tree.map(
+            lambda fixed, new: jnp.concatenate([fixed, new], axis=-3),
+            context.projections,
+            first.project(ends),
+        )
+        if self.depth == 1:
+            last_queries = projections.query[..., -outputs:, :, :]
+            projections = projections._replace(query=last_queries)
+            x = first.attend(ends[..., 1:, :], projections, train=train)
+        else:
+            x = jnp.concatenate([context.tokens, ends], axis=-2)
+            x = first.attend(x, projections, train=train)
+        for i, layer in enumerate(self.layers[1:], start=2):
+            x = layer(x, train=train, last=outputs if i == self.depth else None)
+        return self.out(x).reshape(*batch, self.future, self.features)
+
+    def __call__(
+        self,
+        x_t: Float[Array, "*batch future features"],
+        t: Int[Array, "*#batch"],
+        past: Float[Array, "*batch past features"],
+        path: Float[Array, "*batch future 2"],
+        facing: Float[Array, "*batch future 6"],
+        label: Int[Array, "*batch"],
+        keep_past: Bool[Array, "*batch"],
+        *,
+        train: bool = False,
+    ) -> Float[Array, "*batch future features"]:
+        """`encode`, then `denoise`; arguments as there.
+
+        Args:
+          x_t: Noisy features.
+          t: Step in 1..T.
+          past: Features of the last displayed poses.
+          path: Ground positions of the future, metres.
+          facing: 6D rotations of the future facings.
+          label: Style.
+          keep_past: False for the null condition.
+          train: Whether to drop; needs rngs={"dropout": key}.
+
+        Returns:
+          Predicted features x_0.
+        """
+        context = self.encode(past, path, facing, label, keep_past, train=train)
+        return self.denoise(context, x_t, t, train=train)
+
+    def positions(self) -> Float[Array, "tokens width"]:
+        """Position codes of all tokens, in the order of the module's docstring.
+
+        Returns:
+          One row a token.
+        """
+        return blocks.sinusoidal_positions(self.num_tokens, self.width)
+
+    def _drop(self, x: Array, train: bool) -> Array:
+        return self.drop(x, deterministic=not train)

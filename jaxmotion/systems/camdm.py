@@ -1,0 +1,417 @@
+"""CAMDM: a transformer diffusion model that continues a motion along a trajectory.
+
+A pose is one 6D rotation a joint and a last pseudo-joint (x, y, z, 0, 0, 0) for the
+root; a sample is the next 45 poses. The condition is the last 10 poses, the ground path
+and facings wanted for the 45, and a style. Eight steps of the cosine schedule:
+
+    plan = reverse_chain(ancestral_step(schedule, net), key, x_8, start=8)
+
+No feature is normalised: values are metres and entries of rotation matrices.
+
+Source: Chen et al. 2024, "Taming Diffusion Probabilistic Models for Character Control";
+what the paper leaves open is as in the released code, and said where it is used.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.diffusion import chain, guidance, schedule
+from jaxmotion.learning import losses
+from jaxmotion.motion import features, rotation, skeleton, trajectory
+from jaxmotion.networks import ablation, transformer
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Architecture and method; the defaults are the paper's.
+
+    Attributes:
+      num_joints: Joints of the skeleton.
+      num_labels: Styles.
+      past: Past poses of the condition, frames.
+      future: Poses of a sample, frames.
+      fps: Frames a second.
+      num_steps: T of the cosine schedule (paper 8, released weights 4).
+      network: "transformer", or the ablation's "mlp" or "single_token".
+      width: Channels of a token (released code; the paper does not say).
+      depth: Layers (released code 4; the ablation's MLP 8).
+      heads: Attention heads.
+      hidden: Channels of the feed-forward layers.
+      dropout: Rate.
+      frames_per_token: Frames of one token; ours, 1 in the paper.
+      rotation_layout: 6D as two rows (released code) or two columns.
+      heading: Frame of a sample. "random": axes turned by a random yaw (released
+        code). "facing": +z is where the character faces in the last past pose (ours:
+        the network need not learn that turning the world changes nothing).
+      drop_past: Probability that the past is zeroed in training.
+      weight_data: Weight of the mean squared error of features (eq. 2).
+      weight_velocity: Of the displacements of rotations.
+      weight_position: Of the joint positions (eq. 3).
+      weight_position_velocity: Of the displacements of joint positions (released
+        code; not in the paper's eq. 4).
+      weight_foot: Of foot sliding.
+      contact_speed: A foot slower than this stands, metres a second.
+    """
+
+    num_joints: int
+    num_labels: int
+    past: int = 10
+    future: int = 45
+    fps: float = 30.0
+    num_steps: int = 8
+    network: Literal["transformer", "mlp", "single_token"] = "transformer"
+    width: int = 256
+    depth: int = 4
+    heads: int = 4
+    hidden: int = 1024
+    dropout: float = 0.2
+    frames_per_token: int = 1
+    rotation_layout: Literal["rows", "columns"] = "rows"
+    heading: Literal["random", "facing"] = "random"
+    drop_past: float = 0.15
+    weight_data: float = 1.0
+    weight_velocity: float = 1.0
+    weight_position: float = 1.0
+    weight_position_velocity: float = 1.0
+    weight_foot: float = 1.0
+    contact_speed: float = 0.3
+
+    @property
+    def window(self) -> int:
+        """Frames of a training window."""
+        return self.past + self.future
+
+    @property
+    def num_features(self) -> int:
+        """Channels of a pose."""
+        return (self.num_joints + 1) * 6
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Condition:
+    """What a plan is made for, in the frame of the plan.
+
+    Attributes:
+      past: Features of the last displayed poses.
+      trajectory: Ground positions (x, z), metres, and facings wanted for the future.
+      label: Style.
+      keep_past: False for the null condition of classifier-free guidance.
+    """
+
+    past: Float[Array, "*batch past features"]
+    trajectory: trajectory.Trajectory
+    label: Int[Array, "*batch"]
+    keep_past: Bool[Array, "*batch"]
+
+    def arguments(self, config: Config) -> tuple[Array, ...]:
+        """The network's arguments behind x_t and t.
+
+        Args:
+          config: Says how facings are laid out.
+
+        Returns:
+          past, path, facing (6D), label, keep_past.
+        """
+        facing = rotation.rot6d_from_matrix(
+            rotation.matrix_from_facing(self.trajectory.facing)
+        )
+        if config.rotation_layout == "rows":
+            facing = rotation.rot6d_rows_to_columns(facing)
+        return (
+            self.past,
+            self.trajectory.position,
+            facing,
+            self.label,
+            self.keep_past,
+        )
+
+
+def network(config: Config) -> transformer.CamdmTransformer:
+    """The denoiser's Flax module.
+
+    Args:
+      config: Its sizes.
+
+    Returns:
+      A module with methods `encode`, `denoise` and their composition.
+    """
+    kind = {
+        "transformer": transformer.CamdmTransformer,
+        "mlp": ablation.CamdmMlp,
+        "single_token": ablation.SingleTokenTransformer,
+    }[config.network]
+    names = {field.name for field in dataclasses.fields(kind)} - {"parent", "name"}
+    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
+    return kind(features=config.num_features, **sizes)
+
+
+def init(key: Key, config: Config) -> Params:
+    """Initial parameters.
+
+    Args:
+      key: Consumed.
+      config: The architecture.
+
+    Returns:
+      Parameters of `network(config)`.
+    """
+    past = jnp.zeros((config.past, config.num_features))
+    x_t = jnp.zeros((config.future, config.num_features))
+    path, facing = jnp.zeros((config.future, 2)), jnp.zeros((config.future, 6))
+    label, keep = jnp.zeros((), jnp.int32), jnp.ones((), bool)
+    t = jnp.ones((), jnp.int32)
+    return network(config).init(key, x_t, t, past, path, facing, label, keep)["params"]
+
+
+def smoothing_matrices(
+    frames: int, sigmas: tuple[float, ...]
+) -> Float[Array, "sigmas {frames} {frames}"]:
+    """Gaussian filters along time as matrices; the border reflects.
+
+    Args:
+      frames: Length of the window.
+      sigmas: Standard deviations in frames; 0 gives the identity.
+
+    Returns:
+      One matrix each; rows sum to 1.
+    """
+    matrices = []
+    for sigma in sigmas:
+        radius = int(4 * sigma + 0.5)
+        offset = np.arange(-radius, radius + 1)
+        weight = np.exp(-0.5 * (offset / sigma) ** 2) if sigma else np.ones(1)
+        place = (np.arange(frames)[:, None] + offset) % (2 * frames)
+        place = np.where(place < frames, place, 2 * frames - 1 - place)
+        matrix = np.zeros((frames, frames))
+        np.add.at(matrix, (np.arange(frames)[:, None], place), weight / weight.sum())
+        matrices.append(matrix)
+    return jnp.asarray(np.stack(matrices), jnp.float32)
+
+
+def example(
+    key: Key,
+    bones: skeleton.Skeleton,
+    window: skeleton.Motion,
+    label: Int[Array, ""],
+    *,
+    config: Config,
+) -> tuple[Condition, Float[Array, "future features"]]:
+    """One training example from one window of motion.
+
+    The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4,
+    1/4); the facings are smoothed with sigma 5 or 10.
+
+    Args:
+      key: Consumed.
+      bones: The skeleton.
+      window: Past and future frames, in the world.
+      label: Style.
+      config: The method.
+
+    Returns:
+      The condition, and the features of the future.
+
+    Source: released code of CAMDM. Differs: facings are smoothed within the window,
+    there within the whole clip.
+    """
+    key_turn, key_path, key_facing, key_keep = jax.random.split(key, 4)
+    last = config.past - 1
+    course = trajectory.root_trajectory(bones, window)
+    if config.heading == "facing":
+        facing = course.facing[last]
+    else:
+        yaw = jax.random.uniform(key_turn, (), maxval=2 * jnp.pi)
+        facing = jnp.stack([jnp.sin(yaw), jnp.cos(yaw)])
+    frame = trajectory.PlanarFrame(origin=course.position[last], facing=facing)
+
+    filters = smoothing_matrices(config.window, (0.0, 5.0, 10.0))
+    weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
+    path = filters[jax.random.categorical(key_path, weights)] @ course.position
+    path = path - path[last] + course.position[last]
+    facings = filters[1 + jax.random.bernoulli(key_facing).astype(int)] @ course.facing
+    facings = rotation.safe_normalize(facings, jnp.array([0.0, 1.0]))
+    wanted = trajectory.to_local(
+        trajectory.Trajectory(position=path, facing=facings), frame
+    )
+    poses = features.motion_features(
+        features.to_frame(window, frame), rotation_layout=config.rotation_layout
+    )
+    keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_past)
+    condition = Condition(
+        past=poses[: config.past],
+        trajectory=jax.tree.map(lambda x: x[config.past :], wanted),
+        label=label,
+        keep_past=keep,
+    )
+    return condition, poses[config.past :]
+
+
+def loss(
+    params: Params,
+    key: Key,
+    batch: tuple[skeleton.Motion, Int[Array, " batch"]],
+    *,
+    bones: skeleton.Skeleton,
+    config: Config,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """The training loss of a batch of windows.
+
+    Args:
+      params: The network's parameters.
+      key: Consumed.
+      batch: Windows of `config.window` frames, and their styles.
+      bones: The skeleton.
+      config: The method.
+
+    Returns:
+      The weighted sum, and its five terms by name, unweighted.
+
+    Source: Chen et al. 2024 (CAMDM), eq. 2-4, and the released code's fifth term.
+    """
+    windows, labels = batch
+    size = labels.shape[0]
+    key_example, key_t, key_noise, key_drop = jax.random.split(key, 4)
+    keys = jax.random.split(key_example, size)
+    condition, x_0 = jax.vmap(
+        lambda k, w, c: example(k, bones, w, c, config=config)
+    )(keys, windows, labels)
+    table = schedule.cosine_schedule(config.num_steps)
+    t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
+    noise = jax.random.normal(key_noise, x_0.shape)
+    x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
+    prediction = network(config).apply(
+        {"params": params},
+        x_t,
+        t,
+        *condition.arguments(config),
+        train=config.dropout > 0,
+        rngs={"dropout": key_drop},
+    )
+    terms = loss_terms(bones, prediction, x_0, config=config)
+    weights = {
+        "data": config.weight_data,
+        "velocity": config.weight_velocity,
+        "position": config.weight_position,
+        "position_velocity": config.weight_position_velocity,
+        "foot": config.weight_foot,
+    }
+    return sum(weights[name] * value for name, value in terms.items()), terms
+
+
+def loss_terms(
+    bones: skeleton.Skeleton,
+    prediction: Float[Array, "*batch frames features"],
+    target: Float[Array, "*batch frames features"],
+    *,
+    config: Config,
+) -> dict[str, Float[Array, ""]]:
+    """The five losses: data, velocity, position, position_velocity, foot.
+
+    Positions and foot displacements are in the world, with the predicted root. A foot
+    stands where the target's is slower than `config.contact_speed`, at any height.
+
+    Args:
+      bones: The skeleton.
+      prediction: Predicted features.
+      target: True features.
+      config: The method.
+
+    Returns:
+      Each unweighted mean.
+    """
+    every = jnp.ones(target.shape[:-1], bool)
+    predicted, wanted = (
+        skeleton.joint_positions(
+            bones,
+            features.motion_from_features(
+                x, config.fps, rotation_layout=config.rotation_layout
+            ),
+        )
+        for x in (prediction, target)
+    )
+    flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
+    feet = jnp.array(bones.feet)
+    speed = jnp.linalg.norm(
+        skeleton.joint_velocities(wanted[..., feet, :], config.fps), axis=-1
+    )
+    stands = jnp.pad(
+        speed <= config.contact_speed, [(0, 0)] * (speed.ndim - 2) + [(0, 1), (0, 0)]
+    )
+    without_root = slice(0, -6)
+    return {
+        "data": losses.masked_mse(prediction, target, every),
+        "velocity": losses.velocity_loss(
+            prediction[..., without_root], target[..., without_root], every
+        ),
+        # As in MDM, a squared distance is summed over xyz' mean over all channels.
+        "position": losses.masked_mse(flat(predicted), flat(wanted), every),
+        "position_velocity": losses.velocity_loss(
+            flat(predicted), flat(wanted), every
+        ),
+        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands),
+    }
+
+
+Plan = Callable[..., Float[Array, "future features"]]
+
+
+def planner(
+    params: Params,
+    *,
+    config: Config,
+    table: schedule.Schedule | None = None,
+    step: Literal["ancestral", "ddim"] = "ancestral",
+) -> Plan:
+    """The sampler, with everything that the steps share computed once.
+
+    Inside a jitted function that closes over concrete parameters they are constants,
+    which the compiler lays out once: fastest at batch 1, one program a model.
+
+    Args:
+      params: The network's parameters.
+      config: The method.
+      table: Schedule; None for the cosine one of `config.num_steps`.
+      step: "ancestral" (the paper's), or "ddim" for comparisons.
+
+    Returns:
+      `plan(key, condition, *, scale=None) -> [future, features]`. With a scale, the
+      prediction is null + scale (full - null), where null has no past (eq. 5);
+      without, the network is called once a step.
+    """
+    net = network(config)
+    make_step = {"ancestral": chain.ancestral_step, "ddim": chain.ddim_step}[step]
+
+    def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
+        del key  # deterministic
+        return net.apply({"params": params}, context, x_t, t, method="denoise")
+
+    def encode(condition: Condition):
+        arguments = condition.arguments(config)
+        return net.apply({"params": params}, *arguments, method="encode")
+
+    def plan(key: Key, condition: Condition, *, scale=None) -> Array:
+        noise_table = schedule.cosine_schedule(config.num_steps)
+        noise_table = noise_table if table is None else table
+        context = encode(condition)
+        if scale is None:
+            denoiser = lambda k, x, t: denoise(k, x, t, context)  # noqa: E731
+        else:
+            off = jnp.zeros_like(condition.keep_past)
+            null = encode(dataclasses.replace(condition, keep_past=off))
+            denoiser = guidance.classifier_free(denoise, context, null, scale)
+        return chain.sample(
+            make_step(noise_table, denoiser),
+            key,
+            (config.future, config.num_features),
+            num_steps=noise_table.num_steps,
+        )
+
+    return plan

@@ -1,0 +1,349 @@
+"""CAMDM's run-time: a character that plans, plays, and plans again when told.
+
+One tick (1/30 s) of one character:
+
+1. If the command changed, or M frames of the plan have been played, plan anew:
+   a. the path the user wants: springs from the desired velocity and facing;
+   b. the model's own path: the rest of the plan, extended by HFTE to its length;
+   c. the blend of both is the condition, with the last 10 *displayed* poses;
+   d. sample 45 poses; within the first plans after a change of style with
+      classifier-free guidance on the past, which frees the model from its old style;
+   e. an inertialised seam: the plan starts where the displayed motion is, with its
+      velocity, and takes up the model's motion within 0.2 s.
+2. Display the next pose of the plan, and move the springs on.
+
+Source: Chen et al. 2024 (CAMDM), section 3.2; the released Unity run-time for what the
+paper does not say (noted at each constant).
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.control import inertia
+from jaxmotion.control.rollout import Controller
+from jaxmotion.diffusion import schedule
+from jaxmotion.motion import features, skeleton, spring, trajectory
+from jaxmotion.systems import camdm
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Control:
+    """Constants of the run-time; the defaults are the paper's where it has them.
+
+    Attributes:
+      apply: M, frames of a plan to play while the command stays (paper 15).
+      replan_on_change: The lazy trigger of the paper; the release plans only every
+        M frames (False).
+      extend: Use HFTE; without it the user's path alone is the condition (ablation).
+      reuse: K of HFTE, points reflected at a time (paper 15, released code 23).
+      guidance_scale: Of the past after a change of style (paper 0.7, code 0.5).
+      guided_plans: Plans that are guided after a change of style (paper: "when the
+        style label has just changed", so 1; code 2).
+      half_life: Of the springs of velocity and facing, seconds (orangeduck 0.27).
+      bias_position: Exponent of the blend of positions (released scene 0.7, code
+        0.4).
+      bias_facing: Exponent of the blend of facings (released code 2.2).
+      seam: Duration of the inertialised seam, seconds (released code 0.2); 0 for none.
+    """
+
+    apply: int = 15
+    replan_on_change: bool = True
+    extend: bool = True
+    reuse: int = 15
+    guidance_scale: float = 0.7
+    guided_plans: int = 1
+    half_life: float = 0.27
+    bias_position: float = 0.7
+    bias_facing: float = 2.2
+    seam: float = 0.2
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class CharacterState:
+    """A character between two ticks; everything in the world.
+
+    Attributes:
+      past: The last displayed poses.
+      plan: The poses being played.
+      cursor: Next pose of the plan.
+      velocity: Of the desired motion (the spring), metres a second.
+      acceleration: Of the desired motion, metres a second squared.
+      facing: Desired facing (the spring), unit.
+      turn_rate: Of the desired facing, radians a second.
+      command: The last command; its label is -1 before the first.
+      guided: Plans that are still to be guided.
+    """
+
+    past: skeleton.Motion
+    plan: skeleton.Motion
+    cursor: Int[Array, "*batch"]
+    velocity: Float[Array, "*batch 2"]
+    acceleration: Float[Array, "*batch 2"]
+    facing: Float[Array, "*batch 2"]
+    turn_rate: Float[Array, "*batch"]
+    command: trajectory.Command
+    guided: Int[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """What one tick displays.
+
+    Attributes:
+      root_position: Of the displayed pose, metres, world.
+      joint_rotation: Of the displayed pose, two columns.
+      desired_velocity: What the user's springs ask for now, metres a second.
+      desired_facing: Likewise, unit.
+      planned: Whether this tick made a new plan.
+    """
+
+    root_position: Float[Array, "*batch 3"]
+    joint_rotation: Float[Array, "*batch joints 6"]
+    desired_velocity: Float[Array, "*batch 2"]
+    desired_facing: Float[Array, "*batch 2"]
+    planned: Bool[Array, "*batch"]
+
+
+def init_state(
+    bones: skeleton.Skeleton, past: skeleton.Motion, *, config: camdm.Config
+) -> CharacterState:
+    """State of a character that has shown `past` and has no plan yet.
+
+    Args:
+      bones: The skeleton.
+      past: At least `config.past` displayed poses of one character, world.
+      config: The method.
+
+    Returns:
+      The state; the springs start at the mean velocity of the poses.
+
+    Raises:
+      ValueError: if there are fewer poses.
+    """
+    frames = past.root_position.shape[-2]
+    if frames < config.past:
+        raise ValueError(f"past has {frames} frames, expected {config.past} or more")
+    past = jax.tree.map(lambda x: x[-config.past :], past)
+    position = past.root_position
+    step = (position[-1] - position[0]) / (config.past - 1)
+    ahead = jnp.arange(1, config.future + 1, dtype=position.dtype)[:, None]
+    level = step * jnp.array([1.0, 0.0, 1.0])
+    plan = skeleton.Motion(
+        root_position=position[-1] + ahead * level,
+        joint_rotation=jnp.repeat(past.joint_rotation[-1:], config.future, axis=0),
+        fps=past.fps,
+    )
+    facing = trajectory.root_trajectory(bones, past).facing[-1]
+    velocity = level[::2] * config.fps
+    return CharacterState(
+        past=past,
+        plan=plan,
+        cursor=jnp.zeros((), jnp.int32),
+        velocity=velocity,
+        acceleration=jnp.zeros(2),
+        facing=facing,
+        turn_rate=jnp.zeros(()),
+        command=trajectory.Command(
+            velocity=velocity, facing=facing, label=jnp.full((), -1, jnp.int32)
+        ),
+        guided=jnp.zeros((), jnp.int32),
+    )
+
+
+def _changed(state: CharacterState, command: trajectory.Command) -> Bool[Array, ""]:
+    old = state.command
+    return (
+        jnp.any(jnp.abs(old.velocity - command.velocity) > 1e-3)
+        | jnp.any(jnp.abs(old.facing - command.facing) > 1e-3)
+        | (old.label != command.label)
+    )
+
+
+def _new_style(state: CharacterState, command: trajectory.Command) -> Bool[Array, ""]:
+    return (state.command.label != command.label) & (state.command.label >= 0)
+
+
+def plan_frame(
+    bones: skeleton.Skeleton, past: skeleton.Motion, *, config: camdm.Config
+) -> trajectory.PlanarFrame:
+    """Frame of the next plan: at the last displayed pose.
+
+    Args:
+      bones: The skeleton.
+      past: Displayed poses, world.
+      config: Says whether the frame turns with the character.
+
+    Returns:
+      The frame. With heading "random" its axes are the world's, as in the release.
+    """
+    last = jax.tree.map(lambda x: x[-1:], past)
+    here = trajectory.root_trajectory(bones, last)
+    facing = here.facing[0] if config.heading == "facing" else jnp.array([0.0, 1.0])
+    return trajectory.PlanarFrame(origin=here.position[0], facing=facing)
+
+
+def wanted_trajectory(
+    bones: skeleton.Skeleton,
+    state: CharacterState,
+    command: trajectory.Command,
+    *,
+    config: camdm.Config,
+    control: Control,
+) -> trajectory.Trajectory:
+    """Steps 1a to 1c: the user's path, blended with the model's own.
+
+    Args:
+      bones: The skeleton.
+      state: The character's state.
+      command: What the user wants.
+      config: The method.
+      control: Constants.
+
+    Returns:
+      The path of the next `config.future` frames, world.
+    """
+    here = trajectory.PlanarFrame(
+        origin=state.past.root_position[-1, ::2], facing=state.facing
+    )
+    desired = trajectory.desired_trajectory(
+        here,
+        state.velocity,
+        command,
+        num_frames=config.future,
+        fps=config.fps,
+        half_life=control.half_life,
+        acceleration=state.acceleration,
+        turn_rate=state.turn_rate,
+    )
+    if not control.extend:
+        return desired
+    own = trajectory.extend(
+        trajectory.root_trajectory(bones, state.plan),
+        control.apply,
+        reuse=control.reuse,
+    )
+    ahead = jax.tree.map(
+        lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, config.future), own
+    )
+    return trajectory.blend(
+        ahead,
+        desired,
+        bias_position=control.bias_position,
+        bias_facing=control.bias_facing,
+    )
+
+
+def controller(
+    params: Params,
+    bones: skeleton.Skeleton,
+    *,
+    config: camdm.Config,
+    control: Control | None = None,
+    table: schedule.Schedule | None = None,
+) -> Controller:
+    """The run-time of one character, for `rollout.tick` and `rollout.rollout`.
+
+    Args:
+      params: The network's parameters.
+      bones: The skeleton.
+      config: The method.
+      control: Constants; None for the defaults.
+      table: Schedule; None for the cosine one of `config.num_steps`.
+
+    Returns:
+      A controller whose frames are `Frame`s. Its second planner is the guided one.
+    """
+    control = Control() if control is None else control
+    sample = camdm.planner(params, config=config, table=table)
+
+    def urgency(state: CharacterState, command: trajectory.Command) -> Array:
+        first = state.command.label < 0
+        played = state.cursor >= control.apply
+        need = first | played
+        if control.replan_on_change:
+            need = need | _changed(state, command)
+        new_style = _new_style(state, command) & (control.guided_plans > 0)
+        guided = need & (new_style | (state.guided > 0))
+        return need.astype(jnp.int32) + guided.astype(jnp.int32)
+
+    def plan(key: Key, state: CharacterState, command, guided: bool):
+        frame = plan_frame(bones, state.past, config=config)
+        wanted = wanted_trajectory(bones, state, command, config=config, control=control)
+        left = jnp.where(_new_style(state, command), control.guided_plans, state.guided)
+        condition = camdm.Condition(
+            past=features.motion_features(
+                features.to_frame(state.past, frame),
+                rotation_layout=config.rotation_layout,
+            ),
+            trajectory=trajectory.to_local(wanted, frame),
+            label=command.label,
+            keep_past=jnp.ones((), bool),
+        )
+        # Beside a guided character an unguided one gets the scale that changes nothing.
+        scale = jnp.where(left > 0, control.guidance_scale, 1.0) if guided else None
+        poses = sample(key, condition, scale=scale)
+        chunk = features.from_frame(
+            features.motion_from_features(
+                poses, config.fps, rotation_layout=config.rotation_layout
+            ),
+            frame,
+        )
+        if control.seam > 0:
+            shown = jax.tree.map(lambda x: x[-2:], state.past)
+            chunk = inertia.inertialize(shown, chunk, duration=control.seam)
+        return dataclasses.replace(
+            state,
+            plan=chunk,
+            cursor=jnp.zeros_like(state.cursor),
+            guided=jnp.maximum(left - 1, 0),
+        )
+
+    def advance(state: CharacterState, command: trajectory.Command):
+        pose = jax.tree.map(
+            lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
+        )
+        past = jax.tree.map(
+            lambda old, new: jnp.concatenate([old[1:], new]), state.past, pose
+        )
+        times = {"half_life": control.half_life, "dt": 1.0 / config.fps}
+        _, velocity, acceleration = spring.velocity_spring(
+            jnp.zeros(2), state.velocity, state.acceleration, command.velocity, **times
+        )
+        facing, turn_rate = spring.facing_spring(
+            state.facing, state.turn_rate, command.facing, **times
+        )
+        frame = Frame(
+            root_position=pose.root_position[0],
+            joint_rotation=pose.joint_rotation[0],
+            desired_velocity=velocity,
+            desired_facing=facing,
+            planned=state.cursor == 0,
+        )
+        # A style that changes while the old plan still plays arms the next plans.
+        armed = _new_style(state, command) & (state.cursor > 0)
+        return dataclasses.replace(
+            state,
+            past=past,
+            guided=jnp.where(armed, control.guided_plans, state.guided),
+            cursor=state.cursor + 1,
+            velocity=velocity,
+            acceleration=acceleration,
+            facing=facing,
+            turn_rate=turn_rate,
+            command=command,
+        ), frame
+
+    return Controller(
+        urgency=urgency,
+        plans=(
+            lambda k, s, c: plan(k, s, c, False),
+            lambda k, s, c: plan(k, s, c, True),
+        ),
+        advance=advance,
+    )

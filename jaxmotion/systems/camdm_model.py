@@ -1,0 +1,111 @@
+"""A CAMDM model as a value: configuration, skeleton and styles, to and from JSON.
+
+A checkpoint holds this beside the parameters, so a model can be used without the
+experiment or the data that made it.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion.motion.skeleton import Skeleton, check_parents
+from jaxmotion.systems import camdm
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Model:
+    """Everything but the parameters.
+
+    Attributes:
+      config: The method.
+      bones: The skeleton that it was trained on.
+      labels: Names of the styles.
+      source: The data, and its licence.
+    """
+
+    config: camdm.Config
+    bones: Skeleton
+    labels: tuple[str, ...]
+    source: str
+
+    def label(self, name: str) -> int:
+        """Number of a style.
+
+        Args:
+          name: Its name.
+
+        Returns:
+          The number.
+
+        Raises:
+          ValueError: if the model has no such style; names those it has.
+        """
+        if name not in self.labels:
+            raise ValueError(
+                f"unknown style {name!r}: the model has {', '.join(self.labels)}"
+            )
+        return self.labels.index(name)
+
+
+def to_json(model: Model) -> dict[str, Any]:
+    """JSON of a model.
+
+    Args:
+      model: The model.
+
+    Returns:
+      A JSON object.
+    """
+    return {
+        "system": "camdm",
+        "config": dataclasses.asdict(model.config),
+        "skeleton": {
+            "offsets": np.asarray(model.bones.offsets, np.float64).tolist(),
+            "parents": list(model.bones.parents),
+            "names": list(model.bones.names),
+            "feet": list(model.bones.feet),
+        },
+        "labels": list(model.labels),
+        "source": model.source,
+    }
+
+
+def from_json(value: dict[str, Any], *, where: str) -> Model:
+    """Inverse of `to_json`.
+
+    Args:
+      value: The JSON object.
+      where: The file, for error messages.
+
+    Returns:
+      The model.
+
+    Raises:
+      ValueError: names the file and the field that is missing or wrong.
+    """
+    if value.get("system") != "camdm":
+        raise ValueError(
+            f"{where}: field 'system' is {value.get('system')!r}, expected 'camdm'"
+        )
+    known = {field.name for field in dataclasses.fields(camdm.Config)}
+    unknown = set(value.get("config", {})) - known
+    if unknown:
+        raise ValueError(f"{where}: field 'config' has unknown {sorted(unknown)}")
+    try:
+        bones = value["skeleton"]
+        check_parents(tuple(bones["parents"]))
+        return Model(
+            config=camdm.Config(**value["config"]),
+            bones=Skeleton(
+                offsets=jnp.asarray(bones["offsets"], jnp.float32),
+                parents=tuple(bones["parents"]),
+                names=tuple(bones["names"]),
+                feet=tuple(bones["feet"]),
+            ),
+            labels=tuple(value["labels"]),
+            source=value["source"],
+        )
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{where}: field {error} is missing or wrong") from error
