@@ -1,0 +1,232 @@
+"""Motion as flat features, their normalisation, and changes of ground frame.
+
+A network sees a frame as one vector, whose slices a `FeatureLayout` names. CAMDM's is
+the 6D rotation of each joint followed by a pseudo-joint (x, y, z, 0, 0, 0) with the
+root's position: (J + 1) * 6 numbers.
+"""
+
+import dataclasses
+import functools
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.motion import ground, rotation
+from jaxmotion.motion.layout import FeatureLayout as FeatureLayout
+from jaxmotion.motion.layout import feature_layout as feature_layout
+from jaxmotion.motion.layout import pack as pack
+from jaxmotion.motion.layout import unpack as unpack
+from jaxmotion.motion.skeleton import Motion
+from jaxmotion.motion.trajectory import PlanarFrame
+
+RotationLayout = Literal["rows", "columns"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Normalizer:
+    """An affine map to zero mean and unit deviation.
+
+    Attributes:
+      mean: Of each feature.
+      std: Of each feature, never below the floor it was fitted with.
+    """
+
+    mean: Float[Array, " features"]
+    std: Float[Array, " features"]
+
+
+@jax.jit
+def fit_normalizer(
+    features: Float[Array, "*batch features"], *, floor: float | Array = 1e-4
+) -> Normalizer:
+    """Mean and standard deviation of each feature over all other axes.
+
+    Args:
+      features: Feature vectors of the training data.
+      floor: Least deviation, in the features' units, so that constant channels stay
+        finite (they map to zero).
+
+    Returns:
+      The normaliser.
+
+    Source: own.
+    """
+    rows = features.reshape(-1, features.shape[-1])
+    mean = jnp.mean(rows, axis=0)
+    # Two passes: the mean of squares would lose a small deviation on a large mean.
+    variance = jnp.mean((rows - mean[None]) ** 2, axis=0)
+    return Normalizer(mean=mean, std=jnp.maximum(jnp.sqrt(variance), floor))
+
+
+def _like(vector: Array, x: Array) -> Array:
+    return vector.reshape((1,) * (x.ndim - 1) + (-1,))
+
+
+@jax.jit
+def normalize(
+    normalizer: Normalizer, x: Float[Array, "*batch features"]
+) -> Float[Array, "*batch features"]:
+    """Maps features to zero mean and unit deviation.
+
+    Args:
+      normalizer: Fitted on the training data.
+      x: Features in their own units.
+
+    Returns:
+      Normalised features.
+
+    Source: own.
+    """
+    return (x - _like(normalizer.mean, x)) / _like(normalizer.std, x)
+
+
+@jax.jit
+def denormalize(
+    normalizer: Normalizer, x: Float[Array, "*batch features"]
+) -> Float[Array, "*batch features"]:
+    """Inverse of `normalize`.
+
+    Args:
+      normalizer: Fitted on the training data.
+      x: Normalised features.
+
+    Returns:
+      Features in their own units.
+
+    Source: own.
+    """
+    return x * _like(normalizer.std, x) + _like(normalizer.mean, x)
+
+
+def _move(motion: Motion, facing: Array, before: Array, after: Array, turn) -> Motion:
+    """Moves by `before`, turns all ground vectors, moves by `after`."""
+    root = motion.root_position
+    # The two columns of the root's rotation are vectors, and turn as vectors do.
+    columns = motion.joint_rotation[..., 0, :].reshape(*root.shape[:-1], 2, 3)
+    facing = facing[..., None, :]
+    planar = turn(
+        root[..., ::2] + before[..., None, :],
+        jnp.broadcast_to(facing, (*root.shape[:-1], 2)),
+    )
+    planar = planar + after[..., None, :]
+    turned = turn(
+        columns[..., ::2],
+        jnp.broadcast_to(facing[..., None, :], (*columns.shape[:-1], 2)),
+    )
+    columns = columns.at[..., ::2].set(turned)
+    rot6d = columns.reshape(*root.shape[:-1], 6)
+    return dataclasses.replace(
+        motion,
+        root_position=root.at[..., ::2].set(planar),
+        joint_rotation=motion.joint_rotation.at[..., 0, :].set(rot6d),
+    )
+
+
+@jax.jit
+def to_frame(motion: Motion, frame: PlanarFrame) -> Motion:
+    """A world motion seen from a ground frame: origin at zero, facing along +z.
+
+    Rigid: only the root's position and rotation change, heights stay.
+
+    Args:
+      motion: Frames in the world.
+      frame: One for the whole motion.
+
+    Returns:
+      The motion in that frame.
+
+    Source: own.
+    """
+    zero = jnp.zeros_like(frame.origin)
+    return _move(motion, frame.facing, -frame.origin, zero, ground.into_frame)
+
+
+@jax.jit
+def from_frame(motion: Motion, frame: PlanarFrame) -> Motion:
+    """Inverse of `to_frame`.
+
+    Args:
+      motion: Frames in the ground frame.
+      frame: One for the whole motion.
+
+    Returns:
+      The motion in the world.
+
+    Source: own.
+    """
+    zero = jnp.zeros_like(frame.origin)
+    return _move(motion, frame.facing, zero, frame.origin, ground.out_of_frame)
+
+
+def _check_layout(rotation_layout: str) -> None:
+    if rotation_layout not in ("rows", "columns"):
+        raise ValueError(
+            f"rotation_layout is {rotation_layout!r}, expected 'rows' or 'columns'"
+        )
+
+
+@functools.partial(jax.jit, static_argnames=("rotation_layout",))
+def motion_features(
+    motion: Motion, *, rotation_layout: RotationLayout = "rows"
+) -> Float[Array, "*batch frames features"]:
+    """CAMDM's features: 6D of each joint, then the root as (x, y, z, 0, 0, 0).
+
+    Args:
+      motion: Frames; positions in metres.
+      rotation_layout: First two "rows" of each matrix, as in the released code, or its
+        first two "columns".
+
+    Returns:
+      (J + 1) * 6 features a frame.
+
+    Raises:
+      ValueError: if the layout is neither.
+
+    Source: Chen et al. 2024 (CAMDM), sec. 3.1 and released code.
+    """
+    _check_layout(rotation_layout)
+    rot6d, root = motion.joint_rotation, motion.root_position
+    if rotation_layout == "rows":
+        rot6d = rotation.rot6d_rows_to_columns(rot6d)
+    pseudo = jnp.concatenate([root, jnp.zeros_like(root)], axis=-1)
+    joints = jnp.concatenate([rot6d, pseudo[..., None, :]], axis=-2)
+    return joints.reshape(*root.shape[:-1], -1)
+
+
+@functools.partial(jax.jit, static_argnames=("fps", "rotation_layout"))
+def motion_from_features(
+    features: Float[Array, "*batch frames features"],
+    fps: float,
+    *,
+    rotation_layout: RotationLayout = "rows",
+) -> Motion:
+    """Inverse of `motion_features`; any finite features give rotations.
+
+    Args:
+      features: (J + 1) * 6 numbers a frame, as a network predicts them; the last three
+        are ignored.
+      fps: Frames a second.
+      rotation_layout: As in `motion_features`.
+
+    Returns:
+      The motion, with orthonormal 6D rotations (Gram-Schmidt).
+
+    Raises:
+      ValueError: if the layout is neither, or the size is not (J + 1) * 6, J >= 1.
+
+    Source: Chen et al. 2024 (CAMDM), sec. 3.1 and released code.
+    """
+    _check_layout(rotation_layout)
+    size = features.shape[-1]
+    if size % 6 or size < 12:
+        raise ValueError(f"{size} features, expected (joints + 1) * 6")
+    joints = features.reshape(*features.shape[:-1], -1, 6)
+    rot6d, root = joints[..., :-1, :], joints[..., -1, :3]
+    if rotation_layout == "rows":
+        rot6d = rotation.rot6d_rows_to_columns(rot6d)
+    else:
+        rot6d = rotation.rot6d_from_matrix(rotation.matrix_from_rot6d(rot6d))
+    return Motion(root_position=root, joint_rotation=rot6d, fps=fps)
