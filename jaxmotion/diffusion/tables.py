@@ -31,26 +31,26 @@ class Schedule:
       log_alpha_bar: Log of the share of x_0's variance left at step t; 0 at index 0.
     """
 
-    beta: Float[Array, " entries"]
-    log_alpha_bar: Float[Array, " entries"]
+    beta: Float[Array, "*batch entries"]
+    log_alpha_bar: Float[Array, "*batch entries"]
 
     @property
     def num_steps(self) -> int:
         """Number of steps T."""
-        return self.beta.shape[0] - 1
+        return self.beta.shape[-1] - 1
 
     @property
-    def alpha_bar(self) -> Float[Array, " entries"]:
+    def alpha_bar(self) -> Float[Array, "*batch entries"]:
         """Share of x_0's variance left at step t; 1 at index 0."""
         return jnp.exp(self.log_alpha_bar)
 
     @property
-    def one_minus_alpha_bar(self) -> Float[Array, " entries"]:
+    def one_minus_alpha_bar(self) -> Float[Array, "*batch entries"]:
         """Variance of the noise at step t; 0 at index 0, exact for small steps."""
         return jnp.abs(jnp.expm1(self.log_alpha_bar))  # abs: no -0, whose snr is -inf
 
     @property
-    def snr(self) -> Float[Array, " entries"]:
+    def snr(self) -> Float[Array, "*batch entries"]:
         """Signal-to-noise ratio alpha_bar / (1 - alpha_bar); infinite at index 0."""
         return self.alpha_bar / self.one_minus_alpha_bar
 
