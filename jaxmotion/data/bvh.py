@@ -7,6 +7,9 @@ the axis rotations in the order of the rotation channels, column vectors: channe
 Z, X, Y mean R = Rz Rx Ry.
 """
 
+import dataclasses
+from collections.abc import Collection
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -19,9 +22,11 @@ __all__ = [
     "BvhError",
     "bvh_from_motion",
     "bvh_transforms",
+    "frame_rate",
     "motion_from_bvh",
     "parse_bvh",
     "read_bvh",
+    "without_joints",
     "write_bvh",
 ]
 
@@ -81,6 +86,39 @@ def _subtree(bvh: Bvh, root: int) -> list[int]:
     for joint, parent in enumerate(bvh.parents):
         inside[joint] = joint == root or (parent >= 0 and inside[parent])
     return [joint for joint, is_inside in enumerate(inside) if is_inside]
+
+
+def without_joints(bvh: Bvh, names: Collection[str]) -> Bvh:
+    """The file's content without some joints and everything below them.
+
+    Args:
+      bvh: A parsed file.
+      names: Joints to drop, such as those of the fingers; never the root.
+
+    Returns:
+      The rest.
+
+    Raises:
+      BvhError: for an unknown joint name, or the root's.
+    """
+    dropped = {_require_joint(bvh, name) for name in names}
+    if 0 in dropped:
+        raise BvhError(f"{bvh.name}: the root {bvh.names[0]!r} cannot be dropped")
+    keep: list[int] = []
+    for joint, parent in enumerate(bvh.parents):
+        if joint not in dropped and (parent < 0 or parent in keep):
+            keep.append(joint)
+    first = np.cumsum([0] + [len(channels) for channels in bvh.channels])
+    columns = [c for joint in keep for c in range(first[joint], first[joint + 1])]
+    return dataclasses.replace(
+        bvh,
+        names=tuple(bvh.names[joint] for joint in keep),
+        parents=(-1, *(keep.index(bvh.parents[joint]) for joint in keep[1:])),
+        offsets=bvh.offsets[keep],
+        channels=tuple(bvh.channels[joint] for joint in keep),
+        end_sites=tuple(bvh.end_sites[joint] for joint in keep),
+        values=bvh.values[:, columns],
+    )
 
 
 def _require_joint(bvh: Bvh, name: str) -> int:

@@ -73,10 +73,19 @@ class Clips:
         return fields[field]
 
 
-def _check_skeletons(
+def check_skeletons(
     skeletons: Sequence[Skeleton], names: Sequence[str], tolerance: float
 ) -> None:
-    """Raises unless all skeletons have the first one's joints and bones."""
+    """Raises unless all skeletons have the first one's joints and bones.
+
+    Args:
+      skeletons: One skeleton a clip.
+      names: One name a clip.
+      tolerance: Largest difference between the offsets of two skeletons, metres.
+
+    Raises:
+      ValueError: names the two clips and the joint.
+    """
     first = skeletons[0]
     offsets = np.asarray(first.offsets)
     for name, other in zip(names, skeletons, strict=True):
@@ -155,7 +164,7 @@ def clips_from_motions(
     for what, values in {"skeletons": per_clip, "names": names, **labels}.items():
         if len(values) != len(motions):
             raise ValueError(f"{len(values)} {what} for {len(motions)} motions")
-    _check_skeletons(per_clip, names, tolerance)
+    check_skeletons(per_clip, names, tolerance)
     _check_motions(motions, names, per_clip[0].num_joints)
     words = {
         field: tuple((label_names or {}).get(field, sorted(set(values))))

@@ -1,0 +1,185 @@
+"""Reads a published motion set, or generates one, into one npz file of clips.
+
+The sets are third-party recordings: get them from their publishers, mind their
+licences, and keep what this script writes out of the repository. World coordinates
+(metres, y up) stay as published.
+
+Example:
+  python experiments/prepare_data.py procedural --out data/walker.npz
+  python experiments/prepare_data.py lafan1 --manual-dir raw/lafan1 --out data/l.npz
+"""
+
+import dataclasses
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+from jaxmotion.data import clips_io, mirror, resample, selection
+from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
+
+Source = Literal["bandai_namco/1", "bandai_namco/2", "lafan1", "style100", "procedural"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to read, and where to write it."""
+
+    source: Annotated[Source, tyro.conf.Positional]
+    """The motion set; "procedural" generates a styled walker."""
+    out: Path
+    """File to write (.npz)."""
+    manual_dir: Path | None = None
+    """Folder with the files as their publisher lays them out (zips or unzipped)."""
+    fps: float = 30.0
+    """Frames a second of the result; other rates are resampled."""
+    mirror: bool = False
+    """Add the left-right mirror image of every clip (style100: of symmetric styles,
+    under the same label; the others swap left and right in their labels)."""
+    tfds_dir: Path | None = None
+    """Folder of the tensorflow-datasets files; by default tfds beside --out."""
+    overwrite: bool = False
+    """Replace --out, and read the published files again."""
+    seed: int = 0
+    """Seed of the procedural walker."""
+
+
+def check_config(config: Config) -> None:
+    """Finds what would stop the work at its end before it begins.
+
+    Args:
+      config: The settings.
+
+    Raises:
+      FileNotFoundError: if the folder of the published files is missing.
+      FileExistsError: if the output exists and is not to be replaced.
+      OSError: if the output cannot be written.
+      ValueError: if the rate is not positive.
+    """
+    if not (np.isfinite(config.fps) and config.fps > 0):
+        raise ValueError(f"--fps should be positive, found {config.fps}")
+    if config.source != "procedural":
+        if config.manual_dir is None:
+            raise FileNotFoundError(f"{config.source} needs --manual-dir")
+        if not config.manual_dir.is_dir():
+            raise FileNotFoundError(f"--manual-dir: no folder {config.manual_dir}")
+    if config.out.is_dir():
+        raise IsADirectoryError(f"--out: {config.out} is a folder, expected a file")
+    if config.out.exists() and not config.overwrite:
+        raise FileExistsError(f"--out: {config.out} exists; use --overwrite")
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    probe = config.out.with_name(f".{config.out.name}.{os.getpid()}.probe")
+    probe.touch()
+    probe.unlink()
+
+
+def read_published(config: Config) -> Clips:
+    """Clips of a published set, by way of its tensorflow-datasets builder.
+
+    Args:
+      config: The settings.
+
+    Returns:
+      The clips at the rate of the set.
+    """
+    from jaxmotion.data.builders import bandai_namco, base, lafan1, style100
+
+    name, _, variant = config.source.partition("/")
+    if name == "style100":
+        variant = "mirror" if config.mirror else "original"
+    classes = {
+        "bandai_namco": bandai_namco.BandaiNamco,
+        "lafan1": lafan1.Lafan1,
+        "style100": style100.Style100,
+    }
+    folder = config.tfds_dir or config.out.parent / "tfds"
+    builder = classes[name](
+        config=variant or None, data_dir=str(folder), file_format="array_record"
+    )
+    base.prepare(builder, config.manual_dir, overwrite=config.overwrite)
+    return base.clips_from_source(builder)
+
+
+def at_rate(clips: Clips, fps: float) -> Clips:
+    """The clips at another frame rate.
+
+    Args:
+      clips: The clips.
+      fps: Frames a second.
+
+    Returns:
+      The clips themselves if they have that rate.
+    """
+    if clips.fps == fps:
+        return clips
+    motions = [clip_motion(clips, i) for i in range(clips.num_clips)]
+    return clips_from_motions(
+        [resample.resample(motion, fps) for motion in motions],
+        clips.skeleton,
+        names=clips.clip_names,
+        labels={
+            field: [names[int(i)] for i in np.asarray(clips.labels[field])]
+            for field, names in clips.label_names
+        },
+        label_names=dict(clips.label_names),
+        source=clips.source,
+    )
+
+
+def describe(clips: Clips, path: Path) -> str:
+    """Counts of what was written.
+
+    Args:
+      clips: The clips.
+      path: The file.
+
+    Returns:
+      Lines to print.
+    """
+    minutes = clips.num_frames / clips.fps / 60
+    lengths = np.diff(np.asarray(clips.offsets))
+    lines = [
+        f"source   {clips.source}",
+        f"clips    {clips.num_clips} ({lengths.min()} to {lengths.max()} frames)",
+        f"frames   {clips.num_frames} at {clips.fps:g} fps = {minutes:.1f} minutes",
+        f"joints   {clips.skeleton.num_joints}, feet "
+        f"{', '.join(clips.skeleton.names[foot] for foot in clips.skeleton.feet)}",
+    ]
+    for field, names in clips.label_names:
+        counts = np.bincount(np.asarray(clips.labels[field]), minlength=len(names))
+        words = [f"{name} {n}" for name, n in zip(names, counts, strict=True)]
+        lines.append(f"{field:8} {', '.join(words)}")
+    return "\n".join([*lines, f"written  {path}, {path.stat().st_size / 1e6:.1f} MB"])
+
+
+def main(config: Config) -> None:
+    """Prepares the data and prints what it is.
+
+    Args:
+      config: The settings.
+    """
+    check_config(config)
+    start = time.time()
+    if config.source == "procedural":
+        from jaxmotion.data import procedural
+
+        clips = procedural.make_clips(seed=config.seed)
+    else:
+        clips = read_published(config)
+    clips = at_rate(clips, config.fps)
+    if config.mirror and config.source != "style100":
+        clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
+    clips_io.save_clips(config.out, clips)
+    print(describe(clips, config.out))
+    print(f"took     {time.time() - start:.1f} s")
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,240 @@
+"""What the tensorflow-datasets builders share; TensorFlow itself is never imported.
+
+A builder stores whole clips, one example each, as array_record files, which
+`as_data_source` reads without TensorFlow. `clips_from_source` makes `Clips` of them;
+windows are cut later, on the device. World coordinates stay as published: nothing is
+centred, turned or put on the floor.
+"""
+
+import os
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import tensorflow_datasets as tfds
+
+from jaxmotion.data.clips import Clips, clips_from_motions
+from jaxmotion.motion.skeleton import Motion, Skeleton
+
+_TENSORS = {
+    "root_position": ((None, 3), np.float32),
+    "joint_rotation": ((None, None, 6), np.float32),
+    "offsets": ((None, 3), np.float32),
+    "parents": ((None,), np.int32),
+    "feet": ((None,), np.int32),
+    "fps": ((), np.float32),
+}
+
+
+class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
+    """A set of labelled clips; a subclass says where they come from.
+
+    Attributes:
+      LABELS: Label fields of each clip.
+      LABEL_NAMES: Published order of a field's labels; other fields are sorted.
+      SOURCE: Name of the set and its licence.
+      HOMEPAGE: Where it is published.
+    """
+
+    VERSION = tfds.core.Version("1.0.0")
+    RELEASE_NOTES = {"1.0.0": "First version."}
+    LABELS: tuple[str, ...] = ()
+    LABEL_NAMES: Mapping[str, Sequence[str]] = {}
+    SOURCE = ""
+    HOMEPAGE = ""
+
+    @property
+    def source(self) -> str:
+        """Name of the set (and its configuration) and its licence."""
+        return self.SOURCE
+
+    @property
+    def label_names(self) -> Mapping[str, Sequence[str]]:
+        """Published order of the labels of a field, where there is one."""
+        return self.LABEL_NAMES
+
+    def _info(self) -> tfds.core.DatasetInfo:
+        features = {
+            # Bytes, because two axes of unknown length need an encoding.
+            name: tfds.features.Tensor(
+                shape=shape,
+                dtype=dtype,
+                encoding="bytes" if len(shape) == 3 else "none",
+            )
+            for name, (shape, dtype) in _TENSORS.items()
+        }
+        # Joint names may contain spaces, but no line ends.
+        for name in ("name", "joint_names", *self.LABELS):
+            features[name] = tfds.features.Text()
+        return tfds.core.DatasetInfo(
+            builder=self,
+            description=f"{self.source}: {type(self).__doc__}",
+            features=tfds.features.FeaturesDict(features),
+            homepage=self.HOMEPAGE,
+        )
+
+    def _split_generators(self, dl_manager):
+        return {"train": self._generate_examples(Path(dl_manager.manual_dir))}
+
+
+def example(
+    name: str, skeleton: Skeleton, motion: Motion, labels: Mapping[str, str]
+) -> tuple[str, dict]:
+    """Key and features of one clip.
+
+    Args:
+      name: Unique name of the clip.
+      skeleton: Its bones.
+      motion: Its frames.
+      labels: One word for each label field.
+
+    Returns:
+      What a builder's generator yields.
+    """
+    features = {
+        "root_position": np.asarray(motion.root_position, np.float32),
+        "joint_rotation": np.asarray(motion.joint_rotation, np.float32),
+        "offsets": np.asarray(skeleton.offsets, np.float32),
+        "parents": np.array(skeleton.parents, np.int32),
+        "feet": np.array(skeleton.feet, np.int32),
+        "fps": np.float32(motion.fps),
+        "joint_names": "\n".join(skeleton.names),
+        "name": name,
+        **labels,
+    }
+    return name, features
+
+
+def read_files(
+    manual_dir: str | os.PathLike, suffixes: tuple[str, ...], *, stem: str = ""
+) -> Iterator[tuple[str, bytes]]:
+    """Files of a folder or, where it has none of the kind, of the zips in it.
+
+    Args:
+      manual_dir: Folder; searched with all folders below it.
+      suffixes: Wanted ends of file names, lower case.
+      stem: Only files below a folder of that name (in the path or inside the zip), or
+        in a zip named so.
+
+    Yields:
+      Path (for zips "archive.zip/member") and content, sorted by path.
+
+    Raises:
+      FileNotFoundError: if the folder is missing or has no such file.
+      ValueError: if a zip is damaged; names it.
+    """
+    folder = Path(manual_dir)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {str(folder)!r} with the published files")
+    loose = [
+        path
+        for path in sorted(folder.rglob("*"))
+        if path.name.lower().endswith(suffixes)
+        and path.is_file()
+        and (not stem or stem in path.resolve().parts)
+    ]
+    if loose:
+        for path in loose:
+            yield str(path), path.read_bytes()
+        return
+    archives = [path for path in sorted(folder.rglob("*.zip")) if stem in path.name]
+    found = False
+    for path in archives:
+        try:
+            with zipfile.ZipFile(path) as archive:
+                for member in sorted(archive.namelist()):
+                    if member.lower().endswith(suffixes):
+                        found = True
+                        yield f"{path}/{member}", archive.read(member)
+        except zipfile.BadZipFile as error:
+            raise ValueError(f"{path}: damaged zip ({error})") from None
+    if not found:
+        raise FileNotFoundError(
+            f"{str(folder)!r} has neither files *{', *'.join(suffixes)} nor a zip with "
+            f"them{f' named {stem}' if stem else ''}"
+        )
+
+
+def prepare(
+    builder: tfds.core.DatasetBuilder,
+    manual_dir: str | os.PathLike,
+    *,
+    overwrite: bool = False,
+) -> tfds.core.DatasetBuilder:
+    """Reads the published files into the builder's folder, unless it is there.
+
+    Args:
+      builder: One of the builders, made with `file_format="array_record"`.
+      manual_dir: Folder with the published files.
+      overwrite: Read them again although the builder's folder is there.
+
+    Returns:
+      The builder.
+
+    Raises:
+      FileNotFoundError: if the folder or its files are missing.
+      ValueError: if a file is malformed; names it.
+    """
+    if not Path(manual_dir).is_dir():
+        raise FileNotFoundError(
+            f"no folder {str(manual_dir)!r}. {builder.MANUAL_DOWNLOAD_INSTRUCTIONS}"
+        )
+    modes = tfds.download.GenerateMode
+    mode = modes.REUSE_CACHE_IF_EXISTS if overwrite else modes.REUSE_DATASET_IF_EXISTS
+    config = tfds.download.DownloadConfig(
+        manual_dir=os.fspath(manual_dir), download_mode=mode
+    )
+    builder.download_and_prepare(download_config=config, file_format="array_record")
+    return builder
+
+
+def _word(value) -> str:
+    """Text of a data source, which comes as bytes."""
+    return value.decode() if isinstance(value, bytes) else str(value)
+
+
+def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Clips:
+    """All clips of a prepared builder.
+
+    Args:
+      builder: A prepared builder.
+      tolerance: Largest difference between the offsets of two skeletons, metres.
+
+    Returns:
+      The clips, sorted by name.
+
+    Raises:
+      ValueError: if the clips have different skeletons or rates; names two.
+    """
+    records = sorted(builder.as_data_source(split="train"), key=lambda r: r["name"])
+    skeletons, motions = [], []
+    for record in records:
+        skeletons.append(
+            Skeleton(
+                offsets=jnp.asarray(record["offsets"]),
+                parents=tuple(int(parent) for parent in record["parents"]),
+                names=tuple(_word(record["joint_names"]).split("\n")),
+                feet=tuple(int(foot) for foot in record["feet"]),
+            )
+        )
+        motions.append(
+            Motion(
+                root_position=jnp.asarray(record["root_position"]),
+                joint_rotation=jnp.asarray(record["joint_rotation"]),
+                fps=float(record["fps"]),
+            )
+        )
+    return clips_from_motions(
+        motions,
+        skeletons,
+        names=[_word(record["name"]) for record in records],
+        labels={
+            field: [_word(record[field]) for record in records]
+            for field in builder.LABELS
+        },
+        label_names=builder.label_names,
+        source=builder.source,
+        tolerance=tolerance,
+    )

@@ -1,0 +1,220 @@
+"""100STYLE: a hundred styles of walking, running and standing (Mason et al. 2022).
+
+Layout: `<Style>/<Style>_<ACTION>.bvh`, `Frame_Cuts.csv` with one row a style of start
+and stop of each action (in frames of the 60 fps recording), `Dataset_List.csv` with
+name, description, stochastic y/n, symmetric y/n and notes.
+
+Source: the preprocessing of CAMDM's released code (every second frame, cut at start//2
+and stop//2, fingers dropped, symmetric styles mirrored under the same label). Differs:
+clips are not turned, centred or put on the floor; what follows works in any place.
+"""
+
+import csv
+import dataclasses
+import io
+import logging
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+import tensorflow_datasets as tfds
+
+from jaxmotion.data import bvh, mirror
+from jaxmotion.data.builders import base
+from jaxmotion.motion.skeleton import Skeleton
+
+ACTIONS = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3")
+_DROPPED = ("eye", "index", "middle", "ring", "pinky", "thumb")
+_FEET = (
+    ("LeftToe_End", "RightToe_End"),
+    ("LeftToeBase", "RightToeBase"),
+    ("LeftToe", "RightToe"),
+)
+_LOG = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass
+class Style100Config(tfds.core.BuilderConfig):
+    """Whether symmetric styles get a mirrored copy under the same label."""
+
+    mirror: bool = False
+
+
+class Style100(base.MotionBuilder):
+    """A hundred styles, ten actions each, taken at 30 of 60 frames a second."""
+
+    BUILDER_CONFIGS = [
+        Style100Config(name="original", description="As recorded."),
+        Style100Config(
+            name="mirror",
+            description="With mirrored copies of symmetric styles.",
+            mirror=True,
+        ),
+    ]
+    MANUAL_DOWNLOAD_INSTRUCTIONS = (
+        "Put 100STYLE.zip, or the unzipped style folders with Frame_Cuts.csv and "
+        "Dataset_List.csv, into the folder."
+    )
+    LABELS = ("style", "action")
+    LABEL_NAMES = {"action": ACTIONS}
+    SOURCE = "100STYLE (CC BY 4.0)"
+    HOMEPAGE = "https://www.ianxmason.com/100style/"
+
+    def _generate_examples(self, folder: Path) -> Iterator[tuple[str, dict]]:
+        tables = {
+            PurePosixPath(path.replace("\\", "/")).name: (
+                path,
+                data.decode("utf-8-sig"),
+            )
+            for path, data in base.read_files(folder, (".csv",))
+        }
+        for name in ("Frame_Cuts.csv", "Dataset_List.csv"):
+            if name not in tables:
+                raise FileNotFoundError(f"{folder}: no {name}")
+        cuts = read_cuts(*tables["Frame_Cuts.csv"])
+        symmetric = read_symmetric(*tables["Dataset_List.csv"])
+        skipped: dict[str, list[str]] = {"style not in the list": [], "no cut": []}
+        for path, data in base.read_files(folder, (".bvh",)):
+            name = PurePosixPath(path.replace("\\", "/")).stem
+            style, action = name.split("_")[0], name.split("_")[-1]
+            if action not in ACTIONS:
+                raise ValueError(
+                    f"{path}: unknown action {action!r}, expected {', '.join(ACTIONS)}"
+                )
+            if style not in symmetric:
+                skipped["style not in the list"].append(name)
+                continue
+            if (style, action) not in cuts:
+                skipped["no cut"].append(name)
+                continue
+            content = cut_clip(bvh.read_bvh(data, name=path), cuts[style, action])
+            skeleton, motion = bvh.motion_from_bvh(content, feet=_feet(content))
+            labels = {"style": style, "action": action}
+            yield base.example(name, skeleton, motion, labels)
+            if self.builder_config.mirror and symmetric[style]:
+                copy = mirror.mirror(skeleton, motion, plan=_plan(skeleton))
+                yield base.example(f"{name}_mirrored", skeleton, copy, labels)
+        for reason, names in skipped.items():
+            if names:
+                _LOG.warning("%d files skipped, %s: %s", len(names), reason, names[:5])
+
+
+def _plan(skeleton: Skeleton) -> mirror.MirrorPlan:
+    """Mirror plan from the skeleton alone, the same for all clips.
+
+    A performer's retargeted skeleton may be a little lopsided; 2 cm is allowed.
+    """
+    return mirror.mirror_plan(skeleton, tolerance=0.02)
+
+
+def _feet(content: bvh.Bvh) -> tuple[str, ...]:
+    """The outermost pair of toe joints."""
+    for pair in _FEET:
+        if set(pair) <= set(content.names):
+            return pair
+    raise bvh.BvhError(
+        f"{content.name}: no toes: expected one of the pairs {_FEET} among the joints "
+        f"{', '.join(content.names)}"
+    )
+
+
+def cut_clip(content: bvh.Bvh, cut: tuple[int, int]) -> bvh.Bvh:
+    """The cut at 30 frames a second, without fingers and eyes.
+
+    Args:
+      content: A recording at 60 frames a second, or one already taken at 30.
+      cut: First and last (exclusive) frame at 60 frames a second.
+
+    Returns:
+      The frames start//2 : stop//2 of every second frame.
+
+    Raises:
+      BvhError: if the rate is another, or the cut is not within the recording.
+    """
+    fps = bvh.frame_rate(content.frame_time)
+    if fps not in (60.0, 30.0):
+        raise bvh.BvhError(
+            f"{content.name}: {fps:g} frames a second, expected 60 (or 30)"
+        )
+    start, stop = cut[0] // 2, cut[1] // 2
+    values = content.values[:: 2 if fps == 60.0 else 1]
+    if not 0 <= start < stop <= len(values):
+        raise bvh.BvhError(
+            f"{content.name}: the cut {cut[0]}..{cut[1]} of Frame_Cuts.csv is not "
+            f"within the {2 * len(values)} frames of the recording at 60 a second"
+        )
+    content = dataclasses.replace(
+        content, values=values[start:stop], frame_time=1.0 / 30.0
+    )
+    dropped = [
+        name
+        for name in content.names[1:]
+        if any(part in name.lower() for part in _DROPPED)
+    ]
+    return bvh.without_joints(content, dropped)
+
+
+def read_cuts(path: str, text: str) -> dict[tuple[str, str], tuple[int, int]]:
+    """Start and stop of each style and action.
+
+    Args:
+      path: Name for messages.
+      text: Frame_Cuts.csv: a header, then style and start, stop for each action in the
+        order of `ACTIONS`. An empty cell or one with an "n" (NA, nan) means missing.
+
+    Returns:
+      Start and stop in frames at 60 a second, by style and action.
+
+    Raises:
+      ValueError: names the file, the line and the cell.
+    """
+    cuts = {}
+    for number, row in enumerate(csv.reader(io.StringIO(text)), start=1):
+        if number == 1 or not any(cell.strip() for cell in row):
+            continue
+        cells = [cell.strip() for cell in row]
+        cells += [""] * (1 + 2 * len(ACTIONS) - len(cells))
+        for slot, action in enumerate(ACTIONS):
+            pair = cells[1 + 2 * slot : 3 + 2 * slot]
+            if any(not cell or "n" in cell.lower() for cell in pair):
+                continue
+            try:
+                start, stop = (int(float(cell)) for cell in pair)
+            except ValueError:
+                raise ValueError(
+                    f"{path}, line {number}: cut of {cells[0]} {action} should be two "
+                    f"frame numbers or NA, found {pair}"
+                ) from None
+            cuts[cells[0], action] = (start, stop)
+    if not cuts:
+        raise ValueError(f"{path}: no cuts below the header")
+    return cuts
+
+
+def read_symmetric(path: str, text: str) -> dict[str, bool]:
+    """Whether each listed style is symmetric.
+
+    Args:
+      path: Name for messages.
+      text: Dataset_List.csv: a header, then name, description, stochastic y/n,
+        symmetric y/n, notes.
+
+    Returns:
+      True for symmetric styles, by style.
+
+    Raises:
+      ValueError: names the file and the line.
+    """
+    symmetric = {}
+    for number, row in enumerate(csv.reader(io.StringIO(text)), start=1):
+        if number == 1 or not any(cell.strip() for cell in row):
+            continue
+        answer = row[3].strip().lower()[:1] if len(row) > 3 else ""
+        if answer not in ("y", "n"):
+            raise ValueError(
+                f"{path}, line {number}: column 4 (symmetric) should be y or n, found "
+                f"{row[3:4]}"
+            )
+        symmetric[row[0].strip()] = answer == "y"
+    if not symmetric:
+        raise ValueError(f"{path}: no styles below the header")
+    return symmetric

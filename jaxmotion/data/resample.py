@@ -1,0 +1,104 @@
+"""Motions at another frame rate."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmotion.motion import rotation
+from jaxmotion.motion.skeleton import Motion
+
+
+def slerp(
+    a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"], t: Float[Array, "*#batch"]
+) -> Float[Array, "*batch 4"]:
+    """Spherical interpolation of unit quaternions along the shorter arc.
+
+    Args:
+      a: Quaternions at t = 0.
+      b: Quaternions at t = 1.
+      t: Position between them, in [0, 1].
+
+    Returns:
+      Unit quaternions.
+
+    Source: Shoemake 1985.
+    """
+    cosine = jnp.sum(a * b, axis=-1, keepdims=True)
+    b, cosine = jnp.where(cosine < 0, -b, b), jnp.abs(cosine)
+    # The angle from both chords is exact near zero, where arccos is not.
+    angle = 2.0 * jnp.arctan2(
+        jnp.linalg.norm(a - b, axis=-1, keepdims=True),
+        jnp.linalg.norm(a + b, axis=-1, keepdims=True),
+    )
+    t = jnp.broadcast_to(t, a.shape[:-1])[..., None]
+    sine = jnp.sin(angle)
+    is_small = sine < 1e-6
+    divisor = jnp.where(is_small, 1.0, sine)
+    weight_a = jnp.where(is_small, 1.0 - t, jnp.sin((1.0 - t) * angle) / divisor)
+    weight_b = jnp.where(is_small, t, jnp.sin(t * angle) / divisor)
+    mixed = weight_a * a + weight_b * b
+    return mixed / jnp.linalg.norm(mixed, axis=-1, keepdims=True)
+
+
+def resample(motion: Motion, fps: float) -> Motion:
+    """The motion at another frame rate, from its first frame on.
+
+    The same rate returns the motion itself. Where the rate divides the motion's by a
+    whole number n, every nth frame is taken unchanged. Otherwise positions are
+    interpolated linearly and rotations by slerp. Nothing is filtered. The last frame is
+    the last one that is not behind the motion's own last frame.
+
+    Args:
+      motion: Frames, with any batch axes.
+      fps: Frames a second that are wanted.
+
+    Returns:
+      The motion at that rate.
+
+    Raises:
+      ValueError: if the rate is not positive and finite, the motion has no frames, or
+        the rate is more than 16 times or less than 1/16 of the motion's (a mistake).
+    """
+    num_frames = motion.root_position.shape[-2]
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps should be positive and finite, found {fps}")
+    if num_frames == 0:
+        raise ValueError("the motion has no frames")
+    ratio = motion.fps / fps
+    if not 1 / 16 <= ratio <= 16:
+        raise ValueError(
+            f"resampling from {motion.fps:g} to {fps:g} frames a second is more than "
+            "a factor of 16; is one of them wrong?"
+        )
+    if ratio == 1.0:
+        return motion
+    step = round(ratio)
+    if step >= 1 and abs(ratio - step) < 1e-6 * ratio:
+        return dataclasses.replace(
+            motion,
+            root_position=motion.root_position[..., ::step, :],
+            joint_rotation=motion.joint_rotation[..., ::step, :, :],
+            fps=float(fps),
+        )
+    # The tolerance keeps a last frame that rounding puts just behind the end.
+    count = int(np.floor((num_frames - 1) / ratio + 1e-6)) + 1
+    time = np.minimum(np.arange(count) * ratio, num_frames - 1)
+    low = np.minimum(np.floor(time).astype(np.int64), max(num_frames - 2, 0))
+    high = np.minimum(low + 1, num_frames - 1)
+    t = jnp.asarray(time - low, motion.root_position.dtype)
+    position = motion.root_position
+    quaternion = rotation.quaternion_from_matrix(
+        rotation.matrix_from_rot6d(motion.joint_rotation)
+    )
+    turned = slerp(quaternion[..., low, :, :], quaternion[..., high, :, :], t[:, None])
+    before, after = position[..., low, :], position[..., high, :]
+    weight = jnp.broadcast_to(t[:, None], before.shape)
+    return Motion(
+        root_position=(1 - weight) * before + weight * after,
+        joint_rotation=rotation.rot6d_from_matrix(
+            rotation.matrix_from_quaternion(turned)
+        ),
+        fps=float(fps),
+    )

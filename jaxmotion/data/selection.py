@@ -1,0 +1,164 @@
+"""Parts of clips and clips put together: by label, by chance, one set after another."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxmotion.data.clips import Clips, check_skeletons, take_clips
+
+
+def _label_numbers(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
+    """Numbers of those labels; every name must be known."""
+    known = clips.names(field)
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(
+            f"unknown {field} {', '.join(map(repr, unknown))}: the clips have "
+            f"{', '.join(known)}"
+        )
+    return [known.index(name) for name in names]
+
+
+def select(clips: Clips, field: str, names: Sequence[str]) -> Clips:
+    """Clips whose label is one of those; the numbers of the labels stay as they were.
+
+    Args:
+      clips: The clips.
+      field: Label field, such as "content".
+      names: Labels to keep.
+
+    Returns:
+      Those clips, in the same order.
+
+    Raises:
+      ValueError: if the field or a name is unknown (lists the known ones), or no clip
+        is left.
+    """
+    if isinstance(names, str):
+        raise ValueError(f"names should be a sequence of labels, found {names!r}")
+    numbers = _label_numbers(clips, field, names)
+    keep = np.flatnonzero(np.isin(np.asarray(clips.labels[field]), numbers))
+    if keep.size == 0:
+        raise ValueError(f"no clip has {field} {', '.join(names)}")
+    return take_clips(clips, keep)
+
+
+def relabel(clips: Clips, field: str) -> Clips:
+    """Renumbers a label field so that only labels that occur are left.
+
+    After `select`, a network needs as many label embeddings as labels that occur.
+
+    Args:
+      clips: The clips.
+      field: Label field.
+
+    Returns:
+      The same clips with labels 0..number of labels that occur - 1, in the old order.
+
+    Raises:
+      ValueError: if the field is unknown.
+    """
+    names = clips.names(field)
+    used, compact = np.unique(np.asarray(clips.labels[field]), return_inverse=True)
+    label_names = tuple(
+        (own, tuple(names[number] for number in used) if own == field else words)
+        for own, words in clips.label_names
+    )
+    labels = {**clips.labels, field: jnp.asarray(compact, jnp.int32)}
+    return dataclasses.replace(clips, labels=labels, label_names=label_names)
+
+
+def split_clips(
+    clips: Clips, *, fraction: float, seed: int, field: str = "style"
+) -> tuple[Clips, Clips]:
+    """Splits whole clips at random, label by label.
+
+    Of each label with n clips, round(n * fraction) are held out, but at least one stays
+    in the training part and, where n > 1, at least one is held out.
+
+    Args:
+      clips: The clips.
+      fraction: Part of each label's clips to hold out, in (0, 1).
+      seed: Seed of the shuffle; the same seed splits the same clips alike.
+      field: Label field by which to stratify.
+
+    Returns:
+      The training clips and the held-out clips, both in the original order.
+
+    Raises:
+      ValueError: if the fraction is out of range, the field is unknown, or no label has
+        two clips.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise ValueError(f"fraction should be between 0 and 1, found {fraction}")
+    clips.names(field)
+    generator = np.random.default_rng(seed)
+    labels = np.asarray(clips.labels[field])
+    held_out: list[int] = []
+    for label in np.unique(labels):
+        members = np.flatnonzero(labels == label)
+        count = int(np.clip(round(members.size * fraction), 1, members.size - 1))
+        held_out += generator.permutation(members)[:count].tolist()
+    train = np.setdiff1d(np.arange(clips.num_clips), held_out)
+    return take_clips(clips, train), take_clips(clips, sorted(held_out))
+
+
+def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
+    """Puts several sets of clips of one skeleton behind each other.
+
+    Label names are merged, in the order in which they first occur.
+
+    Args:
+      parts: Sets of clips with the same label fields and rate.
+      tolerance: Largest difference between the offsets of two skeletons, metres.
+
+    Returns:
+      One set with the first part's skeleton; its source lists those of the parts.
+
+    Raises:
+      ValueError: if there is no part, or the fields, rates or skeletons differ.
+    """
+    if not parts:
+        raise ValueError("no clips to concatenate")
+    fields = [field for field, _ in parts[0].label_names]
+    for part in parts[1:]:
+        found = [field for field, _ in part.label_names]
+        if sorted(found) != sorted(fields):
+            raise ValueError(f"label fields differ: {fields} and {found}")
+    rates = {part.fps for part in parts}
+    if len(rates) > 1:
+        raise ValueError(f"rates differ: {sorted(rates)} frames a second")
+    check_skeletons(
+        [part.skeleton for part in parts],
+        [part.clip_names[0] for part in parts],
+        tolerance,
+    )
+    words = {
+        field: tuple(dict.fromkeys(w for part in parts for w in part.names(field)))
+        for field in fields
+    }
+    lengths = np.concatenate([np.diff(np.asarray(part.offsets)) for part in parts])
+    return dataclasses.replace(
+        parts[0],
+        root_position=jnp.concatenate([part.root_position for part in parts]),
+        joint_rotation=jnp.concatenate([part.joint_rotation for part in parts]),
+        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
+        labels={field: _merged(parts, field, words[field]) for field in fields},
+        label_names=tuple(words.items()),
+        clip_names=tuple(name for part in parts for name in part.clip_names),
+        source="; ".join(dict.fromkeys(part.source for part in parts)),
+    )
+
+
+def _merged(parts: Sequence[Clips], field: str, words: tuple[str, ...]) -> Array:
+    """Labels of all parts as numbers of the merged names."""
+    numbers = [
+        np.array([words.index(name) for name in part.names(field)])[
+            np.asarray(part.labels[field])
+        ]
+        for part in parts
+    ]
+    return jnp.asarray(np.concatenate(numbers), jnp.int32)
