@@ -1,7 +1,7 @@
 """The skeleton, motions of it, and forward kinematics.
 
 A pose is a root position in the world and one parent-local rotation a joint. With
-parent p of joint j (FACTS 0.6, column vectors):
+parent p of joint j (column vectors):
 
     R_g[0] = R[0]           p[0] = root position
     R_g[j] = R_g[p] R[j]    p[j] = p[p] + R_g[p] offset[j]
@@ -145,7 +145,7 @@ def forward_kinematics(
     Raises:
       ValueError: if the number of rotations is not the skeleton's number of joints.
 
-    Source: FACTS 0.6 (the forward kinematics of CAMDM, eq. 3).
+    Source: Chen et al. 2024 (CAMDM), eq. 3.
     """
     return global_transforms(skeleton, root_position, joint_rotation)[0]
 
