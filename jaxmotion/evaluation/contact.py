@@ -1,0 +1,133 @@
+"""Feet that slide on the ground. Heights are y above the ground at y = 0, metres."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.motion.spring import Scalar
+
+
+class Slide(NamedTuple):
+    """How fast low feet move, and for how long feet were low at all.
+
+    A foot that never comes down slides nowhere: read `speed` together with `seconds`.
+    """
+
+    speed: Float[Array, "*batch"]
+    seconds: Float[Array, "*batch"]
+
+
+def _foot_steps(foot_positions: Float[Array, "*batch frames feet 3"]) -> Array:
+    """Distance on the ground from each frame to the next, metres."""
+    if foot_positions.shape[-3] < 2:
+        raise ValueError("1 frame or none, expected at least 2 to have a step")
+    return jnp.linalg.norm(jnp.diff(foot_positions[..., ::2], axis=-3), axis=-1)
+
+
+@jax.jit
+def slide_distance(
+    foot_positions: Float[Array, "*batch frames feet 3"],
+    fps: Scalar,
+    *,
+    max_height: Scalar = 0.01,
+) -> Slide:
+    """Metres that the toes slide for each second that they are low.
+
+    Over all feet and all frames in which a foot is lower than `max_height`: the
+    horizontal distance to the next frame, summed, divided by the time summed. To join
+    clips, weight their speeds with their seconds.
+
+    Args:
+      foot_positions: World positions of the toes, metres, ground at y = 0.
+      fps: Frames a second.
+      max_height: Metres, exclusive ("below, e.g., 1 cm" in the paper).
+
+    Returns:
+      Speed in metres a second (zero where no foot is ever low) and the seconds that
+      feet were low, added over feet.
+
+    Raises:
+      ValueError: if there are fewer than two frames.
+
+    Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 2. Differs: a second of low
+      foot, so that it depends on neither length nor frame rate.
+    """
+    steps = _foot_steps(foot_positions)
+    is_low = foot_positions[..., :-1, :, 1] < max_height
+    metres = jnp.sum(jnp.where(is_low, steps, 0.0), axis=(-2, -1))
+    seconds = jnp.sum(is_low, axis=(-2, -1)) / fps
+    speed = metres / jnp.where(seconds > 0, seconds, 1.0)
+    return Slide(speed=speed, seconds=seconds)
+
+
+@jax.jit
+def skate_ratio(
+    foot_positions: Float[Array, "*batch frames feet 3"],
+    fps: Scalar,
+    *,
+    max_height: Scalar = 0.05,
+    min_speed: Scalar = 0.5,
+) -> Float[Array, "*batch"]:
+    """Part of the frames in which any foot skates.
+
+    A foot skates from one frame to the next if it is lower than `max_height` in both
+    and moves faster than `min_speed` on the ground.
+
+    Args:
+      foot_positions: World positions of feet or toes, metres, ground at y = 0.
+      fps: Frames a second.
+      max_height: Metres, exclusive.
+      min_speed: Metres a second, exclusive. The source's 2.5 cm a frame at 20 fps.
+
+    Returns:
+      Ratio in [0, 1].
+
+    Raises:
+      ValueError: if there are fewer than two frames.
+
+    Source: Karunratanakul et al. 2023 (GMD), with a threshold a second. Real data do
+      not score zero (about 0.05 there).
+    """
+    is_fast = _foot_steps(foot_positions) * fps > min_speed
+    is_low = foot_positions[..., 1] < max_height
+    skates = is_fast & is_low[..., 1:, :] & is_low[..., :-1, :]
+    return jnp.mean(jnp.any(skates, axis=-1), axis=-1)
+
+
+@jax.jit
+def foot_slide_camdm_release(
+    foot_positions: Float[Array, "*batch frames feet 3"],
+    root_position: Float[Array, "*batch frames 3"],
+    *,
+    max_height: Scalar = 0.01,
+) -> Float[Array, "*batch"]:
+    """What CAMDM's code prints as foot sliding: a ratio, not metres.
+
+    Mean horizontal step of low toes (the last frame, if low, adds a step of zero),
+    divided by the mean horizontal step of the root, or by 1 if the root stands still.
+    A slow root makes it large whatever the feet do.
+
+    Args:
+      foot_positions: World positions of the toes, metres, ground at y = 0 (the source
+        puts the lowest toe of the clip there).
+      root_position: World position of the root, metres.
+      max_height: Metres, exclusive.
+
+    Returns:
+      Ratio without unit; zero where no toe is ever low.
+
+    Raises:
+      ValueError: if there are fewer than two frames.
+
+    Source: released code of CAMDM, cal_metric_foot_sliding.
+    """
+    steps = _foot_steps(foot_positions)
+    steps = jnp.concatenate([steps, jnp.zeros_like(steps[..., :1, :])], axis=-2)
+    is_low = foot_positions[..., 1] < max_height
+    count = jnp.sum(is_low, axis=(-2, -1))
+    total = jnp.sum(jnp.where(is_low, steps, 0.0), axis=(-2, -1))
+    root_step = jnp.diff(root_position[..., ::2], axis=-2)
+    root = jnp.mean(jnp.linalg.norm(root_step, axis=-1), axis=-1)
+    return total / jnp.maximum(count, 1) / jnp.where(root == 0, 1.0, root)

@@ -1,0 +1,105 @@
+"""How much samples differ: over a set, for one condition, and within a style."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.typing import Key
+
+
+def _random_pairs(key: Key, count: int, num_pairs: int) -> tuple[Array, Array]:
+    """Pairs of two different indices below count, all equally likely."""
+    if count < 2:
+        raise ValueError(f"{count} samples, expected at least 2 to have a pair")
+    key_first, key_shift = jax.random.split(key)
+    first = jax.random.randint(key_first, (num_pairs,), 0, count)
+    shift = jax.random.randint(key_shift, (num_pairs,), 1, count)
+    return first, (first + shift) % count
+
+
+@functools.partial(jax.jit, static_argnames=("num_pairs",))
+def diversity(
+    key: Key, features: Float[Array, "samples features"], *, num_pairs: int
+) -> Float[Array, ""]:
+    """Mean distance of random pairs of samples.
+
+    Differs from the source: pairs are of two different samples, drawn anew each, so
+    that the mean is unbiased; there two random subsets are paired, and a sample may
+    meet itself.
+
+    Args:
+      key: Consumed.
+      features: One row a sample, of all conditions together.
+      num_pairs: Pairs to draw (the source: 200 or 300).
+
+    Returns:
+      Mean Euclidean distance, in units of the features.
+
+    Raises:
+      ValueError: if there are fewer than two samples.
+
+    Source: Guo et al. 2020 (Action2Motion).
+    """
+    first, second = _random_pairs(key, features.shape[0], num_pairs)
+    gap = features[first] - features[second]
+    return jnp.mean(jnp.linalg.norm(gap, axis=-1))
+
+
+@functools.partial(jax.jit, static_argnames=("num_pairs",))
+def multimodality(
+    key: Key, features: Float[Array, "conditions repeats features"], *, num_pairs: int
+) -> Float[Array, ""]:
+    """Mean distance of random pairs of samples of the same condition.
+
+    Args:
+      key: Consumed.
+      features: Features of several samples of each condition.
+      num_pairs: Pairs to draw for each condition (the source: 10 or 20).
+
+    Returns:
+      Mean Euclidean distance, in units of the features.
+
+    Raises:
+      ValueError: if a condition has fewer than two samples.
+
+    Source: Guo et al. 2020 (Action2Motion), with pairs of two different samples.
+    """
+
+    def of_one(key: Key, repeats: Array) -> Array:
+        return diversity(key, repeats, num_pairs=num_pairs)
+
+    keys = jax.random.split(key, features.shape[0])
+    return jnp.mean(jax.vmap(of_one)(keys, features))
+
+
+@jax.jit
+def intra_style_variance(
+    positions: Float[Array, "repeats frames joints 3"],
+) -> Float[Array, ""]:
+    """Variance of joint positions over repeats of one style and one control.
+
+    The paper's definition of diversity is a sentence: the variance of each joint's
+    spatial location, averaged over all joints, of motions generated with the same
+    control. Here: at each frame and joint the mean squared distance to the mean over
+    the repeats, unbiased, averaged over frames and joints.
+
+    Args:
+      positions: Joint positions, metres, in the frame they are to be compared in:
+        world for the whole rollout, root-local for the pose alone.
+
+    Returns:
+      Variance, square metres (summed over the three axes).
+
+    Raises:
+      ValueError: if there are fewer than two repeats.
+
+    Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 4 (no code was released).
+    """
+    repeats = positions.shape[0]
+    if repeats < 2:
+        raise ValueError(f"{repeats} repeats, expected at least 2 to have a variance")
+    gap = positions - jnp.mean(positions, axis=0, keepdims=True)
+    variance = jnp.sum(gap * gap, axis=(0, -1)) / (repeats - 1)
+    return jnp.mean(variance)

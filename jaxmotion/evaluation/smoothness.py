@@ -1,0 +1,93 @@
+"""How smoothly joints move."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.motion.spring import Scalar
+
+
+def _mean_derivative(positions: Array, fps: Scalar, order: int) -> Array:
+    if positions.shape[-3] <= order:
+        raise ValueError(
+            f"{positions.shape[-3]} frames, expected at least {order + 1} for a "
+            f"derivative of order {order}"
+        )
+    derivative = jnp.diff(positions, n=order, axis=-3) * fps**order
+    return jnp.mean(jnp.linalg.norm(derivative, axis=-1), axis=(-2, -1))
+
+
+@jax.jit
+def acceleration(
+    positions: Float[Array, "*batch frames joints 3"], fps: Scalar
+) -> Float[Array, "*batch"]:
+    """Mean length of the joints' acceleration, over frames and joints.
+
+    Second differences times fps^2. Real motion does not score zero, and a frozen one
+    does: compare with the data's own value.
+
+    Args:
+      positions: World positions of the joints, metres.
+      fps: Frames a second.
+
+    Returns:
+      Metres a second squared.
+
+    Raises:
+      ValueError: if there are fewer than three frames.
+
+    Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 3, in its usual meaning (the
+      paper's unit is that of a speed; see `coherence_camdm_release`).
+    """
+    return _mean_derivative(positions, fps, 2)
+
+
+@jax.jit
+def jerk(
+    positions: Float[Array, "*batch frames joints 3"], fps: Scalar
+) -> Float[Array, "*batch"]:
+    """Mean length of the joints' jerk, over frames and joints.
+
+    Third differences times fps^3.
+
+    Args:
+      positions: World positions of the joints, metres.
+      fps: Frames a second.
+
+    Returns:
+      Metres a second cubed.
+
+    Raises:
+      ValueError: if there are fewer than four frames.
+
+    Source: Flash and Hogan 1985, who make its square least.
+    """
+    return _mean_derivative(positions, fps, 3)
+
+
+@jax.jit
+def coherence_camdm_release(
+    positions: Float[Array, "*batch frames joints 3"],
+) -> Float[Array, "*batch"]:
+    """What CAMDM's code prints as acceleration: a ratio of speeds.
+
+    Mean step of all joints divided by the mean horizontal step of joint 0, or by 1 if
+    that stands still. No second difference is taken.
+
+    Args:
+      positions: World positions of the joints, metres; joint 0 is the root.
+
+    Returns:
+      Ratio without unit, near 1 for walking.
+
+    Raises:
+      ValueError: if there are fewer than two frames.
+
+    Source: released code of CAMDM, cal_metric_cohenrence.
+    """
+    if positions.shape[-3] < 2:
+        raise ValueError("1 frame or none, expected at least 2 to have a step")
+    step = jnp.diff(positions, axis=-3)
+    root = jnp.mean(jnp.linalg.norm(step[..., 0, ::2], axis=-1), axis=-1)
+    mean = jnp.mean(jnp.linalg.norm(step, axis=-1), axis=(-2, -1))
+    return mean / jnp.where(root == 0, 1.0, root)

@@ -1,0 +1,75 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.evaluation import contact
+from tests.reference import metrics as oracle
+
+
+def clip(seed, frames=40):
+    rng = np.random.default_rng(seed)
+    feet = rng.normal(size=(frames, 2, 3)) * [0.02, 0.01, 0.02]
+    feet[..., 1] = np.abs(feet[..., 1])
+    root = np.cumsum(rng.normal(size=(frames, 3)) * 0.03, axis=0)
+    return feet.astype(np.float32), root.astype(np.float32)
+
+
+def test_slide_distance_is_that_of_the_definition():
+    feet, _ = clip(0)
+    want = oracle.slide(feet.astype(np.float64), 30.0, 0.01)
+    got = contact.slide_distance(jnp.asarray(feet), 30.0)
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_slide_distance_does_not_depend_on_the_frame_rate():
+    def slid(fps):
+        t = np.arange(int(2 * fps) + 1) / fps
+        feet = np.stack([0.3 * t, 0 * t, 0.4 * t], -1)[:, None]
+        return contact.slide_distance(jnp.asarray(feet, jnp.float32), fps)
+
+    for fps in (20.0, 60.0):
+        np.testing.assert_allclose(slid(fps), (0.5, 2.0), rtol=1e-5)
+
+
+def test_feet_in_the_air_slide_for_no_time():
+    feet = jnp.ones((5, 2, 3))
+    np.testing.assert_array_equal(contact.slide_distance(feet, 30.0), (0.0, 0.0))
+
+
+def test_skate_ratio_counts_frames_with_any_low_fast_foot():
+    # Steps of 0.02 m at 30 fps are 0.6 m/s. Foot 0 slides in steps 0-1; foot 1 moves
+    # in steps 1-3, but is high from frame 3 on, so that only its step 1 counts.
+    x0 = np.cumsum([0, 0.02, 0.02, 0, 0, 0])
+    x1 = np.cumsum([0, 0, 0.02, 0.02, 0.02, 0])
+    height = np.array([0, 0, 0, 0.1, 0.1, 0.1])
+    feet = np.stack(
+        [np.stack([x0, 0 * x0, 0 * x0], -1), np.stack([0 * x1, height, x1], -1)], 1
+    )
+    feet = jnp.asarray(feet, jnp.float32)
+    np.testing.assert_allclose(contact.skate_ratio(feet, 30.0), 2 / 5)
+    np.testing.assert_allclose(contact.skate_ratio(feet, 20.0), 0.0)
+    both = contact.skate_ratio(jnp.stack([feet, 0 * feet]), 30.0)
+    np.testing.assert_allclose(both, [2 / 5, 0.0])
+
+
+def test_released_foot_slide_is_that_of_the_definition():
+    feet, root = clip(1)
+    want = oracle.foot_slide_release(feet.astype(float), root.astype(float), 0.01)
+    got = contact.foot_slide_camdm_release(jnp.asarray(feet), jnp.asarray(root))
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_released_foot_slide_is_a_ratio():
+    feet, root = clip(2)
+    got = contact.foot_slide_camdm_release(jnp.asarray(feet), jnp.asarray(root))
+    slow = contact.foot_slide_camdm_release(jnp.asarray(feet), jnp.asarray(root) / 10)
+    np.testing.assert_allclose(slow, 10 * got, rtol=1e-4)
+    still = contact.foot_slide_camdm_release(jnp.asarray(feet), 0 * jnp.asarray(root))
+    assert np.isfinite(still)
+    high = jnp.asarray(feet) + jnp.array([0, 1.0, 0]).reshape(1, 1, 3)
+    assert contact.foot_slide_camdm_release(high, jnp.asarray(root)) == 0.0
+
+
+def test_one_frame_is_refused():
+    with pytest.raises(ValueError, match="expected at least 2"):
+        contact.slide_distance(jnp.zeros((1, 2, 3)), 30.0)

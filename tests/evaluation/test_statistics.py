@@ -1,0 +1,67 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from jaxmotion.evaluation import statistics
+
+
+@pytest.mark.parametrize("level", [0.5, 0.95, 0.99])
+@pytest.mark.parametrize("count", [2, 5, 20, 3000])
+def test_student_interval_is_scipys(count, level):
+    x = np.random.default_rng(count).normal(2.0, 3.0, count).astype(np.float32)
+    got = statistics.confidence_interval(jnp.asarray(x), level=level)
+    x = x.astype(np.float64)
+    error = x.std(ddof=1) / np.sqrt(count)
+    want = scipy.stats.t.interval(level, count - 1, loc=x.mean(), scale=error)
+    np.testing.assert_allclose(got.estimate, x.mean(), rtol=1e-4)
+    width = want[1] - want[0]
+    np.testing.assert_allclose((got.low, got.high), want, atol=2e-3 * width)
+
+
+def test_normal_interval_is_the_1_96_of_the_literature():
+    x = jnp.array([1.0, 2.0, 3.0, 6.0])
+    got = statistics.confidence_interval(x, method="normal")
+    half = 1.959964 * np.std(x, ddof=1) / 2
+    np.testing.assert_allclose((got.low, got.high), (3 - half, 3 + half), rtol=1e-5)
+
+
+def test_student_interval_holds_the_mean_as_often_as_it_says():
+    x = jax.random.normal(jax.random.key(0), (2000, 4))
+    got = jax.vmap(lambda row: statistics.confidence_interval(row, level=0.9))(x)
+    rate = np.mean((got.low <= 0) & (got.high >= 0))
+    assert abs(rate - 0.9) < 4 * np.sqrt(0.09 / 2000)
+
+
+def test_bootstrap_of_a_mean_is_near_its_normal_interval():
+    x = jax.random.normal(jax.random.key(1), (200,))
+    got = statistics.bootstrap_interval(
+        jax.random.key(2), x, jnp.mean, num_resamples=2000
+    )
+    want = statistics.confidence_interval(x, method="normal")
+    np.testing.assert_allclose(got.estimate, want.estimate, rtol=1e-6)
+    width = float(want.high - want.low)
+    # The ends of 2000 percentiles scatter by about 3 % of the width.
+    np.testing.assert_allclose(
+        (got.low, got.high), (want.low, want.high), atol=0.1 * width
+    )
+
+
+def test_bootstrap_draws_whole_clips_of_a_pytree():
+    clips = {"a": jnp.arange(6.0), "b": 2 * jnp.arange(6.0)}
+
+    def gap(drawn):
+        return jnp.max(jnp.abs(drawn["b"] - 2 * drawn["a"]))
+
+    got = statistics.bootstrap_interval(jax.random.key(3), clips, gap, num_resamples=50)
+    np.testing.assert_array_equal(got, (0.0, 0.0, 0.0))
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(ValueError, match="1 samples, expected at least 2"):
+        statistics.confidence_interval(jnp.zeros(1))
+    with pytest.raises(ValueError, match=r"numbers of clips \[2, 3\]"):
+        statistics.bootstrap_interval(
+            jax.random.key(0), (jnp.zeros(2), jnp.zeros(3)), lambda x: jnp.sum(x[0])
+        )
