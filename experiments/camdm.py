@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from jaxmotion.data import clips_io, selection, windows
+from jaxmotion.data import clips_io, mirror, selection, windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.learning import checkpoint, loop, training
 from jaxmotion.systems import camdm, camdm_model
@@ -31,10 +31,10 @@ PRESETS = {
         frames_per_token=5,
         heading="facing",
         dropout=0.0,
-        weight_velocity=10.0,
+        weight_velocity=5.0,
         weight_position=2.0,
-        weight_position_velocity=50.0,
-        weight_foot=50.0,
+        weight_position_velocity=20.0,
+        weight_foot=20.0,
     ),
 }
 
@@ -73,8 +73,8 @@ class Train:
     label: str = "style"
     held_out: float = 0.1
     mirror: bool = True
-    steps: int = 12000
-    batch: int = 64
+    steps: int = 24000
+    batch: int = 32
     learning_rate: float = 5e-4
     warmup: int = 500
     ema: float = 0.999
@@ -125,7 +125,7 @@ def train(args: Train) -> None:
     clips, _ = split_data(args.data, args.contents, args.label, args.held_out)
     model = model_of(args, clips)
     if args.mirror:
-        clips = selection.concatenate([clips, mirrored(clips)])
+        clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
     index = windows.window_index(clips, model.config.window, short="skip")
     print(
         f"{clips.num_clips} clips, {clips.num_frames} frames, "

@@ -1,0 +1,31 @@
+"""Real-time motion diffusion in JAX: one functional core, four systems.
+
+Users write `jaxmotion.diffusion.chain.ancestral_step`, or import a module:
+`from jaxmotion.diffusion import chain`.
+"""
+
+from jaxmotion import (
+    control,
+    data,
+    diffusion,
+    evaluation,
+    learning,
+    motion,
+    networks,
+    protocols,
+    systems,
+)
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "control",
+    "data",
+    "diffusion",
+    "evaluation",
+    "learning",
+    "motion",
+    "networks",
+    "protocols",
+    "systems",
+]

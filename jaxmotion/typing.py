@@ -5,7 +5,7 @@ any leading batch axes. Callables are protocols, so that a plain function or a c
 fits without inheriting from anything.
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Int
 from jaxtyping import Key as _Key
@@ -21,6 +21,7 @@ class Gaussian(NamedTuple):
     variance: Float[Array, "*#shape"]
 
 
+@runtime_checkable
 class Denoiser(Protocol):
     """Predicts the clean sample from a noisy one.
 
@@ -35,6 +36,7 @@ class Denoiser(Protocol):
         ...
 
 
+@runtime_checkable
 class ConditionalDenoiser(Protocol):
     """A denoiser that takes its condition as an argument (for classifier-free use)."""
 
@@ -45,6 +47,7 @@ class ConditionalDenoiser(Protocol):
         ...
 
 
+@runtime_checkable
 class Step(Protocol):
     """One step of the reverse chain: x_t -> x_{t-1}."""
 
@@ -55,6 +58,7 @@ class Step(Protocol):
         ...
 
 
+@runtime_checkable
 class Objective(Protocol):
     """A scalar that guidance makes small."""
 

@@ -1,0 +1,1 @@
+"""Autoregression at run-time: rollouts, seams, fixed sequences of commands."""

@@ -1,0 +1,1 @@
+"""Diffusion on arrays of any kind: schedules, the reverse chain, guidance."""

@@ -126,21 +126,61 @@ def restore(folder: str | Path, like: Any, step: int | None = None) -> Any:
             args = ocp.args.Composite(state=ocp.args.StandardRestore(like))
             state = manager.restore(step, args=args)["state"]
     except Exception as error:
-        raise CheckpointError(
-            f"{folder}: step {step} is corrupt or of another model: "
-            f"{str(error).splitlines()[0] if str(error) else type(error).__name__}"
-        ) from error
-    for path, (want, got) in zip(
-        [p for p, _ in jax.tree_util.tree_leaves_with_path(like)],
-        zip(jax.tree.leaves(like), jax.tree.leaves(state), strict=True),
-        strict=True,
-    ):
+        raise _foreign(folder, step, error) from error
+    _check_shapes(folder, step, like, state)
+    return state
+
+
+def _foreign(folder: Path, step: int, error: Exception) -> CheckpointError:
+    lines = str(error).splitlines() or [type(error).__name__]
+    return CheckpointError(
+        f"{folder}: step {step} is corrupt or of another model: {lines[0]}"
+    )
+
+
+def _check_shapes(folder: Path, step: int, like: Any, found: Any) -> None:
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(like)]
+    pairs = zip(jax.tree.leaves(like), jax.tree.leaves(found), strict=True)
+    for path, (want, got) in zip(paths, pairs, strict=True):
         if want.shape != got.shape:
             raise CheckpointError(
                 f"{folder}: step {step} is of another model: "
                 f"{jax.tree_util.keystr(path)} is {got.shape}, expected {want.shape}"
             )
-    return state
+
+
+def restore_part(
+    folder: str | Path, like: dict[str, Any], step: int | None = None
+) -> dict[str, Any]:
+    """Some fields of a saved state, such as the averaged parameters alone.
+
+    Args:
+      folder: The run's checkpoint folder.
+      like: Field names to trees of the same structure and shapes.
+      step: Which; None for the newest.
+
+    Returns:
+      Those fields.
+
+    Raises:
+      CheckpointError: if there is none, it is corrupt, or of another model; names the
+        folder.
+    """
+    folder = Path(folder)
+    step = _newest(folder, step)
+    part = ocp.args.PyTreeRestore(
+        item=like,
+        restore_args=ocp.checkpoint_utils.construct_restore_args(like),
+        partial_restore=True,
+    )
+    try:
+        with ocp.PyTreeCheckpointer() as reader:
+            found = reader.restore(folder.absolute() / str(step) / "state", args=part)
+        found = jax.tree.map(jax.numpy.asarray, found)
+    except Exception as error:
+        raise _foreign(folder, step, error) from error
+    _check_shapes(folder, step, like, found)
+    return found
 
 
 def export_params(
@@ -191,7 +231,9 @@ def import_params(
             arrays = {name: file[name] for name in file.files}
         config = json.loads(str(arrays.pop("config")))
     except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise CheckpointError(f"{path}: not an export of parameters: {error}") from error
+        raise CheckpointError(
+            f"{path}: not an export of parameters: {error}"
+        ) from error
     params: dict[str, Any] = {}
     for name, array in arrays.items():
         *parents, last = name.split("/")

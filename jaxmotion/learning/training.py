@@ -6,7 +6,7 @@ state. So a run that stops and resumes draws what an uninterrupted one would hav
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,7 @@ class TrainState:
     opt_state: Any
 
 
+@runtime_checkable
 class Loss(Protocol):
     """A loss that training makes small."""
 
@@ -47,6 +48,7 @@ class Loss(Protocol):
         ...
 
 
+@runtime_checkable
 class Update(Protocol):
     """One optimiser step."""
 

@@ -1,0 +1,1 @@
+"""Kinematics: rotations, skeletons, features, paths on the ground, contacts."""

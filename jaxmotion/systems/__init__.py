@@ -1,0 +1,1 @@
+"""The methods as compositions of diffusion, motion, networks and control."""

@@ -280,9 +280,9 @@ def loss(
     size = labels.shape[0]
     key_example, key_t, key_noise, key_drop = jax.random.split(key, 4)
     keys = jax.random.split(key_example, size)
-    condition, x_0 = jax.vmap(
-        lambda k, w, c: example(k, bones, w, c, config=config)
-    )(keys, windows, labels)
+    condition, x_0 = jax.vmap(lambda k, w, c: example(k, bones, w, c, config=config))(
+        keys, windows, labels
+    )
     table = schedule.cosine_schedule(config.num_steps)
     t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
     noise = jax.random.normal(key_noise, x_0.shape)
@@ -353,9 +353,7 @@ def loss_terms(
         ),
         # As in MDM, a squared distance is summed over xyz' mean over all channels.
         "position": losses.masked_mse(flat(predicted), flat(wanted), every),
-        "position_velocity": losses.velocity_loss(
-            flat(predicted), flat(wanted), every
-        ),
+        "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
         "foot": losses.foot_slide_loss(predicted[..., feet, :], stands),
     }
 

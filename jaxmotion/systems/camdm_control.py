@@ -274,7 +274,9 @@ def controller(
 
     def plan(key: Key, state: CharacterState, command, guided: bool):
         frame = plan_frame(bones, state.past, config=config)
-        wanted = wanted_trajectory(bones, state, command, config=config, control=control)
+        wanted = wanted_trajectory(
+            bones, state, command, config=config, control=control
+        )
         left = jnp.where(_new_style(state, command), control.guided_plans, state.guided)
         condition = camdm.Condition(
             past=features.motion_features(

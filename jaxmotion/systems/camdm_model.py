@@ -5,13 +5,17 @@ experiment or the data that made it.
 """
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion.learning import checkpoint
 from jaxmotion.motion.skeleton import Skeleton, check_parents
 from jaxmotion.systems import camdm
+from jaxmotion.typing import Params
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -109,3 +113,29 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         )
     except (KeyError, TypeError) as error:
         raise ValueError(f"{where}: field {error} is missing or wrong") from error
+
+
+def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
+    """Model and averaged parameters (EMA) of a run folder or an exported file.
+
+    Args:
+      folder: Run folder that `experiments/camdm.py train` made, or an npz file that
+        `checkpoint.export_params` wrote.
+
+    Returns:
+      The model, its parameters, and the whole JSON that was stored with it.
+
+    Raises:
+      CheckpointError: if there is no checkpoint, or it is corrupt or foreign.
+      ValueError: if its JSON is not that of a CAMDM model.
+    """
+    path = Path(folder)
+    if path.is_file():
+        params, value = checkpoint.import_params(path)
+        return from_json(value, where=str(path)), params, value
+    steps = path / "checkpoints"
+    value = checkpoint.load_config(steps)
+    model = from_json(value, where=str(steps))
+    shapes = jax.eval_shape(lambda: camdm.init(jax.random.key(0), model.config))
+    found = checkpoint.restore_part(steps, {"ema_params": shapes})
+    return model, found["ema_params"], value

@@ -1,0 +1,106 @@
+"""Fixed sequences of commands, so that rollouts of different models compare.
+
+A preset is a cycle of segments: for some seconds, travel in one direction (and in some
+presets look in another). Directions are turned in steps, never continuously: the lazy
+trigger re-plans whenever the command changes.
+
+* "forward": faces where it travels; straight stretches, turns by 45 and 90 degrees to
+  both sides, and a full circle in twelve steps of half a second.
+* "strafe": moves into the eight directions with a fixed facing, then turns slowly on
+  the way, as the published preset of CAMDM does (55 s there).
+* "stop_and_go": travels, stands, travels on.
+
+Source: ours, after the preset of CAMDM's release (Chen et al. 2024).
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmotion.motion.trajectory import Command
+
+# Seconds, direction of travel and facing in degrees from +z towards +x, part of speed.
+_Segment = tuple[float, float, float, float]
+
+
+def _forward() -> list[_Segment]:
+    segments: list[_Segment] = []
+    heading = 0.0
+    for seconds, turn in [(3, 0), (3, 45), (3, 45), (3, -90), (3, -45), (3, 90)]:
+        heading += turn
+        segments.append((seconds, heading, heading, 1.0))
+    for _ in range(12):
+        heading += 30.0
+        segments.append((0.5, heading, heading, 1.0))
+    for seconds, turn in [(3, -90), (3, -45), (3, 90)]:
+        heading += turn
+        segments.append((seconds, heading, heading, 1.0))
+    return segments
+
+
+def _strafe() -> list[_Segment]:
+    eight = [(2.0, 45.0 * i, 0.0, 1.0) for i in (0, 1, 7, 2, 6, 4, 3, 5, 0)]
+    turning = [(0.5, 15.0 * i, 15.0 * i, 1.0) for i in range(1, 25)]
+    return eight + turning
+
+
+def _stop_and_go() -> list[_Segment]:
+    segments: list[_Segment] = []
+    for heading in (0.0, 60.0, 0.0, -60.0):
+        segments += [(3.0, heading, heading, 1.0), (2.0, heading, heading, 0.0)]
+    return segments
+
+
+PRESETS = {"forward": _forward, "strafe": _strafe, "stop_and_go": _stop_and_go}
+
+
+def _unit(degrees: np.ndarray) -> np.ndarray:
+    angle = np.deg2rad(degrees)
+    return np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+
+
+def preset_commands(
+    name: str, *, seconds: float, fps: float, speed: float, label: int
+) -> Command:
+    """Commands of a preset, one a tick; a preset that ends begins again.
+
+    Args:
+      name: One of `PRESETS`.
+      seconds: Length.
+      fps: Ticks a second.
+      speed: Metres a second.
+      label: Style.
+
+    Returns:
+      Commands [ticks, ...], for a character that starts facing +z.
+
+    Raises:
+      ValueError: if there is no such preset; names those there are.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}: there are {', '.join(PRESETS)}")
+    table = np.array(PRESETS[name]())
+    ticks = round(seconds * fps)
+    ends = np.cumsum(table[:, 0])
+    time = np.arange(ticks) / fps % ends[-1]
+    row = table[np.searchsorted(ends, time, side="right")]
+    return Command(
+        velocity=jnp.asarray(_unit(row[:, 1]) * row[:, 3:] * speed, dtype=jnp.float32),
+        facing=jnp.asarray(_unit(row[:, 2]), dtype=jnp.float32),
+        label=jnp.full(ticks, label, jnp.int32),
+    )
+
+
+def integrate_path(
+    velocity: Float[Array, "*batch frames 2"], fps: float
+) -> Float[Array, "*batch frames 2"]:
+    """Path of a point that starts at the origin and moves with given velocities.
+
+    Args:
+      velocity: Metres a second, one a frame.
+      fps: Frames a second.
+
+    Returns:
+      Positions after each frame, metres.
+    """
+    return jnp.cumsum(velocity, axis=-2) / fps

@@ -1,0 +1,80 @@
+"""Whether a long rollout is still a living character.
+
+Two ways to fail: it *diverges* (numbers that no body shows) or it *freezes* (the limbs
+stop although it is told to move). Both are yes or no, with stated bounds.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+@functools.partial(jax.jit, static_argnames=("fps",))
+def has_diverged(
+    positions: Float[Array, "*batch frames joints 3"],
+    *,
+    fps: float,
+    min_root: float,
+    max_root: float,
+    max_speed: float = 20.0,
+) -> Bool[Array, "*batch"]:
+    """Whether any frame is outside what a body can show.
+
+    Args:
+      positions: World positions of the joints, metres; joint 0 is the root.
+      fps: Frames a second.
+      min_root: Lowest root height, metres.
+      max_root: Highest root height, metres.
+      max_speed: Of any joint, metres a second.
+
+    Returns:
+      True where a number is not finite, the root is outside its heights, or a joint is
+      faster than the bound.
+    """
+    finite = jnp.all(jnp.isfinite(positions), axis=(-3, -2, -1))
+    height = positions[..., 0, 1]
+    inside = jnp.all((height >= min_root) & (height <= max_root), axis=-1)
+    step = jnp.diff(positions, axis=-3) * fps
+    slow = jnp.all(jnp.sum(step**2, axis=-1) <= max_speed**2, axis=(-2, -1))
+    return ~(finite & inside & slow)
+
+
+@functools.partial(jax.jit, static_argnames=("fps", "seconds"))
+def is_frozen(
+    positions: Float[Array, "*batch frames joints 3"],
+    wanted_velocity: Float[Array, "*batch frames 2"],
+    *,
+    fps: float,
+    seconds: float = 2.0,
+    min_speed: float = 0.05,
+    commanded: float = 0.3,
+) -> Bool[Array, "*batch"]:
+    """Whether a character stops moving its limbs for some seconds while told to travel.
+
+    Time is cut into windows of `seconds`. A window is frozen if the joints' mean speed
+    is below `min_speed` while the slowest velocity wanted in it is above `commanded`.
+
+    Args:
+      positions: World positions of the joints, metres.
+      wanted_velocity: Velocity (x, z) asked for in each frame, metres a second.
+      fps: Frames a second.
+      seconds: Length of a window.
+      min_speed: Metres a second.
+      commanded: Metres a second.
+
+    Returns:
+      True where any window is frozen.
+    """
+    length = round(seconds * fps)
+    speed = jnp.linalg.norm(jnp.diff(positions, axis=-3), axis=-1).mean(-1) * fps
+    windows = speed.shape[-1] // length
+    cut = (
+        lambda x: x[..., : windows * length].reshape(  # noqa: E731
+            *x.shape[:-1], windows, length
+        )
+    )
+    wanted = jnp.linalg.norm(wanted_velocity[..., :-1, :], axis=-1)
+    still = cut(speed).mean(-1) < min_speed
+    return jnp.any(still & (cut(wanted).min(-1) > commanded), axis=-1)

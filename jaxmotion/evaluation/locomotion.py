@@ -1,0 +1,80 @@
+"""The metrics of steered locomotion, window by window.
+
+Real clips and rollouts go through the same function in windows of the same length, so
+that their rows compare. A real clip has no user; what it "should" do is its own path,
+smoothed, which is also what the network is trained to follow: the errors of the
+ground-truth row are therefore those of a walker's natural sway.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.evaluation import alignment, contact, smoothness
+from jaxmotion.motion import skeleton, trajectory
+
+
+def locomotion_metrics(
+    bones: skeleton.Skeleton,
+    motion: skeleton.Motion,
+    wanted_velocity: Float[Array, "windows frames 2"],
+    wanted_facing: Float[Array, "windows frames 2"],
+    *,
+    contact_height: float,
+) -> dict[str, Float[Array, " windows"]]:
+    """Metrics of windows.
+
+    Args:
+      bones: The skeleton; its feet are the joints whose sliding counts.
+      motion: Windows [windows, frames, ...], world.
+      wanted_velocity: Velocity asked for in each frame, metres a second.
+      wanted_facing: Facing asked for in each frame.
+      contact_height: A foot joint below this height should not move, metres.
+
+    Returns:
+      trajectory_error and orientation_error in radians; slide_speed in metres a second
+      over slide_seconds of low feet; skate_ratio; acceleration, m/s^2; jerk, m/s^3;
+      and the released code's variants under names that end in camdm_release.
+    """
+    fps = motion.fps
+    positions = skeleton.joint_positions(bones, motion)
+    feet = positions[..., jnp.array(bones.feet), :]
+    path = positions[..., 0, ::2]
+    facing = trajectory.root_trajectory(bones, motion).facing
+    slide = contact.slide_distance(feet, fps, max_height=contact_height)
+    direction = alignment.trajectory_error(wanted_velocity, path, fps)
+    return {
+        "trajectory_error": direction.error,
+        "trajectory_used": direction.used,
+        "orientation_error": alignment.orientation_error(wanted_facing, facing),
+        "slide_speed": slide.speed,
+        "slide_seconds": slide.seconds,
+        "skate_ratio": contact.skate_ratio(feet, fps, max_height=contact_height),
+        "acceleration": smoothness.acceleration(positions, fps),
+        "jerk": smoothness.jerk(positions, fps),
+        "slide_camdm_release": contact.foot_slide_camdm_release(
+            feet, positions[..., 0, :], max_height=contact_height
+        ),
+        "coherence_camdm_release": smoothness.coherence_camdm_release(positions),
+        "trajectory_camdm_release": alignment.trajectory_error_camdm_release(
+            wanted_velocity, path
+        ),
+        "orientation_camdm_release": alignment.orientation_error_camdm_release(
+            wanted_facing, facing
+        ),
+    }
+
+
+def smooth(
+    x: Float[Array, "*batch frames n"], matrix: Float[Array, "frames frames"]
+) -> Float[Array, "*batch frames n"]:
+    """Filters along time with a matrix of weights.
+
+    Args:
+      x: Frames.
+      matrix: Row f holds the weights of frame f.
+
+    Returns:
+      Filtered frames.
+    """
+    return jax.numpy.einsum("fg,...gn->...fn", matrix, x)

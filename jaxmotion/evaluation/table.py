@@ -1,0 +1,114 @@
+"""Tables of metrics: rows with intervals and sample counts, as JSON and Markdown.
+
+A sample is one clip or one rollout: windows of one clip are not independent, so they
+are averaged within their clip before anything is said about the spread.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.evaluation import statistics
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One number of a table.
+
+    Attributes:
+      value: The estimate.
+      low: Lower end of its interval; None where none is given.
+      high: Upper end.
+      samples: Clips, rollouts or resamples that it came from.
+    """
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+    samples: int = 1
+
+
+def group_means(
+    values: Float[Array, " windows"],
+    groups: Int[Array, " windows"],
+    weights: Float[Array, " windows"] | None = None,
+) -> Float[Array, " groups"]:
+    """Mean of the windows of each clip; clips without weight are left out.
+
+    Args:
+      values: One a window.
+      groups: Its clip.
+      weights: Of the windows; None for equal ones.
+
+    Returns:
+      One a clip that occurs.
+    """
+    groups = np.asarray(groups)
+    weights = np.ones(groups.shape) if weights is None else np.asarray(weights)
+    number = int(groups.max()) + 1
+    total = np.bincount(groups, weights, number)
+    summed = np.bincount(groups, weights * np.asarray(values, np.float64), number)
+    used = total > 0
+    return jnp.asarray(summed[used] / total[used], jnp.float32)
+
+
+def cell(samples: Float[Array, " samples"], *, scale: float = 1.0) -> Cell:
+    """Mean of independent samples with its 95 % interval (Student's t).
+
+    Args:
+      samples: One a clip or rollout.
+      scale: Factor for the unit of the table.
+
+    Returns:
+      The cell; without an interval for a single sample.
+    """
+    count = int(samples.shape[0])
+    if count < 2:
+        return Cell(value=float(samples[0]) * scale, samples=count)
+    estimate, low, high = (
+        float(x) * scale for x in statistics.confidence_interval(samples)
+    )
+    return Cell(value=estimate, low=low, high=high, samples=count)
+
+
+def to_json(rows: dict[str, dict[str, Cell]]) -> dict[str, Any]:
+    """Rows as a JSON object.
+
+    Args:
+      rows: Row names to column names to cells.
+
+    Returns:
+      The same, with cells as objects.
+    """
+    return {
+        name: {column: dataclasses.asdict(x) for column, x in row.items()}
+        for name, row in rows.items()
+    }
+
+
+def _text(x: Cell | None) -> str:
+    if x is None:
+        return "–"
+    if x.low is None or x.high is None:
+        return f"{x.value:.3g} (n={x.samples})"
+    return f"{x.value:.3g} [{x.low:.3g}, {x.high:.3g}] (n={x.samples})"
+
+
+def to_markdown(rows: dict[str, dict[str, Cell]]) -> str:
+    """Rows as a Markdown table; a cell that a row lacks is a dash.
+
+    Args:
+      rows: Row names to column names to cells.
+
+    Returns:
+      The table, intervals in brackets, sample counts in parentheses.
+    """
+    columns = list(dict.fromkeys(c for row in rows.values() for c in row))
+    lines = ["| row | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    for name, row in rows.items():
+        cells = " | ".join(_text(row.get(column)) for column in columns)
+        lines.append(f"| {name} | {cells} |")
+    return "\n".join(lines)

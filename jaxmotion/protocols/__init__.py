@@ -1,0 +1,1 @@
+"""How each system is evaluated: compositions of data, systems and metrics."""
