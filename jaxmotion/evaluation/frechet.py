@@ -98,8 +98,9 @@ def frechet_distance(a: Moments, b: Moments) -> Float[Array, ""]:
 
     The usual FID, not divided by the number of features. Fewer samples than features
     are allowed, though the estimate is then biased upwards: compare only distances of
-    equal counts. In float32 the error is about 1e-3 of tr A + tr B where a covariance
-    is singular, 1e-5 elsewhere.
+    equal counts. In float32 the error measured with 512 features is 1e-4 of tr A + tr B
+    where covariances are nearly singular, below 1e-6 elsewhere; 64-bit inputs need
+    `jax.enable_x64`.
 
     Args:
       a: Moments of one set.

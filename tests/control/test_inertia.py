@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxmotion.control import inertia, rotation_vector
+from jaxmotion.control import inertia
 from jaxmotion.motion import rotation
 from jaxmotion.motion.skeleton import Motion
 from tests.reference import inertia as oracle
@@ -245,23 +245,3 @@ def test_short_or_foreign_motions_are_refused():
         inertia.inertialize(one, made)
     with pytest.raises(ValueError, match="past has 60.0 fps, the chunk 30.0"):
         inertia.inertialize(motion(np.zeros((4, 3)), np.zeros((4, 1, 3)), 60.0), made)
-
-
-# --- rotation vectors ------------------------------------------------------------
-
-
-def test_rotation_vectors_agree_with_scipy():
-    vectors = np.random.default_rng(0).normal(size=(50, 3))
-    vectors[0], vectors[1] = 0.0, [1e-7, 0, 0]
-    turns = Rotation.from_rotvec(vectors)
-    got = rotation_vector.to_matrix(jnp.asarray(vectors, jnp.float32))
-    np.testing.assert_allclose(got, turns.as_matrix(), atol=1e-6)
-    back = rotation_vector.from_matrix(jnp.asarray(turns.as_matrix(), jnp.float32))
-    np.testing.assert_allclose(back, turns.as_rotvec(), atol=2e-5)
-
-
-def test_nearest_takes_the_other_way_round():
-    near = rotation_vector.nearest(
-        jnp.array([0.0, np.pi - 0.1, 0.0]), jnp.array([0.0, -np.pi + 0.1, 0.0])
-    )
-    np.testing.assert_allclose(near, [0, -np.pi - 0.1, 0], atol=1e-6)

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.motion import facing as facing_module
-from jaxmotion.motion import ground, rotation, skeleton, spring, trajectory
+from jaxmotion.motion import ground, skeleton, trajectory
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
 from tests.reference import trajectory as oracle
 
@@ -30,74 +30,6 @@ def biped(names):
         parents=(-1, 0, 1, 1),
         names=names,
     )
-
-
-# --- springs ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("half_life", [0.05, 0.27, 1.155])
-@pytest.mark.parametrize("t", [1 / 60, 0.5, 3.0])
-def test_springs_solve_their_differential_equations(half_life, t):
-    x, v, a, goal = 0.3, -1.2, 2.5, 1.7
-    want = oracle.integrate_spring(x, v, goal, half_life, t)
-    x_, v_, a_, goal_ = (jnp.float32(n) for n in (x, v, a, goal))
-    got = spring.spring(x_, v_, goal_, half_life=half_life, dt=t)
-    np.testing.assert_allclose(got, want, atol=2e-5)
-    want = oracle.integrate_velocity_spring(x, v, a, goal, half_life, t)
-    got = spring.velocity_spring(x_, v_, a_, goal_, half_life=half_life, dt=t)
-    np.testing.assert_allclose(got, want, rtol=1e-4, atol=5e-5)
-
-
-def test_springs_are_semigroups():
-    x, v, a, goal = (jnp.float32(n) for n in (0.3, -1.2, 2.5, 1.7))
-    for dt1, dt2 in [(0.1, 0.25), (0.01, 1.0)]:
-        for state, call in [
-            ((x, v), lambda s, dt: spring.spring(*s, goal, half_life=0.3, dt=dt)),
-            (
-                (x, v, a),
-                lambda s, dt: spring.velocity_spring(*s, goal, half_life=0.3, dt=dt),
-            ),
-        ]:
-            once, twice = call(state, dt1 + dt2), call(call(state, dt1), dt2)
-            np.testing.assert_allclose(once, twice, rtol=1e-4, atol=1e-5)
-
-
-def test_velocity_spring_at_its_goal_velocity_moves_by_velocity_times_time():
-    v = jnp.array([1.5, -0.5])
-    x, v_new, a = spring.velocity_spring(
-        jnp.zeros(2), v, jnp.zeros(2), v, half_life=0.27, dt=0.4
-    )
-    np.testing.assert_array_equal(x, v * jnp.float32(0.4))
-    np.testing.assert_array_equal(v_new, v)
-    np.testing.assert_array_equal(a, jnp.zeros(2))
-
-
-def test_half_life_is_nominal():
-    zero, one = jnp.float32(0), jnp.float32(1)
-    _, v, _ = spring.velocity_spring(zero, zero, zero, one, half_life=0.27, dt=0.27)
-    np.testing.assert_allclose(1 - v, (1 + 2 * np.log(2)) / 4, rtol=1e-5)
-
-
-def test_springs_of_no_half_life_arrive_at_once_and_finitely():
-    zero, one = jnp.float32(0), jnp.float32(1)
-    x, v = spring.spring(zero, zero, one, half_life=0.0, dt=0.1)
-    np.testing.assert_array_equal([x, v], [1.0, 0.0])
-    x, v, a = spring.velocity_spring(zero, zero, zero, one, half_life=0.0, dt=0.1)
-    np.testing.assert_allclose([x, v, a], [0.1, 1.0, 0.0], atol=1e-4)
-
-
-def test_facing_spring_takes_the_shorter_arc_across_pi():
-    start, goal = jnp.asarray(directions(3.0)), jnp.asarray(directions(-3.0))
-    angles = []
-    for dt in (0.0, 0.1, 0.3, 5.0):
-        facing, _ = spring.facing_spring(
-            start, jnp.float32(0.5), goal, half_life=0.27, dt=dt
-        )
-        np.testing.assert_allclose(np.linalg.norm(facing), 1.0, atol=1e-6)
-        # The oracle integrates the angle itself, unwrapped to the near side.
-        want, _ = oracle.integrate_spring(3.0, 0.5, 2 * np.pi - 3.0, 0.27, dt or 1e-9)
-        angles.append(oracle.wrap(oracle.yaw(np.asarray(facing)) - want))
-    np.testing.assert_allclose(angles, 0.0, atol=1e-5)
 
 
 # --- desired trajectory ----------------------------------------------------------
@@ -297,24 +229,6 @@ def test_frames_are_rigid_and_invert():
 # --- facing of a body ------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("Hips", "Spine", "LeftUpLeg", "RightUpLeg"),
-        ("mixamorig:Hips", "a", "mixamorig:LeftUpLeg", "mixamorig:RightUpLeg"),
-        ("joint_Root", "Hips", "UpperLeg_L", "UpperLeg_R"),
-        ("Hips", "Chest", "LeftHip", "RightHip"),
-    ],
-)
-def test_hips_are_found_by_name(names):
-    assert facing_module.hip_joints(biped(names)) == (2, 3)
-
-
-def test_unknown_hips_name_what_was_expected():
-    with pytest.raises(ValueError, match=r"LeftUpLeg/RightUpLeg.*a, b, c, d"):
-        facing_module.hip_joints(biped(("a", "b", "c", "d")))
-
-
 def test_root_trajectory_is_that_of_full_kinematics():
     bones = biped(("Root", "Hips", "UpperLeg_L", "UpperLeg_R"))
     key_p, key_r = jax.random.split(jax.random.key(1))
@@ -328,18 +242,6 @@ def test_root_trajectory_is_that_of_full_kinematics():
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     np.testing.assert_allclose(got.facing, forward, atol=1e-5)
     np.testing.assert_array_equal(got.position, motion.root_position[..., ::2])
-
-
-def test_facing_turns_with_the_root():
-    bones = biped(("Root", "Hips", "LeftUpLeg", "RightUpLeg"))
-    yaw = np.array([0.0, 0.5, 3.1, -3.1], np.float32)
-    rest = rotation.rot6d_from_matrix(jnp.broadcast_to(jnp.eye(3), (4, 4, 3, 3)))
-    turned = rotation.rot6d_from_matrix(rotation.matrix_from_yaw(jnp.asarray(yaw)))
-    motion = skeleton.Motion(
-        root_position=jnp.zeros((4, 3)), joint_rotation=rest.at[:, 0].set(turned)
-    )
-    facing = trajectory.root_trajectory(bones, motion).facing
-    np.testing.assert_allclose(facing, directions(yaw), atol=1e-6)
 
 
 def test_everything_is_finite_at_zero_vectors():
