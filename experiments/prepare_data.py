@@ -100,6 +100,8 @@ def read_published(config: Config) -> Clips:
     builder = classes[name](
         config=variant or None, data_dir=str(folder), file_format="array_record"
     )
+    if builder.data_path.exists() and not config.overwrite:
+        print(f"reusing  {builder.data_path}; --overwrite reads --manual-dir again")
     base.prepare(builder, config.manual_dir, overwrite=config.overwrite)
     return base.clips_from_source(builder)
 

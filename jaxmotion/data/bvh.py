@@ -130,6 +130,16 @@ def _require_joint(bvh: Bvh, name: str) -> int:
     return bvh.names.index(name)
 
 
+def _world(parents, positions, rotations, joint: int) -> tuple[np.ndarray, np.ndarray]:
+    """World position and rotation of one joint in all frames."""
+    position, turn = positions[:, joint], rotations[:, joint]
+    while (joint := parents[joint]) >= 0:
+        above = rotations[:, joint]
+        position = positions[:, joint] + np.einsum("fij,fj->fi", above, position)
+        turn = above @ turn
+    return position, turn
+
+
 def motion_from_bvh(
     bvh: Bvh,
     *,
@@ -159,14 +169,7 @@ def motion_from_bvh(
     """
     top = 0 if root is None else _require_joint(bvh, root)
     positions, rotations = bvh_transforms(bvh)
-    position, turn = positions[:, top], rotations[:, top]
-    parent = bvh.parents[top]
-    while parent >= 0:
-        position = positions[:, parent] + np.einsum(
-            "fij,fj->fi", rotations[:, parent], position
-        )
-        turn = rotations[:, parent] @ turn
-        parent = bvh.parents[parent]
+    position, turn = _world(bvh.parents, positions, rotations, top)
     joints = _subtree(bvh, top)
     index = {joint: i for i, joint in enumerate(joints)}
     for name in feet:

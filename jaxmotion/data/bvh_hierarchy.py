@@ -74,6 +74,7 @@ class Hierarchy:
             words.append(word)
         name = " ".join(words)
         if name in self.names:
+            self.at -= 1  # the line of the name, not of the brace
             self.fail(f"joint name {name!r} is used twice")
         return name
 

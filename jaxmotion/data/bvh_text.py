@@ -10,7 +10,7 @@ import dataclasses
 import os
 import re
 import warnings
-from typing import IO
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,15 @@ from jaxmotion.data.bvh_hierarchy import BvhError, Hierarchy
 _MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.IGNORECASE | re.MULTILINE)
 _FRAMES = re.compile(r"\s*Frames\s*:?\s*(\S+)\s*", re.IGNORECASE)
 _FRAME_TIME = re.compile(r"\s*Frame\s+Time\s*:?\s*(\S+)\s*", re.IGNORECASE)
+
+
+@runtime_checkable
+class Readable(Protocol):
+    """An open binary file."""
+
+    def read(self) -> bytes:
+        """The rest of the file."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -160,7 +169,7 @@ def parse_bvh(text: str, *, name: str = "bvh") -> Bvh:
 
 
 def read_bvh(
-    source: str | os.PathLike | bytes | IO[bytes], *, name: str | None = None
+    source: str | os.PathLike | bytes | Readable, *, name: str | None = None
 ) -> Bvh:
     """Reads a BVH file.
 

@@ -35,7 +35,7 @@ class Clips:
 
     root_position: Float[Array, "frames 3"]
     joint_rotation: Float[Array, "frames joints 6"]
-    offsets: Int[Array, "clips+1"]
+    offsets: Int[Array, "boundaries"]
     labels: dict[str, Int[Array, "clips"]]
     skeleton: Skeleton
     fps: float = jax.tree.static(default=30.0)
@@ -170,13 +170,6 @@ def clips_from_motions(
         field: tuple((label_names or {}).get(field, sorted(set(values))))
         for field, values in labels.items()
     }
-    for field, values in labels.items():
-        for name, value in zip(names, values, strict=True):
-            if value not in words[field]:
-                raise ValueError(
-                    f"clip {name!r}: unknown {field} {value!r}, expected one of "
-                    f"{', '.join(words[field])}"
-                )
     lengths = [motion.root_position.shape[0] for motion in motions]
     mean_offsets = np.mean([np.asarray(s.offsets, np.float64) for s in per_clip], 0)
     return Clips(
@@ -184,7 +177,7 @@ def clips_from_motions(
         joint_rotation=_join([motion.joint_rotation for motion in motions]),
         offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
         labels={
-            field: jnp.asarray([words[field].index(v) for v in values], jnp.int32)
+            field: _label_numbers(field, values, words[field], names)
             for field, values in labels.items()
         },
         skeleton=dataclasses.replace(
@@ -195,6 +188,19 @@ def clips_from_motions(
         clip_names=tuple(names),
         source=source,
     )
+
+
+def _label_numbers(
+    field: str, values: Sequence[str], words: tuple[str, ...], names: Sequence[str]
+) -> Array:
+    """Number of each clip's label among the words."""
+    for name, value in zip(names, values, strict=True):
+        if value not in words:
+            raise ValueError(
+                f"clip {name!r}: unknown {field} {value!r}, expected one of "
+                f"{', '.join(words)}"
+            )
+    return jnp.asarray([words.index(value) for value in values], jnp.int32)
 
 
 def _join(arrays: Sequence[Array]) -> Array:

@@ -2,6 +2,7 @@
 
 import os
 import zipfile
+import zlib
 
 import jax.numpy as jnp
 import numpy as np
@@ -77,13 +78,14 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
 def _read_fields(path: str) -> dict[str, np.ndarray]:
     """All arrays of the file, each of the expected kind and number of axes."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise ValueError("not an npz archive")
+        file = np.load(path, allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError("an array, not an npz archive")
+        with file:
             fields = {name: file[name] for name in file.files}
     except FileNotFoundError:
         raise FileNotFoundError(f"no clips file {path!r}") from None
-    except (ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except (ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(
             f"{path}: not a clips file, or a damaged one ({error})"
         ) from None
@@ -92,9 +94,10 @@ def _read_fields(path: str) -> dict[str, np.ndarray]:
             f"{path}: not a clips file: its field 'format' should be {_FORMAT!r}; "
             f"it has the fields {', '.join(sorted(fields)) or 'none'}"
         )
-    if fields["version"].ndim or int(fields["version"]) != _VERSION:
+    version = fields.get("version")
+    if version is None or version.ndim or version != _VERSION:
         raise ValueError(
-            f"{path}: version {fields['version']} of the clips format, expected "
+            f"{path}: version {version} of the clips format, expected "
             f"{_VERSION}; prepare the data again"
         )
     wanted = dict(_FIELDS)
@@ -135,7 +138,15 @@ def _check_fields(path: str, fields: dict[str, np.ndarray]) -> None:
         if not np.isfinite(fields[name]).all():
             index = np.argwhere(~np.isfinite(fields[name]))[0].tolist()
             raise ValueError(f"{path}: field {name!r} is not finite at {index}")
+    _check_ranges(path, fields, num_frames, num_joints)
+
+
+def _check_ranges(
+    path: str, fields: dict[str, np.ndarray], num_frames: int, num_joints: int
+) -> None:
+    """Raises unless clips, rate, feet and labels are in range."""
     offsets = fields["offsets"]
+    num_clips = offsets.size - 1
     if num_clips < 1 or offsets[0] != 0 or offsets[-1] != num_frames:
         raise ValueError(
             f"{path}: field 'offsets' should run from 0 to {num_frames} frames"

@@ -2,16 +2,17 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxmotion.motion import rotation
 from jaxmotion.motion.skeleton import Motion
 
 
 def slerp(
-    a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"], t: Float[Array, "*#batch"]
+    a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"], t: Float[Array, "*batch"]
 ) -> Float[Array, "*batch 4"]:
     """Spherical interpolation of unit quaternions along the shorter arc.
 
@@ -32,7 +33,7 @@ def slerp(
         jnp.linalg.norm(a - b, axis=-1, keepdims=True),
         jnp.linalg.norm(a + b, axis=-1, keepdims=True),
     )
-    t = jnp.broadcast_to(t, a.shape[:-1])[..., None]
+    t = t[..., None]
     sine = jnp.sin(angle)
     is_small = sine < 1e-6
     divisor = jnp.where(is_small, 1.0, sine)
@@ -88,17 +89,27 @@ def resample(motion: Motion, fps: float) -> Motion:
     low = np.minimum(np.floor(time).astype(np.int64), max(num_frames - 2, 0))
     high = np.minimum(low + 1, num_frames - 1)
     t = jnp.asarray(time - low, motion.root_position.dtype)
-    position = motion.root_position
-    quaternion = rotation.quaternion_from_matrix(
-        rotation.matrix_from_rot6d(motion.joint_rotation)
+    position, rot6d = _between(
+        motion.root_position, motion.joint_rotation, jnp.array(low), jnp.array(high), t
     )
-    turned = slerp(quaternion[..., low, :, :], quaternion[..., high, :, :], t[:, None])
+    return Motion(root_position=position, joint_rotation=rot6d, fps=float(fps))
+
+
+@jax.jit
+def _between(
+    position: Float[Array, "*batch frames 3"],
+    rot6d: Float[Array, "*batch frames joints 6"],
+    low: Int[Array, " new"],
+    high: Int[Array, " new"],
+    t: Float[Array, " new"],
+) -> tuple[Float[Array, "*batch new 3"], Float[Array, "*batch new joints 6"]]:
+    """Frames between frames low and high."""
     before, after = position[..., low, :], position[..., high, :]
     weight = jnp.broadcast_to(t[:, None], before.shape)
-    return Motion(
-        root_position=(1 - weight) * before + weight * after,
-        joint_rotation=rotation.rot6d_from_matrix(
-            rotation.matrix_from_quaternion(turned)
-        ),
-        fps=float(fps),
+    quaternion = rotation.quaternion_from_matrix(rotation.matrix_from_rot6d(rot6d))
+    a, b = quaternion[..., low, :, :], quaternion[..., high, :, :]
+    turned = slerp(a, b, jnp.broadcast_to(t[:, None], a.shape[:-1]))
+    return (
+        (1 - weight) * before + weight * after,
+        rotation.rot6d_from_matrix(rotation.matrix_from_quaternion(turned)),
     )

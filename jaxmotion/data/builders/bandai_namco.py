@@ -65,18 +65,7 @@ class BandaiNamco(base.MotionBuilder):
     def _generate_examples(self, folder: Path) -> Iterator[tuple[str, dict]]:
         number = self.builder_config.name
         stem = f"Bandai-Namco-Research-Motiondataset-{number}"
-        lists = {
-            PurePosixPath(path).name: [
-                line.strip().removeprefix(f"dataset-{number}_")
-                for line in data.decode().splitlines()
-                if line.strip()
-            ]
-            for path, data in base.read_files(folder, ("_label.txt",), stem=stem)
-        }
-        names = {field: lists.get(f"{field}_label.txt") for field in _FIELDS}
-        for field, found in names.items():
-            if found is None:
-                raise ValueError(f"{folder}: no cfg/{field}_label.txt in {stem}")
+        names = _read_lists(folder, number, stem)
         motions: dict[str, bytes] = {}
         orphans: list[str] = []
         for path, data in base.read_files(folder, (".json", ".bvh"), stem=stem):
@@ -105,6 +94,22 @@ class BandaiNamco(base.MotionBuilder):
                 len(orphans),
                 orphans[0],
             )
+
+
+def _read_lists(folder: Path, number: str, stem: str) -> dict[str, list[str]]:
+    """The label lists in cfg/, without the prefix of each line."""
+    lists = {
+        PurePosixPath(path.replace("\\", "/")).name: [
+            line.strip().removeprefix(f"dataset-{number}_")
+            for line in data.decode().splitlines()
+            if line.strip()
+        ]
+        for path, data in base.read_files(folder, ("_label.txt",), stem=stem)
+    }
+    for field in _FIELDS:
+        if f"{field}_label.txt" not in lists:
+            raise ValueError(f"{folder}: no cfg/{field}_label.txt in {stem}")
+    return {field: lists[f"{field}_label.txt"] for field in _FIELDS}
 
 
 def read_labels(path: str, data: bytes, names: dict[str, list[str]]) -> dict[str, str]:

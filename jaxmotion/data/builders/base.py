@@ -177,16 +177,19 @@ def prepare(
       FileNotFoundError: if the folder or its files are missing.
       ValueError: if a file is malformed; names it.
     """
-    if not Path(manual_dir).is_dir():
+    folder = Path(manual_dir)
+    if not folder.is_dir() or not any(folder.iterdir()):
+        problem = "is empty" if folder.is_dir() else "does not exist"
         raise FileNotFoundError(
-            f"no folder {str(manual_dir)!r}. {builder.MANUAL_DOWNLOAD_INSTRUCTIONS}"
+            f"the folder {str(folder)!r} {problem}. "
+            f"{builder.MANUAL_DOWNLOAD_INSTRUCTIONS}"
         )
     modes = tfds.download.GenerateMode
     mode = modes.REUSE_CACHE_IF_EXISTS if overwrite else modes.REUSE_DATASET_IF_EXISTS
     config = tfds.download.DownloadConfig(
         manual_dir=os.fspath(manual_dir), download_mode=mode
     )
-    builder.download_and_prepare(download_config=config, file_format="array_record")
+    builder.download_and_prepare(download_config=config)
     return builder
 
 

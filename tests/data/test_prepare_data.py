@@ -1,0 +1,75 @@
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxmotion.data import clips_io
+from tests.data import test_builders
+
+SCRIPT = Path(__file__).parents[2] / "experiments" / "prepare_data.py"
+
+
+@pytest.fixture(scope="module")
+def script():
+    """The script as a module."""
+    spec = importlib.util.spec_from_file_location("prepare_data", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["prepare_data"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["prepare_data"]
+
+
+@pytest.fixture
+def raw(tmp_path):
+    return test_builders.put(tmp_path / "raw", test_builders.bandai_files())
+
+
+def test_published_clips_are_written_mirrored_and_resampled(
+    script, raw, tmp_path, capsys
+):
+    out = tmp_path / "data" / "b.npz"
+    options = {"source": "bandai_namco/2", "out": out, "manual_dir": raw}
+    script.main(script.Config(**options, mirror=True, fps=60.0))
+    found = clips_io.load_clips(out)
+    assert (found.num_clips, found.fps, found.num_frames) == (4, 60.0, 4 * 7)
+    assert found.clip_names[2:] == tuple(f"{n}_mirrored" for n in found.clip_names[:2])
+    np.testing.assert_array_equal(found.labels["content"], [3, 0, 3, 0])
+    printed = capsys.readouterr().out
+    for word in ("clips    4", "frames   28 at 60 fps", "elderly 2", "CC BY-NC 4.0"):
+        assert word in printed
+    assert (tmp_path / "data" / "tfds").is_dir()
+    with pytest.raises(FileExistsError, match="b.npz exists"):
+        script.main(script.Config(**options))
+    # A second reading sees that a clip is gone: nothing stale is reused.
+    for path in raw.rglob("*run_active*"):
+        path.unlink()
+    script.main(script.Config(**options, overwrite=True))
+    assert clips_io.load_clips(out).clip_names == ("dataset-2_walk_elderly_001",)
+
+
+def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
+    base = {"source": "bandai_namco/2", "manual_dir": raw, "out": tmp_path / "o.npz"}
+    (tmp_path / "file").write_text("")
+    cases = [
+        ({"manual_dir": tmp_path / "gone"}, FileNotFoundError, "no folder .*gone"),
+        ({"manual_dir": None}, FileNotFoundError, "needs --manual-dir"),
+        ({"out": tmp_path / "file" / "o.npz"}, OSError, "file"),
+        ({"out": tmp_path}, IsADirectoryError, "is a folder"),
+        ({"fps": 0.0}, ValueError, "--fps"),
+    ]
+    for change, error, message in cases:
+        with pytest.raises(error, match=message):
+            script.main(script.Config(**{**base, **change}))
+    assert sorted(os.listdir(tmp_path)) == ["file", "raw"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_write_permission_is_an_error(script, raw, tmp_path):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    out = tmp_path / "locked" / "o.npz"
+    with pytest.raises(PermissionError):
+        script.main(script.Config(source="bandai_namco/2", manual_dir=raw, out=out))
