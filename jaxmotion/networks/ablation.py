@@ -172,9 +172,11 @@ class SingleTokenTransformer(_OneVectorCondition):
         Returns:
           Predicted features x_0.
         """
-        first = (context.condition + context.steps[t])[..., None, :]
+        step = jnp.broadcast_to(context.steps[t], context.condition.shape)
+        first = (context.condition + step)[..., None, :]
         x = jnp.concatenate([first, self.embed_noisy(x_t)], axis=-2)
-        x = x + blocks.sinusoidal_positions(x.shape[-2], self.width)
+        positions = blocks.sinusoidal_positions(x.shape[-2], self.width)
+        x = blocks.add_rows(x, positions)
         x = self.drop(x, deterministic=not train)
         for i, layer in enumerate(self.layers, start=1):
             last = self.future if i == self.depth else None

@@ -42,6 +42,21 @@ def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
     return jnp.asarray(table, jnp.float32)
 
 
+def add_rows(
+    x: Float[Array, "*batch tokens width"], rows: Float[Array, "*rows width"]
+) -> Float[Array, "*batch tokens width"]:
+    """Adds the same rows (positions) to the tokens of every sample.
+
+    Args:
+      x: Tokens.
+      rows: One row for each token, or one for all.
+
+    Returns:
+      Their sum.
+    """
+    return x + jnp.broadcast_to(rows, x.shape)
+
+
 class Projections(NamedTuple):
     """Queries, keys and values of some tokens, split into heads."""
 

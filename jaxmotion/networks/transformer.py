@@ -155,11 +155,12 @@ class CamdmTransformer(nn.Module):
             axis=-2,
         )
         positions = self.positions()
-        tokens = self._drop(tokens + positions[1 : -self.num_outputs], train)
+        own = positions[1 : -self.num_outputs]
+        tokens = self._drop(blocks.add_rows(tokens, own), train)
         return Context(
             tokens=tokens,
             projections=self.layers[0].project(tokens),
-            steps=self.embed_time(self.num_steps) + positions[0],
+            steps=blocks.add_rows(self.embed_time(self.num_steps), positions[0]),
         )
 
     def denoise(
@@ -183,11 +184,14 @@ class CamdmTransformer(nn.Module):
         """
         batch, outputs = x_t.shape[:-2], self.num_outputs
         step = jnp.broadcast_to(context.steps[t], (*batch, self.width))
-        noisy = self.embed_noisy(fold_frames(x_t, self.frames_per_token))
+        noisy = blocks.add_rows(
+            self.embed_noisy(fold_frames(x_t, self.frames_per_token)),
+            self.positions()[-outputs:],
+        )
         ends = jnp.concatenate(
             [
                 self._drop(step, train)[..., None, :],
-                self._drop(noisy + self.positions()[-outputs:], train),
+                self._drop(noisy, train),
             ],
             axis=-2,
         )

@@ -235,7 +235,7 @@ def example(
     filters = smoothing_matrices(config.window, (0.0, 5.0, 10.0))
     weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
     path = filters[jax.random.categorical(key_path, weights)] @ course.position
-    path = path - path[last] + course.position[last]
+    path = path + (course.position[last] - path[last])[None]
     facings = filters[1 + jax.random.bernoulli(key_facing).astype(int)] @ course.facing
     facings = rotation.safe_normalize(facings, jnp.array([0.0, 1.0]))
     wanted = trajectory.to_local(

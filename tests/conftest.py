@@ -1,0 +1,47 @@
+"""Settings of the whole suite, and a small walker that needs no data.
+
+Keys that are used twice and arrays that broadcast by rank raise. Tests run on the CPU
+unless JAX_PLATFORMS says otherwise.
+"""
+
+import os
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+jax.config.update("jax_debug_key_reuse", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(scope="session")
+def bones():
+    """Hips and two legs."""
+    from tests import tiny
+
+    return tiny.skeleton()
+
+
+@pytest.fixture(scope="session")
+def walker():
+    """Clips of the walker in two styles."""
+    from tests import tiny
+
+    return tiny.clips()
+
+
+@pytest.fixture(scope="session")
+def config():
+    """A CAMDM that compiles in seconds."""
+    from tests import tiny
+
+    return tiny.config()
+
+
+@pytest.fixture(scope="session")
+def params(config):
+    """Its initial parameters."""
+    from jaxmotion.systems import camdm
+
+    return jax.jit(camdm.init, static_argnums=1)(jax.random.key(7), config)
