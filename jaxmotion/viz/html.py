@@ -1,0 +1,152 @@
+"""A self-contained page that plays a motion: no network, no library.
+
+Drag to orbit, wheel to zoom, slider to scrub, space to pause.
+"""
+
+import html as escaping
+import json
+from pathlib import Path
+
+import numpy as np
+
+from jaxmotion.viz import figure as drawing
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>__TITLE__</title>
+<style>
+body { margin: 0; font: 14px sans-serif; background: #fafafa; color: #222; }
+canvas { display: block; width: 100vw; height: calc(100vh - 76px); }
+#bar { display: flex; gap: 12px; align-items: center; padding: 8px 12px; }
+#time { flex: 1; }
+.key { display: inline-block; width: 18px; height: 4px; vertical-align: middle; }
+h1 { font-size: 14px; margin: 8px 12px 0; font-weight: 600; }
+</style></head><body>
+<h1>__TITLE__</h1>
+<div id="bar"><button id="play" aria-label="play or pause">pause</button>
+<input id="time" type="range" min="0" value="0" aria-label="frame">
+<span id="clock"></span>
+<span><i class="key" style="background:#2ca02c"></i> commanded</span>
+<span><i class="key" style="background:#ff7f0e"></i> walked</span></div>
+<canvas id="view"></canvas>
+<script>
+const data = __DATA__;
+const canvas = document.getElementById("view"), pen = canvas.getContext("2d");
+const slider = document.getElementById("time"), clock = document.getElementById("clock");
+const button = document.getElementById("play");
+const frames = data.positions.length;
+slider.max = frames - 1;
+let frame = 0, playing = true, azimuth = 0.6, elevation = 0.35, zoom = 1;
+function project(p, centre) {
+  const x = p[0] - centre[0], y = p[1] - 0.85, z = p[2] - centre[2];
+  const right = x * Math.cos(azimuth) - z * Math.sin(azimuth);
+  const depth = x * Math.sin(azimuth) + z * Math.cos(azimuth);
+  const up = y * Math.cos(elevation) - depth * Math.sin(elevation);
+  const scale = canvas.height / 3.2 * zoom;
+  return [canvas.width / 2 + right * scale, canvas.height / 2 - up * scale];
+}
+function line(points, centre, color, width) {
+  pen.strokeStyle = color; pen.lineWidth = width; pen.beginPath();
+  points.forEach((p, i) => {
+    const q = project(p, centre);
+    if (i) pen.lineTo(q[0], q[1]); else pen.moveTo(q[0], q[1]);
+  });
+  pen.stroke();
+}
+function draw() {
+  const ratio = window.devicePixelRatio || 1;
+  canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+  const now = Math.floor(frame), pose = data.positions[now], c = pose[0];
+  pen.clearRect(0, 0, canvas.width, canvas.height); pen.lineCap = "round";
+  const x0 = Math.floor(c[0]) - 5, z0 = Math.floor(c[2]) - 5;
+  for (let i = 0; i <= 10; i++) {
+    line([[x0 + i, 0, z0], [x0 + i, 0, z0 + 10]], c, "#ddd", ratio);
+    line([[x0, 0, z0 + i], [x0 + 10, 0, z0 + i]], c, "#ddd", ratio);
+  }
+  for (const [path, color] of [[data.commanded, "#2ca02c"], [data.walked, "#ff7f0e"]]) {
+    if (!path) continue;
+    line(path.map(p => [p[0], 0, p[1]]), c, color + "55", ratio);
+    line(path.slice(0, now + 1).map(p => [p[0], 0, p[1]]), c, color, 3 * ratio);
+  }
+  data.parents.forEach((parent, j) => {
+    if (parent >= 0) line([pose[parent], pose[j]], c, data.colors[j], 4 * ratio);
+  });
+  slider.value = now;
+  clock.textContent = (now / data.fps).toFixed(2) + " s of " +
+    ((frames - 1) / data.fps).toFixed(2) + " s";
+}
+let last = performance.now();
+function loop(time) {
+  if (playing) frame = (frame + (time - last) / 1000 * data.fps) % frames;
+  last = time; draw(); requestAnimationFrame(loop);
+}
+function toggle() { playing = !playing; button.textContent = playing ? "pause" : "play"; }
+button.onclick = toggle;
+slider.oninput = () => { frame = +slider.value; if (playing) toggle(); };
+window.onkeydown = e => {
+  if (e.code === "Space" && e.target !== button) { e.preventDefault(); toggle(); }
+};
+canvas.onpointermove = e => {
+  if (!e.buttons) return;
+  azimuth += e.movementX * 0.01;
+  elevation = Math.min(1.5, Math.max(0, elevation + e.movementY * 0.01));
+};
+canvas.onwheel = e => {
+  e.preventDefault(); zoom = Math.min(6, Math.max(0.2, zoom * Math.exp(-e.deltaY / 600)));
+};
+requestAnimationFrame(loop);
+</script></body></html>
+"""
+
+
+def save_html(
+    path: str | Path,
+    positions: np.ndarray,
+    parents: tuple[int, ...],
+    *,
+    fps: float,
+    names: tuple[str, ...] | None = None,
+    commanded: np.ndarray | None = None,
+    walked: np.ndarray | None = None,
+    title: str = "",
+) -> None:
+    """Writes the page.
+
+    Args:
+      path: File to write.
+      positions: [F, J, 3] world positions, metres, y up.
+      parents: Parent of each joint.
+      fps: Frames a second.
+      names: Joint names, to colour left and right; None for grey.
+      commanded: [F, 2] commanded path (x, z), or None.
+      walked: [F, 2] walked path, or None.
+      title: Shown above; escaped.
+
+    Raises:
+      ValueError: if positions are not [F, J, 3] with as many joints as parents, or not
+        finite.
+      OSError: if the file cannot be written.
+    """
+    positions = np.asarray(positions, float)
+    if positions.ndim != 3 or positions.shape[1:] != (len(parents), 3):
+        raise ValueError(
+            f"positions are {positions.shape}, expected [frames, {len(parents)}, 3]"
+        )
+    if not np.isfinite(positions).all():
+        raise ValueError("positions are not finite")
+    path = drawing.check_writable(path)
+
+    def rounded(x: np.ndarray | None) -> list | None:
+        return None if x is None else np.round(np.asarray(x, float), 3).tolist()
+
+    data = {
+        "positions": rounded(positions),
+        "parents": list(parents),
+        "colors": drawing.bone_colors(names, len(parents)),
+        "fps": fps,
+        "commanded": rounded(commanded),
+        "walked": rounded(walked),
+    }
+    # "</" would end the script element wherever it stands.
+    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\\\/")
+    page = _PAGE.replace("__TITLE__", escaping.escape(title)).replace("__DATA__", text)
+    path.write_text(page, encoding="utf-8")
