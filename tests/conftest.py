@@ -41,7 +41,8 @@ def config():
 
 @pytest.fixture(scope="session")
 def params(config):
-    """Its initial parameters."""
+    """Parameters of it."""
     from jaxmotion.systems import camdm
+    from tests import tiny
 
-    return jax.jit(camdm.init, static_argnums=1)(jax.random.key(7), config)
+    return tiny.random_params(camdm.init, config, seed=7)

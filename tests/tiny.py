@@ -111,6 +111,22 @@ def config(**changes) -> camdm.Config:
     return camdm.Config(**(sizes | changes))
 
 
+def random_params(init, *args, seed: int = 0):
+    """Parameters as `init(key, *args)` makes them, drawn by NumPy: no compilation."""
+    key = jax.random.key(seed)
+    shapes = jax.eval_shape(lambda k: init(k, *args), key)
+    generator = np.random.default_rng(seed)
+
+    def draw(path, x):
+        name = path[-1].key
+        if name == "scale":
+            return jnp.ones(x.shape, x.dtype)
+        deviation = 0.1 if name == "bias" else x.shape[-2] ** -0.5
+        return jnp.asarray(generator.normal(0.0, deviation, x.shape), x.dtype)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
 def training_parts(
     config: camdm.Config,
     *,
@@ -134,7 +150,6 @@ def training_parts(
     objective = functools.partial(camdm.loss, bones=walker.skeleton, config=config)
     update = training.make_update(objective, optimizer, ema_decay=0.9)
     run = training.train_chunk(update, sample_batch, num_steps=num_steps, mesh=mesh)
-    key_init, key_train = jax.random.split(jax.random.key(3))
-    params = jax.jit(camdm.init, static_argnums=1)(key_init, config)
+    params = random_params(camdm.init, config, seed=3)
     state = training.init_train_state(params, optimizer)
-    return run, state, key_train, (walker, index)
+    return run, state, jax.random.key(3), (walker, index)

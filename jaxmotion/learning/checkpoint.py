@@ -156,7 +156,8 @@ def restore_part(
 
     Args:
       folder: The run's checkpoint folder.
-      like: Field names to trees of the same structure and shapes.
+      like: Field names to nested dicts of arrays (or ShapeDtypeStructs), of the same
+        structure and shapes.
       step: Which; None for the newest.
 
     Returns:
@@ -173,14 +174,34 @@ def restore_part(
         restore_args=ocp.checkpoint_utils.construct_restore_args(like),
         partial_restore=True,
     )
+    saved = folder.absolute() / str(step) / "state"
     try:
         with ocp.PyTreeCheckpointer() as reader:
-            found = reader.restore(folder.absolute() / str(step) / "state", args=part)
-        found = jax.tree.map(jax.numpy.asarray, found)
+            stored = reader.metadata(saved).item_metadata.tree
+            # Orbax would hand back what `like` has where the disk has nothing.
+            _check_part(folder, step, like, {name: stored.get(name) for name in like})
+            found = reader.restore(saved, args=part)
+        return jax.tree.map(jax.numpy.asarray, found)
+    except CheckpointError:
+        raise
     except Exception as error:
         raise _foreign(folder, step, error) from error
-    _check_shapes(folder, step, like, found)
-    return found
+
+
+def _check_part(folder: Path, step: int, like: Any, stored: Any) -> None:
+    want, got = (
+        {
+            jax.tree_util.keystr(path): tuple(leaf.shape)
+            for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+        }
+        for tree in (like, stored)
+    )
+    for name in sorted(want.keys() | got.keys()):
+        if want.get(name) != got.get(name):
+            raise CheckpointError(
+                f"{folder}: step {step} is of another model: {name} is "
+                f"{got.get(name, 'missing')}, expected {want.get(name, 'nothing')}"
+            )
 
 
 def export_params(
@@ -227,10 +248,13 @@ def import_params(
       CheckpointError: if the file is no such export, or of another model.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        file = np.load(path, allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError("one array, expected an npz archive")
+        with file:
             arrays = {name: file[name] for name in file.files}
         config = json.loads(str(arrays.pop("config")))
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise CheckpointError(
             f"{path}: not an export of parameters: {error}"
         ) from error

@@ -4,10 +4,13 @@ All arithmetic is in the compiled chunk (`training.train_chunk`); this loop star
 looks at the losses it returns, and writes checkpoints between chunks.
 """
 
+import contextlib
 import dataclasses
 import json
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +91,42 @@ def check_finite(info: Info, first_step: int, folder: Path) -> None:
     )
 
 
+@contextlib.contextmanager
+def _held_interrupt() -> Iterator[list[int]]:
+    """Notes the first Ctrl-C instead of raising; a second one raises at once.
+
+    A chunk donates its state: an exception in the midst of it would leave nothing to
+    save. Outside the main thread nothing is changed.
+    """
+    seen: list[int] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield seen
+        return
+
+    def note(number: int, _: Any) -> None:
+        if seen:
+            raise KeyboardInterrupt
+        seen.append(number)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield seen
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _forget_lost_steps(path: Path, done: int) -> None:
+    """Drops rows behind the checkpoint that a run goes on from, and a torn last row."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        with contextlib.suppress(ValueError, KeyError):
+            if json.loads(line)["step"] <= done:
+                kept.append(line + "\n")
+    path.write_text("".join(kept))
+
+
 def train(
     run_chunk: Callable[[TrainState, Key, Any], tuple[TrainState, Info]],
     state: TrainState,
@@ -98,12 +137,12 @@ def train(
 ) -> TrainState:
     """Trains to `loop.num_steps`, from a new or a restored state.
 
-    Ctrl-C ends it after the running chunk; the state is then saved. A kill at any
-    moment leaves the last checkpoint whole.
+    The first Ctrl-C lets the running chunk end and saves it. A kill at any moment
+    leaves the last checkpoint whole.
 
     Args:
       run_chunk: From `train_chunk`, with `loop.chunk` steps.
-      state: New, or restored from `<folder>/checkpoints`.
+      state: New, or restored from `<folder>/checkpoints`; donated.
       key: The same for all parts of a run.
       data: Arrays on the device.
       loop: How long, and what to write.
@@ -115,6 +154,7 @@ def train(
       TrainingDiverged: if a loss is not finite; nothing of that chunk is saved.
       ValueError: if the chunk does not divide the steps that are left.
       OSError: if the folder cannot be written.
+      KeyboardInterrupt: after Ctrl-C, when the state is saved.
     """
     checkpoints = loop.folder / "checkpoints"
     check_writable(checkpoints)
@@ -124,28 +164,25 @@ def train(
             f"steps left ({loop.num_steps - done}) and save_every "
             f"({loop.save_every}) must be multiples of the chunk ({loop.chunk})"
         )
-    interrupted = False
+    losses = loop.folder / "losses.jsonl"
+    _forget_lost_steps(losses, done)
+    stop = False
     bar = tqdm(total=loop.num_steps, initial=done, unit="step", smoothing=0.1)
-    with bar, open(loop.folder / "losses.jsonl", "a", buffering=1) as log:
-        while done < loop.num_steps and not interrupted:
+    with bar, open(losses, "a", buffering=1) as log, _held_interrupt() as interrupts:
+        while done < loop.num_steps and not stop:
             start = time.perf_counter()
-            try:
-                state, info = jax.block_until_ready(run_chunk(state, key, data))
-            except KeyboardInterrupt:
-                # The donated state is gone: what the disk has is what there is.
-                bar.write(f"interrupted; last checkpoint: {checkpoints}")
-                raise
-            try:
-                check_finite(info, done + 1, checkpoints)
-                done += loop.chunk
-                means = {name: float(np.mean(x)) for name, x in info.items()}
-                seconds = time.perf_counter() - start
-                row = {"step": done, **means, "steps_per_second": loop.chunk / seconds}
-                log.write(json.dumps(row) + "\n")
-                bar.set_postfix({name: f"{means[name]:.4f}" for name in loop.show})
-                bar.update(loop.chunk)
-            except KeyboardInterrupt:
-                interrupted = True
-            if done % loop.save_every == 0 or done >= loop.num_steps or interrupted:
+            state, info = jax.block_until_ready(run_chunk(state, key, data))
+            check_finite(info, done + 1, checkpoints)
+            done += loop.chunk
+            means = {name: float(np.mean(x)) for name, x in info.items()}
+            rate = loop.chunk / (time.perf_counter() - start)
+            row = {"step": done, **means, "steps_per_second": rate}
+            log.write(json.dumps(row) + "\n")
+            bar.set_postfix({name: f"{means[name]:.4f}" for name in loop.show})
+            bar.update(loop.chunk)
+            stop = bool(interrupts)
+            if done % loop.save_every == 0 or done >= loop.num_steps or stop:
                 checkpoint.save(checkpoints, done, state, loop.config)
+    if stop and done < loop.num_steps:
+        raise KeyboardInterrupt(f"stopped at step {done}; saved in {checkpoints}")
     return state

@@ -5,6 +5,7 @@ state. So a run that stops and resumes draws what an uninterrupted one would hav
 """
 
 import dataclasses
+import typing
 from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,6 +20,8 @@ from jaxmotion.typing import Key, Params
 Info = dict[str, Array]
 
 
+# Unchecked, because checkpointing maps a state to the same tree of other things.
+@typing.no_type_check
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class TrainState:
@@ -142,7 +145,8 @@ def make_update(
         ema_params = jax.tree.map(
             lambda old, new: old + (1.0 - decay) * (new - old), state.ema_params, params
         )
-        info = {"loss": value, **info, "grad_norm": optax.global_norm(grads)}
+        squares = [jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)]
+        info = {"loss": value, **info, "grad_norm": jnp.sqrt(sum(squares))}
         return TrainState(
             step=state.step + 1,
             params=params,

@@ -193,4 +193,3 @@ class EncoderLayer(nn.Module):
         return self.attend(
             x if last is None else x[..., -last:, :], projections, train=train
         )
-

@@ -83,5 +83,3 @@ class Recognizer(nn.Module):
         x = nn.leaky_relu(self.hidden_norm(self.hidden(x)))
         features = nn.leaky_relu(self.feature_norm(self.feature(x)))
         return features, self.out(features)
-
-

@@ -1,0 +1,230 @@
+"""Checkpoints: equal to the bit, whole or absent, and errors that name the folder."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from jaxmotion.learning import checkpoint, training
+
+# Orbax abandons its other reads when one fails.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+
+
+def state_of(seed, width=4):
+    params = {
+        "layer": {"kernel": jax.random.normal(jax.random.key(seed), (width, 3))},
+        "bias": jnp.full(3, 0.1 * seed),
+    }
+    optimizer = optax.adamw(1e-3)
+    state = training.init_train_state(params, optimizer)
+    gradient = jax.tree.map(jnp.ones_like, params)
+    _, opt_state = optimizer.update(gradient, state.opt_state, params)
+    return training.TrainState(
+        step=jnp.int32(seed),
+        params=params,
+        ema_params=jax.tree.map(lambda x: 0.5 * x, params),
+        opt_state=opt_state,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Steps 1, 2 and 3 were saved with keep=2."""
+    folder = tmp_path_factory.mktemp("run") / "checkpoints"
+    for step in (1, 2, 3):
+        checkpoint.save(folder, step, state_of(step), {"step": step, "name": "é"})
+    return folder
+
+
+def test_restored_equals_saved_to_the_bit(folder):
+    like = jax.eval_shape(lambda: state_of(0))
+    for found in (
+        checkpoint.restore(folder, like),
+        checkpoint.restore(folder, state_of(0)),
+    ):
+        assert jax.tree.structure(found) == jax.tree.structure(state_of(3))
+        jax.tree.map(np.testing.assert_array_equal, found, state_of(3))
+        types = [leaf.dtype for leaf in jax.tree.leaves(found)]
+        assert types == [leaf.dtype for leaf in jax.tree.leaves(state_of(3))]
+
+
+def test_the_oldest_goes_and_steps_can_be_chosen(folder):
+    assert checkpoint.latest_step(folder) == 3
+    found = checkpoint.restore(folder, state_of(0), step=2)
+    jax.tree.map(np.testing.assert_array_equal, found, state_of(2))
+    assert checkpoint.load_config(folder) == {"step": 3, "name": "é"}
+    assert checkpoint.load_config(folder, step=2)["step"] == 2
+    with pytest.raises(checkpoint.CheckpointError, match=f"{folder}.*step 1"):
+        checkpoint.restore(folder, state_of(0), step=1)
+
+
+def test_restore_part(folder):
+    like = {"ema_params": jax.eval_shape(lambda: state_of(0).ema_params)}
+    found = checkpoint.restore_part(folder, like)
+    assert list(found) == ["ema_params"]
+    jax.tree.map(
+        np.testing.assert_array_equal, found["ema_params"], state_of(3).ema_params
+    )
+
+
+def test_of_another_model(folder):
+    wide = state_of(0, width=5)
+    named = f"{folder}.*step 3"
+    with pytest.raises(checkpoint.CheckpointError, match=named):
+        checkpoint.restore(folder, wide)
+    with pytest.raises(checkpoint.CheckpointError, match=named):
+        checkpoint.restore_part(folder, {"ema_params": wide.ema_params})
+    with pytest.raises(checkpoint.CheckpointError, match=named):
+        checkpoint.restore(folder, {"other": jnp.zeros(2)})
+    with pytest.raises(checkpoint.CheckpointError, match=named):
+        checkpoint.restore_part(folder, {"other": jnp.zeros(2)})
+    deeper = state_of(0).params | {"layer_2": {"kernel": jnp.zeros((3, 3))}}
+    shallower = {"bias": jnp.zeros(3)}
+    for params in (deeper, shallower):
+        with pytest.raises(checkpoint.CheckpointError, match=f"{named}.*layer"):
+            checkpoint.restore_part(folder, {"params": params})
+
+
+def test_missing(tmp_path):
+    for folder in (tmp_path / "none", tmp_path):
+        assert checkpoint.latest_step(folder) is None
+        for read in (
+            lambda f: checkpoint.restore(f, state_of(0)),
+            lambda f: checkpoint.restore_part(f, {"params": state_of(0).params}),
+            checkpoint.load_config,
+        ):
+            with pytest.raises(checkpoint.CheckpointError, match=str(folder)):
+                read(folder)
+    assert not (tmp_path / "none").exists()
+
+
+def damage(folder, how):
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    for path in files:
+        content = path.read_bytes()
+        if how == "truncated":
+            path.write_bytes(content[: len(content) // 2])
+        elif how == "flipped":
+            path.write_bytes(bytes(255 - byte for byte in content))
+        else:
+            path.unlink()
+
+
+@pytest.mark.parametrize("how", ["truncated", "flipped", "emptied"])
+def test_corrupt(tmp_path, how):
+    folder = tmp_path / "checkpoints"
+    checkpoint.save(folder, 7, state_of(7), {})
+    damage(folder / "7", how)
+    for read in (
+        lambda: checkpoint.restore(folder, state_of(0)),
+        lambda: checkpoint.restore_part(folder, {"params": state_of(0).params}),
+        lambda: checkpoint.load_config(folder),
+    ):
+        with pytest.raises(checkpoint.CheckpointError, match=str(folder)):
+            read()
+
+
+def test_a_torn_step_does_not_count(tmp_path):
+    """What a kill in the midst of a save leaves behind is neither read nor fatal."""
+    folder = tmp_path / "checkpoints"
+    checkpoint.save(folder, 1, state_of(1), {})
+    torn = folder / "2.orbax-checkpoint-tmp-17"
+    (torn / "state").mkdir(parents=True)
+    (torn / "state" / "manifest.ocdbt").write_bytes(b"half")
+    assert checkpoint.latest_step(folder) == 1
+    found = checkpoint.restore(folder, state_of(0))
+    jax.tree.map(np.testing.assert_array_equal, found, state_of(1))
+    checkpoint.save(folder, 2, state_of(2), {})
+    assert checkpoint.latest_step(folder) == 2
+
+
+def test_unwritable(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
+    with pytest.raises(OSError, match="file"):
+        checkpoint.save(tmp_path / "file" / "run", 1, state_of(1), {})
+
+
+SAVER = """
+import itertools, sys
+import numpy as np
+from jaxmotion.learning import checkpoint
+for step in itertools.count(1):
+    state = {name: np.full(200_000, step, np.float32) for name in "abcd"}
+    checkpoint.save(sys.argv[1], step, state, {"step": step})
+    print(step, flush=True)
+"""
+
+
+def test_a_kill_in_the_midst_of_saving_leaves_a_whole_step(tmp_path):
+    folder = tmp_path / "checkpoints"
+    process = subprocess.Popen(
+        [sys.executable, "-c", SAVER, str(folder)],
+        stdout=subprocess.PIPE,
+        cwd=Path(__file__).parents[2],
+        text=True,
+    )
+    told = 0
+    for _ in range(6):
+        told = int(process.stdout.readline())
+    time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    step = checkpoint.latest_step(folder)
+    assert step >= told
+    assert checkpoint.load_config(folder)["step"] == step
+    like = {name: jnp.zeros(200_000) for name in "abcd"}
+    for array in checkpoint.restore(folder, like).values():
+        np.testing.assert_array_equal(array, step)
+
+
+def test_export_and_import(tmp_path):
+    params = state_of(3).params
+    path = tmp_path / "folder" / "model.npz"
+    checkpoint.export_params(path, params, {"a": [1, 2]}, dtype=np.float32)
+    found, config = checkpoint.import_params(path, like=params)
+    jax.tree.map(np.testing.assert_array_equal, found, params)
+    assert config == {"a": [1, 2]}
+    checkpoint.export_params(path, params, {})
+    half, _ = checkpoint.import_params(path)
+    assert half["bias"].dtype == jnp.float32
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), half, params)
+    assert [p.name for p in path.parent.iterdir()] == ["model.npz"]
+
+
+def test_import_of_something_else(tmp_path):
+    path = tmp_path / "model.npz"
+    contents = {
+        "text": b"hello",
+        "empty": b"",
+        "json": json.dumps({"config": 1}).encode(),
+    }
+    for content in contents.values():
+        path.write_bytes(content)
+        with pytest.raises(checkpoint.CheckpointError, match="model.npz"):
+            checkpoint.import_params(path)
+    np.savez(path, a=np.zeros(3))
+    with pytest.raises(checkpoint.CheckpointError, match="model.npz"):
+        checkpoint.import_params(path)
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    with pytest.raises(checkpoint.CheckpointError, match="array.npy"):
+        checkpoint.import_params(tmp_path / "array.npy")
+    checkpoint.export_params(path, state_of(0).params, {})
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(checkpoint.CheckpointError, match="model.npz"):
+        checkpoint.import_params(path)
+    with pytest.raises(checkpoint.CheckpointError, match="none.npz"):
+        checkpoint.import_params(tmp_path / "none.npz")
+    checkpoint.export_params(path, state_of(0).params, {})
+    with pytest.raises(checkpoint.CheckpointError, match="model.npz.*another model"):
+        checkpoint.import_params(path, like=state_of(0, width=9).params)

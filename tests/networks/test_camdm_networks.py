@@ -1,0 +1,197 @@
+"""Shapes, variants and the cut of the denoisers in two; parity has its own file."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.networks import ablation, blocks, transformer
+from tests import tiny
+
+SIZES = dict(
+    features=12,
+    past=4,
+    future=6,
+    num_labels=3,
+    num_steps=4,
+    width=16,
+    depth=2,
+    heads=2,
+    hidden=24,
+    dropout=0.3,
+)
+KINDS = {
+    "transformer": transformer.CamdmTransformer(**SIZES),
+    "one layer": transformer.CamdmTransformer(**(SIZES | {"depth": 1})),
+    "two frames a token": transformer.CamdmTransformer(**SIZES, frames_per_token=2),
+    "mlp": ablation.CamdmMlp(**SIZES),
+    "single token": ablation.SingleTokenTransformer(**SIZES),
+}
+TRANSFORMERS = [name for name in KINDS if name not in ("mlp", "single token")]
+
+
+def arguments(*batch):
+    """x_t, t, past, path, facing, label, keep_past."""
+    generator = np.random.default_rng(0)
+    normal = lambda *shape: jnp.asarray(  # noqa: E731
+        generator.normal(size=(*batch, *shape)), jnp.float32
+    )
+    whole = lambda high: jnp.asarray(  # noqa: E731
+        generator.integers(0, high, batch), jnp.int32
+    )
+    return (
+        normal(6, 12),
+        1 + whole(4),
+        normal(4, 12),
+        normal(6, 2),
+        normal(6, 6),
+        whole(3),
+        whole(2) == 1,
+    )
+
+
+@functools.cache
+def parameters(name):
+    return tiny.random_params(KINDS[name].init, *arguments())
+
+
+@functools.cache
+def forward(name):
+    return functools.partial(jax.jit(KINDS[name].apply), parameters(name))
+
+
+def test_the_papers_network_has_147_tokens_and_3439260_parameters():
+    net = transformer.CamdmTransformer(features=156)
+    zeros = lambda *shape: jnp.zeros(shape)  # noqa: E731
+    shapes = jax.eval_shape(
+        net.init,
+        jax.random.key(0),
+        zeros(45, 156),
+        jnp.ones((), jnp.int32),
+        zeros(10, 156),
+        zeros(45, 2),
+        zeros(45, 6),
+        jnp.zeros((), jnp.int32),
+        jnp.ones((), bool),
+    )
+    assert net.num_tokens == 147
+    assert sum(x.size for x in jax.tree.leaves(shapes)) == 3_439_260
+    five = transformer.CamdmTransformer(features=156, frames_per_token=5)
+    assert five.num_tokens == 31
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_batch_is_its_samples(name):
+    batched = arguments(3)
+    out = forward(name)(*batched)
+    assert out.shape == (3, 6, 12)
+    single = jax.tree.map(lambda x: x[1], batched)
+    np.testing.assert_allclose(forward(name)(*single), out[1], atol=5e-6)
+
+
+@pytest.mark.parametrize("name", ["transformer", "mlp", "single token"])
+def test_one_step_for_a_whole_batch(name):
+    x_t, _, *condition = arguments(3)
+    for_all = forward(name)(x_t, jnp.int32(2), *condition)
+    for_each = forward(name)(x_t, jnp.full(3, 2, jnp.int32), *condition)
+    np.testing.assert_array_equal(for_all, for_each)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_argument_matters(name):
+    args = list(arguments())
+    args[-1] = jnp.ones((), bool)
+    base = forward(name)(*args)
+    changes = [lambda x: x + 1.0, lambda t: t % 4 + 1, *([lambda x: x + 1.0] * 3)]
+    changes += [lambda label: (label + 1) % 3, jnp.logical_not]
+    for i, change in enumerate(changes):
+        other = [change(x) if i == j else x for j, x in enumerate(args)]
+        assert np.abs(forward(name)(*other) - base).max() > 1e-4, i
+
+
+@pytest.mark.parametrize("name", ["transformer", "mlp", "single token"])
+def test_a_dropped_past_is_a_past_of_zeros(name):
+    *args, _ = arguments()
+    dropped = forward(name)(*args, jnp.zeros((), bool))
+    args[2] = jnp.zeros_like(args[2])
+    kept = forward(name)(*args, jnp.ones((), bool))
+    np.testing.assert_array_equal(dropped, kept)
+
+
+@pytest.mark.parametrize("name", TRANSFORMERS)
+def test_encode_and_denoise_are_the_plain_network(name):
+    """Oracle: all tokens in the documented order through all whole layers."""
+    net, variables = KINDS[name], parameters(name)
+
+    def plain(net, x_t, t, past, path, facing, label, keep_past):
+        fold = lambda x: transformer.fold_frames(x, net.frames_per_token)  # noqa: E731
+        tokens = jnp.concatenate(
+            [
+                net.embed_time(net.num_steps)[t][None],
+                net.embed_label(label)[None],
+                net.embed_path(fold(path)),
+                net.embed_facing(fold(facing)),
+                net.embed_past(fold(past * keep_past)),
+                net.embed_noisy(fold(x_t)),
+            ]
+        )
+        tokens = tokens + blocks.sinusoidal_positions(*tokens.shape)
+        for layer in net.layers:
+            tokens = layer(tokens, train=False)
+        out = net.out(tokens[-net.num_outputs :])
+        return out.reshape(net.future, net.features)
+
+    args = arguments()
+    expected = net.apply(variables, *args, method=plain)
+    np.testing.assert_allclose(forward(name)(*args), expected, atol=5e-6)
+
+
+@pytest.mark.parametrize("name", ["transformer", "mlp", "single token"])
+def test_dropout_only_in_training_and_by_its_key(name):
+    net, args = KINDS[name], arguments()
+    train = jax.jit(
+        lambda variables, key: net.apply(
+            variables, *args, train=True, rngs={"dropout": key}
+        )
+    )
+    first, again, other = (
+        train(parameters(name), jax.random.key(seed)) for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).max() > 1e-3
+    assert np.abs(first - forward(name)(*args)).max() > 1e-3
+
+
+def test_frames_fold_in_order_and_must_divide():
+    x = jnp.arange(12.0).reshape(6, 2)
+    folded = transformer.fold_frames(x, 3)
+    np.testing.assert_array_equal(folded, np.arange(12.0).reshape(2, 6))
+    with pytest.raises(ValueError, match="6 frames are no multiple.*4"):
+        transformer.fold_frames(x, 4)
+
+
+def test_positions_are_sines_and_cosines():
+    table = blocks.sinusoidal_positions(5000, 8)
+    for position in (0, 1, 4999):
+        for channel in range(4):
+            angle = position / 10000 ** (2 * channel / 8)
+            expected = [np.sin(angle), np.cos(angle)]
+            found = table[position, 2 * channel : 2 * channel + 2]
+            np.testing.assert_allclose(found, expected, atol=1e-6)
+    with pytest.raises(ValueError, match="width is 7"):
+        blocks.sinusoidal_positions(3, 7)
+
+
+def test_the_first_step_reads_the_first_position():
+    embedding = blocks.TimeEmbedding(8)
+    rows, variables = embedding.init_with_output(jax.random.key(0), 4)
+    codes = np.asarray(blocks.sinusoidal_positions(4, 8), np.float64)
+    layers = jax.tree.map(lambda x: np.asarray(x, np.float64), variables["params"])
+    hidden = codes @ layers["hidden"]["kernel"] + layers["hidden"]["bias"]
+    hidden = hidden / (1 + np.exp(-hidden))
+    expected = hidden @ layers["out"]["kernel"] + layers["out"]["bias"]
+    assert rows.shape == (5, 8)
+    np.testing.assert_allclose(rows[1:], expected, atol=1e-6)
+    np.testing.assert_array_equal(rows[0], rows[1])
