@@ -15,6 +15,17 @@ jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
+@pytest.fixture(scope="module")
+def quick_compile():
+    """Compiles whole training and control programs a third as long, unoptimised.
+
+    For modules whose subject is not the arithmetic of a single function.
+    """
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture(scope="session")
 def bones():
     """Hips and two legs."""

@@ -10,6 +10,8 @@ import pytest
 from jaxmotion.networks import ablation, blocks, transformer
 from tests import tiny
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 SIZES = dict(
     features=12,
     past=4,

@@ -2,9 +2,12 @@
 
 import jax
 import numpy as np
+import pytest
 
 from jaxmotion.networks.recognizer import Recognizer
 from tests import tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
 
 
 def test_shapes_and_independence_of_the_batch():
