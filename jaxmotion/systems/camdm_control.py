@@ -48,6 +48,9 @@ class Control:
         0.4).
       bias_facing: Exponent of the blend of facings (released code 2.2).
       seam: Duration of the inertialised seam, seconds (released code 0.2); 0 for none.
+      follow: Half-life, seconds, in which the wanted path returns to the commanded
+        one, the integral of the desired velocity; 0 to steer by velocity alone, as
+        the paper does. Ours: without it every rollout drifts off its course.
     """
 
     apply: int = 15
@@ -60,6 +63,7 @@ class Control:
     bias_position: float = 0.7
     bias_facing: float = 2.2
     seam: float = 0.2
+    follow: float = 0.0
 
 
 @jax.tree_util.register_dataclass
@@ -75,6 +79,7 @@ class CharacterState:
       acceleration: Of the desired motion, metres a second squared.
       facing: Desired facing (the spring), unit.
       turn_rate: Of the desired facing, radians a second.
+      anchor: Where the desired motion is, (x, z) metres: the commanded path's end.
       command: The last command; its label is -1 before the first.
       guided: Plans that are still to be guided.
     """
@@ -86,6 +91,7 @@ class CharacterState:
     acceleration: Float[Array, "*batch 2"]
     facing: Float[Array, "*batch 2"]
     turn_rate: Float[Array, "*batch"]
+    anchor: Float[Array, "*batch 2"]
     command: trajectory.Command
     guided: Int[Array, "*batch"]
 
@@ -149,6 +155,7 @@ def init_state(
         acceleration=jnp.zeros(2),
         facing=facing,
         turn_rate=jnp.zeros(()),
+        anchor=position[-1, ::2],
         command=trajectory.Command(
             velocity=velocity, facing=facing, label=jnp.full((), -1, jnp.int32)
         ),
@@ -221,6 +228,11 @@ def wanted_trajectory(
         acceleration=state.acceleration,
         turn_rate=state.turn_rate,
     )
+    if control.follow > 0:
+        ahead = jnp.arange(1, config.future + 1) / config.fps
+        returned = 1.0 - 0.5 ** (ahead / control.follow)
+        pull = returned[:, None] * (state.anchor - here.origin)
+        desired = dataclasses.replace(desired, position=desired.position + pull)
     if not control.extend:
         return desired
     own = trajectory.extend(
@@ -314,8 +326,8 @@ def controller(
             lambda old, new: jnp.concatenate([old[1:], new]), state.past, pose
         )
         times = {"half_life": control.half_life, "dt": 1.0 / config.fps}
-        _, velocity, acceleration = spring.velocity_spring(
-            jnp.zeros(2), state.velocity, state.acceleration, command.velocity, **times
+        anchor, velocity, acceleration = spring.velocity_spring(
+            state.anchor, state.velocity, state.acceleration, command.velocity, **times
         )
         facing, turn_rate = spring.facing_spring(
             state.facing, state.turn_rate, command.facing, **times
@@ -338,6 +350,7 @@ def controller(
             acceleration=acceleration,
             facing=facing,
             turn_rate=turn_rate,
+            anchor=anchor,
             command=command,
         ), frame
 
