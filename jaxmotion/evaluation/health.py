@@ -70,11 +70,10 @@ def is_frozen(
     length = round(seconds * fps)
     speed = jnp.linalg.norm(jnp.diff(positions, axis=-3), axis=-1).mean(-1) * fps
     windows = speed.shape[-1] // length
-    cut = (
-        lambda x: x[..., : windows * length].reshape(  # noqa: E731
-            *x.shape[:-1], windows, length
-        )
-    )
+
+    def cut(x: Array) -> Array:
+        return x[..., : windows * length].reshape(*x.shape[:-1], windows, length)
+
     wanted = jnp.linalg.norm(wanted_velocity[..., :-1, :], axis=-1)
     still = cut(speed).mean(-1) < min_speed
     return jnp.any(still & (cut(wanted).min(-1) > commanded), axis=-1)

@@ -5,6 +5,7 @@ Source: Chen et al. 2024 (CAMDM), section 4.1; released feature extractor.
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -107,14 +108,18 @@ def recognized(
 
 
 def metric_row(
-    bones: skeleton.Skeleton, found: Windows, hits: np.ndarray, *, height: float
+    bones: skeleton.Skeleton,
+    found: Windows,
+    hits: np.ndarray | None,
+    *,
+    height: float,
 ) -> dict[str, table.Cell]:
     """All columns but the Fréchet distances, with intervals over clips or rollouts.
 
     Args:
       bones: The skeleton.
       found: Windows.
-      hits: From `recognized`.
+      hits: From `recognized`; None to leave style accuracy out.
       height: Below it a foot joint should not move, metres.
 
     Returns:
@@ -136,10 +141,11 @@ def metric_row(
             table.group_means(values[name], found.group, weight), scale=scale
         )
 
-    return {
-        "style_accuracy_%": table.cell(
-            table.group_means(hits, found.group), scale=100.0
-        ),
+    style = {}
+    if hits is not None:
+        means = table.group_means(hits, found.group)
+        style = {"style_accuracy_%": table.cell(means, scale=100.0)}
+    return style | {
         "trajectory_error_deg": column(
             "trajectory_error", weights="trajectory_used", scale=degrees
         ),
@@ -247,3 +253,69 @@ def repeat_diversity(
     shape = (characters // repeats, repeats, -1, bones.num_joints, 3)
     local = jnp.asarray(local).reshape(shape)
     return table.cell(jax.vmap(diversity.intra_style_variance)(local))
+
+
+def evaluation_table(
+    bones: skeleton.Skeleton,
+    real: Windows,
+    dense: Windows,
+    made: Windows,
+    frames: camdm_control.Frame,
+    recognizer: Recognized,
+    *,
+    repeats: int,
+    seed: int = 0,
+) -> tuple[dict[str, dict[str, table.Cell]], dict[str, Any]]:
+    """The table, and what belongs beside it.
+
+    Args:
+      bones: The skeleton.
+      real: Windows of held-out clips, one behind the other.
+      dense: Windows of training clips with a short stride: the reference.
+      made: Windows of the rollouts.
+      frames: The rollouts themselves.
+      recognizer: From `fit_recognizer`.
+      repeats: Neighbouring characters that share style and commands.
+      seed: Of the subsets for Fréchet distances.
+
+    Returns:
+      Rows "held-out (ground truth)", "training half vs half (noise floor)" and
+      "rollouts"; and the contact height, window counts and health of the rollouts.
+    """
+    toes = in_batches(
+        jax.jit(
+            lambda m: skeleton.joint_positions(bones, m)[..., jnp.array(bones.feet), :]
+        ),
+        real.motion,
+    )
+    root = np.asarray(real.motion.root_position)[..., 1]
+    # Where toes rest, and one centimetre more, as the paper's "below, e.g., 1 cm".
+    height = float(np.percentile(toes[..., 1], 1)) + 0.01
+    real_feature, real_hits = recognized(bones, real, recognizer)
+    made_feature, made_hits = recognized(bones, made, recognizer)
+    reference, _ = recognized(bones, dense, recognizer)
+    clips = np.asarray(dense.group)
+    own = np.isin(clips, np.random.default_rng(seed).permutation(np.unique(clips))[::2])
+    count = min(len(real_feature), len(made_feature), int(own.sum()), int((~own).sum()))
+    distance = functools.partial(frechet_cell, count=count, seed=seed)
+    rows = {
+        "held-out (ground truth)": metric_row(bones, real, real_hits, height=height)
+        | {"fid": distance(real_feature, reference)},
+        "training half vs half (noise floor)": {
+            "fid": distance(reference[own], reference[~own])
+        },
+        "rollouts": metric_row(bones, made, made_hits, height=height)
+        | {
+            "fid": distance(made_feature, reference),
+            "diversity_m2": repeat_diversity(bones, made, repeats=repeats),
+        },
+    }
+    return rows, {
+        "contact_height_m": height,
+        "windows": {"held_out": len(real_hits), "rollouts": len(made_hits)},
+        "fid_windows": count,
+        "fid_reference_windows": len(reference),
+        "health": rollout_health(
+            bones, frames, fps=made.motion.fps, height=float(np.median(root))
+        ),
+    }

@@ -66,6 +66,17 @@ class Control:
     follow: float = 0.0
 
 
+# The released Unity run-time (its code; its scene has bias_position 0.7). It smooths
+# commands by a linear interpolation instead of springs, which is not offered here.
+RELEASED = Control(
+    replan_on_change=False,
+    reuse=23,
+    guidance_scale=0.5,
+    guided_plans=2,
+    bias_position=0.4,
+)
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class CharacterState:

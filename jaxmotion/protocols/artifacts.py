@@ -1,0 +1,67 @@
+"""What an experiment leaves behind: a rollout to look at, and a table to cite."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmotion.control import presets
+from jaxmotion.data import bvh
+from jaxmotion.evaluation import table
+from jaxmotion.motion import skeleton
+
+
+def write_rollout(
+    folder: Path,
+    bones: skeleton.Skeleton,
+    motion: skeleton.Motion,
+    desired_velocity: Float[Array, "frames 2"],
+    *,
+    title: str,
+) -> None:
+    """Writes rollout.bvh, rollout.gif and rollout.html.
+
+    Args:
+      folder: Where to; it must exist.
+      bones: The skeleton.
+      motion: Frames of one character, world.
+      desired_velocity: What was commanded, metres a second; its integral is drawn as
+        the commanded path.
+      title: Of the pictures.
+
+    Raises:
+      OSError: if a file cannot be written.
+    """
+    # matplotlib is slow to import, and only those who draw need it.
+    from jaxmotion.viz import animation, html
+
+    fps = motion.fps
+    bvh.write_bvh(folder / "rollout.bvh", bvh.bvh_from_motion(bones, motion))
+    positions = np.asarray(skeleton.joint_positions(bones, motion))
+    walked = positions[:, 0, ::2]
+    commanded = np.asarray(presets.integrate_path(desired_velocity, fps)) + walked[0]
+    shown = dict(
+        fps=fps, names=bones.names, commanded=commanded, walked=walked, title=title
+    )
+    animation.save_gif(folder / "rollout.gif", positions, bones.parents, **shown)
+    html.save_html(folder / "rollout.html", positions, bones.parents, **shown)
+    print(f"wrote rollout.bvh, rollout.gif and rollout.html to {folder}")
+
+
+def write_table(
+    folder: Path, rows: dict[str, dict[str, table.Cell]], report: dict[str, Any]
+) -> None:
+    """Writes metrics.json and table.md, and prints the table.
+
+    Args:
+      folder: Where to; it must exist.
+      rows: The table.
+      report: What belongs beside it: arguments, versions, hardware, bounds.
+    """
+    whole = report | {"rows": table.to_json(rows)}
+    (folder / "metrics.json").write_text(json.dumps(whole, indent=1))
+    text = table.to_markdown(rows)
+    (folder / "table.md").write_text(text + "\n")
+    print(text)
