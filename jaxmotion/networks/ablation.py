@@ -26,11 +26,11 @@ class FlatContext:
 
     Attributes:
       condition: One vector.
-      steps: Embeddings of steps 0..T.
+      steps: Embeddings of steps 0..T, one table for a batch.
     """
 
     condition: Float[Array, "*batch width"]
-    steps: Float[Array, "steps width"]
+    steps: Float[Array, "*stack steps width"]
 
 
 def flatten_condition(

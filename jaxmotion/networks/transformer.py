@@ -36,12 +36,13 @@ class Context:
     Attributes:
       tokens: Condition tokens with their positions.
       projections: The first layer's queries, keys and values of them.
-      steps: Embeddings of steps 0..T, with the time token's position.
+      steps: Embeddings of steps 0..T, with the time token's position; one table for
+        a batch (guidance stacks whole contexts).
     """
 
     tokens: Float[Array, "*batch condition width"]
     projections: blocks.Projections
-    steps: Float[Array, "steps width"]
+    steps: Float[Array, "*stack steps width"]
 
 
 def fold_frames(x: Float[Array, "*batch frames features"], n: int) -> Array:

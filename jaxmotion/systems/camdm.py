@@ -134,7 +134,12 @@ class Condition:
         )
 
 
-def network(config: Config) -> transformer.CamdmTransformer:
+Network = (
+    transformer.CamdmTransformer | ablation.CamdmMlp | ablation.SingleTokenTransformer
+)
+
+
+def network(config: Config) -> Network:
     """The denoiser's Flax module.
 
     Args:
@@ -351,7 +356,7 @@ def loss_terms(
         "velocity": losses.velocity_loss(
             prediction[..., without_root], target[..., without_root], every
         ),
-        # As in MDM, a squared distance is summed over xyz' mean over all channels.
+        # As in MDM, the mean runs over x, y and z as well.
         "position": losses.masked_mse(flat(predicted), flat(wanted), every),
         "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
         "foot": losses.foot_slide_loss(predicted[..., feet, :], stands),
