@@ -26,15 +26,15 @@ _Segment = tuple[float, float, float, float]
 def _forward() -> list[_Segment]:
     segments: list[_Segment] = []
     heading = 0.0
-    for seconds, turn in [(3, 0), (3, 45), (3, 45), (3, -90), (3, -45), (3, 90)]:
+    for turn in (0.0, 45.0, 45.0, -90.0, -45.0, 90.0):
         heading += turn
-        segments.append((seconds, heading, heading, 1.0))
+        segments.append((3.0, heading, heading, 1.0))
     for _ in range(12):
         heading += 30.0
         segments.append((0.5, heading, heading, 1.0))
-    for seconds, turn in [(3, -90), (3, -45), (3, 90)]:
+    for turn in (-90.0, -45.0, 90.0):
         heading += turn
-        segments.append((seconds, heading, heading, 1.0))
+        segments.append((3.0, heading, heading, 1.0))
     return segments
 
 

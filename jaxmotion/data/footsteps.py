@@ -1,12 +1,14 @@
 """Where the feet of a generated walker are: steps on a path, exact stances.
 
 The path of the body is known in advance, so a step can be aimed at where the body will
-be. Feet alternate. A foot stands with its toe joint at one point of the ground, exactly,
-until it swings along a smooth curve to its next point. While the body stands still and
-faces as its feet do, nobody steps.
+be. Feet alternate. A foot stands with its toe joint at one point of the ground,
+exactly, until it swings along a smooth curve to its next point. While the body stands
+still and faces as its feet do, nobody steps.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import numpy as np
 
@@ -30,19 +32,163 @@ class Footsteps:
     phase: np.ndarray
 
 
-def wrap(angle: np.ndarray) -> np.ndarray:
+def wrap(angle: np.ndarray | float) -> np.ndarray | float:
     """The same angle in [-pi, pi)."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def smoothstep(s: np.ndarray) -> np.ndarray:
+def smoothstep(s: np.ndarray | float) -> np.ndarray | float:
     """Rises from 0 to 1 with no velocity or acceleration at either end."""
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
-def _turned(yaw: np.ndarray, x: float, z: float) -> np.ndarray:
+def _turned(yaw: float, x: float, z: float) -> np.ndarray:
     c, s = np.cos(yaw), np.sin(yaw)
     return np.stack([c * x + s * z, -s * x + c * z], axis=-1)
+
+
+# A foot on the ground: its toe (x, z), metres, and its direction, radians.
+_Placed = tuple[np.ndarray, float]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Step:
+    """One step of one foot; it stands at first, and again after `air` frames."""
+
+    side: int
+    start: _Placed
+    goal: _Placed
+    turn: float
+    lift: float
+    air: int
+    length: int
+
+
+def _home(
+    path: np.ndarray,
+    yaw: np.ndarray,
+    pose: tuple[float, float, float],
+    frame: int,
+    side: int,
+) -> _Placed:
+    """Where a foot stands beside the body; pose is width, toe ahead and toe out."""
+    width, toe_ahead, toe_out = pose
+    frame = min(max(frame, 0), len(path) - 1)
+    sign = 1.0 - 2.0 * side
+    offset = _turned(yaw[frame], sign * width / 2, toe_ahead)
+    return path[frame] + offset, yaw[frame] + sign * toe_out
+
+
+def _is_off(foot: _Placed, home: _Placed) -> bool:
+    """Whether a foot stands too far or too twisted from where it should."""
+    away = np.linalg.norm(home[0] - foot[0])
+    turned = abs(wrap(np.array(home[1] - foot[1])))
+    return bool(away > 0.06 or turned > 0.35)
+
+
+def _stand(
+    feet: Footsteps, frame: int, at: list[_Placed], side: int, toe_height: float
+) -> None:
+    place, direction = at[side]
+    feet.toe[frame, side] = [place[0], toe_height, place[1]]
+    feet.yaw[frame, side] = direction
+
+
+def _take(
+    feet: Footsteps, now: int, step: _Step, at: list[_Placed], toe_height: float
+) -> None:
+    """Writes the frames of a step: one foot swings and lands, the other stands."""
+    side, (start, start_yaw) = step.side, step.start
+    landed = list(at)
+    landed[side] = step.goal
+    for i in range(min(step.length, len(feet.phase) - now)):
+        frame = now + i
+        _stand(feet, frame, at, 1 - side, toe_height)
+        if i >= step.air:
+            _stand(feet, frame, landed, side, toe_height)
+            continue
+        s = (i + 1) / (step.air + 1)
+        e = smoothstep(np.array(s))
+        place = start + e * (step.goal[0] - start)
+        up = step.lift * (np.sin(np.pi * s) ** 2)
+        feet.toe[frame, side] = [place[0], toe_height + up, place[1]]
+        feet.yaw[frame, side] = start_yaw + step.turn * e
+        feet.contact[frame, side] = False
+        feet.swing[frame, side] = s
+
+
+def _empty(frames: int) -> Footsteps:
+    return Footsteps(
+        toe=np.zeros((frames, 2, 3)),
+        yaw=np.zeros((frames, 2)),
+        contact=np.ones((frames, 2), bool),
+        swing=np.zeros((frames, 2)),
+        phase=np.zeros(frames),
+    )
+
+
+def _aim(
+    home: Callable[[int, int], _Placed],
+    now: int,
+    side: int,
+    start: _Placed,
+    length: int,
+    *,
+    double_support: float,
+    lift: float,
+    jitter: float,
+    generator: np.random.Generator,
+) -> _Step:
+    """The step that a foot takes now."""
+    air = max(int(round(length * (1.0 - double_support))), 4)
+    # The foot will carry the body from landing to its next lift-off; its home at the
+    # middle of that time is where it should land.
+    goal, goal_yaw = home(now + air + length // 2, side)
+    goal = goal + generator.normal(0.0, jitter, 2)
+    turn = float(wrap(np.array(goal_yaw - start[1])))
+    return _Step(
+        side=side,
+        start=start,
+        goal=(goal, start[1] + turn),
+        turn=turn,
+        lift=lift * float(np.exp(generator.normal(0.0, 0.08))),
+        air=air,
+        length=length,
+    )
+
+
+def _walk(
+    home: Callable[[int, int], _Placed],
+    length_at: Callable[[int], int],
+    aim: Callable[[int, int, _Placed, int], _Step],
+    moving: np.ndarray,
+    side: int,
+    toe_height: float,
+) -> Footsteps:
+    """Steps on, or stands where neither the body moves nor a foot is off its home."""
+    frames = len(moving)
+    feet = _empty(frames)
+    at = [home(0, 0), home(0, 1)]
+    now, steps = 0, 0
+    while now < frames:
+        length = length_at(now)
+        off = [_is_off(at[foot], home(now + 1, foot)) for foot in (0, 1)]
+        if not (moving[min(now + length, frames - 1)] or off[side]):
+            if off[1 - side]:
+                side = 1 - side
+                continue
+            for foot in (0, 1):
+                _stand(feet, now, at, foot, toe_height)
+            feet.phase[now] = np.pi * steps
+            now += 1
+            continue
+        step = aim(now, side, at[side], length)
+        _take(feet, now, step, at, toe_height)
+        # Right swings first in even phases, so that arms know which leg leads.
+        part = np.arange(1, length + 1)[: frames - now] / length
+        feet.phase[now : now + length] = np.pi * (steps + part)
+        at[side], now, steps, side = step.goal, now + length, steps + 1, 1 - side
+    return feet
 
 
 def plan_footsteps(
@@ -81,72 +227,22 @@ def plan_footsteps(
     Returns:
       The feet in every frame.
     """
-    frames = len(path)
     speed = np.linalg.norm(np.gradient(path, axis=0), axis=-1) * fps
-    sides = np.array([1.0, -1.0])
+    home = functools.partial(_home, path, yaw, (width, toe_ahead, toe_out))
 
-    def home(frame: int, side: int) -> tuple[np.ndarray, float]:
-        frame = min(max(frame, 0), frames - 1)
-        offset = _turned(yaw[frame], sides[side] * width / 2, toe_ahead)
-        return path[frame] + offset, yaw[frame] + sides[side] * toe_out
-
-    toe = np.zeros((frames, 2, 3))
-    foot_yaw, swing = np.zeros((frames, 2)), np.zeros((frames, 2))
-    contact = np.ones((frames, 2), bool)
-    phase = np.zeros(frames)
-    at = [home(0, 0), home(0, 1)]
-    now, side, steps = 0, int(generator.integers(2)), 0
-    while now < frames:
+    def length_at(now: int) -> int:
         # Someone about to set off already takes the steps of the speed to come.
-        soon = min(now + int(0.5 * fps), frames - 1)
+        soon = min(now + int(0.5 * fps), len(path) - 1)
         pace = cadence + cadence_slope * max(speed[now], speed[soon])
-        length = max(int(round(fps / pace)), 6)
-        target, heading = home(now + 1, side)
-        away = np.linalg.norm(target - at[side][0])
-        moving = speed[min(now + length, frames - 1)] > 0.12
-        turned = abs(wrap(np.array(heading - at[side][1])))
-        if not (moving or away > 0.06 or turned > 0.35):
-            other, other_heading = home(now + 1, 1 - side)
-            if (
-                np.linalg.norm(other - at[1 - side][0]) > 0.06
-                or abs(wrap(np.array(other_heading - at[1 - side][1]))) > 0.35
-            ):
-                side = 1 - side
-                continue
-            for foot in (0, 1):
-                toe[now, foot] = [at[foot][0][0], toe_height, at[foot][0][1]]
-                foot_yaw[now, foot] = at[foot][1]
-            phase[now] = np.pi * steps
-            now += 1
-            continue
-        air = max(int(round(length * (1.0 - double_support))), 4)
-        # The foot will carry the body from landing to its next lift-off; its home at
-        # the middle of that time is where it should land.
-        goal, goal_yaw = home(now + air + length // 2, side)
-        goal = goal + generator.normal(0.0, jitter, 2)
-        height = lift * float(np.exp(generator.normal(0.0, 0.08)))
-        start, start_yaw = at[side]
-        turn = float(wrap(np.array(goal_yaw - start_yaw)))
-        for i in range(length):
-            frame = now + i
-            if frame >= frames:
-                break
-            s = min((i + 1) / (air + 1), 1.0)
-            done = i >= air
-            e = smoothstep(np.array(s))
-            place = goal if done else start + e * (goal - start)
-            up = 0.0 if done else height * (np.sin(np.pi * s) ** 2)
-            toe[frame, side] = [place[0], toe_height + up, place[1]]
-            foot_yaw[frame, side] = start_yaw + turn * (1.0 if done else e)
-            contact[frame, side] = done
-            swing[frame, side] = 0.0 if done else s
-            stood = at[1 - side]
-            toe[frame, 1 - side] = [stood[0][0], toe_height, stood[0][1]]
-            foot_yaw[frame, 1 - side] = stood[1]
-            # Right swings first in even phases, so that arms know which leg leads.
-            phase[frame] = np.pi * (steps + (i + 1) / length)
-        at[side] = (goal, start_yaw + turn)
-        now += length
-        steps += 1
-        side = 1 - side
-    return Footsteps(toe=toe, yaw=foot_yaw, contact=contact, swing=swing, phase=phase)
+        return max(int(round(fps / pace)), 6)
+
+    aim = functools.partial(
+        _aim,
+        home,
+        double_support=double_support,
+        lift=lift,
+        jitter=jitter,
+        generator=generator,
+    )
+    side = int(generator.integers(2))
+    return _walk(home, length_at, aim, speed > 0.12, side, toe_height)

@@ -17,14 +17,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmotion.data.clips import Clips
 from jaxmotion.data.footsteps import plan_footsteps
-from jaxmotion.data.walker import (
-    GAITS,
-    TOE_AHEAD,
-    TOE_HEIGHT,
-    Gait,
-    solve_pose,
-    walker_skeleton,
-)
+from jaxmotion.data.gaits import GAITS, Gait
+from jaxmotion.data.walker import TOE_AHEAD, TOE_HEIGHT, solve_pose, walker_skeleton
 from jaxmotion.motion import rotation, spring
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.motion.trajectory import Command
@@ -73,18 +67,52 @@ def follow_commands(
     return jax.lax.scan(move, start, commands)[1]
 
 
+def _check_fps(fps: float) -> None:
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"fps is {fps}, expected a positive number")
+
+
+def _check_commands(commands: Command) -> None:
+    velocity, facing = np.asarray(commands.velocity), np.asarray(commands.facing)
+    shape = (len(velocity), 2)
+    if velocity.shape != shape or facing.shape != shape or len(velocity) < 2:
+        raise ValueError(
+            f"commands have velocity {velocity.shape} and facing {facing.shape}, "
+            "expected [frames, 2] both, at least 2 frames"
+        )
+    off = np.abs(np.linalg.norm(facing, axis=-1) - 1.0)
+    for field, bad, rule in (
+        ("velocity", ~np.isfinite(velocity).all(axis=-1), "finite numbers"),
+        ("facing", ~(off < 1e-3), "a unit vector"),
+    ):
+        if bad.any():
+            frame = int(bad.argmax())
+            found = getattr(commands, field)[frame]
+            raise ValueError(
+                f"commands: {field} of frame {frame} is {found}, expected {rule}"
+            )
+
+
 def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> Walk:
     """A walk in one gait that follows commands at any speed and turn.
 
     Args:
-      commands: Velocity and facing of each frame; labels are ignored.
-      gait: The manner. Speeds above its max_speed are not refused, but look rushed.
+      commands: Velocity and facing (unit) of each frame, at least two; labels are
+        ignored.
+      gait: The manner. Speeds above its max_speed look rushed; far above, legs are too
+        short for the steps.
       fps: Frames a second.
       seed: Of the small variations between steps.
 
     Returns:
       The motion, and which toes stand.
+
+    Raises:
+      ValueError: if a command is not finite or its facing not of length one (names the
+        frame), the rate is not positive, or the legs do not reach the steps.
     """
+    _check_fps(fps)
+    _check_commands(commands)
     generator = np.random.default_rng(seed)
     path, facing = follow_commands(commands, jnp.float32(fps), jnp.float32(0.27))
     path, facing = np.asarray(path, float), np.asarray(facing, float)
@@ -174,26 +202,25 @@ def make_clips(
       The clips, with labels "style".
 
     Raises:
-      ValueError: if minutes or clip_seconds is not positive.
+      ValueError: if minutes or fps is not positive, a clip has fewer than two frames,
+        or there is no gait.
     """
-    if minutes <= 0 or clip_seconds <= 0:
-        raise ValueError(
-            f"minutes {minutes} and clip_seconds {clip_seconds} must be positive"
-        )
+    _check_fps(fps)
     gaits = GAITS if gaits is None else gaits
+    frames = round(clip_seconds * fps) if np.isfinite(clip_seconds) else 0
+    if not (np.isfinite(minutes) and minutes > 0 and frames >= 2 and gaits):
+        raise ValueError(
+            f"minutes {minutes}, clip_seconds {clip_seconds} and {len(gaits)} gaits: "
+            "expected positive minutes, clips of two frames or more, and a gait"
+        )
     each = max(int(np.ceil(minutes * 60 / clip_seconds / len(gaits))), 1)
-    frames = round(clip_seconds * fps)
-    motions, styles, names = [], [], []
-    for style, (name, gait) in enumerate(gaits.items()):
-        for number in range(each):
-            own = np.random.default_rng([seed, style, number])
-            speed = gait.max_speed * own.uniform(0.7, 1.0)
-            commands = random_commands(own, frames=frames, fps=fps, max_speed=speed)
-            made = walk(commands, gait, fps=fps, seed=int(own.integers(2**31)))
-            motions.append(made.motion)
-            styles.append(style)
-            names.append(f"{name}_{number:03d}")
+    motions = [
+        _random_walk([seed, style, number], gait, frames=frames, fps=fps)
+        for style, gait in enumerate(gaits.values())
+        for number in range(each)
+    ]
     joined = jax.tree.map(lambda *x: jnp.concatenate(x), *motions)
+    styles = np.repeat(np.arange(len(gaits)), each)
     return Clips(
         root_position=joined.root_position,
         joint_rotation=joined.joint_rotation,
@@ -202,6 +229,14 @@ def make_clips(
         skeleton=walker_skeleton(),
         fps=fps,
         label_names=(("style", tuple(gaits)),),
-        clip_names=tuple(names),
+        clip_names=tuple(f"{name}_{i:03d}" for name in gaits for i in range(each)),
         source=SOURCE,
     )
+
+
+def _random_walk(seed: list[int], gait: Gait, *, frames: int, fps: float) -> Motion:
+    """One clip: random commands up to a random part of the gait's speed."""
+    own = np.random.default_rng(seed)
+    speed = gait.max_speed * own.uniform(0.7, 1.0)
+    commands = random_commands(own, frames=frames, fps=fps, max_speed=speed)
+    return walk(commands, gait, fps=fps, seed=int(own.integers(2**31))).motion

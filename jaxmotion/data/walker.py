@@ -5,12 +5,11 @@ global rotation of a leg bone with columns (lateral, -bone, forward) is found di
 from where hip, knee and ankle are.
 """
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.data.footsteps import Footsteps
+from jaxmotion.data.gaits import Gait
 from jaxmotion.motion.skeleton import Skeleton
 
 THIGH, SHANK = 0.43, 0.42
@@ -18,6 +17,10 @@ TOE_HEIGHT = 0.03
 TOE_AHEAD = 0.14
 _ANKLE_UP = 0.07
 _HIP_SIDE, _HIP_DOWN = 0.09, 0.05
+# Least distance from hip to ankle, metres: a folded knee.
+_SHORTEST = 0.15
+# Foot (left, right) and its thigh.
+_LEGS = ((0, 14), (1, 18))
 
 _BONES = [
     ("Hips", -1, (0.0, 0.0, 0.0)),
@@ -43,140 +46,6 @@ _BONES = [
     ("RightFoot", 19, (0.0, -SHANK, 0.0)),
     ("RightToeBase", 20, (0.0, -_ANKLE_UP, TOE_AHEAD)),
 ]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Gait:
-    """A manner of walking; angles in radians, lengths in metres.
-
-    Attributes:
-      max_speed: Metres a second.
-      cadence: Steps a second at no speed.
-      cadence_slope: More steps a second for each metre a second.
-      double_support: Part of a step with both feet down.
-      width: Between the feet.
-      lift: Of a swinging toe.
-      toe_out: Of each foot.
-      crouch: How much lower than upright the pelvis is.
-      lean: Of the trunk, forward.
-      head: Of the head, forward.
-      sway: Of the pelvis to the standing side.
-      bounce: Up and down, twice a stride.
-      twist: Of the pelvis with the leading leg; the chest goes against it.
-      arm_swing: Forward and back.
-      arm_forward: Of both upper arms.
-      arm_out: Of both upper arms from hanging.
-      elbow: Flexion.
-    """
-
-    max_speed: float = 1.6
-    cadence: float = 1.2
-    cadence_slope: float = 0.6
-    double_support: float = 0.2
-    width: float = 0.17
-    lift: float = 0.07
-    toe_out: float = 0.12
-    crouch: float = 0.0
-    lean: float = 0.04
-    head: float = 0.0
-    sway: float = 0.02
-    bounce: float = 0.0
-    twist: float = 0.1
-    arm_swing: float = 0.4
-    arm_forward: float = 0.0
-    arm_out: float = 0.12
-    elbow: float = 0.3
-
-
-GAITS = {
-    "neutral": Gait(),
-    "elderly": Gait(
-        max_speed=0.8,
-        cadence=1.5,
-        cadence_slope=0.5,
-        double_support=0.35,
-        lift=0.03,
-        crouch=0.06,
-        lean=0.5,
-        head=-0.2,
-        arm_swing=0.12,
-        arm_forward=0.35,
-        elbow=0.9,
-        twist=0.04,
-    ),
-    "proud": Gait(
-        lean=-0.12,
-        head=-0.08,
-        arm_swing=0.65,
-        arm_out=0.3,
-        elbow=0.15,
-        lift=0.09,
-        cadence=1.15,
-        twist=0.18,
-    ),
-    "sneaky": Gait(
-        max_speed=1.0,
-        cadence=0.9,
-        cadence_slope=0.5,
-        crouch=0.2,
-        lean=0.55,
-        head=-0.4,
-        lift=0.12,
-        arm_swing=0.15,
-        arm_forward=0.7,
-        elbow=1.5,
-        width=0.22,
-    ),
-    "march": Gait(
-        cadence=1.5,
-        cadence_slope=0.35,
-        lift=0.3,
-        arm_swing=0.9,
-        elbow=0.1,
-        lean=-0.02,
-        arm_out=0.06,
-        sway=0.01,
-    ),
-    "tired": Gait(
-        max_speed=1.0,
-        cadence=0.95,
-        cadence_slope=0.5,
-        double_support=0.3,
-        lift=0.025,
-        crouch=0.04,
-        lean=0.28,
-        head=0.5,
-        arm_swing=0.2,
-        arm_out=0.05,
-        elbow=0.1,
-        sway=0.05,
-    ),
-    "zombie": Gait(
-        max_speed=1.0,
-        cadence=0.9,
-        cadence_slope=0.6,
-        lift=0.04,
-        lean=0.1,
-        head=0.25,
-        sway=0.08,
-        arm_swing=0.05,
-        arm_forward=1.45,
-        arm_out=0.05,
-        elbow=0.1,
-        width=0.26,
-    ),
-    "bouncy": Gait(
-        cadence=1.4,
-        bounce=0.035,
-        lift=0.12,
-        arm_swing=0.55,
-        elbow=1.2,
-        arm_out=0.25,
-        twist=0.2,
-        lean=0.0,
-        crouch=0.05,
-    ),
-}
 
 
 def walker_skeleton() -> Skeleton:
@@ -233,7 +102,7 @@ def _leg(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Global rotations of thigh and shank: two-bone IK, knee forward."""
     line = ankle - hip
-    far = np.clip(np.linalg.norm(line, axis=-1), 0.15, THIGH + SHANK - 1e-4)
+    far = np.clip(np.linalg.norm(line, axis=-1), _SHORTEST, THIGH + SHANK - 1e-4)
     line = line / np.linalg.norm(line, axis=-1, keepdims=True)
     bend = forward - np.sum(forward * line, -1, keepdims=True) * line
     bend = bend / np.linalg.norm(bend, axis=-1, keepdims=True)
@@ -296,8 +165,10 @@ def solve_pose(
 
     Returns:
       [F, 3] metres, and [F, 22, 3, 3] parent-local rotation matrices.
+
+    Raises:
+      ValueError: if the legs do not reach the steps; names the first such frame.
     """
-    frames = len(path)
     side = _smoothed(
         steps.contact[:, 0].astype(float) - steps.contact[:, 1], 0.08 * fps
     )
@@ -310,23 +181,46 @@ def solve_pose(
     facing = np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
     ahead = np.sum((steps.toe[:, 0, ::2] - steps.toe[:, 1, ::2]) * facing, axis=-1)
     lead = _smoothed(np.clip(ahead / 0.6, -1.0, 1.0), 0.05 * fps)
-    local = np.tile(np.eye(3), (frames, len(_BONES), 1, 1))
-    pelvis = _axis(yaw - gait.twist * lead, "y") @ _axis(0.2 * gait.lean + 0 * yaw, "x")
-    local[:, 0] = pelvis
+    local = np.tile(np.eye(3), (len(path), len(_BONES), 1, 1))
+    _pose_trunk(local, yaw, lead, gait)
+    _pose_arms(local, lead, gait)
+    root = _lowered(root, local[:, 0], steps, fps)
+    _pose_legs(local, root, steps, fps)
+    return root, local
+
+
+def _pose_trunk(
+    local: np.ndarray, yaw: np.ndarray, lead: np.ndarray, gait: Gait
+) -> None:
+    """Sets pelvis, spine, neck and head; the chest turns against the pelvis."""
+    frames = len(yaw)
+    lean = _axis(0.2 * gait.lean + 0 * yaw, "x")
+    local[:, 0] = _axis(yaw - gait.twist * lead, "y") @ lean
     for joint in (1, 2, 3):
         local[:, joint] = _axis(gait.twist * 0.7 * lead, "y") @ _axis(
             np.full(frames, gait.lean * 0.27), "x"
         )
+    # The head looks ahead whatever the lean, but for the gait's own nod.
     local[:, 4] = _axis(np.full(frames, 0.4 * gait.head - 0.3 * gait.lean), "x")
     local[:, 5] = _axis(np.full(frames, 0.6 * gait.head - 0.3 * gait.lean), "x")
+
+
+def _pose_arms(local: np.ndarray, lead: np.ndarray, gait: Gait) -> None:
+    """Sets upper arms and elbows; each arm swings with the other side's leg."""
     for shoulder, sign in ((6, 1.0), (10, -1.0)):
         swing = gait.arm_forward - sign * gait.arm_swing * lead
-        hang = np.full(frames, -sign * (np.pi / 2 - gait.arm_out))
+        hang = np.full(len(lead), -sign * (np.pi / 2 - gait.arm_out))
         local[:, shoulder + 1] = _axis(-swing, "x") @ _axis(hang, "z")
         flex = gait.elbow + 0.25 * gait.arm_swing * np.maximum(-sign * lead, 0.0)
         local[:, shoulder + 2] = _axis(-sign * flex, "y")
-    root = _lowered(root, pelvis, steps, fps)
-    for foot, thigh in ((0, 14), (1, 18)):
+
+
+def _pose_legs(
+    local: np.ndarray, root: np.ndarray, steps: Footsteps, fps: float
+) -> None:
+    """Sets thigh, shank, foot and toes so that each toe is where its step is."""
+    pelvis = local[:, 0]
+    for foot, thigh in _LEGS:
         hip = root + pelvis @ np.array(_BONES[thigh][2])
         pitch, turn, ankle = _foot(steps, foot, hip, fps)
         forward = _axis(steps.yaw[:, foot], "y")[..., 2] + pelvis[..., 2]
@@ -336,7 +230,6 @@ def solve_pose(
         local[:, thigh + 2] = np.swapaxes(lower, -1, -2) @ turn
         # The toes stay level while the heel rises.
         local[:, thigh + 3] = _axis(-pitch, "x")
-    return root, local
 
 
 def _foot(
@@ -350,27 +243,42 @@ def _foot(
     return pitch, turn, steps.toe[:, foot] - turn @ np.array(_BONES[17][2])
 
 
+def _leg_lengths(
+    root: np.ndarray, pelvis: np.ndarray, steps: Footsteps, fps: float
+) -> np.ndarray:
+    """Distance from hip to ankle that each leg must bridge, [F, 2] metres."""
+    far = []
+    for foot, thigh in _LEGS:
+        hip = root + pelvis @ np.array(_BONES[thigh][2])
+        far.append(np.linalg.norm(_foot(steps, foot, hip, fps)[2] - hip, axis=-1))
+    return np.stack(far, axis=-1)
+
+
 def _lowered(
     root: np.ndarray, pelvis: np.ndarray, steps: Footsteps, fps: float
 ) -> np.ndarray:
     """The root, lowered smoothly where a leg would not reach its foot."""
     root = root.copy()
     half = max(int(0.2 * fps), 1)
-    for _ in range(8):
-        short = np.zeros(len(root))
-        for foot, thigh in ((0, 14), (1, 18)):
-            hip = root + pelvis @ np.array(_BONES[thigh][2])
-            far = np.linalg.norm(_foot(steps, foot, hip, fps)[2] - hip, axis=-1)
-            short = np.maximum(short, far - (THIGH + SHANK - 2e-4))
+    far = first = _leg_lengths(root, pelvis, steps, fps)
+    for _ in range(24):
+        short = np.maximum(far.max(axis=1) - (THIGH + SHANK - 2e-4), 0.0)
         if short.max() <= 0:
-            return root
+            break
         padded = np.pad(short, half, mode="edge")
         worst = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).max(1)
         root[:, 1] -= 1.5 * _smoothed(worst, 0.08 * fps)
-    raise ValueError(
-        f"legs {short.max():.3f} m too short for the steps at frame {short.argmax()}: "
-        "command a lower speed"
-    )
+        far = _leg_lengths(root, pelvis, steps, fps)
+    # A knee does not fold beyond _SHORTEST: then the toe would leave its place.
+    if far.max() > THIGH + SHANK - 2e-4 or far.min() < _SHORTEST:
+        frame = int(first.max(axis=1).argmax())
+        raise ValueError(
+            f"steps too long for the legs, most of all at frame {frame} "
+            f"({frame / fps:.2f} s): hip and ankle {first[frame].max():.3f} m apart, a "
+            f"leg is {THIGH + SHANK:.2f} m, and no crouch reaches; command a lower "
+            "speed or slower turns"
+        )
+    return root
 
 
 def _swing_pitch(swing: np.ndarray) -> np.ndarray:
