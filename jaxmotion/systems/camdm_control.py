@@ -152,7 +152,7 @@ def init_state(
     ahead = jnp.arange(1, config.future + 1, dtype=position.dtype)[:, None]
     level = step * jnp.array([1.0, 0.0, 1.0])
     plan = skeleton.Motion(
-        root_position=position[-1] + ahead * level,
+        root_position=position[-1:] + ahead * level[None],
         joint_rotation=jnp.repeat(past.joint_rotation[-1:], config.future, axis=0),
         fps=past.fps,
     )
@@ -242,7 +242,7 @@ def wanted_trajectory(
     if control.follow > 0:
         ahead = jnp.arange(1, config.future + 1) / config.fps
         returned = 1.0 - 0.5 ** (ahead / control.follow)
-        pull = returned[:, None] * (state.anchor - here.origin)
+        pull = returned[:, None] * (state.anchor - here.origin)[None]
         desired = dataclasses.replace(desired, position=desired.position + pull)
     if not control.extend:
         return desired
@@ -281,8 +281,13 @@ def controller(
 
     Returns:
       A controller whose frames are `Frame`s. Its second planner is the guided one.
+
+    Raises:
+      ValueError: if `control.apply` is not in 1..`config.future`.
     """
     control = Control() if control is None else control
+    if not 1 <= control.apply <= config.future:
+        raise ValueError(f"apply is {control.apply}, expected 1..{config.future}")
     sample = camdm.planner(params, config=config, table=table)
 
     def urgency(state: CharacterState, command: trajectory.Command) -> Array:
