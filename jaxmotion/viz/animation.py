@@ -1,14 +1,22 @@
 """Animated GIF of a stick figure with the commanded and the walked path."""
 
+import dataclasses
+import functools
 import io
+import textwrap
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxmotion.viz import figure as drawing
+
+_PATH_COLORS = (drawing.COMMANDED, drawing.WALKED)
 
 
 def _grid(centre: np.ndarray, size: float) -> np.ndarray:
@@ -21,32 +29,106 @@ def _grid(centre: np.ndarray, size: float) -> np.ndarray:
     return np.array(along_z + along_x, float)
 
 
-def _draw(axes, view, positions, frame, parents, colors, paths, contacts, legend):
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Scene:
+    """What is drawn; bones and paths are in world coordinates."""
+
+    view: Callable[[np.ndarray], np.ndarray]
+    positions: np.ndarray
+    parents: list[int]
+    colors: list[str]
+    paths: list[tuple[np.ndarray, str, str]]
+    contacts: tuple[tuple[int, ...], np.ndarray] | None
+
+
+def _draw(axes: Axes, scene: _Scene, frame: int) -> None:
     """One frame; the camera follows the root on the ground."""
-    pose = positions[frame]
+    view, pose = scene.view, scene.positions[frame]
     centre = pose[0, [0, 2]]
     axes.clear()
     axes.set_axis_off()
     grid = view(_grid(centre, 3.0))
     axes.add_collection(LineCollection(grid, colors="#dddddd", linewidths=0.8))
-    for line, color, label in paths:
+    for line, color, label in scene.paths:
         axes.plot(*view(line).T, color=color, lw=0.8, alpha=0.35)
         axes.plot(*view(line[: frame + 1]).T, color=color, lw=2, label=label)
-    bones = np.stack(
-        [view(pose[list(parents[1:])]), view(pose[1:])],
-        axis=1,
-    )
+    bones = np.stack([view(pose[scene.parents]), view(pose[1:])], axis=1)
     axes.add_collection(
-        LineCollection(bones, colors=colors[1:], linewidths=2.5, capstyle="round")
+        LineCollection(bones, colors=scene.colors, linewidths=2.5, capstyle="round")
     )
-    if contacts is not None:
-        feet, down = contacts
+    if scene.contacts is not None:
+        feet, down = scene.contacts
         axes.scatter(*view(pose[list(feet)][down[frame]]).T, color="#2ca02c", s=25)
     middle = view(np.array([centre[0], 0.85, centre[1]]))
     axes.set_xlim(middle[0] - 1.5, middle[0] + 1.5)
     axes.set_ylim(middle[1] - 1.5, middle[1] + 1.5)
-    if legend:
+    if scene.paths:
         axes.legend(loc="lower left", fontsize=7, framealpha=0.9)
+
+
+def _picture(title: str, size: int) -> tuple[Figure, Axes]:
+    """A square figure whose title is wrapped, and shrunk if that is not enough."""
+    picture = Figure(figsize=(size / 100, size / 100), dpi=100)
+    FigureCanvasAgg(picture)
+    text = picture.text(
+        0.5,
+        0.99,
+        textwrap.fill(title, max(size // 6, 1)),
+        fontsize=8,
+        ha="center",
+        va="top",
+        parse_math=False,
+    )
+    box = text.get_window_extent()
+    shrink = min(1.0, 0.96 * size / max(box.width, 1), 0.25 * size / max(box.height, 1))
+    text.set_fontsize(8 * shrink)
+    top = text.get_window_extent().y0 / size if title else 1.0
+    return picture, picture.add_axes((0, 0, 1, top - 0.01))
+
+
+def _draw_all(scene: _Scene, frames: range, title: str, size: int) -> list[Image.Image]:
+    """Pictures of 64 colours."""
+    picture, axes = _picture(title, size)
+    images = []
+    for frame in frames:
+        _draw(axes, scene, frame)
+        buffer = io.BytesIO()
+        picture.savefig(buffer, format="rgba")
+        whole = picture.canvas.get_width_height()
+        image = Image.frombytes("RGBA", whole, buffer.getvalue())
+        images.append(image.convert("RGB").quantize(64))
+    return images
+
+
+def _lines(
+    ground: dict[str, np.ndarray | None],
+) -> list[tuple[np.ndarray, str, str]]:
+    """Paths in the world with colour and label, of those that are given."""
+    return [
+        (drawing.on_ground(line), color, name)
+        for (name, line), color in zip(ground.items(), _PATH_COLORS, strict=True)
+        if line is not None
+    ]
+
+
+def _durations(number: int, seconds: float) -> list[int]:
+    """Milliseconds of each picture; a GIF counts hundredths, so these must vary."""
+    times = np.round(100 * seconds * np.arange(number + 1)).astype(int)
+    return (10 * np.maximum(np.diff(times), 1)).tolist()
+
+
+def _contacts(
+    contact: np.ndarray | None, feet: tuple[int, ...] | None, frames: int
+) -> tuple[tuple[int, ...], np.ndarray] | None:
+    if contact is None:
+        return None
+    expected = (frames, len(feet or ()))
+    if not feet or np.shape(contact) != expected:
+        raise ValueError(
+            f"contact is {np.shape(contact)} of feet {feet}, expected feet and "
+            "[frames, feet]"
+        )
+    return feet, np.asarray(contact, bool)
 
 
 def save_gif(
@@ -87,43 +169,28 @@ def save_gif(
       size: Pixels of a side.
 
     Raises:
-      ValueError: if positions are not [F, J, 3] with as many joints as parents.
+      ValueError: if an array has a wrong shape or is not finite (names it), or `every`
+        is not positive.
       OSError: if the file cannot be written.
     """
-    positions = np.asarray(positions, float)
-    if positions.ndim != 3 or positions.shape[1:] != (len(parents), 3):
+    ground = {"commanded": commanded, "walked": walked}
+    positions = drawing.check_motion(positions, parents, fps=fps, paths=ground)
+    marks = _contacts(contact, feet, len(positions))
+    if every < 1 or size < 64:
         raise ValueError(
-            f"positions are {positions.shape}, expected [frames, {len(parents)}, 3]"
+            f"every {every}, size {size}: expected every >= 1 and size >= 64 pixels"
         )
     path = drawing.check_writable(path)
-    picture = Figure(figsize=(size / 100, size / 100), dpi=100)
-    axes = picture.add_axes((0, 0, 1, 0.94))
-    picture.suptitle(title, fontsize=8)
-    lines = [
-        (drawing._ground(np.asarray(line, float)), color, label)
-        for line, color, label in (
-            (commanded, drawing.COMMANDED, "commanded"),
-            (walked, drawing.WALKED, "walked"),
-        )
-        if line is not None
-    ]
-    colors = drawing.bone_colors(names, len(parents))
-    marks = None if contact is None else (feet, np.asarray(contact, bool))
-
-    def view(points: np.ndarray) -> np.ndarray:
-        return drawing.project(points, azimuth=azimuth, elevation=elevation)
-
-    images = []
-    for frame in range(0, len(positions), every):
-        _draw(axes, view, positions, frame, parents, colors, lines, marks, bool(lines))
-        buffer = io.BytesIO()
-        picture.savefig(buffer, format="rgba")
-        image = Image.frombytes("RGBA", (size, size), buffer.getvalue())
-        images.append(image.convert("RGB").quantize(64))
+    scene = _Scene(
+        view=functools.partial(drawing.project, azimuth=azimuth, elevation=elevation),
+        positions=positions,
+        parents=list(parents[1:]),
+        colors=drawing.bone_colors(names, len(parents))[1:],
+        paths=_lines(ground),
+        contacts=marks,
+    )
+    images = _draw_all(scene, range(0, len(positions), every), title, size)
+    times = _durations(len(images), every / fps)
     images[0].save(
-        path,
-        save_all=True,
-        append_images=images[1:],
-        duration=round(1000 * every / fps),
-        loop=0,
+        path, save_all=True, append_images=images[1:], duration=times, loop=0
     )

@@ -1,16 +1,13 @@
-"""Stick figures on a ground grid, drawn by matplotlib without a display.
+"""What pictures share: the view, colours, checks; and plots of paths and sweeps.
 
-World axes are y up; matplotlib's are z up, so a point (x, y, z) is drawn at (x, -z, y)
-in a right-handed view: what is on the character's left stays on its left.
+Figures are made without pyplot, so that neither a display is needed nor the backend of
+a notebook changed.
 """
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
-
-matplotlib.use("Agg")
 
 LEFT, RIGHT, MIDDLE = "#1f77b4", "#d62728", "#333333"
 COMMANDED, WALKED = "#2ca02c", "#ff7f0e"
@@ -39,6 +36,51 @@ def check_writable(path: str | Path) -> Path:
     except OSError as error:
         raise OSError(f"{path}: cannot write here: {error}") from error
     return path
+
+
+def check_motion(
+    positions: np.ndarray,
+    parents: tuple[int, ...],
+    *,
+    fps: float,
+    paths: dict[str, np.ndarray | None],
+) -> np.ndarray:
+    """Raises unless a motion can be drawn.
+
+    Args:
+      positions: [F, J, 3] world positions, metres.
+      parents: Parent of each joint.
+      fps: Frames a second.
+      paths: Ground paths [F, 2] by name; None for one that is not drawn.
+
+    Returns:
+      The positions as floats.
+
+    Raises:
+      ValueError: names what has a wrong shape or value, and what was expected.
+    """
+    positions = np.asarray(positions, float)
+    if positions.ndim != 3 or positions.shape[1:] != (len(parents), 3):
+        raise ValueError(
+            f"positions are {positions.shape}, expected [frames, {len(parents)}, 3]"
+        )
+    if not (np.isfinite(fps) and fps > 0 and len(positions)):
+        raise ValueError(
+            f"{len(positions)} frames at {fps} fps, expected at least one frame and a "
+            "positive rate"
+        )
+    arrays = {"positions": positions} | {
+        k: v for k, v in paths.items() if v is not None
+    }
+    for name, found in arrays.items():
+        shape, expected = np.shape(found), (len(positions), 2)
+        if name != "positions" and shape != expected:
+            raise ValueError(f"{name} path is {shape}, expected {expected}")
+        finite = np.isfinite(np.asarray(found, float)).reshape(len(positions), -1)
+        if not finite.all():
+            frame = int((~finite.all(axis=1)).argmax())
+            raise ValueError(f"{name}: frame {frame} is not finite")
+    return positions
 
 
 def bone_colors(names: tuple[str, ...] | None, number: int) -> list[str]:
@@ -84,9 +126,16 @@ def project(points: np.ndarray, *, azimuth: float, elevation: float) -> np.ndarr
     return np.stack([right, y * np.cos(e) - depth * np.sin(e)], axis=-1)
 
 
-def _ground(path: np.ndarray | None) -> np.ndarray | None:
-    if path is None:
-        return None
+def on_ground(path: np.ndarray) -> np.ndarray:
+    """World points of a ground path.
+
+    Args:
+      path: [F, 2] (x, z) metres.
+
+    Returns:
+      [F, 3] metres, y = 0.
+    """
+    path = np.asarray(path, float)
     return np.stack([path[:, 0], np.zeros(len(path)), path[:, 1]], axis=-1)
 
 

@@ -5,6 +5,7 @@ Drag to orbit, wheel to zoom, slider to scrub, space to pause.
 
 import html as escaping
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,8 @@ h1 { font-size: 14px; margin: 8px 12px 0; font-weight: 600; }
 <script>
 const data = __DATA__;
 const canvas = document.getElementById("view"), pen = canvas.getContext("2d");
-const slider = document.getElementById("time"), clock = document.getElementById("clock");
+const slider = document.getElementById("time");
+const clock = document.getElementById("clock");
 const button = document.getElementById("play");
 const frames = data.positions.length;
 slider.max = frames - 1;
@@ -54,7 +56,8 @@ function line(points, centre, color, width) {
 }
 function draw() {
   const ratio = window.devicePixelRatio || 1;
-  canvas.width = canvas.clientWidth * ratio; canvas.height = canvas.clientHeight * ratio;
+  canvas.width = canvas.clientWidth * ratio;
+  canvas.height = canvas.clientHeight * ratio;
   const now = Math.floor(frame), pose = data.positions[now], c = pose[0];
   pen.clearRect(0, 0, canvas.width, canvas.height); pen.lineCap = "round";
   const x0 = Math.floor(c[0]) - 5, z0 = Math.floor(c[2]) - 5;
@@ -79,7 +82,9 @@ function loop(time) {
   if (playing) frame = (frame + (time - last) / 1000 * data.fps) % frames;
   last = time; draw(); requestAnimationFrame(loop);
 }
-function toggle() { playing = !playing; button.textContent = playing ? "pause" : "play"; }
+function toggle() {
+  playing = !playing; button.textContent = playing ? "pause" : "play";
+}
 button.onclick = toggle;
 slider.oninput = () => { frame = +slider.value; if (playing) toggle(); };
 window.onkeydown = e => {
@@ -91,7 +96,8 @@ canvas.onpointermove = e => {
   elevation = Math.min(1.5, Math.max(0, elevation + e.movementY * 0.01));
 };
 canvas.onwheel = e => {
-  e.preventDefault(); zoom = Math.min(6, Math.max(0.2, zoom * Math.exp(-e.deltaY / 600)));
+  e.preventDefault();
+  zoom = Math.min(6, Math.max(0.2, zoom * Math.exp(-e.deltaY / 600)));
 };
 requestAnimationFrame(loop);
 </script></body></html>
@@ -122,17 +128,12 @@ def save_html(
       title: Shown above; escaped.
 
     Raises:
-      ValueError: if positions are not [F, J, 3] with as many joints as parents, or not
-        finite.
+      ValueError: if an array has a wrong shape or is not finite; names it.
       OSError: if the file cannot be written.
     """
-    positions = np.asarray(positions, float)
-    if positions.ndim != 3 or positions.shape[1:] != (len(parents), 3):
-        raise ValueError(
-            f"positions are {positions.shape}, expected [frames, {len(parents)}, 3]"
-        )
-    if not np.isfinite(positions).all():
-        raise ValueError("positions are not finite")
+    positions = drawing.check_motion(
+        positions, parents, fps=fps, paths={"commanded": commanded, "walked": walked}
+    )
     path = drawing.check_writable(path)
 
     def rounded(x: np.ndarray | None) -> list | None:
@@ -147,6 +148,8 @@ def save_html(
         "walked": rounded(walked),
     }
     # "</" would end the script element wherever it stands.
-    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\\\/")
-    page = _PAGE.replace("__TITLE__", escaping.escape(title)).replace("__DATA__", text)
+    text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
+    filled = {"__TITLE__": escaping.escape(title), "__DATA__": text}
+    # In one pass: a title may contain the name of the other slot.
+    page = re.sub("__TITLE__|__DATA__", lambda slot: filled[slot.group()], _PAGE)
     path.write_text(page, encoding="utf-8")

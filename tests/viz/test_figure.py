@@ -1,0 +1,98 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxmotion.viz import figure
+from tests.viz import samples
+
+
+def test_left_is_blue_and_right_is_red():
+    names = ("Hips", "LeftArm", "r_foot", "RightLeg", "hand_l", "Head")
+    found = figure.bone_colors(names, 6)
+    left, right, middle = figure.LEFT, figure.RIGHT, figure.MIDDLE
+    assert found == [middle, left, middle, right, left, middle] or found == [
+        middle,
+        left,
+        right,
+        right,
+        left,
+        middle,
+    ]
+    assert figure.bone_colors(None, 3) == [middle] * 3
+
+
+def test_the_view_is_an_orthographic_projection():
+    # A camera's own axes: right, up and towards the viewer are orthonormal.
+    for azimuth, elevation in [(0.0, 0.0), (35.0, 20.0), (200.0, 70.0)]:
+        axes = figure.project(np.eye(3), azimuth=azimuth, elevation=elevation)
+        np.testing.assert_allclose(axes.T @ axes, np.eye(2), atol=1e-12)
+    # Straight ahead: +x to the right, +y up; from above what is nearer is lower.
+    flat = figure.project(np.eye(3), azimuth=0.0, elevation=0.0)
+    np.testing.assert_allclose(flat, [[1, 0], [0, 1], [0, 0]], atol=1e-12)
+    above = figure.project(np.eye(3), azimuth=0.0, elevation=90.0)
+    np.testing.assert_allclose(above, [[1, 0], [0, 0], [0, -1]], atol=1e-12)
+    # A camera turned by 90 degrees about +y stands on the +x axis.
+    side = figure.project(np.eye(3), azimuth=90.0, elevation=0.0)
+    np.testing.assert_allclose(side, [[0, 0], [0, 1], [-1, 0]], atol=1e-12)
+
+
+def test_a_character_that_faces_the_viewer_has_its_left_on_the_right():
+    left = np.array([0.3, 1.0, 0.0])  # facing +z, y up: left is +x
+    assert figure.project(left, azimuth=0.0, elevation=10.0)[0] > 0
+
+
+def test_a_file_below_a_file_cannot_be_written(tmp_path):
+    (tmp_path / "plain").write_text("kept")
+    with pytest.raises(OSError, match=r"plain/deep/a\.gif: cannot write here"):
+        figure.check_writable(tmp_path / "plain" / "deep" / "a.gif")
+    with pytest.raises(OSError, match=str(tmp_path)):
+        figure.check_writable(tmp_path)
+    assert (tmp_path / "plain").read_text() == "kept"
+
+
+def test_checking_leaves_no_file_and_keeps_an_old_one(tmp_path):
+    figure.check_writable(tmp_path / "new" / "a.gif")
+    assert list((tmp_path / "new").iterdir()) == []
+    old = tmp_path / "old.txt"
+    old.write_text("kept")
+    assert figure.check_writable(old) == old
+    assert old.read_text() == "kept"
+
+
+def test_plots_are_pictures_that_change_with_their_data(tmp_path):
+    _, path = samples.circle()
+    figure.plot_paths(tmp_path / "a.png", path, path + 0.1, title="paths")
+    figure.plot_paths(tmp_path / "b.png", path, path * [1, 0.5], title="paths")
+    a, b = (np.asarray(Image.open(tmp_path / f"{n}.png").convert("L")) for n in "ab")
+    assert a.shape == b.shape == (500, 500)
+    assert np.mean(a != b) > 0.001
+    x = np.array([2.0, 4.0, 8.0])
+    lines = {"p50": (x, x, 2 * x), "p95": (x, x**2, None)}
+    for log in (True, False):
+        out = tmp_path / f"sweep{log}.png"
+        figure.plot_sweep(out, lines, xlabel="steps", ylabel="ms", log=log)
+        assert np.asarray(Image.open(out).convert("L")).std() > 5
+
+
+def test_plots_check_their_file_first(tmp_path):
+    (tmp_path / "plain").write_text("")
+    bad = tmp_path / "plain" / "a.png"
+    with pytest.raises(OSError, match="plain"):
+        figure.plot_paths(bad, np.zeros((2, 2)), np.zeros((2, 2)))
+    with pytest.raises(OSError, match="plain"):
+        figure.plot_sweep(bad, {}, xlabel="", ylabel="")
+
+
+def test_a_notebook_keeps_its_backend():
+    code = (
+        "import matplotlib; matplotlib.use('svg');"
+        "import jaxmotion.viz.animation, jaxmotion.viz.figure, jaxmotion.viz.html;"
+        "print(matplotlib.get_backend())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "svg"
