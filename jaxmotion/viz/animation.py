@@ -79,9 +79,13 @@ def _picture(title: str, size: int) -> tuple[Figure, Axes]:
         va="top",
         parse_math=False,
     )
-    box = text.get_window_extent()
-    shrink = min(1.0, 0.96 * size / max(box.width, 1), 0.25 * size / max(box.height, 1))
-    text.set_fontsize(8 * shrink)
+    # Widths of small letters are whole pixels: one shrinking may not be enough.
+    for _ in range(8):
+        box = text.get_window_extent()
+        room = min(0.96 * size / max(box.width, 1), 0.25 * size / max(box.height, 1))
+        if room >= 1.0:
+            break
+        text.set_fontsize(0.98 * room * text.get_fontsize())
     top = text.get_window_extent().y0 / size if title else 1.0
     return picture, picture.add_axes((0, 0, 1, top - 0.01))
 
