@@ -100,7 +100,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
     try:
         bones = value["skeleton"]
         check_parents(tuple(bones["parents"]))
-        return Model(
+        model = Model(
             config=camdm.Config(**value["config"]),
             bones=Skeleton(
                 offsets=jnp.asarray(bones["offsets"], jnp.float32),
@@ -113,6 +113,22 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         )
     except (KeyError, TypeError) as error:
         raise ValueError(f"{where}: field {error} is missing or wrong") from error
+    except ValueError as error:
+        raise ValueError(f"{where}: field 'skeleton' is wrong: {error}") from error
+    config = model.config
+    for name, found, expected in (
+        ("skeleton", model.bones.num_joints, config.num_joints),
+        ("labels", len(model.labels), config.num_labels),
+    ):
+        if found != expected:
+            raise ValueError(
+                f"{where}: field {name!r} has {found} entries, the config {expected}"
+            )
+    return model
+
+
+def _shapes(model: Model) -> Params:
+    return jax.eval_shape(lambda: camdm.init(jax.random.key(0), model.config))
 
 
 def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
@@ -131,11 +147,13 @@ def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
     """
     path = Path(folder)
     if path.is_file():
-        params, value = checkpoint.import_params(path)
-        return from_json(value, where=str(path)), params, value
+        _, value = checkpoint.import_params(path)
+        model = from_json(value, where=str(path))
+        params, _ = checkpoint.import_params(path, like=_shapes(model))
+        return model, params, value
     steps = path / "checkpoints"
     value = checkpoint.load_config(steps)
     model = from_json(value, where=str(steps))
-    shapes = jax.eval_shape(lambda: camdm.init(jax.random.key(0), model.config))
+    shapes = _shapes(model)
     found = checkpoint.restore_part(steps, {"ema_params": shapes})
     return model, found["ema_params"], value

@@ -1,0 +1,92 @@
+"""The recogniser sees limbs and nothing else, and learns to tell styles."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.learning import recognition
+from jaxmotion.motion import features, skeleton, trajectory
+from tests import tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+CONFIG = recognition.RecognizerConfig(num_classes=2, num_joints=5, frames=12)
+
+
+def test_the_input_against_a_loop(bones):
+    motion = tiny.walk(20, turn=1.0, start=0.5)
+    found = recognition.recognizer_input(bones, motion)
+    positions = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
+    for frame in range(20):
+        root = positions[frame, 0]
+        across = positions[frame, 1] - positions[frame, 3]
+        ahead = np.cross(across, [0, 1, 0])
+        ahead /= np.linalg.norm(ahead)
+        left = np.cross([0, 1, 0], ahead)
+        expected = [
+            [(p - root) @ left, (p - root)[1], (p - root) @ ahead]
+            for p in positions[frame]
+        ]
+        expected[0] = [0, root[1], 0]
+        np.testing.assert_allclose(
+            np.asarray(found[frame]).reshape(5, 3), expected, atol=1e-5
+        )
+
+
+def test_neither_place_nor_facing_is_seen(bones):
+    motion = tiny.walk(20, turn=1.0)
+    frame = trajectory.PlanarFrame(
+        origin=jnp.array([3.0, -5.0]), facing=jnp.array([0.6, -0.8])
+    )
+    np.testing.assert_allclose(
+        recognition.recognizer_input(bones, features.from_frame(motion, frame)),
+        recognition.recognizer_input(bones, motion),
+        atol=1e-5,
+    )
+
+
+def test_the_loss_is_the_cross_entropy():
+    params = tiny.random_params(recognition.init_recognizer, CONFIG)
+    x = jax.random.normal(jax.random.key(0), (6, 12, 15))
+    labels = jnp.array([0, 1, 1, 0, 1, 0])
+    loss, info = jax.jit(
+        lambda params, key: recognition.recognizer_loss(
+            params, key, (x, labels), config=CONFIG
+        )
+    )(params, jax.random.key(1))
+    _, logits = recognition.Recognizer(2).apply(
+        {"params": params}, x, train=True, rngs={"dropout": jax.random.key(1)}
+    )
+    logits = np.asarray(logits, np.float64)
+    chance = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)
+    expected = -np.mean(np.log(chance[np.arange(6), labels]))
+    np.testing.assert_allclose(loss, expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        info["accuracy"], np.mean(logits.argmax(-1) == labels), rtol=1e-6
+    )
+
+
+@pytest.fixture(scope="module")
+def windows_of_styles(bones):
+    """Windows of slow and fast walkers; every second is held out."""
+    x, labels = [], []
+    for label, speed in enumerate((0.7, 1.4)):
+        for start in range(8):
+            motion = tiny.walk(60, speed=speed, start=float(start))
+            rows = recognition.recognizer_input(bones, motion)
+            x += [rows[i : i + 12] for i in range(start, 48, 6)]
+            labels += [label] * len(range(start, 48, 6))
+    return jnp.stack(x), jnp.asarray(labels, jnp.int32)
+
+
+def test_it_learns_to_tell_two_styles(windows_of_styles):
+    x, labels = windows_of_styles
+    params, info = recognition.train_recognizer(
+        jax.random.key(0), x[::2], labels[::2], config=CONFIG, num_steps=50, batch=16
+    )
+    assert info["loss"].shape == (50,)
+    assert info["loss"][-10:].mean() < info["loss"][:3].mean()
+    found, logits = recognition.recognize(params, x[1::2], config=CONFIG)
+    assert found.shape == (x[1::2].shape[0], 512)
+    assert np.mean(logits.argmax(-1) == labels[1::2]) > 0.9
