@@ -8,40 +8,28 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
-import functools
 import json
+import sys
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
-import jax.numpy as jnp
 import tyro
 
-from jaxmotion.data import clips_io, mirror, selection, windows
+from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import Clips
-from jaxmotion.learning import checkpoint, loop, training
-from jaxmotion.systems import camdm, camdm_model
+from jaxmotion.learning import loop
+from jaxmotion.protocols import artifacts, camdm_evaluation, camdm_runs, camdm_training
+from jaxmotion.systems import camdm_model
 
-PRESETS = {
-    # The paper's network and frame; a day on a large GPU.
-    "paper": dict(),
-    # For a CPU or a short run: 31 tokens instead of 147, samples that face +z, and
-    # weights that count displacements (per frame, hence tiny) as much as features.
-    "small": dict(
-        frames_per_token=5,
-        heading="facing",
-        dropout=0.0,
-        weight_velocity=5.0,
-        weight_position=2.0,
-        weight_position_velocity=20.0,
-        weight_foot=20.0,
-    ),
-}
+Steering = Literal["forward", "strafe", "stop_and_go"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Train CAMDM on prepared clips; a run that was stopped goes on where it was.
+
+    Example: python experiments/camdm.py train --data data/bandai2.npz --out runs/camdm
 
     Attributes:
       data: Clips from prepare_data.py.
@@ -50,10 +38,10 @@ class Train:
       contents: Use only clips of these contents (for Bandai-Namco walk, run ...);
         none: all clips.
       label: Field of the clips that is the style.
-      held_out: Fraction of clips kept for evaluation.
+      held_out: Fraction of clips kept for evaluation, in (0, 1).
       mirror: Add a mirrored copy of every training clip.
       steps: Optimiser steps of the whole run.
-      batch: Windows a step.
+      batch: Windows a step (of 55 frames: 10 past, 45 future).
       learning_rate: Peak of AdamW's rate; cosine to a tenth.
       warmup: Steps of linear rise.
       ema: Decay of the parameters' moving average a step.
@@ -61,7 +49,7 @@ class Train:
       save_every: Steps between checkpoints.
       width: Channels of a token; None for the preset's.
       depth: Layers; None for the preset's.
-      diffusion_steps: T.
+      diffusion_steps: Steps T of the diffusion.
       devices: Split each batch over so many devices; 1 for no mesh.
       seed: Of everything random.
     """
@@ -87,99 +75,176 @@ class Train:
     seed: int = 0
 
 
-def split_data(
-    data: Path, contents: tuple[str, ...], label: str, held_out: float
-) -> tuple[Clips, Clips]:
-    """Training and held-out clips; the same for every run with these arguments."""
-    clips = clips_io.load_clips(data)
-    clips.names(label)
-    if contents and "content" in dict(clips.label_names):
-        clips = selection.select(clips, "content", contents)
-    return selection.split_clips(clips, fraction=held_out, seed=0, field=label)
-
-
 def model_of(args: Train, clips: Clips) -> camdm_model.Model:
     """The model that the arguments describe, for these clips."""
-    sizes = {"width": args.width, "depth": args.depth}
+    sizes = camdm_training.PRESETS[args.preset] | {"num_steps": args.diffusion_steps}
     if args.width:
-        sizes["hidden"] = 4 * args.width
-    config = camdm.Config(
-        num_joints=clips.skeleton.num_joints,
-        num_labels=len(clips.names(args.label)),
-        num_steps=args.diffusion_steps,
-        fps=clips.fps,
-        **PRESETS[args.preset],
-        **{name: value for name, value in sizes.items() if value},
-    )
-    return camdm_model.Model(
-        config=config,
-        bones=clips.skeleton,
-        labels=clips.names(args.label),
-        source=clips.source,
-    )
+        sizes |= {"width": args.width, "hidden": 4 * args.width}
+    if args.depth:
+        sizes |= {"depth": args.depth}
+    return camdm_training.make_model(clips, field=args.label, **sizes)
 
 
 def train(args: Train) -> None:
     """Trains, with checkpoints."""
     loop.check_writable(args.out)
-    clips, _ = split_data(args.data, args.contents, args.label, args.held_out)
+    clips, _ = camdm_runs.split_data(
+        args.data, args.contents, args.label, args.held_out
+    )
     model = model_of(args, clips)
     if args.mirror:
         clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
-    index = windows.window_index(clips, model.config.window, short="skip")
+    run, state, key, data = camdm_training.start(
+        clips,
+        model,
+        args.out / "checkpoints",
+        field=args.label,
+        num_steps=args.steps,
+        batch=args.batch,
+        learning_rate=args.learning_rate,
+        warmup=args.warmup,
+        ema=args.ema,
+        chunk=args.chunk,
+        devices=args.devices,
+        seed=args.seed,
+    )
+    config = camdm_model.to_json(model) | {
+        "experiment": camdm_runs.arguments_json(args)
+    }
+    (args.out / "config.json").write_text(json.dumps(config, indent=1))
+    parameters = sum(x.size for x in jax.tree.leaves(state.params))
     print(
         f"{clips.num_clips} clips, {clips.num_frames} frames, "
-        f"{index.starts.shape[0]} windows of {index.length} frames"
+        f"{data[1].starts.shape[0]} windows of {data[1].length} frames; {parameters} "
+        f"parameters on {jax.devices()[0].platform}, from step {int(state.step)}"
     )
-    experiment = {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in dataclasses.asdict(args).items()
-    }
-    config = camdm_model.to_json(model) | {"experiment": experiment}
-    (args.out / "config.json").write_text(json.dumps(config, indent=1))
-
-    optimizer = training.adamw_cosine(
-        learning_rate=args.learning_rate,
+    settings = loop.Loop(
         num_steps=args.steps,
-        warmup_steps=args.warmup,
-        max_norm=1.0,
+        chunk=args.chunk,
+        save_every=args.save_every,
+        folder=args.out,
+        config=config,
+        show=("loss", "data", "position", "foot"),
     )
-    objective = functools.partial(camdm.loss, bones=model.bones, config=model.config)
-    update = training.make_update(objective, optimizer, ema_decay=args.ema)
-    mesh = jax.make_mesh((args.devices,), ("data",)) if args.devices > 1 else None
+    loop.train(run, state, key, data, loop=settings)
 
-    def sample_batch(key, data):
-        clips, index = data
-        motion, clip = windows.sample_windows(key, clips, index, batch=args.batch)
-        return motion, clips.labels[args.label][clip]
 
-    key_init, key_train = jax.random.split(jax.random.key(args.seed))
-    state = training.init_train_state(camdm.init(key_init, model.config), optimizer)
-    parameters = sum(x.size for x in jax.tree.leaves(state.params))
-    print(f"{parameters} parameters on {jax.devices()[0].platform}")
-    if checkpoint.latest_step(args.out / "checkpoints") is not None:
-        state = checkpoint.restore(args.out / "checkpoints", state)
-        print(f"resuming at step {int(state.step)}")
-    loop.train(
-        training.train_chunk(update, sample_batch, num_steps=args.chunk, mesh=mesh),
-        training.replicate(state, mesh),
-        key_train,
-        training.replicate(jax.tree.map(jnp.asarray, (clips, index)), mesh),
-        loop=loop.Loop(
-            num_steps=args.steps,
-            chunk=args.chunk,
-            save_every=args.save_every,
-            folder=args.out,
-            config=config,
-            show=("loss", "data", "position", "foot"),
-        ),
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Steer characters along a preset in every style, and measure them.
+
+    Example: python experiments/camdm.py evaluate --run runs/camdm --rollouts 105
+
+    Attributes:
+      run: Run folder of `train`.
+      data: Clips; None for those that the run was trained on.
+      out: Folder for metrics.json and table.md; None for <run>/evaluation.
+      rollouts: Characters; spread evenly over the styles.
+      seconds: Length of each rollout, seconds; 4 at least.
+      preset: Commands.
+      speed: Metres a second; None for each style's own median walking speed.
+      contents: Contents of the clips to compare with; none: all of the run's.
+      chunk: Characters to run at a time, at most.
+      recognizer_steps: Updates of the style recogniser.
+      seed: Of poses, noise, recogniser and subsets.
+    """
+
+    run: Path = Path("runs/camdm")
+    data: Path | None = None
+    out: Path | None = None
+    rollouts: int = 105
+    seconds: float = 60.0
+    preset: Steering = "forward"
+    speed: float | None = None
+    contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right")
+    chunk: int = 5
+    recognizer_steps: int = 1500
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """Steer one character in one style; writes BVH, GIF and HTML.
+
+    Example: python experiments/camdm.py rollout --run runs/camdm --style elderly
+
+    Attributes:
+      run: Run folder of `train`.
+      data: Clips to start from; None for those that the run was trained on.
+      style: Its style.
+      to_style: Change to this style at half time; None to keep it.
+      seconds: Length, seconds.
+      preset: Commands.
+      speed: Metres a second; None for the style's own median speed.
+      out: Folder; None for <run>/rollout.
+      seed: Of the start pose and the noise.
+    """
+
+    run: Path = Path("runs/camdm")
+    data: Path | None = None
+    style: str = "elderly"
+    to_style: str | None = None
+    seconds: float = 20.0
+    preset: Steering = "forward"
+    speed: float | None = None
+    out: Path | None = None
+    seed: int = 0
+
+
+def evaluate(args: Evaluate) -> None:
+    """Writes the table."""
+    run = camdm_runs.load_run(args.run, args.data, args.contents)
+    out = args.out or args.run / "evaluation"
+    loop.check_writable(out)
+    rows, report = camdm_evaluation.evaluate_run(
+        run,
+        preset=args.preset,
+        rollouts=args.rollouts,
+        seconds=args.seconds,
+        speed=args.speed,
+        chunk=args.chunk,
+        recognizer_steps=args.recognizer_steps,
+        seed=args.seed,
     )
+    report = {"arguments": camdm_runs.arguments_json(args)} | report
+    artifacts.write_table(out, rows, report)
+    print(report)
+
+
+def rollout(args: Rollout) -> None:
+    """Writes rollout.bvh, rollout.gif and rollout.html."""
+    run = camdm_runs.load_run(args.run, args.data)
+    out = args.out or args.run / "rollout"
+    loop.check_writable(out)
+    motion, velocity = camdm_evaluation.steer_one(
+        run,
+        args.style,
+        to_style=args.to_style,
+        preset=args.preset,
+        seconds=args.seconds,
+        speed=args.speed,
+        seed=args.seed,
+    )
+    title = " to ".join(filter(None, (args.style, args.to_style)))
+    title = f"{title} ({run.model.source})"
+    artifacts.write_rollout(out, run.model.bones, motion, velocity, title=title)
+
+
+Command = (
+    Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Rollout, tyro.conf.subcommand("rollout")]
+)
 
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    train(tyro.cli(Train, description=__doc__))
+    args = tyro.cli(Command, description=__doc__)
+    {Train: train, Evaluate: evaluate, Rollout: rollout}[type(args)](args)
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except (OSError, ValueError, loop.TrainingDiverged) as error:
+        sys.exit(f"error: {error}")

@@ -65,9 +65,14 @@ def is_frozen(
       commanded: Metres a second.
 
     Returns:
-      True where any window is frozen.
+      True where any window is frozen; never for motions shorter than a window.
+
+    Raises:
+      ValueError: if a window is shorter than a frame.
     """
     length = round(seconds * fps)
+    if length < 1:
+        raise ValueError(f"windows of {seconds} s at {fps} fps have no frame")
     speed = jnp.linalg.norm(jnp.diff(positions, axis=-3), axis=-1).mean(-1) * fps
     windows = speed.shape[-1] // length
 

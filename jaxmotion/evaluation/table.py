@@ -5,6 +5,7 @@ are averaged within their clip before anything is said about the spread.
 """
 
 import dataclasses
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -63,9 +64,11 @@ def cell(samples: Float[Array, " samples"], *, scale: float = 1.0) -> Cell:
       scale: Factor for the unit of the table.
 
     Returns:
-      The cell; without an interval for a single sample.
+      The cell; without an interval for a single sample, not a number for none.
     """
     count = int(samples.shape[0])
+    if count == 0:
+        return Cell(value=math.nan, samples=0)
     if count < 2:
         return Cell(value=float(samples[0]) * scale, samples=count)
     estimate, low, high = (
@@ -81,10 +84,17 @@ def to_json(rows: dict[str, dict[str, Cell]]) -> dict[str, Any]:
       rows: Row names to column names to cells.
 
     Returns:
-      The same, with cells as objects.
+      The same, with cells as objects; null for what is not a finite number.
     """
+
+    def plain(x: float | None) -> float | None:
+        return None if x is None or not math.isfinite(x) else x
+
     return {
-        name: {column: dataclasses.asdict(x) for column, x in row.items()}
+        name: {
+            column: {k: plain(v) for k, v in dataclasses.asdict(x).items()}
+            for column, x in row.items()
+        }
         for name, row in rows.items()
     }
 
@@ -92,6 +102,8 @@ def to_json(rows: dict[str, dict[str, Cell]]) -> dict[str, Any]:
 def _text(x: Cell | None) -> str:
     if x is None:
         return "–"
+    if not math.isfinite(x.value):
+        return f"– (n={x.samples})"
     if x.low is None or x.high is None:
         return f"{x.value:.3g} (n={x.samples})"
     return f"{x.value:.3g} [{x.low:.3g}, {x.high:.3g}] (n={x.samples})"

@@ -75,6 +75,25 @@ def data_windows(clips: Clips, *, stride: int, field: str) -> Windows:
     )
 
 
+def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
+    """Raises unless rollouts are long enough to be measured; for use before the work.
+
+    Args:
+      ticks: Length of the rollouts.
+      fps: Ticks a second.
+      skip: Ticks to leave out at the start.
+
+    Raises:
+      ValueError: names the length that is needed.
+    """
+    if ticks < skip + WINDOW:
+        raise ValueError(
+            f"rollouts of {ticks / fps:g} s are too short to measure: expected at "
+            f"least {(skip + WINDOW) / fps:g} s ({skip} frames left out, then windows "
+            f"of {WINDOW})"
+        )
+
+
 def rollout_windows(
     frames: camdm_control.Frame, labels: Int[Array, " batch"], *, fps: float, skip: int
 ) -> Windows:
@@ -88,8 +107,12 @@ def rollout_windows(
 
     Returns:
       The windows.
+
+    Raises:
+      ValueError: if the rollouts are shorter than what is left out and one window.
     """
     characters, ticks = frames.root_position.shape[:2]
+    check_ticks(ticks, fps=fps, skip=skip)
     number = (ticks - skip) // WINDOW
 
     def cut(x: Array) -> Array:
@@ -214,11 +237,15 @@ def steered_rollouts(
       commands: From `preset_batch`.
       model: The model.
       control: Constants of the run-time; None for the defaults.
-      chunk: Characters to run at a time; see `rollout.rollout`.
+      chunk: Characters to run at a time, at most (the largest number that divides
+        theirs); see `rollout.rollout`.
 
     Returns:
       Frames [characters, ticks, ...].
     """
+    number = commands.label.shape[0]
+    if chunk is not None:
+        chunk = max(size for size in range(1, chunk + 1) if number % size == 0)
     driver = camdm_control.controller(
         params, model.bones, config=model.config, control=control
     )

@@ -1,9 +1,8 @@
-"""Style recognition and the rows of CAMDM's table.
+"""The rows of CAMDM's table.
 
-Source: Chen et al. 2024 (CAMDM), section 4.1; released feature extractor.
+Source: Chen et al. 2024 (CAMDM), section 4.1.
 """
 
-import dataclasses
 import functools
 from typing import Any
 
@@ -12,99 +11,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import diversity, frechet, health, locomotion, table
 from jaxmotion.learning import recognition
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols.camdm import WINDOW, Windows, data_windows
+from jaxmotion.protocols.camdm import Windows
+from jaxmotion.protocols.camdm_styles import Recognized, in_batches, recognized
 from jaxmotion.systems import camdm_control
-from jaxmotion.typing import Key, Params
 
-
-def in_batches(function, x, size: int = 256):
-    """Applies a jitted function to slices of the first axis, to bound the memory.
-
-    Args:
-      function: Array or pytree with a first axis to the like.
-      x: Its argument.
-      size: Rows at a time.
-
-    Returns:
-      The results, put together.
-    """
-    number = jax.tree.leaves(x)[0].shape[0]
-    parts = [
-        jax.device_get(function(jax.tree.map(lambda a: a[i : i + size], x)))  # noqa: B023
-        for i in range(0, number, size)
-    ]
-    return jax.tree.map(lambda *p: np.concatenate(p), *parts)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Recognized:
-    """A style recogniser and its size.
-
-    Attributes:
-      params: Its parameters.
-      config: Its size.
-    """
-
-    params: Params
-    config: recognition.RecognizerConfig
-
-
-def fit_recognizer(
-    key: Key, clips: Clips, *, field: str, num_steps: int = 1500
-) -> Recognized:
-    """Trains the style recogniser on windows with a stride of 10 frames.
-
-    Args:
-      key: Consumed.
-      clips: Training clips.
-      field: Label field that is the style.
-      num_steps: Updates.
-
-    Returns:
-      The recogniser.
-    """
-    found = data_windows(clips, stride=10, field=field)
-    config = recognition.RecognizerConfig(
-        num_classes=len(clips.names(field)),
-        num_joints=clips.skeleton.num_joints,
-        frames=WINDOW,
-    )
-    to_input = jax.jit(functools.partial(recognition.recognizer_input, clips.skeleton))
-    x = jnp.asarray(in_batches(to_input, found.motion))
-    params, _ = recognition.train_recognizer(
-        key, x, found.label, config=config, num_steps=num_steps
-    )
-    return Recognized(params=params, config=config)
-
-
-def recognized(
-    bones: skeleton.Skeleton, found: Windows, recognizer: Recognized
-) -> tuple[np.ndarray, np.ndarray]:
-    """Features of windows, and whether each one's style is recognised.
-
-    Args:
-      bones: The skeleton.
-      found: Windows.
-      recognizer: From `fit_recognizer`.
-
-    Returns:
-      Features [windows, 512], and hits [windows] (0 or 1).
-    """
-
-    @jax.jit
-    def run(x: tuple[skeleton.Motion, Array]) -> tuple[Array, Array]:
-        motion, label = x
-        given = recognition.recognizer_input(bones, motion)
-        feature, logits = recognition.recognize(
-            recognizer.params, given, config=recognizer.config
-        )
-        return feature, (jnp.argmax(logits, axis=-1) == label).astype(jnp.float32)
-
-    return in_batches(run, (found.motion, found.label))
+_DEGREES = 180.0 / np.pi
+# Column: metric, metric that weights its windows, factor.
+_COLUMNS = {
+    "trajectory_error_deg": ("trajectory_error", "trajectory_used", _DEGREES),
+    "orientation_error_deg": ("orientation_error", None, _DEGREES),
+    "foot_slide_m/s": ("slide_speed", "slide_seconds", 1.0),
+    "skate_ratio": ("skate_ratio", None, 1.0),
+    "acceleration_m/s2": ("acceleration", None, 1.0),
+    "jerk_m/s3": ("jerk", None, 1.0),
+    "slide_camdm_release": ("slide_camdm_release", None, 1.0),
+    "coherence_camdm_release": ("coherence_camdm_release", None, 1.0),
+    "trajectory_camdm_release_deg": ("trajectory_camdm_release", None, _DEGREES),
+    "orientation_camdm_release_deg": ("orientation_camdm_release", None, _DEGREES),
+}
 
 
 def metric_row(
@@ -133,36 +60,15 @@ def metric_row(
         )
 
     values = in_batches(run, found)
-    degrees = 180.0 / np.pi
-
-    def column(name: str, *, weights: str | None = None, scale: float = 1.0):
-        weight = None if weights is None else values[weights]
-        return table.cell(
-            table.group_means(values[name], found.group, weight), scale=scale
-        )
-
-    style = {}
+    row = {}
     if hits is not None:
         means = table.group_means(hits, found.group)
-        style = {"style_accuracy_%": table.cell(means, scale=100.0)}
-    return style | {
-        "trajectory_error_deg": column(
-            "trajectory_error", weights="trajectory_used", scale=degrees
-        ),
-        "orientation_error_deg": column("orientation_error", scale=degrees),
-        "foot_slide_m/s": column("slide_speed", weights="slide_seconds"),
-        "skate_ratio": column("skate_ratio"),
-        "acceleration_m/s2": column("acceleration"),
-        "jerk_m/s3": column("jerk"),
-        "slide_camdm_release": column("slide_camdm_release"),
-        "coherence_camdm_release": column("coherence_camdm_release"),
-        "trajectory_camdm_release_deg": column(
-            "trajectory_camdm_release", scale=degrees
-        ),
-        "orientation_camdm_release_deg": column(
-            "orientation_camdm_release", scale=degrees
-        ),
-    }
+        row["style_accuracy_%"] = table.cell(means, scale=100.0)
+    for column, (name, weights, scale) in _COLUMNS.items():
+        weight = None if weights is None else values[weights]
+        means = table.group_means(values[name], found.group, weight)
+        row[column] = table.cell(means, scale=scale)
+    return row
 
 
 def frechet_cell(
@@ -255,6 +161,43 @@ def repeat_diversity(
     return table.cell(jax.vmap(diversity.intra_style_variance)(local))
 
 
+def contact_height(bones: skeleton.Skeleton, real: Windows) -> float:
+    """Height below which toes should not move.
+
+    Args:
+      bones: The skeleton.
+      real: Windows of real clips.
+
+    Returns:
+      Where toes rest (their first percentile), and one centimetre more, as the paper's
+      "below, e.g., 1 cm"; metres.
+    """
+    feet = jnp.array(bones.feet)
+    toes = in_batches(
+        jax.jit(lambda m: skeleton.joint_positions(bones, m)[..., feet, :]), real.motion
+    )
+    return float(np.percentile(toes[..., 1], 1)) + 0.01
+
+
+def random_half(clips: np.ndarray, seed: int) -> np.ndarray:
+    """Which windows are of a random half of the clips.
+
+    Args:
+      clips: Clip of each window.
+      seed: Of the choice.
+
+    Returns:
+      True for the windows of that half.
+
+    Raises:
+      ValueError: if there is one clip only.
+    """
+    different = np.unique(clips)
+    if len(different) < 2:
+        raise ValueError("one clip, expected at least two to compare halves")
+    return np.isin(clips, np.random.default_rng(seed).permutation(different)[::2])
+
+
 def evaluation_table(
     bones: skeleton.Skeleton,
     real: Windows,
@@ -275,27 +218,19 @@ def evaluation_table(
       made: Windows of the rollouts.
       frames: The rollouts themselves.
       recognizer: From `fit_recognizer`.
-      repeats: Neighbouring characters that share style and commands.
+      repeats: Neighbouring characters that share style and commands; with one there
+        is no column of diversity.
       seed: Of the subsets for Fréchet distances.
 
     Returns:
       Rows "held-out (ground truth)", "training half vs half (noise floor)" and
       "rollouts"; and the contact height, window counts and health of the rollouts.
     """
-    toes = in_batches(
-        jax.jit(
-            lambda m: skeleton.joint_positions(bones, m)[..., jnp.array(bones.feet), :]
-        ),
-        real.motion,
-    )
-    root = np.asarray(real.motion.root_position)[..., 1]
-    # Where toes rest, and one centimetre more, as the paper's "below, e.g., 1 cm".
-    height = float(np.percentile(toes[..., 1], 1)) + 0.01
+    height = contact_height(bones, real)
     real_feature, real_hits = recognized(bones, real, recognizer)
     made_feature, made_hits = recognized(bones, made, recognizer)
     reference, _ = recognized(bones, dense, recognizer)
-    clips = np.asarray(dense.group)
-    own = np.isin(clips, np.random.default_rng(seed).permutation(np.unique(clips))[::2])
+    own = random_half(np.asarray(dense.group), seed)
     count = min(len(real_feature), len(made_feature), int(own.sum()), int((~own).sum()))
     distance = functools.partial(frechet_cell, count=count, seed=seed)
     rows = {
@@ -305,17 +240,16 @@ def evaluation_table(
             "fid": distance(reference[own], reference[~own])
         },
         "rollouts": metric_row(bones, made, made_hits, height=height)
-        | {
-            "fid": distance(made_feature, reference),
-            "diversity_m2": repeat_diversity(bones, made, repeats=repeats),
-        },
+        | {"fid": distance(made_feature, reference)},
     }
+    if repeats > 1:
+        found = repeat_diversity(bones, made, repeats=repeats)
+        rows["rollouts"]["diversity_m2"] = found
+    root = float(np.median(np.asarray(real.motion.root_position)[..., 1]))
     return rows, {
         "contact_height_m": height,
         "windows": {"held_out": len(real_hits), "rollouts": len(made_hits)},
         "fid_windows": count,
         "fid_reference_windows": len(reference),
-        "health": rollout_health(
-            bones, frames, fps=made.motion.fps, height=float(np.median(root))
-        ),
+        "health": rollout_health(bones, frames, fps=made.motion.fps, height=root),
     }

@@ -1,0 +1,161 @@
+"""Characters of a run, steered along a preset; and how they measure up."""
+
+import dataclasses
+import platform
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmotion.evaluation import table
+from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.protocols import camdm as protocol
+from jaxmotion.protocols import camdm_rows, camdm_styles
+from jaxmotion.protocols.camdm_runs import Run
+from jaxmotion.typing import Key
+
+# Ticks to leave out at the start, where the data's own pose still shows.
+SKIP = 60
+
+
+def preset_of_run(
+    run: Run, preset: str, labels: np.ndarray, *, seconds: float, speed: float | None
+) -> tuple[np.ndarray, trajectory.Command]:
+    """Speed and commands of each character.
+
+    Args:
+      run: The run.
+      preset: Of `presets.PRESETS`.
+      labels: Style of each character.
+      seconds: Length.
+      speed: Metres a second; None for each style's own median speed.
+
+    Returns:
+      Speeds [characters], and commands [characters, ticks, ...].
+
+    Raises:
+      ValueError: if there is no such preset.
+    """
+    speeds = np.asarray(protocol.style_speeds(run.train, field=run.field))[labels]
+    speeds = speeds if speed is None else np.full(labels.shape, speed)
+    return speeds, protocol.preset_batch(
+        preset, labels, speeds, seconds=seconds, fps=run.model.config.fps
+    )
+
+
+def steer_one(
+    run: Run,
+    style: str,
+    *,
+    preset: str,
+    seconds: float,
+    to_style: str | None = None,
+    speed: float | None = None,
+    seed: int = 0,
+) -> tuple[skeleton.Motion, Float[Array, "frames 2"]]:
+    """Steers one character from a pose of the training clips.
+
+    Args:
+      run: The run.
+      style: Its style.
+      preset: Of `presets.PRESETS`.
+      seconds: Length.
+      to_style: Its style from half time on; None for the same.
+      speed: Metres a second; None for the first style's own median speed.
+      seed: Of the start pose and the noise.
+
+    Returns:
+      The motion, and the velocity asked for in each frame, metres a second.
+
+    Raises:
+      ValueError: if there is no such preset or style; names those there are.
+    """
+    model = run.model
+    label = np.array([model.label(style)])
+    end = label[0] if to_style is None else model.label(to_style)
+    _, commands = preset_of_run(run, preset, label, seconds=seconds, speed=speed)
+    half = commands.label.shape[1] // 2
+    changed = commands.label.at[:, half:].set(int(end))
+    commands = dataclasses.replace(commands, label=changed)
+    states = protocol.start_states(run.train, model, label, field=run.field, seed=seed)
+    frames = protocol.steered_rollouts(
+        run.params, jax.random.key(seed), states, commands, model=model
+    )
+    motion = skeleton.Motion(
+        root_position=frames.root_position[0],
+        joint_rotation=frames.joint_rotation[0],
+        fps=model.config.fps,
+    )
+    return motion, frames.desired_velocity[0]
+
+
+def evaluate_run(
+    run: Run,
+    *,
+    preset: str,
+    rollouts: int,
+    seconds: float,
+    speed: float | None = None,
+    chunk: int | None = None,
+    recognizer_steps: int = 1500,
+    seed: int = 0,
+) -> tuple[dict[str, dict[str, table.Cell]], dict[str, Any]]:
+    """Steers characters in every style, and measures them beside held-out clips.
+
+    Args:
+      run: The run.
+      preset: Of `presets.PRESETS`.
+      rollouts: Characters, spread evenly over the styles; at least one a style.
+      seconds: Length of each rollout.
+      speed: Metres a second; None for each style's own median speed.
+      chunk: Characters to run at a time, at most.
+      recognizer_steps: Updates of the style recogniser.
+      seed: Of poses, noise, recogniser and subsets.
+
+    Returns:
+      The table, and what belongs beside it: speeds, health, counts, versions.
+
+    Raises:
+      ValueError: before any training, if there is no such preset, rollouts are too
+        short, or a style has no held-out clip.
+    """
+    model, field, fps = run.model, run.field, run.model.config.fps
+    repeats = max(rollouts // len(model.labels), 1)
+    labels = np.repeat(np.arange(len(model.labels)), repeats)
+    speeds, commands = preset_of_run(run, preset, labels, seconds=seconds, speed=speed)
+    protocol.check_ticks(commands.label.shape[1], fps=fps, skip=SKIP)
+    states = protocol.start_states(run.held_out, model, labels, field=field, seed=seed)
+    key_fit, key_roll = jax.random.split(jax.random.key(seed))
+    recognizer = camdm_styles.fit_recognizer(
+        key_fit, run.train, field=field, num_steps=recognizer_steps
+    )
+    frames = _timed_rollouts(run, key_roll, states, commands, chunk)
+    real = protocol.data_windows(run.held_out, stride=protocol.WINDOW, field=field)
+    dense = protocol.data_windows(run.train, stride=10, field=field)
+    made = protocol.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=SKIP)
+    rows, report = camdm_rows.evaluation_table(
+        model.bones, real, dense, made, frames, recognizer, repeats=repeats
+    )
+    return rows, report | {
+        "source": model.source,
+        "speeds": dict(zip(model.labels, speeds[::repeats].tolist(), strict=True)),
+        "jax": jax.__version__,
+        "machine": f"{platform.machine()}, {jax.devices()[0]}",
+    }
+
+
+def _timed_rollouts(
+    run: Run, key: Key, states: Any, commands: trajectory.Command, chunk: int | None
+) -> Any:
+    """Frames of the characters; prints how long they took, compilation included."""
+    begun = time.perf_counter()
+    frames = protocol.steered_rollouts(
+        run.params, key, states, commands, model=run.model, chunk=chunk
+    )
+    jax.block_until_ready(frames)
+    taken = time.perf_counter() - begun
+    print(f"{commands.label.shape[0]} rollouts in {taken:.0f} s")
+    return frames

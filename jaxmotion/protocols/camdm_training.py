@@ -1,0 +1,124 @@
+"""How CAMDM is trained: data, objective, optimiser and state of a run, put together."""
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxmotion.data import windows
+from jaxmotion.data.clips import Clips
+from jaxmotion.learning import checkpoint, training
+from jaxmotion.systems import camdm
+from jaxmotion.systems.camdm_model import Model
+from jaxmotion.typing import Key
+
+# Sizes and weights of `camdm.Config`, by name.
+PRESETS = {
+    # The paper's network and frame; a day on a large GPU.
+    "paper": dict(),
+    # For a CPU or a short run: 31 tokens instead of 147, samples that face +z, and
+    # weights that count displacements (per frame, hence tiny) as much as features.
+    "small": dict(
+        frames_per_token=5,
+        heading="facing",
+        dropout=0.0,
+        weight_velocity=5.0,
+        weight_position=2.0,
+        weight_position_velocity=20.0,
+        weight_foot=20.0,
+    ),
+}
+
+
+def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
+    """A model for clips.
+
+    Args:
+      clips: The clips; their skeleton, rate, styles and source become the model's.
+      field: Label field that is the style.
+      **sizes: Of `camdm.Config`, but for those that the clips decide.
+
+    Returns:
+      The model.
+
+    Raises:
+      ValueError: if the clips have no such field.
+    """
+    config = camdm.Config(
+        num_joints=clips.skeleton.num_joints,
+        num_labels=len(clips.names(field)),
+        fps=clips.fps,
+        **sizes,
+    )
+    return Model(
+        config=config,
+        bones=clips.skeleton,
+        labels=clips.names(field),
+        source=clips.source,
+    )
+
+
+def start(
+    clips: Clips,
+    model: Model,
+    checkpoints: Path,
+    *,
+    field: str,
+    num_steps: int,
+    batch: int,
+    learning_rate: float,
+    warmup: int,
+    ema: float,
+    chunk: int,
+    devices: int = 1,
+    seed: int = 0,
+) -> tuple[Callable, training.TrainState, Key, Any]:
+    """All that `loop.train` needs: a new run, or the newest checkpoint of an old one.
+
+    Args:
+      clips: Training clips; those shorter than a window are left out.
+      model: The model.
+      checkpoints: Folder of the run's checkpoints; it need not exist.
+      field: Label field that is the style.
+      num_steps: Optimiser steps of the whole run.
+      batch: Windows a step.
+      learning_rate: Peak of AdamW's rate; cosine to a tenth.
+      warmup: Steps of linear rise.
+      ema: Decay of the parameters' moving average a step.
+      chunk: Steps of one compiled call.
+      devices: Split each batch over so many; 1 for no mesh.
+      seed: Of the parameters and of all that training draws.
+
+    Returns:
+      The compiled chunk, the state, the key, and the data on the device.
+
+    Raises:
+      ValueError: if no clip is as long as a window, or the checkpoint is of another
+        model.
+    """
+    index = windows.window_index(clips, model.config.window, short="skip")
+    optimizer = training.adamw_cosine(
+        learning_rate=learning_rate,
+        num_steps=num_steps,
+        warmup_steps=warmup,
+        max_norm=1.0,
+    )
+    objective = functools.partial(camdm.loss, bones=model.bones, config=model.config)
+    update = training.make_update(objective, optimizer, ema_decay=ema)
+    mesh = jax.make_mesh((devices,), ("data",)) if devices > 1 else None
+
+    def sample_batch(key: Key, data: tuple[Clips, windows.WindowIndex]) -> tuple:
+        clips, index = data
+        motion, clip = windows.sample_windows(key, clips, index, batch=batch)
+        return motion, clips.labels[field][clip]
+
+    key_init, key_train = jax.random.split(jax.random.key(seed))
+    state = training.init_train_state(camdm.init(key_init, model.config), optimizer)
+    if checkpoint.latest_step(checkpoints) is not None:
+        state = checkpoint.restore(checkpoints, state)
+    run = training.train_chunk(update, sample_batch, num_steps=chunk, mesh=mesh)
+    data = training.replicate(jax.tree.map(jnp.asarray, (clips, index)), mesh)
+    return run, training.replicate(state, mesh), key_train, data
