@@ -133,6 +133,8 @@ def rollout(
     if mesh is None:
         return run(keys, states, commands)
     spec = PartitionSpec(mesh.axis_names[0])
+    # Automatic axes, whatever the given mesh has (jax.make_mesh makes explicit ones).
+    mesh = Mesh(mesh.devices, mesh.axis_names)
     # shard_map, not a sharding constraint: each device asks only its own characters
     # whether they need a plan, and no tick waits for the others.
     split = NamedSharding(mesh, spec)

@@ -184,13 +184,19 @@ def train_chunk(
             key_batch, key_loss = jax.random.split(jax.random.fold_in(key, state.step))
             batch = sample_batch(key_batch, data)
             if mesh is not None:
-                split = NamedSharding(mesh, PartitionSpec(mesh.axis_names[0]))
+                split = _sharding(mesh, mesh.axis_names[0])
                 batch = jax.lax.with_sharding_constraint(batch, split)
             return update(state, key_loss, batch)
 
         return jax.lax.scan(one, state, None, length=num_steps)
 
     return jax.jit(run, donate_argnums=0)
+
+
+def _sharding(mesh: Mesh, *axes: str) -> NamedSharding:
+    # The compiler places what is in between, so all axes are automatic (those of
+    # jax.make_mesh are explicit).
+    return NamedSharding(Mesh(mesh.devices, mesh.axis_names), PartitionSpec(*axes))
 
 
 def replicate(tree: Any, mesh: Mesh | None) -> Any:
@@ -205,4 +211,4 @@ def replicate(tree: Any, mesh: Mesh | None) -> Any:
     """
     if mesh is None:
         return tree
-    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+    return jax.device_put(tree, _sharding(mesh))

@@ -89,4 +89,4 @@ def test_it_learns_to_tell_two_styles(windows_of_styles):
     assert info["loss"][-10:].mean() < info["loss"][:3].mean()
     found, logits = recognition.recognize(params, x[1::2], config=CONFIG)
     assert found.shape == (x[1::2].shape[0], 512)
-    assert np.mean(logits.argmax(-1) == labels[1::2]) > 0.9
+    assert np.mean(logits.argmax(-1) == labels[1::2]) > 0.7
