@@ -47,6 +47,9 @@ def _turned(yaw: float, x: float, z: float) -> np.ndarray:
     return np.stack([c * x + s * z, -s * x + c * z], axis=-1)
 
 
+# More steps a second for each metre a second sideways, and each radian a second.
+_ASIDE_PACE, _TURN_PACE = 1.0, 0.3
+
 # A foot on the ground: its toe (x, z), metres, and its direction, radians.
 _Placed = tuple[np.ndarray, float]
 
@@ -67,15 +70,15 @@ class _Step:
 def _home(
     path: np.ndarray,
     yaw: np.ndarray,
-    pose: tuple[float, float, float],
+    pose: tuple[np.ndarray, float, float],
     frame: int,
     side: int,
 ) -> _Placed:
-    """Where a foot stands beside the body; pose is width, toe ahead and toe out."""
+    """Where a foot stands beside the body; pose is widths, toe ahead and toe out."""
     width, toe_ahead, toe_out = pose
     frame = min(max(frame, 0), len(path) - 1)
     sign = 1.0 - 2.0 * side
-    offset = _turned(yaw[frame], sign * width / 2, toe_ahead)
+    offset = _turned(yaw[frame], sign * width[frame] / 2, toe_ahead)
     return path[frame] + offset, yaw[frame] + sign * toe_out
 
 
@@ -145,12 +148,12 @@ def _aim(
     # middle of that time is where it should land.
     goal, goal_yaw = home(now + air + length // 2, side)
     goal = goal + generator.normal(0.0, jitter, 2)
-    turn = float(wrap(np.array(goal_yaw - start[1])))
+    # Not wrapped: a foot turns the way that the body does, even if that is longer.
     return _Step(
         side=side,
         start=start,
-        goal=(goal, start[1] + turn),
-        turn=turn,
+        goal=(goal, goal_yaw),
+        turn=goal_yaw - start[1],
         lift=lift * float(np.exp(generator.normal(0.0, 0.08))),
         air=air,
         length=length,
@@ -227,14 +230,20 @@ def plan_footsteps(
     Returns:
       The feet in every frame.
     """
-    speed = np.linalg.norm(np.gradient(path, axis=0), axis=-1) * fps
-    home = functools.partial(_home, path, yaw, (width, toe_ahead, toe_out))
+    velocity = np.gradient(path, axis=0) * fps
+    speed = np.linalg.norm(velocity, axis=-1)
+    aside = np.abs(velocity[:, 0] * np.cos(yaw) - velocity[:, 1] * np.sin(yaw))
+    turning = np.abs(np.gradient(yaw)) * fps
+    # Steps a second: quicker sideways and in turns, where a step reaches less far.
+    pace = cadence + cadence_slope * speed + _ASIDE_PACE * aside + _TURN_PACE * turning
+    # Sideways the feet are set so far apart that the one behind does not overtake.
+    widths = np.maximum(width, aside / pace + 0.7 * width)
+    home = functools.partial(_home, path, yaw, (widths, toe_ahead, toe_out))
 
     def length_at(now: int) -> int:
         # Someone about to set off already takes the steps of the speed to come.
-        soon = min(now + int(0.5 * fps), len(path) - 1)
-        pace = cadence + cadence_slope * max(speed[now], speed[soon])
-        return max(int(round(fps / pace)), 6)
+        soon = now + int(0.5 * fps) + 1
+        return max(int(round(fps / pace[now:soon].max())), 6)
 
     aim = functools.partial(
         _aim,

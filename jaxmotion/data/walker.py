@@ -19,6 +19,8 @@ _ANKLE_UP = 0.07
 _HIP_SIDE, _HIP_DOWN = 0.09, 0.05
 # Least distance from hip to ankle, metres: a folded knee.
 _SHORTEST = 0.15
+# Least height of the pelvis, metres: a deep squat.
+_LOWEST = 0.5
 # Foot (left, right) and its thigh.
 _LEGS = ((0, 14), (1, 18))
 
@@ -185,7 +187,7 @@ def solve_pose(
     _pose_trunk(local, yaw, lead, gait)
     _pose_arms(local, lead, gait)
     root = _lowered(root, local[:, 0], steps, fps)
-    _pose_legs(local, root, steps, fps)
+    _pose_legs(local, root, yaw - gait.twist * lead, steps, fps)
     return root, local
 
 
@@ -216,14 +218,20 @@ def _pose_arms(local: np.ndarray, lead: np.ndarray, gait: Gait) -> None:
 
 
 def _pose_legs(
-    local: np.ndarray, root: np.ndarray, steps: Footsteps, fps: float
+    local: np.ndarray,
+    root: np.ndarray,
+    pelvis_yaw: np.ndarray,
+    steps: Footsteps,
+    fps: float,
 ) -> None:
     """Sets thigh, shank, foot and toes so that each toe is where its step is."""
     pelvis = local[:, 0]
     for foot, thigh in _LEGS:
         hip = root + pelvis @ np.array(_BONES[thigh][2])
         pitch, turn, ankle = _foot(steps, foot, hip, fps)
-        forward = _axis(steps.yaw[:, foot], "y")[..., 2] + pelvis[..., 2]
+        # Knees point between pelvis and foot: by angle, for two directions that nearly
+        # cancel would let the knee flip.
+        forward = _axis((steps.yaw[:, foot] + pelvis_yaw) / 2, "y")[..., 2]
         upper, lower = _leg(hip, ankle, forward)
         local[:, thigh] = np.swapaxes(pelvis, -1, -2) @ upper
         local[:, thigh + 1] = np.swapaxes(upper, -1, -2) @ lower
@@ -269,8 +277,10 @@ def _lowered(
         worst = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).max(1)
         root[:, 1] -= 1.5 * _smoothed(worst, 0.08 * fps)
         far = _leg_lengths(root, pelvis, steps, fps)
-    # A knee does not fold beyond _SHORTEST: then the toe would leave its place.
-    if far.max() > THIGH + SHANK - 2e-4 or far.min() < _SHORTEST:
+    # A knee does not fold beyond _SHORTEST, nor sink into the ground: then the toe
+    # would leave its place, or the leg be below its feet.
+    folded = far.min() < _SHORTEST or root[:, 1].min() < _LOWEST
+    if folded or far.max() > THIGH + SHANK - 2e-4:
         frame = int(first.max(axis=1).argmax())
         raise ValueError(
             f"steps too long for the legs, most of all at frame {frame} "

@@ -337,3 +337,31 @@ def test_a_gait_is_data():
         for gait in (slow, gaits.GAITS["neutral"])
     ]
     assert steps[0] < 0.7 * steps[1]
+
+
+def test_random_clips_have_no_jump():
+    """Quick half turns among them, where a foot may lag far behind the body."""
+    for seed in (1, 2):
+        clips = procedural.make_clips(seed=seed, minutes=16.0)
+        position = fk(
+            skeleton.Motion(
+                root_position=clips.root_position,
+                joint_rotation=clips.joint_rotation,
+                fps=FPS,
+            )
+        )
+        speed = np.linalg.norm(np.diff(position, axis=0), axis=-1) * FPS
+        speed[np.asarray(clips.offsets)[1:-1] - 1] = 0.0
+        assert speed.max() < 8.5
+
+
+@pytest.mark.parametrize("gait", gaits.GAITS)
+@pytest.mark.parametrize("part", [0.25, 0.5])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_feet_do_not_pass_through_each_other_sideways(gait, part, sign):
+    speed = sign * part * gaits.GAITS[gait].max_speed
+    commands = still(240, velocity=jnp.tile(jnp.array([[speed, 0.0]]), (240, 1)))
+    position = fk(procedural.walk(commands, gaits.GAITS[gait], seed=1).motion)
+    apart = position[:, TOES[0]] - position[:, TOES[1]]
+    # It faces +z: its left is +x.
+    assert apart[:, 0].min() > 0.05
