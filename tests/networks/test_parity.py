@@ -1,0 +1,113 @@
+"""The network and its sampler against PyTorch's own encoder, with the same weights."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.diffusion import schedule
+from jaxmotion.motion import trajectory
+from jaxmotion.networks import blocks
+from jaxmotion.systems import camdm
+from tests import tiny
+
+torch = pytest.importorskip("torch")
+from benchmarks import torch_camdm  # noqa: E402
+
+BATCH = 3
+CONFIG = camdm.Config(num_joints=25, num_labels=100)  # the paper's
+
+
+@functools.cache
+def parameters():
+    return tiny.random_params(camdm.init, CONFIG, seed=5)
+
+
+@functools.cache
+def peer(batch_first=False):
+    net = torch_camdm.TorchCamdm(CONFIG, batch_first=batch_first)
+    return torch_camdm.load(net, parameters())
+
+
+def conditions():
+    rng = np.random.default_rng(0)
+    normal = lambda *shape: jnp.asarray(  # noqa: E731
+        rng.normal(size=(BATCH, *shape)), jnp.float32
+    )
+    angle = rng.uniform(0, 2 * np.pi, (BATCH, CONFIG.future))
+    facing = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+    return camdm.Condition(
+        past=normal(CONFIG.past, CONFIG.num_features),
+        trajectory=trajectory.Trajectory(
+            position=normal(CONFIG.future, 2), facing=jnp.asarray(facing, jnp.float32)
+        ),
+        label=jnp.array([0, 7, 99]),
+        keep_past=jnp.ones(BATCH, bool),
+    )
+
+
+def as_torch(arguments):
+    past, path, facing, label, _ = (np.array(x) for x in arguments)
+    return *map(torch.from_numpy, (past, path, facing)), torch.from_numpy(label).long()
+
+
+def test_as_many_parameters():
+    ours = sum(x.size for x in jax.tree.leaves(parameters()))
+    theirs = sum(x.numel() for x in peer().parameters())
+    assert ours == theirs == 3_439_260
+
+
+@pytest.mark.parametrize("batch_first", [False, True])
+def test_forward_pass(batch_first):
+    """Steps 1, 4 and 8; a past of zeros is the null condition."""
+    arguments = conditions().arguments(CONFIG)
+    t = np.array([1, 4, 8])
+    x_t = np.random.default_rng(1).normal(size=(BATCH, 45, 156)).astype(np.float32)
+    ours = jax.jit(camdm.network(CONFIG).apply)(
+        {"params": parameters()}, x_t, jnp.asarray(t), *arguments
+    )
+    with torch.inference_mode():
+        theirs = peer(batch_first)(
+            torch.from_numpy(x_t), torch.from_numpy(t), *as_torch(arguments)
+        ).numpy()
+    assert theirs.std() > 0.1
+    np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
+def test_sampler():
+    """All steps, fed with the noise that the chain draws from its keys."""
+    condition = conditions()
+    shape = (CONFIG.future, CONFIG.num_features)
+
+    def noises(key):
+        key_start, key_chain = jax.random.split(key)
+        steps = jnp.arange(1, CONFIG.num_steps + 1)
+        keys = jax.vmap(
+            lambda t: jax.random.split(jax.random.fold_in(key_chain, t))[1]
+        )(steps)
+        draw = lambda k: jax.random.normal(k, shape)  # noqa: E731
+        return jnp.concatenate([draw(key_start)[None], jax.vmap(draw)(keys)])
+
+    # Debugging of key reuse would forbid drawing the chain's own noise a second time.
+    with jax.debug_key_reuse(False):
+        keys = jax.random.split(jax.random.key(2), BATCH)
+        noise = jax.jit(jax.vmap(noises, out_axes=1))(keys)
+        plan = camdm.planner(parameters(), config=CONFIG)
+        ours = jax.jit(jax.vmap(plan))(keys, condition)
+    beta = schedule.cosine_schedule(CONFIG.num_steps).beta
+    table = torch_camdm.posterior_table(np.asarray(beta))
+    with torch.inference_mode():
+        given = as_torch(condition.arguments(CONFIG))
+        theirs = torch_camdm.sample(
+            peer(), table, torch.from_numpy(np.array(noise)), given
+        ).numpy()
+    np.testing.assert_allclose(ours, theirs, atol=2e-5)
+
+
+def test_gelu_is_that_of_float64():
+    x = np.linspace(-12.0, 12.0, 2001)
+    exact = torch.nn.functional.gelu(torch.from_numpy(x)).numpy()
+    found = blocks.gelu(jnp.asarray(x, jnp.float32))
+    np.testing.assert_allclose(found, exact, atol=1e-6)
