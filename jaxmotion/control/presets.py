@@ -75,10 +75,16 @@ def preset_commands(
       Commands [ticks, ...], for a character that starts facing +z.
 
     Raises:
-      ValueError: if there is no such preset; names those there are.
+      ValueError: if there is no such preset (names those there are), the length is not
+        that of a tick at least, or the speed is negative.
     """
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}: there are {', '.join(PRESETS)}")
+    if not (np.isfinite(seconds * fps) and seconds * fps >= 1 and speed >= 0):
+        raise ValueError(
+            f"{seconds} s at {fps} ticks a second and {speed} m/s: expected a tick or "
+            "more, and a speed that is not negative"
+        )
     table = np.array(PRESETS[name]())
     ticks = round(seconds * fps)
     ends = np.cumsum(table[:, 0])

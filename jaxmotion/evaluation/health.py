@@ -10,15 +10,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxmotion.motion.spring import Scalar
+
 
 @functools.partial(jax.jit, static_argnames=("fps",))
 def has_diverged(
     positions: Float[Array, "*batch frames joints 3"],
     *,
     fps: float,
-    min_root: float,
-    max_root: float,
-    max_speed: float = 20.0,
+    min_root: Scalar,
+    max_root: Scalar,
+    max_speed: Scalar = 20.0,
 ) -> Bool[Array, "*batch"]:
     """Whether any frame is outside what a body can show.
 
@@ -48,16 +50,17 @@ def is_frozen(
     *,
     fps: float,
     seconds: float = 2.0,
-    min_speed: float = 0.05,
-    commanded: float = 0.3,
+    min_speed: Scalar = 0.05,
+    commanded: Scalar = 0.3,
 ) -> Bool[Array, "*batch"]:
     """Whether a character stops moving its limbs for some seconds while told to travel.
 
     Time is cut into windows of `seconds`. A window is frozen if the joints' mean speed
-    is below `min_speed` while the slowest velocity wanted in it is above `commanded`.
+    relative to the root is below `min_speed` while the slowest velocity wanted in it is
+    above `commanded`: a statue is frozen whether it stands or glides.
 
     Args:
-      positions: World positions of the joints, metres.
+      positions: World positions of the joints, metres; joint 0 is the root.
       wanted_velocity: Velocity (x, z) asked for in each frame, metres a second.
       fps: Frames a second.
       seconds: Length of a window.
@@ -73,7 +76,8 @@ def is_frozen(
     length = round(seconds * fps)
     if length < 1:
         raise ValueError(f"windows of {seconds} s at {fps} fps have no frame")
-    speed = jnp.linalg.norm(jnp.diff(positions, axis=-3), axis=-1).mean(-1) * fps
+    limbs = positions[..., 1:, :] - positions[..., :1, :]
+    speed = jnp.linalg.norm(jnp.diff(limbs, axis=-3), axis=-1).mean(-1) * fps
     windows = speed.shape[-1] // length
 
     def cut(x: Array) -> Array:

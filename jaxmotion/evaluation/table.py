@@ -87,7 +87,7 @@ def to_json(rows: dict[str, dict[str, Cell]]) -> dict[str, Any]:
       The same, with cells as objects; null for what is not a finite number.
     """
 
-    def plain(x: float | None) -> float | None:
+    def plain(x: float | int | None) -> float | int | None:
         return None if x is None or not math.isfinite(x) else x
 
     return {

@@ -242,9 +242,14 @@ def steered_rollouts(
 
     Returns:
       Frames [characters, ticks, ...].
+
+    Raises:
+      ValueError: if the chunk is not positive.
     """
     number = commands.label.shape[0]
     if chunk is not None:
+        if chunk < 1:
+            raise ValueError(f"chunks of {chunk} characters, expected 1 or more")
         chunk = max(size for size in range(1, chunk + 1) if number % size == 0)
     driver = camdm_control.controller(
         params, model.bones, config=model.config, control=control
