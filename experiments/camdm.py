@@ -18,7 +18,7 @@ import tyro
 
 from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import Clips
-from jaxmotion.learning import loop
+from jaxmotion.learning import checkpoint, loop
 from jaxmotion.protocols import artifacts, camdm_evaluation, camdm_runs, camdm_training
 from jaxmotion.systems import camdm_model
 
@@ -230,17 +230,42 @@ def rollout(args: Rollout) -> None:
     artifacts.write_rollout(out, run.model.bones, motion, velocity, title=title)
 
 
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write a run's averaged parameters and config as one small npz file.
+
+    Example: python experiments/camdm.py export --run runs/camdm --out camdm.npz
+
+    Attributes:
+      run: Run folder of `train`.
+      out: File to write; parameters are stored as float16.
+    """
+
+    run: Path = Path("runs/camdm")
+    out: Path = Path("camdm.npz")
+
+
+def export(args: Export) -> None:
+    """Writes the file."""
+    model, params, _ = camdm_model.load(args.run)
+    config = camdm_model.to_json(model) | {"experiment": {"label": "style"}}
+    checkpoint.export_params(args.out, params, config)
+    print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
+
+
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
 )
 
 
 def main() -> None:
     """Parses the command line and runs the command."""
     args = tyro.cli(Command, description=__doc__)
-    {Train: train, Evaluate: evaluate, Rollout: rollout}[type(args)](args)
+    run = {Train: train, Evaluate: evaluate, Rollout: rollout, Export: export}
+    run[type(args)](args)
 
 
 if __name__ == "__main__":

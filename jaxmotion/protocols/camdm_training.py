@@ -1,5 +1,6 @@
 """How CAMDM is trained: data, objective, optimiser and state of a run, put together."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.learning import checkpoint, training
+from jaxmotion.motion import skeleton
 from jaxmotion.systems import camdm
 from jaxmotion.systems.camdm_model import Model
 from jaxmotion.typing import Key
@@ -19,11 +21,13 @@ from jaxmotion.typing import Key
 PRESETS = {
     # The paper's network and frame; a day on a large GPU.
     "paper": dict(),
-    # For a CPU or a short run: 31 tokens instead of 147, samples that face +z, and
-    # weights that count displacements (per frame, hence tiny) as much as features.
+    # For a CPU or a short run: 31 tokens instead of 147, samples that face +z,
+    # rotations of unit variance, and weights that count displacements (per frame,
+    # hence tiny) as much as features.
     "small": dict(
         frames_per_token=5,
         heading="facing",
+        rotation_scale=4.0,
         dropout=0.0,
         weight_velocity=5.0,
         weight_position=2.0,
@@ -42,7 +46,7 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
       **sizes: Of `camdm.Config`, but for those that the clips decide.
 
     Returns:
-      The model.
+      The model; where rotations are scaled, with the mean of the clips' rotations.
 
     Raises:
       ValueError: if the clips have no such field.
@@ -53,6 +57,15 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
         fps=clips.fps,
         **sizes,
     )
+    if config.rotation_scale != 1.0:
+        every = max(clips.num_frames // 10_000, 1)
+        frames = skeleton.Motion(
+            root_position=clips.root_position[::every],
+            joint_rotation=clips.joint_rotation[::every],
+            fps=clips.fps,
+        )
+        mean = camdm.mean_rotations(clips.skeleton, frames, config=config)
+        config = dataclasses.replace(config, rotation_mean=mean)
     return Model(
         config=config,
         bones=clips.skeleton,

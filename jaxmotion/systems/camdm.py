@@ -50,6 +50,12 @@ class Config:
       heading: Frame of a sample. "random": axes turned by a random yaw (released
         code). "facing": +z is where the character faces in the last past pose (ours:
         the network need not learn that turning the world changes nothing).
+      rotation_scale: Factor on the 6D rotations of a sample, after their mean is taken
+        off; ours, 1 in the paper. Entries vary by about 0.2, the noise of the last
+        step alone has that size, and a short training then learns to ignore the
+        noisy sample; 4 gives both about unit variance, as standardising would.
+      rotation_mean: Mean of the rotations' features (`mean_rotations`); ours, empty
+        for none in the paper.
       drop_past: Probability that the past is zeroed in training.
       weight_data: Weight of the mean squared error of features (eq. 2).
       weight_velocity: Of the displacements of rotations.
@@ -75,6 +81,8 @@ class Config:
     frames_per_token: int = 1
     rotation_layout: Literal["rows", "columns"] = "rows"
     heading: Literal["random", "facing"] = "random"
+    rotation_scale: float = 1.0
+    rotation_mean: tuple[float, ...] = ()
     drop_past: float = 0.15
     weight_data: float = 1.0
     weight_velocity: float = 1.0
@@ -176,6 +184,76 @@ def init(key: Key, config: Config) -> Params:
     return network(config).init(key, x_t, t, past, path, facing, label, keep)["params"]
 
 
+def to_features(
+    motion: skeleton.Motion, *, config: Config
+) -> Float[Array, "*batch frames features"]:
+    """Features of a motion in the frame of a plan.
+
+    Args:
+      motion: In that frame.
+      config: The layout and scale of rotations.
+
+    Returns:
+      One 6D rotation a joint, and the root's (x, y, z, 0, 0, 0).
+    """
+    poses = features.motion_features(motion, rotation_layout=config.rotation_layout)
+    rotations, root = poses[..., :-6], poses[..., -6:]
+    scaled = (rotations - _mean(config, rotations)) * config.rotation_scale
+    return jnp.concatenate([scaled, root], axis=-1)
+
+
+def _mean(config: Config, rotations: Array) -> Array:
+    mean = jnp.asarray(config.rotation_mean or 0.0, rotations.dtype)
+    return jnp.broadcast_to(mean, rotations.shape)
+
+
+def mean_rotations(
+    bones: skeleton.Skeleton, motion: skeleton.Motion, *, config: Config
+) -> tuple[float, ...]:
+    """Mean of the rotations' features over frames, each seen from its own facing.
+
+    Args:
+      bones: The skeleton.
+      motion: Frames of it, world.
+      config: Says how rotations are laid out.
+
+    Returns:
+      `Config.rotation_mean`.
+    """
+
+    def local(pose: skeleton.Motion) -> Array:
+        path = trajectory.root_trajectory(bones, pose)
+        frame = trajectory.PlanarFrame(origin=path.position[0], facing=path.facing[0])
+        return features.motion_features(
+            features.to_frame(pose, frame), rotation_layout=config.rotation_layout
+        )[0, :-6]
+
+    single = jax.tree.map(lambda x: x[:, None], motion)
+    mean = jnp.mean(jax.jit(jax.vmap(local))(single), axis=0)
+    return tuple(round(float(x), 5) for x in mean)
+
+
+def to_motion(
+    poses: Float[Array, "*batch frames features"], *, config: Config
+) -> skeleton.Motion:
+    """Inverse of `to_features`; rotations are made orthonormal.
+
+    Args:
+      poses: Features, perhaps from a network.
+      config: The layout and scale of rotations.
+
+    Returns:
+      The motion, in the frame of the plan.
+    """
+    rotations, root = poses[..., :-6], poses[..., -6:]
+    plain = rotations / config.rotation_scale + _mean(config, rotations)
+    return features.motion_from_features(
+        jnp.concatenate([plain, root], axis=-1),
+        config.fps,
+        rotation_layout=config.rotation_layout,
+    )
+
+
 def smoothing_matrices(
     frames: int, sigmas: tuple[float, ...]
 ) -> Float[Array, "sigmas {frames} {frames}"]:
@@ -246,9 +324,7 @@ def example(
     wanted = trajectory.to_local(
         trajectory.Trajectory(position=path, facing=facings), frame
     )
-    poses = features.motion_features(
-        features.to_frame(window, frame), rotation_layout=config.rotation_layout
-    )
+    poses = to_features(features.to_frame(window, frame), config=config)
     keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_past)
     condition = Condition(
         past=poses[: config.past],
@@ -334,14 +410,12 @@ def loss_terms(
     """
     every = jnp.ones(target.shape[:-1], bool)
     predicted, wanted = (
-        skeleton.joint_positions(
-            bones,
-            features.motion_from_features(
-                x, config.fps, rotation_layout=config.rotation_layout
-            ),
-        )
+        skeleton.joint_positions(bones, to_motion(x, config=config))
         for x in (prediction, target)
     )
+    unit = jnp.full(config.num_features, 1.0 / config.rotation_scale)
+    unit = jnp.broadcast_to(unit.at[-6:].set(1.0), target.shape)
+    prediction, target = prediction * unit, target * unit
     flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
     feet = jnp.array(bones.feet)
     speed = jnp.linalg.norm(

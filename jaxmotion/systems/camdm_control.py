@@ -307,10 +307,7 @@ def controller(
         )
         left = jnp.where(_new_style(state, command), control.guided_plans, state.guided)
         condition = camdm.Condition(
-            past=features.motion_features(
-                features.to_frame(state.past, frame),
-                rotation_layout=config.rotation_layout,
-            ),
+            past=camdm.to_features(features.to_frame(state.past, frame), config=config),
             trajectory=trajectory.to_local(wanted, frame),
             label=command.label,
             keep_past=jnp.ones((), bool),
@@ -318,12 +315,7 @@ def controller(
         # Beside a guided character an unguided one gets the scale that changes nothing.
         scale = jnp.where(left > 0, control.guidance_scale, 1.0) if guided else None
         poses = sample(key, condition, scale=scale)
-        chunk = features.from_frame(
-            features.motion_from_features(
-                poses, config.fps, rotation_layout=config.rotation_layout
-            ),
-            frame,
-        )
+        chunk = features.from_frame(camdm.to_motion(poses, config=config), frame)
         if control.seam > 0:
             shown = jax.tree.map(lambda x: x[-2:], state.past)
             chunk = inertia.inertialize(shown, chunk, duration=control.seam)

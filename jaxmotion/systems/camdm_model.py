@@ -99,9 +99,13 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         raise ValueError(f"{where}: field 'config' has unknown {sorted(unknown)}")
     try:
         bones = value["skeleton"]
+        config = {
+            name: tuple(x) if isinstance(x, list) else x
+            for name, x in value["config"].items()
+        }
         check_parents(tuple(bones["parents"]))
         model = Model(
-            config=camdm.Config(**value["config"]),
+            config=camdm.Config(**config),
             bones=Skeleton(
                 offsets=jnp.asarray(bones["offsets"], jnp.float32),
                 parents=tuple(bones["parents"]),
