@@ -20,7 +20,7 @@ from jaxmotion.protocols.camdm import WINDOW, Windows, data_windows
 from jaxmotion.typing import Key, Params
 
 
-def in_batches(function: Callable[[Any], Any], x: Any, size: int = 256) -> Any:
+def in_batches(function: Callable[[Any], Any], x: Any, *, size: int = 256) -> Any:
     """Applies a jitted function to slices of the first axis, to bound the memory.
 
     Args:

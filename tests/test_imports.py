@@ -1,0 +1,165 @@
+"""The import contract: what each package may import, and one door a third party."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "jaxmotion"
+
+# Folder (or file) -> what of jaxmotion it may import. Imports point down.
+MAY_IMPORT = {
+    "typing.py": set(),
+    "diffusion": {"typing"},
+    "motion": {"typing"},
+    "networks": {"typing"},
+    "evaluation": {"typing", "motion"},
+    # networks: the recogniser is trained and used in learning/recognition.py.
+    "learning": {"typing", "motion", "networks"},
+    "control": {"typing", "motion"},
+    "data": {"typing", "motion"},
+    # learning.checkpoint: a model is loaded as a value (systems/camdm_model.py).
+    "systems": {"typing", "diffusion", "motion", "networks", "control", "learning"},
+    # What an experiment measures and leaves behind: a method, its data, its pictures.
+    "protocols": {
+        "typing",
+        "motion",
+        "data",
+        "evaluation",
+        "control",
+        "learning",
+        "systems",
+        "viz",
+    },
+    "viz": {"typing", "motion"},
+}
+LEARNING_FOR_SYSTEMS = {"losses", "checkpoint"}
+
+# Third party -> where it may be imported (prefixes of paths below the root).
+ANYWHERE = {"jax", "jaxtyping", "numpy"}
+DOORS = {
+    "flax": ("jaxmotion/networks/",),
+    "optax": ("jaxmotion/learning/training.py",),
+    "orbax": ("jaxmotion/learning/checkpoint.py",),
+    "tensorflow_datasets": ("jaxmotion/data/builders/",),
+    "matplotlib": ("jaxmotion/viz/",),
+    "PIL": ("jaxmotion/viz/",),
+    "tqdm": ("jaxmotion/learning/loop.py", "experiments/", "benchmarks/"),
+    "tyro": ("experiments/", "benchmarks/"),
+    "torch": ("benchmarks/",),
+}
+
+
+def imports(path):
+    """Every imported module with the line, and whether it is loaded with the file."""
+    tree = ast.parse(path.read_text())
+    inside = {
+        id(node)
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+        for node in ast.walk(function)
+    }
+    for node in ast.walk(tree):
+        at_top = id(node) not in inside
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node.lineno, at_top
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: relative import"
+            for alias in node.names:
+                yield f"{node.module}.{alias.name}", node.lineno, at_top
+
+
+def files(*folders):
+    found = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
+    assert found
+    return found
+
+
+def relative(path):
+    return path.relative_to(ROOT).as_posix()
+
+
+LIBRARY = files(PACKAGE)
+SCRIPTS = files(ROOT / "experiments", ROOT / "benchmarks")
+
+
+def owner(path):
+    """The entry of MAY_IMPORT that a file falls under; None for __init__.py."""
+    parts = path.relative_to(PACKAGE).parts
+    if parts == ("__init__.py",):
+        return None
+    assert parts[0] in MAY_IMPORT, f"{relative(path)} is in no known part"
+    return parts[0]
+
+
+@pytest.mark.parametrize("path", LIBRARY, ids=relative)
+def test_imports_point_down(path):
+    part = owner(path)
+    if part is None:
+        return
+    for name, line, _ in imports(path):
+        where = f"{relative(path)}:{line} imports {name}"
+        head, *rest = name.split(".")
+        assert head not in ("experiments", "benchmarks", "tests"), where
+        if head != "jaxmotion":
+            continue
+        target = rest[0]
+        assert target == part or target in MAY_IMPORT[part], where
+        if (part, target) == ("systems", "learning"):
+            assert rest[1] in LEARNING_FOR_SYSTEMS, where
+
+
+@pytest.mark.parametrize("path", LIBRARY + SCRIPTS, ids=relative)
+def test_third_parties_come_through_their_doors(path):
+    for name, line, _ in imports(path):
+        head = name.split(".")[0]
+        known = {*sys.stdlib_module_names, *ANYWHERE, "jaxmotion"}
+        # Scripts import the modules beside them by their bare names.
+        if head in known or (path in SCRIPTS and path.with_stem(head).exists()):
+            continue
+        where = f"{relative(path)}:{line} imports {name}"
+        assert head in DOORS, where
+        assert any(relative(path).startswith(door) for door in DOORS[head]), where
+
+
+@pytest.mark.parametrize("path", LIBRARY, ids=relative)
+def test_what_is_slow_to_load_is_loaded_when_used(path):
+    """Only builders load tensorflow-datasets and only viz matplotlib: in functions."""
+    inside = {"jaxmotion.data.builders": "builders", "jaxmotion.viz": "viz"}
+    for name, line, at_top in imports(path):
+        for module, folder in inside.items():
+            if name.startswith(module) and folder not in path.parts:
+                assert not at_top, f"{relative(path)}:{line} imports {name}"
+
+
+def test_no_cycles():
+    modules = {}
+    for path in LIBRARY:
+        name = relative(path).removesuffix(".py").removesuffix("/__init__")
+        modules[name.replace("/", ".")] = path
+    edges = {}
+    for name, path in modules.items():
+        found = set()
+        for target, _, at_top in imports(path):
+            while at_top and target not in modules and "." in target:
+                target = target.rpartition(".")[0]
+            if at_top and target in modules and modules[target].name != "__init__.py":
+                found.add(target)
+        edges[name] = found - {name}
+    done, path = set(), []
+
+    def visit(name):
+        assert name not in path, " -> ".join([*path, name])
+        if name in done:
+            return
+        path.append(name)
+        for target in sorted(edges[name]):
+            visit(target)
+        path.pop()
+        done.add(name)
+
+    for name in modules:
+        visit(name)

@@ -1,0 +1,101 @@
+"""One compilation serves all values: planner, rollout and chunk of training."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.control import rollout
+from jaxmotion.motion.trajectory import Command, Trajectory
+from jaxmotion.systems import camdm, camdm_control
+from tests import tiny
+
+chex = pytest.importorskip("chex")
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+CONFIG = tiny.config(depth=1, heading="facing")
+
+
+@pytest.fixture(autouse=True)
+def fresh_counters():
+    chex.clear_trace_counter()
+
+
+def condition(seed):
+    generator = np.random.default_rng(seed)
+    yaw = generator.normal(size=CONFIG.future)
+    return camdm.Condition(
+        past=jnp.asarray(
+            generator.normal(size=(CONFIG.past, CONFIG.num_features)), jnp.float32
+        ),
+        trajectory=Trajectory(
+            position=jnp.asarray(
+                generator.normal(size=(CONFIG.future, 2)), jnp.float32
+            ),
+            facing=jnp.asarray(np.stack([np.sin(yaw), np.cos(yaw)], -1), jnp.float32),
+        ),
+        label=jnp.int32(seed % 2),
+        keep_past=jnp.bool_(seed % 2),
+    )
+
+
+def test_a_planner_is_traced_once():
+    """Other parameters, keys, conditions, styles and guidance scales."""
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def plan(params, key, condition, scale):
+        return camdm.planner(params, config=CONFIG)(key, condition, scale=scale)
+
+    results = [
+        plan(
+            tiny.random_params(camdm.init, CONFIG, seed=seed),
+            jax.random.key(seed),
+            condition(seed),
+            jnp.float32(0.5 + seed),
+        )
+        for seed in range(3)
+    ]
+    assert np.abs(results[1] - results[0]).max() > 1e-3
+
+
+def test_a_rollout_is_traced_once(bones):
+    """Other states, commands and moments at which plans are made."""
+    control = camdm_control.Control(apply=5, reuse=6)
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def run(params, key, states, commands):
+        made = camdm_control.controller(params, bones, config=CONFIG, control=control)
+        return rollout.rollout(made, key, states, commands)
+
+    planned = []
+    for seed in range(2):
+        state = camdm_control.init_state(
+            bones, tiny.walk(CONFIG.past, start=float(seed)), config=CONFIG
+        )
+        states = jax.tree.map(lambda x: jnp.stack([x] * 2), state)
+        later = np.arange(6) > 2 + seed
+        ahead = jnp.asarray(
+            np.broadcast_to(np.stack([later, ~later], -1), (2, 6, 2)), jnp.float32
+        )
+        label = jnp.broadcast_to(jnp.asarray(later, jnp.int32), (2, 6))
+        commands = Command(velocity=ahead, facing=ahead, label=label)
+        params = tiny.random_params(camdm.init, CONFIG, seed=seed)
+        states, frames = run(params, jax.random.key(seed), states, commands)
+        # What a rollout returns continues it, without another trace.
+        run(params, jax.random.key(9), states, commands)
+        planned.append(np.flatnonzero(frames.planned[0]).tolist())
+    assert planned[0] != planned[1]
+
+
+def test_a_chunk_of_training_is_traced_once(monkeypatch):
+    """Both for a first state and for the state that it returns."""
+    counted = chex.assert_max_traces(camdm.loss, n=1)
+    monkeypatch.setattr(camdm, "loss", counted)
+    run, state, key, data = tiny.training_parts(CONFIG, num_steps=2)
+    losses = []
+    for _ in range(3):
+        state, info = run(state, key, data)
+        losses.append(float(info["loss"][0]))
+    assert len(set(losses)) == 3
