@@ -223,13 +223,18 @@ def batch_features(bones, walker, config):
     return jnp.stack(poses)
 
 
-@pytest.mark.parametrize("layout", ["rows", "columns"])
-def test_loss_terms_are_the_oracles(walker, bones, layout):
+@pytest.mark.parametrize(
+    ("layout", "scale"), [("rows", 1.0), ("columns", 1.0), ("rows", 4.0)]
+)
+def test_loss_terms_are_the_oracles(walker, bones, layout, scale):
+    """Whatever the factor on the rotations, losses are of the rotations themselves."""
     config = tiny.config(rotation_layout=layout, contact_speed=1.2)
     target = batch_features(bones, walker, config)
     noise = np.random.default_rng(0).normal(0, 0.2, target.shape)
     prediction = target + jnp.asarray(noise, jnp.float32)
-    found = terms(config)(bones, prediction, target)
+    scaled = dataclasses.replace(config, rotation_scale=scale)
+    enlarge = lambda x: x.at[..., :-6].multiply(scale)  # noqa: E731
+    found = terms(scaled)(bones, enlarge(prediction), enlarge(target))
     expected = reference.loss_terms(
         np.asarray(bones.offsets, np.float64),
         bones.parents,
@@ -244,6 +249,22 @@ def test_loss_terms_are_the_oracles(walker, bones, layout):
     for name, value in expected.items():
         assert value > 1e-5, name
         np.testing.assert_allclose(found[name], value, rtol=1e-4, err_msg=name)
+
+
+@pytest.mark.parametrize("layout", ["rows", "columns"])
+def test_features_and_back(walker, bones, layout):
+    config = tiny.config(rotation_layout=layout, rotation_scale=3.0)
+    window = window_of(walker, config)
+    poses = camdm.to_features(window, config=config)
+    plain = features.motion_features(window, rotation_layout=layout)
+    np.testing.assert_allclose(poses[:, :-6], 3.0 * plain[:, :-6], rtol=1e-6)
+    np.testing.assert_array_equal(poses[:, -6:], plain[:, -6:])
+    found = camdm.to_motion(poses, config=config)
+    for field in ("root_position", "joint_rotation"):
+        np.testing.assert_allclose(
+            getattr(found, field), getattr(window, field), atol=1e-6
+        )
+    assert found.fps == config.fps
 
 
 def test_losses_are_zero_at_the_target(walker, bones):

@@ -41,9 +41,7 @@ def obedient(height):
                 joint_rotation=rotation.rot6d_from_matrix(joints.set(facing)),
                 fps=config.fps,
             )
-            return features.motion_features(
-                motion, rotation_layout=config.rotation_layout
-            )
+            return camdm.to_features(motion, config=config)
 
         return plan
 
@@ -122,8 +120,9 @@ def heights(frames, character):
     return np.asarray(frames.root_position[character, :, 1]).round(5).tolist()
 
 
-@pytest.mark.parametrize("replan_on_change", [True, False])
-@pytest.mark.parametrize("guided_plans", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("guided_plans", "replan_on_change"), [(0, True), (1, True), (1, False), (2, False)]
+)
 def test_guidance_only_in_the_first_plans_after_a_style_change(
     bones, use, guided_plans, replan_on_change
 ):
@@ -320,7 +319,7 @@ def test_seams_are_continuous_in_position_and_velocity(bones, monkeypatch):
 
         monkeypatch.setattr(camdm, "planner", planner)
         commands = commands_of(*steady(1, 10))
-        for seam in (0.0, 0.2):
+        for seam in (0.0, 0.2) if fps == 120.0 else (0.2,):
             control = dataclasses.replace(CONTROL, apply=30, seam=seam)
             _, frames = roll(bones, commands, control, config)
             before = states_of(bones, 1, config).past
@@ -333,8 +332,8 @@ def test_seams_are_continuous_in_position_and_velocity(bones, monkeypatch):
                 second = jnp.linalg.norm(x[at] - 2 * x[at - 1] + x[at - 2])
                 changes[fps, seam, name] = float(first), float(second)
     for name, jump in {"root": 0.1, "turn": 0.25}.items():
+        assert changes[120.0, 0.0, name][0] > jump
         for fps in (120.0, 240.0):
-            assert changes[fps, 0.0, name][0] > jump
             assert changes[fps, 0.2, name][0] < 2.5 / fps
         ratio = changes[240.0, 0.2, name][1] / changes[120.0, 0.2, name][1]
         assert ratio < 0.35
