@@ -2,145 +2,216 @@
 
 Example:
   python benchmarks/compile_times.py
+  python benchmarks/compile_times.py --steps 32
 """
 
 import dataclasses
 import functools
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import suite
 import tyro
+import workload
+from jaxtyping import Array
 
 from jaxmotion.control import rollout
-from jaxmotion.data import procedural, windows
+from jaxmotion.data import windows
+from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import training
-from jaxmotion.protocols import camdm as protocol
-from jaxmotion.systems import camdm, camdm_control, camdm_model
+from jaxmotion.systems import camdm, camdm_control, camdm_loss, camdm_model
+from jaxmotion.typing import Key, Params
+
+COLUMNS = {
+    "program": "program",
+    "trace": "trace s",
+    "lower": "lower s",
+    "compile": "compile s",
+    "total": "total s",
+}
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Schedule, sampler (one scan, and unrolled), training chunk, rollout.
 
+    Seconds of each phase of one program; JAX's caches are emptied before each. The
+    parameters are arguments.
+
     Attributes:
       steps: Diffusion steps of the sampler.
+      updates: Optimiser steps of the training chunk.
+      batch: Windows of an update.
+      characters: Of the rollout.
+      seconds: Length of the rollout.
+      width: Channels of a token.
       out: Folder for compile_times.json.
       gate: Report to compare with; exit status 1 if something is worse.
     """
 
     steps: int = 8
+    updates: int = 50
+    batch: int = 32
+    characters: int = 16
+    seconds: float = 2.0
+    width: int = 256
     out: Path = Path("runs/benchmarks")
     gate: Path | None = None
 
 
-def phases(name: str, function, *given) -> list[suite.Metric]:
-    """Seconds of the three phases of one program."""
-    start = time.perf_counter()
+def phases(name: str, function: Callable, given: tuple) -> dict[str, Any]:
+    """Seconds of the three phases of one program.
+
+    Args:
+      name: Of the program.
+      function: From `jax.jit`.
+      given: Its arguments.
+
+    Returns:
+      One row of the report.
+    """
+    jax.clear_caches()
+    clock = [time.perf_counter()]
     traced = function.trace(*given)
-    middle = time.perf_counter()
+    clock.append(time.perf_counter())
     lowered = traced.lower()
-    late = time.perf_counter()
+    clock.append(time.perf_counter())
     lowered.compile()
-    end = time.perf_counter()
-    times = {"trace": middle - start, "lower": late - middle, "compile": end - late}
-    return [
-        suite.Metric(f"{name} {phase}", seconds, "s", tolerance=0.6)
-        for phase, seconds in times.items()
-    ]
+    clock.append(time.perf_counter())
+    return {
+        "program": name,
+        "trace": clock[1] - clock[0],
+        "lower": clock[2] - clock[1],
+        "compile": clock[3] - clock[2],
+        "total": clock[3] - clock[0],
+    }
 
 
-def unrolled(config: camdm.Config, params, key, condition):
-    """The sampler with a Python loop over the steps, for comparison."""
+def unrolled(
+    config: camdm.Config, params: Params, key: Key, condition: camdm.Condition
+) -> Array:
+    """The sampler with a Python loop over the steps, for comparison.
+
+    Args:
+      config: The network.
+      params: Its parameters.
+      key: Consumed.
+      condition: Of one character.
+
+    Returns:
+      Clean features.
+    """
     table = schedule.cosine_schedule(config.num_steps)
     net = camdm.network(config)
-    given = condition.arguments(config)
-    context = net.apply({"params": params}, *given, method="encode")
+    arguments = condition.arguments(config)
+    context = net.apply({"params": params}, *arguments, method="encode")
 
-    def denoise(key, x, t):
+    def denoise(key: Key, x: Array, t: Array) -> Array:
         del key
         return net.apply({"params": params}, context, x, t, method="denoise")
 
     step = chain.ancestral_step(table, denoise)
-    x = jax.random.normal(key, (config.future, config.num_features))
+    key_start, key_chain = jax.random.split(key)
+    x = jax.random.normal(key_start, (config.future, config.num_features))
     for t in range(config.num_steps, 0, -1):
-        x = step(jax.random.fold_in(key, t), x, jnp.int32(t))
+        x = step(jax.random.fold_in(key_chain, t), x, jnp.int32(t))
     return x
+
+
+def training_program(
+    args: Config, model: camdm_model.Model, params: Params, clips: Clips
+) -> tuple[Callable, tuple]:
+    """A chunk of training.
+
+    Args:
+      args: The settings.
+      model: The model.
+      params: Its first parameters.
+      clips: The data.
+
+    Returns:
+      The jitted function and its arguments.
+    """
+    optimizer = training.adamw_cosine(num_steps=1000)
+    loss = functools.partial(camdm_loss.loss, bones=model.bones, config=model.config)
+
+    def sample_batch(key: Key, data: tuple) -> tuple:
+        clips, index = data
+        motion, clip = windows.sample_windows(key, clips, index, batch=args.batch)
+        return motion, clips.labels["style"][clip]
+
+    update = training.make_update(loss, optimizer)
+    run = training.train_chunk(update, sample_batch, num_steps=args.updates)
+    state = training.init_train_state(params, optimizer)
+    index = windows.window_index(clips, model.config.window)
+    return run, (state, jax.random.key(0), (clips, index))
+
+
+def programs(args: Config) -> Iterator[tuple[str, Callable, tuple]]:
+    """The programs to measure.
+
+    Args:
+      args: The settings.
+
+    Yields:
+      Name, jitted function and arguments.
+    """
+    clips = workload.make_clips()
+    model, params = workload.walker_model(
+        clips, None, steps=args.steps, width=args.width
+    )
+    config = model.config
+    yield (
+        "schedule, 1000 steps",
+        jax.jit(lambda: schedule.cosine_schedule(1000)),
+        (),
+    )
+
+    def scanned(params: Params, key: Key, condition: camdm.Condition) -> Array:
+        return camdm.planner(params, config=config)(key, condition)
+
+    condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
+    given = (params, jax.random.key(1), condition)
+    yield f"sampler, {args.steps} steps, scan", jax.jit(scanned), given
+    loop = jax.jit(functools.partial(unrolled, config))
+    yield f"sampler, {args.steps} steps, unrolled", loop, given
+    name = f"training, {args.updates} updates"
+    yield name, *training_program(args, model, params, clips)
+
+    def rolled(params: Params, key: Key, states: Any, commands: Any) -> Any:
+        controller = camdm_control.controller(params, model.bones, config=config)
+        return rollout.rollout(controller, key, states, commands)
+
+    steered = workload.steered(model, clips, args.characters, seconds=args.seconds)
+    name = f"rollout, {args.characters} x {args.seconds:g} s"
+    yield name, jax.jit(rolled), (params, jax.random.key(2), *steered)
 
 
 def main() -> None:
     """Measures and writes the report."""
     args = tyro.cli(Config, description=__doc__)
-    clips = procedural.make_clips(minutes=2)
-    config = camdm.Config(num_joints=22, num_labels=8, num_steps=args.steps)
-    params = camdm.init(jax.random.key(0), config)
-    model = camdm_model.Model(
-        config=config,
-        bones=clips.skeleton,
-        labels=clips.names("style"),
-        source=clips.source,
+    suite.prepare(args.out, args.gate)
+    rows = [phases(*program) for program in programs(args)]
+    suite.print_table(rows, COLUMNS)
+    metrics = [
+        suite.Metric(f"{row['program']}: {phase}", row[phase], "s", tolerance=0.6)
+        for row in rows
+        for phase in ("trace", "lower", "compile")
+    ]
+    suite.report(
+        "compile_times",
+        metrics,
+        args.out,
+        gate=args.gate,
+        rows=rows,
+        settings=suite.settings(args),
     )
-    labels = np.zeros(1, int)
-    states = protocol.start_states(clips, model, labels, field="style", seed=0)
-    commands = protocol.preset_batch("forward", labels, np.ones(1), seconds=2, fps=30.0)
-    index = windows.window_index(clips, config.window)
-    motion, _ = windows.sample_windows(jax.random.key(0), clips, index, batch=1)
-    single = jax.tree.map(lambda x: x[0], motion)
-    condition, _ = jax.jit(
-        lambda w: camdm.example(
-            jax.random.key(0), model.bones, w, jnp.int32(0), config=config
-        )
-    )(single)
-    key = jax.random.key(1)
-
-    optimizer = training.adamw_cosine(num_steps=100)
-    loss = functools.partial(camdm.loss, bones=model.bones, config=config)
-
-    def sample_batch(key, data):
-        clips, index = data
-        motion, clip = windows.sample_windows(key, clips, index, batch=32)
-        return motion, clips.labels["style"][clip]
-
-    run = training.train_chunk(
-        training.make_update(loss, optimizer), sample_batch, num_steps=50
-    )
-    controller = camdm_control.controller(params, model.bones, config=config)
-
-    metrics = phases("schedule", jax.jit(lambda: schedule.cosine_schedule(1000)), *())
-    metrics += phases(
-        "sampler (scan)",
-        jax.jit(lambda p, k, c: camdm.planner(p, config=config)(k, c)),
-        params,
-        key,
-        condition,
-    )
-    metrics += phases(
-        "sampler (unrolled)",
-        jax.jit(functools.partial(unrolled, config)),
-        params,
-        key,
-        condition,
-    )
-    metrics += phases(
-        "training chunk, 50 steps",
-        run,
-        training.init_train_state(params, optimizer),
-        key,
-        (clips, index),
-    )
-    metrics += phases(
-        "rollout, 2 s",
-        jax.jit(functools.partial(rollout.rollout, controller)),
-        key,
-        states,
-        commands,
-    )
-    suite.report("compile_times", metrics, args.out, gate=args.gate)
 
 
 if __name__ == "__main__":
-    main()
+    suite.start(main)

@@ -5,17 +5,33 @@ Example:
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import suite
+import timing
 import tyro
+import workload
+from jaxtyping import Array
 
-from jaxmotion.motion import trajectory
 from jaxmotion.systems import camdm
+from jaxmotion.typing import Params
+from jaxmotion.viz import figure
+
+COLUMNS = {
+    "batch": "batch",
+    "steps": "steps",
+    "network_calls": "network calls",
+    "compile_s": "compile s",
+    "p50_ms": "p50 ms",
+    "p95_ms": "p95 ms",
+    "runs": "runs",
+    "frames_per_second": "frames/s",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,88 +70,94 @@ class Config:
     gate: Path | None = None
 
 
-def condition(config: camdm.Config, batch: int) -> camdm.Condition:
-    """A batch of conditions of plausible size; their values do not matter."""
-    rng = np.random.default_rng(0)
-    facing = rng.normal(size=(batch, config.future, 2))
-    facing /= np.linalg.norm(facing, axis=-1, keepdims=True)
-    return camdm.Condition(
-        past=jnp.asarray(
-            rng.normal(size=(batch, config.past, config.num_features)), jnp.float32
-        ),
-        trajectory=trajectory.Trajectory(
-            position=jnp.asarray(
-                rng.normal(size=(batch, config.future, 2)), jnp.float32
-            ),
-            facing=jnp.asarray(facing, jnp.float32),
-        ),
-        label=jnp.zeros(batch, jnp.int32),
-        keep_past=jnp.ones(batch, bool),
-    )
+def sampler(
+    config: camdm.Config, params: Params, batch: int, chunk: int, arguments: bool
+) -> tuple[Callable, tuple]:
+    """One batch of plans as a jitted function.
 
+    Args:
+      config: The network.
+      params: Its parameters.
+      batch: Characters; 1 is the program of one character, not a batch of one.
+      chunk: Characters at a time in batches of 16 and more; 0 for all at once.
+      arguments: Whether the parameters are arguments, not constants.
 
-def sampler(config: camdm.Config, params, batch: int, chunk: int, arguments: bool):
-    """Jitted function and arguments of one batch of plans."""
+    Returns:
+      The function and its arguments.
+    """
 
-    def plans(params, keys, conditions):
+    def plans(params: Params, keys: Array, conditions: camdm.Condition) -> Array:
         plan = camdm.planner(params, config=config)
-        size = chunk if chunk and batch >= 16 and batch % chunk == 0 else batch
-        if size == batch:
+        if batch == 1:
+            return plan(keys[0], jax.tree.map(lambda x: x[0], conditions))
+        if not chunk or batch < 16:
             return jax.vmap(plan)(keys, conditions)
-        return jax.lax.map(lambda x: plan(*x), (keys, conditions), batch_size=size)
+        return jax.lax.map(lambda x: plan(*x), (keys, conditions), batch_size=chunk)
 
-    keys = jax.random.split(jax.random.key(1), batch)
-    conditions = condition(config, batch)
-    if batch == 1:
-        # The one-character program, not a batch of one.
-        keys, conditions = jax.tree.map(lambda x: x[0], (keys, conditions))
-
-        def one(params, key, single):
-            return camdm.planner(params, config=config)(key, single)
-
-        run = one
-    else:
-        run = plans
+    given = (
+        jax.random.split(jax.random.key(1), batch),
+        workload.conditions(config, batch),
+    )
     if arguments:
-        return jax.jit(run), (params, keys, conditions)
-    return jax.jit(lambda k, c: run(params, k, c)), (keys, conditions)
+        return jax.jit(plans), (params, *given)
+    return jax.jit(functools.partial(plans, params)), given
+
+
+def case(args: Config, steps: int, batch: int) -> dict[str, Any]:
+    """Measures one step count and batch.
+
+    Args:
+      args: The settings.
+      steps: Diffusion steps.
+      batch: Characters.
+
+    Returns:
+      One row of the report.
+    """
+    config = workload.paper_config(
+        steps=steps, width=args.width, frames_per_token=args.frames_per_token
+    )
+    params = camdm.init(jax.random.key(0), config)
+    run, given = sampler(config, params, batch, args.chunk, args.arguments)
+    found = timing.measure(run, *given, runs=args.runs, limit_s=args.limit)
+    return {
+        "batch": batch,
+        "steps": steps,
+        "network_calls": steps,
+        **dataclasses.asdict(found),
+        "frames_per_second": 1000 * batch * config.future / found.p50_ms,
+    }
+
+
+def metrics_of(system: str, row: dict[str, Any]) -> list[suite.Metric]:
+    """Metrics of a row, for the gate.
+
+    Args:
+      system: What was measured.
+      row: From `case`.
+
+    Returns:
+      Four metrics.
+    """
+    name = f"{system} steps={row['steps']} batch={row['batch']}"
+    return [
+        suite.Metric(f"{name} p50", row["p50_ms"], "ms"),
+        suite.Metric(f"{name} p95", row["p95_ms"], "ms", tolerance=0.6),
+        suite.Metric(f"{name} compile", row["compile_s"], "s", tolerance=0.6),
+        suite.Metric(f"{name} frames", row["frames_per_second"], "frames/s", "higher"),
+    ]
 
 
 def main() -> None:
     """Measures, writes the report and the plot."""
     args = tyro.cli(Config, description=__doc__)
-    metrics, rows = [], []
+    suite.prepare(args.out, args.gate)
+    rows = []
     for batch in args.batch:
         for steps in args.steps:
-            config = camdm.Config(
-                num_joints=25,
-                num_labels=100,
-                num_steps=steps,
-                width=args.width,
-                hidden=4 * args.width,
-                frames_per_token=args.frames_per_token,
-            )
-            params = camdm.init(jax.random.key(0), config)
-            run, given = sampler(config, params, batch, args.chunk, args.arguments)
-            timing = suite.measure(run, *given, runs=args.runs, limit_s=args.limit)
-            frames = 1000 * batch * config.future / timing.p50_ms
-            name = f"{args.system} steps={steps} batch={batch}"
-            rows.append(
-                dataclasses.asdict(timing)
-                | {"steps": steps, "batch": batch, "network_calls": steps}
-                | {"frames_per_second": frames}
-            )
-            metrics += [
-                suite.Metric(f"{name} p50", timing.p50_ms, "ms"),
-                suite.Metric(f"{name} p95", timing.p95_ms, "ms", tolerance=0.6),
-                suite.Metric(f"{name} compile", timing.compile_s, "s", tolerance=0.6),
-                suite.Metric(f"{name} frames", frames, "frames/s", "higher"),
-            ]
-            print(name, timing, flush=True)
-    suite.report("step_counts", metrics, args.out, gate=args.gate, rows=rows)
-
-    from jaxmotion.viz import figure
-
+            rows.append(case(args, steps, batch))
+            print(f"batch {batch}, {steps} steps: {rows[-1]['p50_ms']:.4g} ms")
+    suite.print_table(rows, COLUMNS)
     lines = {}
     for batch in args.batch:
         own = [row for row in rows if row["batch"] == batch]
@@ -147,9 +169,18 @@ def main() -> None:
         args.out / "step_counts.png",
         lines,
         xlabel="diffusion steps",
-        ylabel="one plan, ms (p50, whisker to p95)",
+        ylabel="a batch of plans, ms (p50, whisker to p95)",
+    )
+    metrics = [metric for row in rows for metric in metrics_of(args.system, row)]
+    suite.report(
+        "step_counts",
+        metrics,
+        args.out,
+        gate=args.gate,
+        rows=rows,
+        settings=suite.settings(args),
     )
 
 
 if __name__ == "__main__":
-    main()
+    suite.start(main)

@@ -1,23 +1,19 @@
-"""What the benchmarks share: timing, the machine, reports, and a gate.
+"""What the benchmarks share: metrics, reports, and a gate against a baseline.
 
-A time is measured around a call that ends with its result ready; compiling is measured
-apart; the first calls warm up and do not count.
+A report says how many calls a percentile comes from, and how busy other processes kept
+the machine meanwhile: figures from a shared machine are no figures of the program.
 """
 
 import dataclasses
-import datetime
 import json
-import os
-import platform
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-import flax
-import jax
-import numpy as np
+import machine
+
+from jaxmotion.learning.loop import check_writable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,87 +35,70 @@ class Metric:
     tolerance: float = 0.3
 
 
-@dataclasses.dataclass(frozen=True)
-class Timing:
-    """Times of one compiled program.
-
-    Attributes:
-      compile_s: Seconds of tracing, lowering and compiling.
-      p50_ms: Median of the timed calls, milliseconds.
-      p95_ms: 95th percentile, milliseconds.
-      runs: Timed calls.
-    """
-
-    compile_s: float
-    p50_ms: float
-    p95_ms: float
-    runs: int
-
-
-def compile_program(function: Callable, *arguments: Any) -> tuple[Callable, float]:
-    """Compiles a jitted function; returns the program and the seconds it took."""
-    start = time.perf_counter()
-    program = function.lower(*arguments).compile()
-    return program, time.perf_counter() - start
-
-
-def time_calls(
-    call: Callable[[], Any], *, runs: int = 50, warmup: int = 3, limit_s: float = 60.0
-) -> np.ndarray:
-    """Milliseconds of each of `runs` calls, fewer where the limit comes first.
+def prepare(out: Path, gate: Path | None) -> None:
+    """Raises if the report could not be written or compared; before any work.
 
     Args:
-      call: Does the work; what it returns is waited for.
-      runs: Calls to time.
-      warmup: Calls before.
-      limit_s: Stop after so many seconds, but not before five calls.
+      out: Folder of the report.
+      gate: Baseline report, or None.
+
+    Raises:
+      OSError: if the folder cannot be written, or the baseline not be read.
+      ValueError: if the baseline is no report.
+    """
+    check_writable(out)
+    if gate is not None:
+        read_baseline(gate)
+
+
+def read_baseline(path: Path) -> dict[str, float]:
+    """Values of a report by the names of its metrics.
+
+    Args:
+      path: Report of `report`.
 
     Returns:
-      One time a call.
+      The values.
+
+    Raises:
+      OSError: if there is no such file.
+      ValueError: if it is no report; names the file.
     """
-    for _ in range(warmup):
-        jax.block_until_ready(call())
-    times: list[float] = []
-    begin = time.perf_counter()
-    while len(times) < runs:
-        start = time.perf_counter()
-        jax.block_until_ready(call())
-        times.append(1000 * (time.perf_counter() - start))
-        if len(times) >= 5 and time.perf_counter() - begin > limit_s:
-            break
-    return np.array(times)
-
-
-def measure(function: Callable, *arguments: Any, runs: int, limit_s: float) -> Timing:
-    """Compiles a jitted function, and times it."""
-    program, seconds = compile_program(function, *arguments)
-    times = time_calls(lambda: program(*arguments), runs=runs, limit_s=limit_s)
-    p50, p95 = np.percentile(times, [50, 95])
-    return Timing(seconds, float(p50), float(p95), len(times))
-
-
-def _cpu() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(x.split(":")[1].strip() for x in lines if "model name" in x)
-    except (OSError, StopIteration):
-        return platform.processor()
+        metrics = json.loads(path.read_text())["metrics"]
+        return {metric["name"]: float(metric["value"]) for metric in metrics}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path}: {error!r}: expected a report with a list 'metrics' of names and "
+            "values"
+        ) from error
 
 
-def environment() -> dict[str, Any]:
-    """Hardware, versions, command and date, for every report."""
+def settings(args: Any) -> dict[str, Any]:
+    """Command-line settings as JSON.
+
+    Args:
+      args: A dataclass.
+
+    Returns:
+      Its fields; paths as text.
+    """
     return {
-        "device": str(jax.devices()[0]),
-        "devices": len(jax.devices()),
-        "cpu": _cpu(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "flax": flax.__version__,
-        "numpy": np.__version__,
-        "command": " ".join(["python", *sys.argv]),
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in dataclasses.asdict(args).items()
     }
+
+
+def start(main: Callable[[], None]) -> None:
+    """Runs a script; bad input ends it with one line and exit status 1.
+
+    Args:
+      main: The script.
+    """
+    try:
+        main()
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")
 
 
 def compare(metrics: list[Metric], baseline: Path) -> list[str]:
@@ -132,7 +111,7 @@ def compare(metrics: list[Metric], baseline: Path) -> list[str]:
     Returns:
       One line for each.
     """
-    known = {m["name"]: m["value"] for m in json.loads(baseline.read_text())["metrics"]}
+    known = read_baseline(baseline)
     worse = []
     for metric in metrics:
         if metric.name not in known:
@@ -149,6 +128,26 @@ def compare(metrics: list[Metric], baseline: Path) -> list[str]:
     return worse
 
 
+def print_table(rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
+    """Prints rows as a table.
+
+    Args:
+      rows: Their values by key.
+      columns: Title of each key to print.
+    """
+
+    def cell(value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+        return str(value)
+
+    lines = [list(columns.values())]
+    lines += [[cell(row[key]) for key in columns] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
+        print("  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)))
+
+
 def report(
     name: str,
     metrics: list[Metric],
@@ -157,7 +156,7 @@ def report(
     gate: Path | None = None,
     **more: Any,
 ) -> None:
-    """Prints metrics, writes them as JSON, and applies the gate.
+    """Writes metrics as JSON, and applies the gate.
 
     Args:
       name: Of the benchmark; the file is <out>/<name>.json.
@@ -169,18 +168,22 @@ def report(
     Raises:
       SystemExit: with status 1, if the gate finds something worse.
     """
-    width = max(len(metric.name) for metric in metrics)
-    for metric in metrics:
-        print(f"{metric.name:{width}}  {metric.value:10.4g} {metric.unit}")
     out.mkdir(parents=True, exist_ok=True)
+    here = machine.environment()
     value = {
         "benchmark": name,
-        "environment": environment(),
+        "environment": here,
         "metrics": [dataclasses.asdict(metric) for metric in metrics],
         **more,
     }
     path = out / f"{name}.json"
     path.write_text(json.dumps(value, indent=1))
+    print(f"{here['cpu']}, {here['cores']} cores, jax {here['jax']}")
+    if (here["other_load"] or 0.0) > 0.1:
+        print(
+            f"Not idle: other processes used {here['other_load']} cores meanwhile, "
+            "so these times are too long."
+        )
     print(f"wrote {path}")
     worse = [] if gate is None else compare(metrics, gate)
     if worse:

@@ -8,12 +8,13 @@ that both predict the same.
 Source: Chen et al. 2024 (CAMDM), section 3.2; sizes of the released code.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
 from torch import nn
 
+from jaxmotion.diffusion import schedule
 from jaxmotion.networks import blocks
 from jaxmotion.systems import camdm
 
@@ -199,3 +200,29 @@ def posterior_table(beta: np.ndarray) -> dict[str, np.ndarray]:
         "from_x_t": (1.0 - before) * np.sqrt(1.0 - beta) / total,
         "deviation": np.sqrt(beta * (1.0 - before) / total),
     }
+
+
+def plan_call(
+    net: Callable, config: camdm.Config, condition: camdm.Condition
+) -> Callable[[], torch.Tensor]:
+    """One plan in PyTorch, with its own noise drawn in the call as ours is.
+
+    Args:
+      net: The network, or what torch.compile made of it.
+      config: The method.
+      condition: Of one character.
+
+    Returns:
+      A call without arguments.
+    """
+    table = posterior_table(np.asarray(schedule.cosine_schedule(config.num_steps).beta))
+    arrays = [np.array(x)[None] for x in condition.arguments(config)[:4]]
+    given = [torch.from_numpy(x) for x in arrays]
+    given[3] = given[3].long()
+    shape = (config.num_steps + 1, 1, config.future, config.num_features)
+
+    def call() -> torch.Tensor:
+        with torch.inference_mode():
+            return sample(net, table, torch.randn(shape), tuple(given))
+
+    return call

@@ -1,0 +1,143 @@
+"""What the benchmarks run: the paper's network, conditions, a walker to steer."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion.data import procedural
+from jaxmotion.data.clips import Clips
+from jaxmotion.motion import trajectory
+from jaxmotion.protocols import camdm as protocol
+from jaxmotion.systems import camdm, camdm_control, camdm_model
+from jaxmotion.typing import Params
+
+
+def paper_config(
+    *, steps: int = 8, width: int = 256, frames_per_token: int = 1, **sizes: Any
+) -> camdm.Config:
+    """The paper's network: 25 joints and 100 styles, 3.44 million parameters.
+
+    Args:
+      steps: Diffusion steps.
+      width: Channels of a token; the feed-forward layers have four times as many.
+      frames_per_token: 1 in the paper.
+      **sizes: Other sizes of `camdm.Config`.
+
+    Returns:
+      The configuration.
+    """
+    defaults = {"num_joints": 25, "num_labels": 100}
+    return camdm.Config(
+        **(defaults | sizes),
+        num_steps=steps,
+        width=width,
+        hidden=4 * width,
+        frames_per_token=frames_per_token,
+    )
+
+
+def conditions(config: camdm.Config, batch: int) -> camdm.Condition:
+    """A batch of conditions of plausible size; their values do not change the time.
+
+    Args:
+      config: The network.
+      batch: Characters.
+
+    Returns:
+      Conditions, batch axis first.
+    """
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, 2 * np.pi, (batch, config.future))
+    facing = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+    normal = lambda *shape: jnp.asarray(  # noqa: E731
+        rng.normal(size=(batch, *shape)), jnp.float32
+    )
+    return camdm.Condition(
+        past=normal(config.past, config.num_features),
+        trajectory=trajectory.Trajectory(
+            position=normal(config.future, 2), facing=jnp.asarray(facing, jnp.float32)
+        ),
+        label=jnp.asarray(np.arange(batch) % config.num_labels, jnp.int32),
+        keep_past=jnp.ones(batch, bool),
+    )
+
+
+def walker_model(
+    clips: Clips, run: Path | None, **sizes: Any
+) -> tuple[camdm_model.Model, Params]:
+    """A model for the procedural walker.
+
+    Args:
+      clips: Of the walker.
+      run: Run folder or exported file; None for random parameters, which take as long
+        as trained ones.
+      **sizes: Of `paper_config`, without a run.
+
+    Returns:
+      The model and its parameters.
+
+    Raises:
+      ValueError: if the run's model is of another skeleton or other styles.
+    """
+    labels = clips.names("style")
+    if run is None:
+        config = paper_config(
+            num_joints=clips.skeleton.num_joints, num_labels=len(labels), **sizes
+        )
+        model = camdm_model.Model(
+            config=config, bones=clips.skeleton, labels=labels, source=clips.source
+        )
+        return model, camdm.init(jax.random.key(0), config)
+    model, params, _ = camdm_model.load(run)
+    if (model.labels, model.bones.names) != (labels, clips.skeleton.names):
+        raise ValueError(
+            f"{run}: a model of {model.bones.num_joints} joints and the styles "
+            f"{', '.join(model.labels)}: expected one of the procedural walker"
+        )
+    return model, params
+
+
+def steered(
+    model: camdm_model.Model,
+    clips: Clips,
+    characters: int,
+    *,
+    seconds: float,
+    staggered: bool = False,
+) -> tuple[camdm_control.CharacterState, trajectory.Command]:
+    """Start states, and commands of the preset "forward" at 1 m/s.
+
+    Args:
+      model: Of the walker.
+      clips: Where the start poses come from.
+      characters: Their number; they take the styles in turn.
+      seconds: Length of the rollout.
+      staggered: Start the preset at another place for each character, so that
+        commands change at other ticks; without it they change at the same.
+
+    Returns:
+      States [characters], commands [characters, ticks].
+    """
+    labels = np.arange(characters) % len(model.labels)
+    states = protocol.start_states(clips, model, labels, field="style", seed=0)
+    fps = model.config.fps
+    ticks, extra = round(seconds * fps), 30.0 if staggered else 0.0
+    commands = protocol.preset_batch(
+        "forward", labels, np.ones(characters), seconds=seconds + extra, fps=fps
+    )
+    places = np.random.default_rng(0).integers(0, round(extra * fps) + 1, characters)
+    rows = jnp.asarray(places[:, None] + np.arange(ticks))
+    picked = jax.tree.map(lambda x: jax.vmap(lambda y, i: y[i])(x, rows), commands)
+    return states, picked
+
+
+def make_clips() -> Clips:
+    """Two minutes of the procedural walker.
+
+    Returns:
+      Its clips, with labels "style".
+    """
+    return procedural.make_clips(minutes=2)

@@ -1,0 +1,210 @@
+"""The scripts at sizes that take seconds, and the arithmetic of their reports."""
+
+import dataclasses
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.systems import camdm
+from tests import tiny
+
+FOLDER = Path(__file__).parents[2] / "benchmarks"
+SMALL = ["--width", "16", "--runs", "2", "--limit", "1"]
+# Script -> arguments, and what its rows are told apart by.
+SCRIPTS = {
+    "step_counts": (
+        [*SMALL, "--steps", "2", "--batch", "1", "16", "--frames-per-token", "5"],
+        [(1, 2), (16, 2)],
+        ("batch", "steps"),
+    ),
+    "rollout_batch": (
+        [*SMALL, "--characters", "16", "--chunks", "8", "--seconds", "0.4"],
+        [(16, 8)],
+        ("characters", "chunk"),
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def load():
+    """Imports a module of the folder, as a script there finds its neighbours."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(FOLDER))
+        yield importlib.import_module
+
+
+def run_script(name, *arguments):
+    """Runs a script in a process of its own and returns what it printed.
+
+    Not in this one, because `lower` rebuilds dataclasses with things that are not
+    arrays, which the type checks of the tests refuse.
+    """
+    return subprocess.run(
+        [sys.executable, FOLDER / f"{name}.py", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+    ).stdout
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_scripts_write_what_they_measure(name, tmp_path):
+    arguments, cases, keys = SCRIPTS[name]
+    printed = run_script(name, *arguments, "--out", tmp_path)
+    value = json.loads((tmp_path / f"{name}.json").read_text())
+    rows = value["rows"]
+    assert [tuple(row[key] for key in keys) for row in rows] == cases
+    for row in rows:
+        assert 0 < row["p50_ms"] <= row["p95_ms"]
+        assert row["compile_s"] > 0
+        assert row.get("traces", 1) == 1
+    one = rows[0]
+    frames = 45 if name == "step_counts" else 16 * 12
+    assert one["frames_per_second"] == pytest.approx(1000 * frames / one["p50_ms"])
+    environment = value["environment"]
+    for key in ("cpu", "cores", "jax", "jaxlib", "flax", "numpy", "python", "date"):
+        assert environment[key], key
+    assert name in environment["command"]
+    assert "frames/s" in printed
+    assert len({metric["name"] for metric in value["metrics"]}) == len(value["metrics"])
+    if name == "step_counts":
+        assert (tmp_path / "step_counts.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_phases_add_up(load):
+    program = jax.jit(lambda x: jnp.sin(x) @ x)
+    row = load("compile_times").phases("sines", program, (jnp.ones((8, 8)),))
+    parts = row["trace"], row["lower"], row["compile"]
+    assert min(parts) > 0
+    assert row["total"] == pytest.approx(sum(parts))
+
+
+@pytest.mark.slow
+def test_compile_times(tmp_path):
+    small = ["--width", 16, "--steps", 2, "--updates", 2, "--batch", 2]
+    small += ["--characters", 1, "--seconds", 0.1]
+    run_script("compile_times", *small, "--out", tmp_path)
+    rows = json.loads((tmp_path / "compile_times.json").read_text())["rows"]
+    kinds = [row["program"].split(",")[0] for row in rows]
+    assert kinds == ["schedule", "sampler", "sampler", "training", "rollout"]
+    assert all(row["compile"] > 0 for row in rows)
+
+
+def test_unrolled_sampler_is_the_scanned_one(load):
+    """What compile_times compares computes the same."""
+    compile_times, workload = load("compile_times"), load("workload")
+    config = tiny.config(num_steps=2)
+    params = tiny.random_params(camdm.init, config)
+    condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
+    scan = jax.jit(camdm.planner(params, config=config))
+    loop = jax.jit(lambda k, c: compile_times.unrolled(config, params, k, c))
+    found, expected = (f(jax.random.key(0), condition) for f in (loop, scan))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+SCRIPT_NAMES = ["step_counts", "rollout_batch", "compile_times", "peers"]
+
+
+@pytest.mark.parametrize("name", SCRIPT_NAMES)
+def test_help_has_defaults_units_and_an_example(name, load, monkeypatch, capsys):
+    if name == "peers":
+        pytest.importorskip("torch")
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", "--help"])
+    with pytest.raises(SystemExit) as stop:
+        load(name).main()
+    assert stop.value.code == 0
+    printed = " ".join(capsys.readouterr().out.replace("\u2502", " ").split())
+    assert f"python benchmarks/{name}.py" in printed
+    assert "default: runs/benchmarks" in printed
+    assert "seconds" in printed.lower()
+
+
+def test_gate(load, tmp_path, monkeypatch):
+    suite = load("suite")
+    monkeypatch.setattr(sys, "argv", ["x.py"])
+    time, rate = (
+        suite.Metric("time", 10.0, "ms", tolerance=0.2),
+        suite.Metric("rate", 100.0, "frames/s", "higher", tolerance=0.2),
+    )
+    suite.report("x", [time, rate], tmp_path)
+    baseline = tmp_path / "x.json"
+    value = lambda metric, x: dataclasses.replace(metric, value=x)  # noqa: E731
+    new = suite.Metric("new", 1e9, "ms")
+    assert suite.compare([value(time, 11.9), value(rate, 84.0), new], baseline) == []
+    assert suite.compare([value(time, 1.0), value(rate, 1e4)], baseline) == []
+    (slow,) = suite.compare([value(time, 12.1), rate], baseline)
+    assert "time: 12.1 ms, baseline 10" in slow
+    (few,) = suite.compare([time, value(rate, 80.0)], baseline)
+    assert "rate" in few
+    with pytest.raises(SystemExit) as stop:
+        suite.report("y", [value(time, 20.0)], tmp_path, gate=baseline)
+    assert stop.value.code == 1
+    assert (tmp_path / "y.json").exists()
+
+
+def test_bad_input_stops_before_the_work(load, tmp_path):
+    suite = load("suite")
+    file = tmp_path / "file"
+    file.write_text("{}")
+    with pytest.raises(OSError, match="file"):
+        suite.prepare(file / "below", None)
+    with pytest.raises(ValueError, match="metrics"):
+        suite.prepare(tmp_path, file)
+    with pytest.raises(OSError, match="none.json"):
+        suite.prepare(tmp_path, tmp_path / "none.json")
+    chunks_of = load("rollout_batch").chunks_of
+    assert chunks_of(16, (4, 0, 4)) == [4, None]
+    with pytest.raises(ValueError, match="--chunks 5.*divisor of 16"):
+        chunks_of(16, (4, 5))
+
+
+def test_time_calls_warms_up_and_stops(load):
+    timing = load("timing")
+    calls = []
+    work = lambda: calls.append(1) or jnp.zeros(())  # noqa: E731
+    assert len(timing.time_calls(work, runs=7, warmup=2)) == 7
+    assert len(calls) == 9
+    # No time at all: one call to warm up, and the least number.
+    calls.clear()
+    assert len(timing.time_calls(work, runs=7, warmup=2, limit_s=0.0, least=3)) == 3
+    assert len(calls) == 4
+
+
+def test_time_in_turn_moves_the_order_on(load):
+    timing = load("timing")
+    order = []
+    calls = {name: (lambda name=name: order.append(name)) for name in "abc"}
+    times = timing.time_in_turn(calls, rounds=5, warmup=1, limit_s=60.0)
+    assert "".join(order) == "abcbcacababcbcacab"
+    assert all(values.shape == (5, 2) for values in times.values())
+
+
+def test_ratios_are_of_the_same_round(load):
+    pytest.importorskip("torch")
+    peers = load("peers")
+    eager = np.array([[10.0, 8.0], [100.0, 80.0], [20.0, 16.0]])
+    rows = peers.rows_of({peers.OURS: eager * [0.5, 0.75], peers.EAGER: eager})
+    ours = rows[0]
+    assert ours["ratio"] == pytest.approx(0.5)
+    assert ours["cpu_ratio"] == pytest.approx(0.75)
+    assert ours["p50_ms"] == pytest.approx(10.0)
+
+    def status(**given):
+        try:
+            peers.judge(ours, 0.65, **given)
+        except SystemExit as stop:
+            return stop.code
+        return 0
+
+    assert status(threads=2, load=0.0) == 0
+    assert status(threads=2, load=1.0) == 2
+    assert status(threads=1, load=1.0) == 1
