@@ -7,7 +7,7 @@ import pytest
 
 from jaxmotion.control import rollout
 from jaxmotion.motion.trajectory import Command, Trajectory
-from jaxmotion.systems import camdm, camdm_control
+from jaxmotion.systems import camdm, camdm_control, camdm_loss
 from tests import tiny
 
 chex = pytest.importorskip("chex")
@@ -91,7 +91,7 @@ def test_a_rollout_is_traced_once(bones):
 
 def test_a_chunk_of_training_is_traced_once(monkeypatch):
     """Both for a first state and for the state that it returns."""
-    counted = chex.assert_max_traces(camdm.loss, n=1)
+    counted = chex.assert_max_traces(camdm_loss.loss, n=1)
     monkeypatch.setattr(camdm, "loss", counted)
     run, state, key, data = tiny.training_parts(CONFIG, num_steps=2)
     losses = []

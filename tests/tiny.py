@@ -14,7 +14,7 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips, clips_from_motions
 from jaxmotion.learning import training
 from jaxmotion.motion.skeleton import Motion, Skeleton
-from jaxmotion.systems import camdm
+from jaxmotion.systems import camdm, camdm_loss
 
 NAMES = ("Hips", "LeftUpLeg", "LeftToe", "RightUpLeg", "RightToe")
 PARENTS = (-1, 0, 1, 0, 3)
@@ -147,7 +147,7 @@ def training_parts(
         motion, clip = windows.sample_windows(key, walker, index, batch=batch)
         return motion, walker.labels["style"][clip]
 
-    objective = functools.partial(camdm.loss, bones=walker.skeleton, config=config)
+    objective = functools.partial(camdm_loss.loss, bones=walker.skeleton, config=config)
     update = training.make_update(objective, optimizer, ema_decay=0.9)
     run = training.train_chunk(update, sample_batch, num_steps=num_steps, mesh=mesh)
     params = random_params(camdm.init, config, seed=3)

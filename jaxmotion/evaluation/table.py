@@ -33,9 +33,9 @@ class Cell:
 
 
 def group_means(
-    values: Float[Array, " windows"],
-    groups: Int[Array, " windows"],
-    weights: Float[Array, " windows"] | None = None,
+    values: Float[Array | np.ndarray, " windows"],
+    groups: Int[Array | np.ndarray, " windows"],
+    weights: Float[Array | np.ndarray, " windows"] | None = None,
 ) -> Float[Array, " groups"]:
     """Mean of the windows of each clip; clips without weight are left out.
 

@@ -22,7 +22,7 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import locomotion
 from jaxmotion.motion import features, rotation, skeleton, trajectory
-from jaxmotion.systems import camdm, camdm_control
+from jaxmotion.systems import camdm_control, camdm_loss
 from jaxmotion.systems.camdm_model import Model
 from jaxmotion.typing import Key, Params
 
@@ -63,7 +63,7 @@ def data_windows(clips: Clips, *, stride: int, field: str) -> Windows:
     index = windows.window_index(clips, WINDOW, stride=stride, short="skip")
     motion = jax.vmap(lambda s: windows.cut(clips, s, WINDOW))(index.starts)
     path = trajectory.root_trajectory(clips.skeleton, motion)
-    matrix = camdm.smoothing_matrices(WINDOW, (10.0,))[0]
+    matrix = camdm_loss.smoothing_matrices(WINDOW, (10.0,))[0]
     position = locomotion.smooth(path.position, matrix)
     facing = locomotion.smooth(path.facing, matrix)
     return Windows(

@@ -13,7 +13,7 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.learning import checkpoint, training
 from jaxmotion.motion import skeleton
-from jaxmotion.systems import camdm
+from jaxmotion.systems import camdm, camdm_loss
 from jaxmotion.systems.camdm_model import Model
 from jaxmotion.typing import Key
 
@@ -64,7 +64,7 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
             joint_rotation=clips.joint_rotation[::every],
             fps=clips.fps,
         )
-        mean = camdm.mean_rotations(clips.skeleton, frames, config=config)
+        mean = camdm_loss.mean_rotations(clips.skeleton, frames, config=config)
         config = dataclasses.replace(config, rotation_mean=mean)
     return Model(
         config=config,
@@ -119,7 +119,9 @@ def start(
         warmup_steps=warmup,
         max_norm=1.0,
     )
-    objective = functools.partial(camdm.loss, bones=model.bones, config=model.config)
+    objective = functools.partial(
+        camdm_loss.loss, bones=model.bones, config=model.config
+    )
     update = training.make_update(objective, optimizer, ema_decay=ema)
     mesh = jax.make_mesh((devices,), ("data",)) if devices > 1 else None
 

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
 from jaxmotion.motion import features, skeleton, trajectory
-from jaxmotion.systems import camdm
+from jaxmotion.systems import camdm, camdm_loss
 from tests import tiny
 from tests.reference import camdm as reference
 
@@ -34,7 +34,7 @@ def make_examples(config):
     def run(keys, bones, window):
         label = jnp.ones((), jnp.int32)
         return jax.vmap(
-            lambda key: camdm.example(key, bones, window, label, config=config)
+            lambda key: camdm_loss.example(key, bones, window, label, config=config)
         )(keys)
 
     return jax.jit(run)
@@ -75,7 +75,7 @@ def test_networks_by_name_have_the_configs_sizes(name):
 @pytest.mark.parametrize("frames", [16, 55, 200])
 def test_smoothing_is_scipys_filter_with_reflecting_borders(frames):
     sigmas = (0.0, 1.0, 5.0, 10.0)
-    matrices = camdm.smoothing_matrices(frames, sigmas)
+    matrices = camdm_loss.smoothing_matrices(frames, sigmas)
     path = np.random.default_rng(0).normal(size=(frames, 2))
     for matrix, sigma in zip(matrices, sigmas, strict=True):
         expected = path
@@ -209,7 +209,7 @@ def test_facings_reach_the_network_as_rotations_about_y(layout):
 
 @functools.cache
 def terms(config):
-    return jax.jit(functools.partial(camdm.loss_terms, config=config))
+    return jax.jit(functools.partial(camdm_loss.loss_terms, config=config))
 
 
 def batch_features(bones, walker, config):
@@ -281,7 +281,9 @@ def test_gradients_at_the_target_are_finite(walker, bones):
     target = batch_features(bones, walker, FACING)
     total = jax.jit(
         jax.grad(
-            lambda p: sum(camdm.loss_terms(bones, p, target, config=FACING).values())
+            lambda p: sum(
+                camdm_loss.loss_terms(bones, p, target, config=FACING).values()
+            )
         )
     )
     for prediction in (target, jnp.zeros_like(target)):
@@ -311,7 +313,7 @@ def test_the_loss_weighs_its_terms_and_draws_all_steps(walker, bones, monkeypatc
     labels = jnp.zeros(size, jnp.int32)
 
     def run(key):
-        value, parts = camdm.loss(
+        value, parts = camdm_loss.loss(
             {}, key, (windows, labels), bones=bones, config=config
         )
         return value, parts, recorder.x_t, recorder.t, recorder.condition
@@ -343,7 +345,7 @@ def test_dropout_is_on_in_training(walker, bones, monkeypatch):
     windows = jax.tree.map(lambda x: x[None], window_of(walker, config))
     batch = (windows, jnp.zeros(1, jnp.int32))
     jax.eval_shape(
-        lambda key: camdm.loss({}, key, batch, bones=bones, config=config)[0],
+        lambda key: camdm_loss.loss({}, key, batch, bones=bones, config=config)[0],
         jax.random.key(0),
     )
     assert recorder.train is True
@@ -365,7 +367,7 @@ def test_the_position_term_is_a_mean_over_xyz(walker, bones):
 
 
 def condition_of(walker, bones, config, key=0):
-    condition, _ = jax.jit(functools.partial(camdm.example, config=config))(
+    condition, _ = jax.jit(functools.partial(camdm_loss.example, config=config))(
         jax.random.key(key), bones, window_of(walker, config), jnp.ones((), jnp.int32)
     )
     return dataclasses.replace(condition, keep_past=jnp.ones((), bool))

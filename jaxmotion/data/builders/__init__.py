@@ -1,0 +1,1 @@
+"""tensorflow-datasets builders, one module a data set; imported only when used."""

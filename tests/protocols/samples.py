@@ -1,0 +1,84 @@
+"""Tiny clips of the procedural walker, and characters that walk like it."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion.data import gaits, procedural, selection
+from jaxmotion.protocols import camdm as protocol
+from jaxmotion.protocols import camdm_runs, camdm_training
+from jaxmotion.systems import camdm, camdm_control
+from tests import tiny
+
+STYLES = ("neutral", "zombie")
+SEED = 3
+
+
+def clips(minutes=0.4):
+    """Half of them in each style, four seconds each."""
+    some = {name: gaits.GAITS[name] for name in STYLES}
+    return procedural.make_clips(
+        seed=SEED, minutes=minutes, gaits=some, clip_seconds=4.0
+    )
+
+
+@functools.cache
+def run():
+    """A run with a random network of 16 channels and one layer."""
+    model = camdm_training.make_model(
+        clips(),
+        field="style",
+        width=16,
+        depth=1,
+        heads=2,
+        hidden=32,
+        num_steps=2,
+        frames_per_token=5,
+        heading="facing",
+        dropout=0.0,
+    )
+    train, held_out = selection.split_clips(
+        clips(), fraction=0.3, seed=0, field="style"
+    )
+    params = tiny.random_params(camdm.init, model.config, seed=1)
+    return camdm_runs.Run(
+        model=model, params=params, train=train, held_out=held_out, field="style"
+    )
+
+
+def walking(labels, seconds=8.0):
+    """Frames of characters that do as they are told: the procedural walker itself."""
+    commands = protocol.preset_batch(
+        "forward", labels, np.full(len(labels), 0.8), seconds=seconds, fps=30.0
+    )
+    made = []
+    for number, label in enumerate(labels):
+        own = jax.tree.map(lambda x, n=number: x[n], commands)
+        gait = gaits.GAITS[STYLES[label]]
+        motion = procedural.walk(own, gait, seed=100 + number).motion
+        path, facing = procedural.follow_commands(
+            own, jnp.float32(30.0), jnp.float32(0.27)
+        )
+        made.append(
+            camdm_control.Frame(
+                root_position=motion.root_position,
+                joint_rotation=motion.joint_rotation,
+                desired_velocity=jnp.gradient(path, axis=0) * 30.0,
+                desired_facing=facing,
+                planned=jnp.zeros(path.shape[0], bool),
+            )
+        )
+    return jax.tree.map(lambda *x: jnp.stack(x), *made)
+
+
+def standing(frames):
+    """The same characters, frozen in their first pose."""
+    first = lambda x: jnp.broadcast_to(x[:, :1], x.shape)  # noqa: E731
+    return dataclasses.replace(
+        frames,
+        root_position=first(frames.root_position),
+        joint_rotation=first(frames.joint_rotation),
+    )
