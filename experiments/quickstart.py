@@ -13,6 +13,7 @@ Examples:
 import dataclasses
 import functools
 import json
+import shutil
 import time
 from pathlib import Path
 
@@ -160,7 +161,9 @@ def main() -> None:
     """Runs the quickstart."""
     args = tyro.cli(Config, description=__doc__)
     loop.check_writable(args.out)
-    (args.out / "losses.jsonl").unlink(missing_ok=True)
+    if (args.out / "losses.jsonl").exists():  # an earlier quickstart's
+        shutil.rmtree(args.out / "checkpoints", ignore_errors=True)
+        (args.out / "losses.jsonl").unlink()
     start = time.perf_counter()
     key_init, key_train, key_roll = jax.random.split(jax.random.key(args.seed), 3)
     gaits = {**GAITS, NEW_STYLE: SWAGGER}

@@ -53,7 +53,7 @@ class Recognized:
 
 
 def fit_recognizer(
-    key: Key, clips: Clips, *, field: str, num_steps: int = 1500
+    key: Key, clips: Clips, *, field: str, num_steps: int = 1500, batch: int = 128
 ) -> Recognized:
     """Trains the style recogniser on windows with a stride of 10 frames.
 
@@ -62,6 +62,7 @@ def fit_recognizer(
       clips: Training clips.
       field: Label field that is the style.
       num_steps: Updates.
+      batch: Windows an update.
 
     Returns:
       The recogniser.
@@ -75,7 +76,7 @@ def fit_recognizer(
     to_input = jax.jit(functools.partial(recognition.recognizer_input, clips.skeleton))
     x = jnp.asarray(in_batches(to_input, found.motion))
     params, _ = recognition.train_recognizer(
-        key, x, found.label, config=config, num_steps=num_steps
+        key, x, found.label, config=config, num_steps=num_steps, batch=batch
     )
     return Recognized(params=params, config=config)
 

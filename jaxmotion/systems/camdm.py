@@ -52,7 +52,7 @@ class Config:
         off; ours, 1 in the paper. Entries vary by about 0.2, the noise of the last
         step alone has that size, and a short training then learns to ignore the
         noisy sample; 4 gives both about unit variance, as standardising would.
-      rotation_mean: Mean of the rotations' features (`camdm_loss.mean_rotations`); ours, empty
+      rotation_mean: Mean of those features (`camdm_loss.mean_rotations`); ours, empty
         for none in the paper.
       drop_past: Probability that the past is zeroed in training.
       weight_data: Weight of the mean squared error of features (eq. 2).
