@@ -92,7 +92,7 @@ def test_a_rollout_is_traced_once(bones):
 def test_a_chunk_of_training_is_traced_once(monkeypatch):
     """Both for a first state and for the state that it returns."""
     counted = chex.assert_max_traces(camdm_loss.loss, n=1)
-    monkeypatch.setattr(camdm, "loss", counted)
+    monkeypatch.setattr(camdm_loss, "loss", counted)
     run, state, key, data = tiny.training_parts(CONFIG, num_steps=2)
     losses = []
     for _ in range(3):

@@ -17,10 +17,11 @@ paper does not say (noted at each constant).
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
 
 from jaxmotion.control import inertia
 from jaxmotion.control.rollout import Controller
@@ -33,6 +34,8 @@ from jaxmotion.systems.camdm_state import (
     Control,
     Frame,
     init_state,
+    is_new_style,
+    urgency,
 )
 from jaxmotion.typing import Key, Params
 
@@ -41,24 +44,14 @@ __all__ = [
     "CharacterState",
     "Control",
     "Frame",
+    "advance",
     "controller",
     "init_state",
     "plan_frame",
+    "replan",
+    "urgency",
     "wanted_trajectory",
 ]
-
-
-def _changed(state: CharacterState, command: trajectory.Command) -> Bool[Array, ""]:
-    old = state.command
-    return (
-        jnp.any(jnp.abs(old.velocity - command.velocity) > 1e-3)
-        | jnp.any(jnp.abs(old.facing - command.facing) > 1e-3)
-        | (old.label != command.label)
-    )
-
-
-def _new_style(state: CharacterState, command: trajectory.Command) -> Bool[Array, ""]:
-    return (state.command.label != command.label) & (state.command.label >= 0)
 
 
 def plan_frame(
@@ -136,6 +129,110 @@ def wanted_trajectory(
     )
 
 
+def replan(
+    sample: camdm.Plan,
+    key: Key,
+    bones: skeleton.Skeleton,
+    state: CharacterState,
+    command: trajectory.Command,
+    *,
+    config: camdm.Config,
+    control: Control,
+    guided: bool,
+) -> CharacterState:
+    """Step 1: a new plan.
+
+    Args:
+      sample: From `camdm.planner`.
+      key: Consumed.
+      bones: The skeleton.
+      state: The character's state.
+      command: What the user wants now.
+      config: The method.
+      control: Constants.
+      guided: Sample with guidance; a character that needs none gets the scale that
+        changes nothing (it may stand beside a guided one in a batch).
+
+    Returns:
+      The state with the plan, none of it displayed yet.
+    """
+    frame = plan_frame(bones, state.past, config=config)
+    wanted = wanted_trajectory(bones, state, command, config=config, control=control)
+    left = jnp.where(is_new_style(state, command), control.guided_plans, state.guided)
+    condition = camdm.Condition(
+        past=camdm.to_features(features.to_frame(state.past, frame), config=config),
+        trajectory=trajectory.to_local(wanted, frame),
+        label=command.label,
+        keep_past=jnp.ones((), bool),
+    )
+    scale = jnp.where(left > 0, control.guidance_scale, 1.0) if guided else None
+    poses = sample(key, condition, scale=scale)
+    chunk = features.from_frame(camdm.to_motion(poses, config=config), frame)
+    if control.seam > 0:
+        shown = jax.tree.map(lambda x: x[-2:], state.past)
+        chunk = inertia.inertialize(shown, chunk, duration=control.seam)
+    return dataclasses.replace(
+        state,
+        plan=chunk,
+        cursor=jnp.zeros_like(state.cursor),
+        guided=jnp.maximum(left - 1, 0),
+    )
+
+
+def advance(
+    state: CharacterState,
+    command: trajectory.Command,
+    *,
+    config: camdm.Config,
+    control: Control,
+) -> tuple[CharacterState, Frame]:
+    """Step 2: displays the next pose, and moves the springs on.
+
+    Args:
+      state: The character's state.
+      command: What the user wants now.
+      config: The method.
+      control: Constants.
+
+    Returns:
+      The next state, and what is displayed.
+    """
+    pose = jax.tree.map(
+        lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
+    )
+    past = jax.tree.map(
+        lambda old, new: jnp.concatenate([old[1:], new]), state.past, pose
+    )
+    times = {"half_life": control.half_life, "dt": 1.0 / config.fps}
+    anchor, velocity, acceleration = spring.velocity_spring(
+        state.anchor, state.velocity, state.acceleration, command.velocity, **times
+    )
+    facing, turn_rate = spring.facing_spring(
+        state.facing, state.turn_rate, command.facing, **times
+    )
+    frame = Frame(
+        root_position=pose.root_position[0],
+        joint_rotation=pose.joint_rotation[0],
+        desired_velocity=velocity,
+        desired_facing=facing,
+        planned=state.cursor == 0,
+    )
+    # A style that changes while the old plan still plays arms the next plans.
+    armed = is_new_style(state, command) & (state.cursor > 0)
+    return dataclasses.replace(
+        state,
+        past=past,
+        guided=jnp.where(armed, control.guided_plans, state.guided),
+        cursor=state.cursor + 1,
+        velocity=velocity,
+        acceleration=acceleration,
+        facing=facing,
+        turn_rate=turn_rate,
+        anchor=anchor,
+        command=command,
+    ), frame
+
+
 def controller(
     params: Params,
     bones: skeleton.Skeleton,
@@ -164,83 +261,20 @@ def controller(
         raise ValueError(f"apply is {control.apply}, expected 1..{config.future}")
     sample = camdm.planner(params, config=config, table=table)
 
-    def urgency(state: CharacterState, command: trajectory.Command) -> Array:
-        first = state.command.label < 0
-        played = state.cursor >= control.apply
-        need = first | played
-        if control.replan_on_change:
-            need = need | _changed(state, command)
-        new_style = _new_style(state, command) & (control.guided_plans > 0)
-        guided = need & (new_style | (state.guided > 0))
-        return need.astype(jnp.int32) + guided.astype(jnp.int32)
-
-    def plan(key: Key, state: CharacterState, command, guided: bool):
-        frame = plan_frame(bones, state.past, config=config)
-        wanted = wanted_trajectory(
-            bones, state, command, config=config, control=control
-        )
-        left = jnp.where(_new_style(state, command), control.guided_plans, state.guided)
-        condition = camdm.Condition(
-            past=camdm.to_features(features.to_frame(state.past, frame), config=config),
-            trajectory=trajectory.to_local(wanted, frame),
-            label=command.label,
-            keep_past=jnp.ones((), bool),
-        )
-        # Beside a guided character an unguided one gets the scale that changes nothing.
-        scale = jnp.where(left > 0, control.guidance_scale, 1.0) if guided else None
-        poses = sample(key, condition, scale=scale)
-        chunk = features.from_frame(camdm.to_motion(poses, config=config), frame)
-        if control.seam > 0:
-            shown = jax.tree.map(lambda x: x[-2:], state.past)
-            chunk = inertia.inertialize(shown, chunk, duration=control.seam)
-        return dataclasses.replace(
+    def plan(guided: bool) -> Callable:
+        return lambda key, state, command: replan(
+            sample,
+            key,
+            bones,
             state,
-            plan=chunk,
-            cursor=jnp.zeros_like(state.cursor),
-            guided=jnp.maximum(left - 1, 0),
+            command,
+            config=config,
+            control=control,
+            guided=guided,
         )
-
-    def advance(state: CharacterState, command: trajectory.Command):
-        pose = jax.tree.map(
-            lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
-        )
-        past = jax.tree.map(
-            lambda old, new: jnp.concatenate([old[1:], new]), state.past, pose
-        )
-        times = {"half_life": control.half_life, "dt": 1.0 / config.fps}
-        anchor, velocity, acceleration = spring.velocity_spring(
-            state.anchor, state.velocity, state.acceleration, command.velocity, **times
-        )
-        facing, turn_rate = spring.facing_spring(
-            state.facing, state.turn_rate, command.facing, **times
-        )
-        frame = Frame(
-            root_position=pose.root_position[0],
-            joint_rotation=pose.joint_rotation[0],
-            desired_velocity=velocity,
-            desired_facing=facing,
-            planned=state.cursor == 0,
-        )
-        # A style that changes while the old plan still plays arms the next plans.
-        armed = _new_style(state, command) & (state.cursor > 0)
-        return dataclasses.replace(
-            state,
-            past=past,
-            guided=jnp.where(armed, control.guided_plans, state.guided),
-            cursor=state.cursor + 1,
-            velocity=velocity,
-            acceleration=acceleration,
-            facing=facing,
-            turn_rate=turn_rate,
-            anchor=anchor,
-            command=command,
-        ), frame
 
     return Controller(
-        urgency=urgency,
-        plans=(
-            lambda k, s, c: plan(k, s, c, False),
-            lambda k, s, c: plan(k, s, c, True),
-        ),
-        advance=advance,
+        urgency=functools.partial(urgency, control=control),
+        plans=(plan(False), plan(True)),
+        advance=functools.partial(advance, config=config, control=control),
     )

@@ -156,3 +156,46 @@ def init_state(
         ),
         guided=jnp.zeros((), jnp.int32),
     )
+
+
+def _changed(state: CharacterState, command: trajectory.Command) -> Bool[Array, ""]:
+    old = state.command
+    return (
+        jnp.any(jnp.abs(old.velocity - command.velocity) > 1e-3)
+        | jnp.any(jnp.abs(old.facing - command.facing) > 1e-3)
+        | (old.label != command.label)
+    )
+
+
+def is_new_style(state: CharacterState, command: trajectory.Command) -> Bool[Array, ""]:
+    """Whether a command changes the style (the first one does not).
+
+    Args:
+      state: The character's state.
+      command: What the user wants now.
+
+    Returns:
+      A truth value.
+    """
+    return (state.command.label != command.label) & (state.command.label >= 0)
+
+
+def urgency(
+    state: CharacterState, command: trajectory.Command, *, control: Control
+) -> Int[Array, ""]:
+    """Which plan a tick needs.
+
+    Args:
+      state: The character's state.
+      command: What the user wants now.
+      control: Constants.
+
+    Returns:
+      0 for none, 1 for a plan, 2 for a guided one.
+    """
+    need = (state.command.label < 0) | (state.cursor >= control.apply)
+    if control.replan_on_change:
+        need = need | _changed(state, command)
+    new_style = is_new_style(state, command) & (control.guided_plans > 0)
+    guided = need & (new_style | (state.guided > 0))
+    return need.astype(jnp.int32) + guided.astype(jnp.int32)

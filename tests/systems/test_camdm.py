@@ -251,13 +251,35 @@ def test_loss_terms_are_the_oracles(walker, bones, layout, scale):
         np.testing.assert_allclose(found[name], value, rtol=1e-4, err_msg=name)
 
 
+def camdm_turned(bones, window, frame, layout):
+    """Rotations of one pose, turned so that it faces +z."""
+    pose = jax.tree.map(lambda x: x[frame : frame + 1], window)
+    facing = trajectory.root_trajectory(bones, pose).facing[0]
+    here = trajectory.PlanarFrame(origin=jnp.zeros(2), facing=facing)
+    local = features.to_frame(pose, here)
+    return features.motion_features(local, rotation_layout=layout)[0, :-6]
+
+
 @pytest.mark.parametrize("layout", ["rows", "columns"])
-def test_features_and_back(walker, bones, layout):
-    config = tiny.config(rotation_layout=layout, rotation_scale=3.0)
-    window = window_of(walker, config)
+@pytest.mark.parametrize("centred", [True, False])
+def test_features_and_back(walker, bones, layout, centred):
+    config = tiny.config(rotation_layout=layout, rotation_scale=3.0, heading="facing")
+    window, mean = window_of(walker, config), np.zeros(30)
+    if centred:
+        found = camdm_loss.mean_rotations(bones, window, config=config)
+        config = dataclasses.replace(config, rotation_mean=found)
+        mean = np.mean(
+            [
+                np.asarray(camdm_turned(bones, window, frame, layout))
+                for frame in range(config.window)
+            ],
+            axis=0,
+        )
+        np.testing.assert_allclose(found, mean, atol=2e-5)
     poses = camdm.to_features(window, config=config)
     plain = features.motion_features(window, rotation_layout=layout)
-    np.testing.assert_allclose(poses[:, :-6], 3.0 * plain[:, :-6], rtol=1e-6)
+    expected = 3.0 * (plain[:, :-6] - jnp.broadcast_to(mean, (config.window, 30)))
+    np.testing.assert_allclose(poses[:, :-6], expected, atol=1e-4)
     np.testing.assert_array_equal(poses[:, -6:], plain[:, -6:])
     found = camdm.to_motion(poses, config=config)
     for field in ("root_position", "joint_rotation"):
@@ -300,7 +322,7 @@ class Recorder:
 
 def test_the_loss_weighs_its_terms_and_draws_all_steps(walker, bones, monkeypatch):
     recorder = Recorder()
-    monkeypatch.setattr(camdm, "network", lambda config: recorder)
+    monkeypatch.setattr(camdm_loss, "network", lambda config: recorder)
     config = tiny.config(
         weight_data=2.0,
         weight_velocity=3.0,
@@ -340,7 +362,7 @@ def test_the_loss_weighs_its_terms_and_draws_all_steps(walker, bones, monkeypatc
 
 def test_dropout_is_on_in_training(walker, bones, monkeypatch):
     recorder = Recorder()
-    monkeypatch.setattr(camdm, "network", lambda config: recorder)
+    monkeypatch.setattr(camdm_loss, "network", lambda config: recorder)
     config = tiny.config(dropout=0.1)
     windows = jax.tree.map(lambda x: x[None], window_of(walker, config))
     batch = (windows, jnp.zeros(1, jnp.int32))
