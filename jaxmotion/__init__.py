@@ -1,7 +1,6 @@
-"""Real-time motion diffusion in JAX: one functional core, four systems.
+"""Real-time motion diffusion in JAX: one functional core for several systems.
 
-Users write `jaxmotion.diffusion.chain.ancestral_step`, or import a module:
-`from jaxmotion.diffusion import chain`.
+Import the module that you use: `from jaxmotion.diffusion import chain`.
 """
 
 from jaxmotion import (

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxmotion.evaluation import alignment, contact, smoothness
 from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.motion.spring import Scalar
 
 
 def locomotion_metrics(
@@ -20,7 +21,7 @@ def locomotion_metrics(
     wanted_velocity: Float[Array, "windows frames 2"],
     wanted_facing: Float[Array, "windows frames 2"],
     *,
-    contact_height: float,
+    contact_height: Scalar,
 ) -> dict[str, Float[Array, " windows"]]:
     """Metrics of windows.
 

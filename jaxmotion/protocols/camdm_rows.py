@@ -34,6 +34,13 @@ _COLUMNS = {
 }
 
 
+@jax.jit
+def _metrics(bones: skeleton.Skeleton, height: Array, x: Windows) -> dict[str, Array]:
+    return locomotion.locomotion_metrics(
+        bones, x.motion, x.velocity, x.facing, contact_height=height
+    )
+
+
 def metric_row(
     bones: skeleton.Skeleton,
     found: Windows,
@@ -52,13 +59,7 @@ def metric_row(
     Returns:
       Columns; angles in degrees.
     """
-
-    @jax.jit
-    def run(x: Windows) -> dict[str, Array]:
-        return locomotion.locomotion_metrics(
-            bones, x.motion, x.velocity, x.facing, contact_height=height
-        )
-
+    run = functools.partial(_metrics, bones, jnp.float32(height))
     values = in_batches(run, found)
     row = {}
     if hits is not None:
@@ -179,11 +180,12 @@ def contact_height(bones: skeleton.Skeleton, real: Windows) -> float:
     return float(np.percentile(toes[..., 1], 1)) + 0.01
 
 
-def random_half(clips: np.ndarray, seed: int) -> np.ndarray:
-    """Which windows are of a random half of the clips.
+def random_half(clips: np.ndarray, labels: np.ndarray, seed: int) -> np.ndarray:
+    """Which windows are of a random half of each style's clips.
 
     Args:
       clips: Clip of each window.
+      labels: Style of each window.
       seed: Of the choice.
 
     Returns:
@@ -192,10 +194,13 @@ def random_half(clips: np.ndarray, seed: int) -> np.ndarray:
     Raises:
       ValueError: if there is one clip only.
     """
-    different = np.unique(clips)
+    different, first = np.unique(clips, return_index=True)
     if len(different) < 2:
         raise ValueError("one clip, expected at least two to compare halves")
-    return np.isin(clips, np.random.default_rng(seed).permutation(different)[::2])
+    shuffled = np.random.default_rng(seed).permutation(len(different))
+    # Sorted by style, every second one: both halves hold every style alike.
+    order = shuffled[np.argsort(labels[first][shuffled], kind="stable")]
+    return np.isin(clips, different[order][::2])
 
 
 def evaluation_table(
@@ -230,7 +235,7 @@ def evaluation_table(
     real_feature, real_hits = recognized(bones, real, recognizer)
     made_feature, made_hits = recognized(bones, made, recognizer)
     reference, _ = recognized(bones, dense, recognizer)
-    own = random_half(np.asarray(dense.group), seed)
+    own = random_half(np.asarray(dense.group), np.asarray(dense.label), seed)
     count = min(len(real_feature), len(made_feature), int(own.sum()), int((~own).sum()))
     distance = functools.partial(frechet_cell, count=count, seed=seed)
     rows = {

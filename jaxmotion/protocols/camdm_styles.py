@@ -94,14 +94,18 @@ def recognized(
     Returns:
       Features [windows, 512], and hits [windows] (0 or 1).
     """
-
-    @jax.jit
-    def run(x: tuple[skeleton.Motion, Array]) -> tuple[Array, Array]:
-        motion, label = x
-        given = recognition.recognizer_input(bones, motion)
-        feature, logits = recognition.recognize(
-            recognizer.params, given, config=recognizer.config
-        )
-        return feature, (jnp.argmax(logits, axis=-1) == label).astype(jnp.float32)
-
+    run = functools.partial(_recognize, recognizer.params, bones, recognizer.config)
     return in_batches(run, (found.motion, found.label))
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _recognize(
+    params: Params,
+    bones: skeleton.Skeleton,
+    config: recognition.RecognizerConfig,
+    x: tuple[skeleton.Motion, Array],
+) -> tuple[Array, Array]:
+    motion, label = x
+    given = recognition.recognizer_input(bones, motion)
+    feature, logits = recognition.recognize(params, given, config=config)
+    return feature, (jnp.argmax(logits, axis=-1) == label).astype(jnp.float32)

@@ -75,10 +75,13 @@ def walking(labels, seconds=8.0):
 
 
 def standing(frames):
-    """The same characters, frozen in their first pose."""
-    first = lambda x: jnp.broadcast_to(x[:, :1], x.shape)  # noqa: E731
+    """The same commands, to characters frozen in the skeleton's rest pose, arms out."""
+    six = jnp.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    root = frames.root_position
     return dataclasses.replace(
         frames,
-        root_position=first(frames.root_position),
-        joint_rotation=first(frames.joint_rotation),
+        root_position=jnp.broadcast_to(root[:, :1], root.shape),
+        joint_rotation=jnp.broadcast_to(
+            six.reshape(1, 1, 1, 6), frames.joint_rotation.shape
+        ),
     )

@@ -155,9 +155,10 @@ def test_rollouts_show_a_frame_a_tick_from_where_they_start(run):
     assert frames.joint_rotation.shape == (4, 36, run.model.bones.num_joints, 6)
     assert frames.planned[:, 0].all() and frames.planned.mean() < 0.3
     assert np.isfinite(np.asarray(frames.root_position)).all()
-    # The springs take up the commanded 1 m/s.
-    speed = np.linalg.norm(frames.desired_velocity, axis=-1)
-    assert np.all(np.diff(speed, axis=1) > -1e-3) and 0.85 < speed[:, -1].min() <= 1.01
+    # The springs take up the commanded 1 m/s along +z, whatever the start pose did.
+    gap = np.asarray(frames.desired_velocity) - np.array([0.0, 1.0])
+    gap = np.linalg.norm(gap, axis=-1)
+    assert gap[:, -1].max() < 0.1 < 0.5 < gap[:, 0].min()
 
 
 def test_a_chunk_that_does_not_divide_is_made_smaller(run):

@@ -1,0 +1,217 @@
+"""experiments/camdm.py: train, evaluate and roll out on clips that the tests make."""
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxmotion.data import bvh_text, clips_io
+from jaxmotion.learning import checkpoint
+from tests.protocols import samples
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "experiments" / "camdm.py"
+SIZES = (
+    "--width 16 --depth 1 --batch 4 --diffusion-steps 2 --held-out 0.4 --warmup 1 "
+    "--chunk 1 --save-every 2"
+)
+
+
+@pytest.fixture(scope="module")
+def script():
+    """The script as a module."""
+    spec = importlib.util.spec_from_file_location("camdm_script", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["camdm_script"] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules["camdm_script"]
+
+
+@pytest.fixture
+def call(script, monkeypatch):
+    """Runs a command line in this process."""
+
+    def run(line):
+        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *line.split()])
+        script.main()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "clips.npz"
+    clips_io.save_clips(path, samples.clips())
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(script, data, tmp_path_factory, quick_compile):
+    """A run of two steps."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        line = f"train --data {data} --out {folder} {SIZES} --steps 2"
+        patch.setattr(sys, "argv", [str(SCRIPT), *line.split()])
+        script.main()
+    return folder
+
+
+@pytest.mark.parametrize(
+    "command, words",
+    [
+        ("", ["train", "evaluate", "rollout", "Examples:", "--data data/bandai2.npz"]),
+        ("train", ["(default: 24000)", "in (0, 1)", "Windows a step", "Example:"]),
+        ("evaluate", ["(default: 60.0)", "seconds", "Metres a second", "Example:"]),
+        ("rollout", ["(default: 20.0)", "seconds", "Metres a second", "Example:"]),
+    ],
+)
+def test_help_has_defaults_units_and_an_example(call, capsys, command, words):
+    with pytest.raises(SystemExit) as stop:
+        call(f"{command} --help")
+    assert stop.value.code == 0
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    for word in words:
+        assert word in text
+    if command:
+        options = set(re.findall(r" --([a-z-]+)", text)) - {"help"}
+        assert text.count("(default:") >= len(options) - text.count("--no-") - 3
+
+
+def test_training_leaves_a_run_that_goes_on(script, call, data, trained, tmp_path):
+    assert checkpoint.latest_step(trained / "checkpoints") == 2
+    config = json.loads((trained / "config.json").read_text())
+    assert config["labels"] == list(samples.STYLES)
+    assert config["experiment"]["steps"] == 2
+    assert config["experiment"]["data"] == str(data)
+    rows = [json.loads(x) for x in (trained / "losses.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in rows] == [1, 2]
+    assert all(np.isfinite(row["loss"]) for row in rows)
+
+
+def check_rollout(folder, seconds):
+    frames = round(30 * seconds)
+    assert bvh_text.read_bvh(folder / "rollout.bvh").values.shape[0] == frames
+    with Image.open(folder / "rollout.gif") as image:
+        assert image.n_frames > 1
+    text = (folder / "rollout.html").read_text()
+    data = json.loads(re.search(r"^const data = (.*);$", text, re.M).group(1))
+    assert len(data["positions"]) == len(data["commanded"]) == frames
+    assert "procedural walker" in text
+
+
+def check_evaluation(folder, rollouts):
+    found = json.loads((folder / "metrics.json").read_text())
+    assert set(found["rows"]) == {
+        "held-out (ground truth)",
+        "training half vs half (noise floor)",
+        "rollouts",
+    }
+    assert found["health"]["rollouts"] == rollouts
+    assert set(found["speeds"]) == set(samples.STYLES)
+    assert found["arguments"]["preset"] == "forward"
+    assert "procedural" in found["source"]
+    assert (folder / "table.md").read_text().count("\n") == 5
+
+
+@pytest.mark.usefixtures("quick_compile")
+def test_a_rollout_is_written_as_bvh_gif_and_page(call, trained, tmp_path):
+    out = tmp_path / "seen"
+    call(
+        f"rollout --run {trained} --style neutral --to-style zombie --seconds 1 "
+        f"--out {out}"
+    )
+    check_rollout(out, 1.0)
+    assert "neutral to zombie" in (out / "rollout.html").read_text()
+
+
+@pytest.mark.usefixtures("quick_compile")
+@pytest.mark.slow
+def test_an_evaluation_writes_its_table(call, trained):
+    call(
+        f"evaluate --run {trained} --rollouts 2 --seconds 4 --recognizer-steps 2 "
+        "--chunk 2"
+    )
+    check_evaluation(trained / "evaluation", 2)
+
+
+BAD = [
+    ("train --data {gone} --out {out}", OSError, "gone"),
+    ("train --data {data} --out {out} --label mood", ValueError, "field 'mood'"),
+    ("train --data {data} --out {file}/below", OSError, "plain/below"),
+    ("train --data {data} --out {run} {sizes} --depth 2", ValueError, "another model"),
+    ("rollout --run {empty} --style neutral", ValueError, "empty"),
+    ("rollout --run {run} --style sad", ValueError, "the model has neutral, zombie"),
+    ("rollout --run {run} --style zombie --to-style sad", ValueError, "style 'sad'"),
+    ("rollout --run {run} --style zombie --data {gone}", OSError, "gone"),
+    ("rollout --run {run} --style zombie --out {file}/below", OSError, "plain/below"),
+    ("rollout --run {run} --style zombie --seconds 0", ValueError, "0.0 s"),
+    ("evaluate --run {empty}", ValueError, "empty"),
+    ("evaluate --run {run} --seconds 2", ValueError, "too short to measure"),
+    ("evaluate --run {run} --data {gone}", OSError, "gone"),
+]
+
+
+@pytest.mark.parametrize("line, error, message", BAD)
+def test_what_is_wrong_is_named_before_any_work(
+    call, data, trained, tmp_path, line, error, message
+):
+    (tmp_path / "plain").write_text("")
+    (tmp_path / "empty").mkdir()
+    places = dict(
+        gone=tmp_path / "gone.npz",
+        out=tmp_path / "out",
+        file=tmp_path / "plain",
+        empty=tmp_path / "empty",
+        run=trained,
+        data=data,
+        sizes=SIZES,
+    )
+    before = (trained / "config.json").read_text()
+    with pytest.raises(error, match=message):
+        call(line.format(**places))
+    assert (trained / "config.json").read_text() == before
+    assert checkpoint.latest_step(trained / "checkpoints") == 2
+
+
+def test_an_unknown_preset_lists_the_known_ones(call, trained, capsys):
+    with pytest.raises(SystemExit) as stop:
+        call(f"rollout --run {trained} --style zombie --preset waltz")
+    assert stop.value.code == 2
+    text = capsys.readouterr()
+    for word in ("waltz", "forward", "strafe", "stop_and_go"):
+        assert word in text.out + text.err
+
+
+def run(line):
+    command = [sys.executable, str(SCRIPT), *line.split()]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+def test_from_a_shell_an_error_is_one_line(tmp_path):
+    done = run(f"train --data {tmp_path}/gone.npz --out {tmp_path}/out")
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith("error: ")
+    assert "gone.npz" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_from_a_shell_train_resume_evaluate_and_roll_out(data, tmp_path):
+    folder = tmp_path / "run"
+    for line in (
+        f"train --data {data} --out {folder} {SIZES} --steps 2",
+        f"train --data {data} --out {folder} {SIZES} --steps 4",
+        f"evaluate --run {folder} --rollouts 8 --seconds 6 --recognizer-steps 30",
+        f"rollout --run {folder} --style zombie --seconds 3",
+    ):
+        done = run(line)
+        assert done.returncode == 0, done.stderr
+    assert checkpoint.latest_step(folder / "checkpoints") == 4
+    check_evaluation(folder / "evaluation", 8)
+    check_rollout(folder / "rollout", 3.0)
