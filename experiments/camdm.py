@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import jax
+import numpy as np
 import tyro
 
 from jaxmotion.data import mirror, selection
@@ -34,7 +35,8 @@ class Train:
     Attributes:
       data: Clips from prepare_data.py.
       out: Run folder: checkpoints, config.json, losses.jsonl.
-      preset: "paper", or "small" for a CPU or a short run.
+      preset: "small" for a CPU or a short run, or "paper" (whose authors train with
+        --optimizer adamw --learning-rate 1e-4 --batch 512).
       contents: Use only clips of these contents (for Bandai-Namco walk, run ...);
         none: all clips.
       label: Field of the clips that is the style.
@@ -42,11 +44,13 @@ class Train:
       mirror: Add a mirrored copy of every training clip.
       steps: Optimiser steps of the whole run.
       batch: Windows a step (of 55 frames: 10 past, 45 future).
-      learning_rate: Peak of AdamW's rate; cosine to a tenth.
+      optimizer: "muon" or "adamw".
+      learning_rate: Peak of its rate; cosine to a tenth.
       warmup: Steps of linear rise.
       ema: Decay of the parameters' moving average a step.
       chunk: Steps of one compiled call.
       save_every: Steps between checkpoints.
+      network: "transformer", or a denoiser of the ablation (table 3).
       width: Channels of a token; None for the preset's.
       depth: Layers; None for the preset's.
       diffusion_steps: Steps T of the diffusion.
@@ -61,13 +65,15 @@ class Train:
     label: str = "style"
     held_out: float = 0.1
     mirror: bool = True
-    steps: int = 24000
-    batch: int = 32
-    learning_rate: float = 5e-4
-    warmup: int = 500
+    steps: int = 11000
+    batch: int = 48
+    optimizer: Literal["muon", "adamw"] = "muon"
+    learning_rate: float = 1e-3
+    warmup: int = 300
     ema: float = 0.999
     chunk: int = 50
     save_every: int = 1000
+    network: Literal["transformer", "mlp", "single_token"] = "transformer"
     width: int | None = None
     depth: int | None = None
     diffusion_steps: int = 8
@@ -77,7 +83,10 @@ class Train:
 
 def model_of(args: Train, clips: Clips) -> camdm_model.Model:
     """The model that the arguments describe, for these clips."""
-    sizes = camdm_training.PRESETS[args.preset] | {"num_steps": args.diffusion_steps}
+    sizes = camdm_training.PRESETS[args.preset] | {
+        "num_steps": args.diffusion_steps,
+        "network": args.network,
+    }
     if args.width:
         sizes |= {"width": args.width, "hidden": 4 * args.width}
     if args.depth:
@@ -91,9 +100,9 @@ def train(args: Train) -> None:
     clips, _ = camdm_runs.split_data(
         args.data, args.contents, args.label, args.held_out
     )
-    model = model_of(args, clips)
-    if args.mirror:
+    if args.mirror:  # first, for it may add labels: left of what was only right
         clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
+    model = model_of(args, clips)
     run, state, key, data = camdm_training.start(
         clips,
         model,
@@ -101,6 +110,7 @@ def train(args: Train) -> None:
         field=args.label,
         num_steps=args.steps,
         batch=args.batch,
+        optimizer=args.optimizer,
         learning_rate=args.learning_rate,
         warmup=args.warmup,
         ema=args.ema,
@@ -112,9 +122,12 @@ def train(args: Train) -> None:
         "experiment": camdm_runs.arguments_json(args)
     }
     (args.out / "config.json").write_text(json.dumps(config, indent=1))
+    lengths = np.diff(np.asarray(clips.offsets))
+    short = int(np.sum(lengths < model.config.window))
     parameters = sum(x.size for x in jax.tree.leaves(state.params))
     print(
-        f"{clips.num_clips} clips, {clips.num_frames} frames, "
+        f"{clips.num_clips} clips ({short} too short to use), {clips.num_frames} "
+        "frames, "
         f"{data[1].starts.shape[0]} windows of {data[1].length} frames; {parameters} "
         f"parameters on {jax.devices()[0].platform}, from step {int(state.step)}"
     )

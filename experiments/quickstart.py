@@ -93,8 +93,8 @@ def start_model(args: Config, clips, key):
 def train(args: Config, clips, model, params, key):
     """Trains on the clips; returns the averaged parameters and the losses."""
     steps = args.steps or (6000 if args.from_scratch else 400)
-    optimizer = training.adamw_cosine(
-        learning_rate=1e-3 if args.from_scratch else 5e-4,
+    optimizer = training.muon_cosine(
+        learning_rate=1e-3 if args.from_scratch else 3e-4,
         num_steps=steps,
         warmup_steps=min(steps // 4, 500),
         max_norm=1.0,

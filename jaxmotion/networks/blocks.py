@@ -6,11 +6,18 @@ epsilon 1e-5) and exact GELU:
     h = norm_1(x + out(softmax(q k^T / sqrt(d)) v))        q, k, v = projections of x
     y = norm_2(h + W_2 gelu(W_1 h))
 
+With norm="pre" the branches read normalised tokens and add to plain ones, which trains
+several times faster from scratch (Xiong et al. 2020, "On Layer Normalization in the
+Transformer Architecture"):
+
+    h = x + out(softmax(q k^T / sqrt(d)) v)                q, k, v of norm_1(x)
+    y = h + W_2 gelu(W_1 norm_2(h))
+
 It is cut in two, `project` and `attend`, so that a sampler can keep the projections of
 tokens that do not change between steps, and can skip the rows that nobody reads.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -115,19 +122,21 @@ class TimeEmbedding(nn.Module):
 
 
 class EncoderLayer(nn.Module):
-    """Post-norm transformer encoder layer without an attention mask.
+    """Transformer encoder layer without an attention mask.
 
     Attributes:
       width: Channels of a token.
       heads: Attention heads; divides width.
       hidden: Channels of the feed-forward layer.
       dropout: Rate on attention weights, and on the three branch outputs.
+      norm: "post", or "pre"; see the module's docstring.
     """
 
     width: int
     heads: int
     hidden: int
     dropout: float
+    norm: Literal["post", "pre"] = "post"
 
     def setup(self):
         """Makes projections, feed-forward layers and norms."""
@@ -156,6 +165,8 @@ class EncoderLayer(nn.Module):
         Returns:
           The projections.
         """
+        if self.norm == "pre":
+            x = self.norm_1(x)
         key, value = jnp.split(self.key_value(x), 2, axis=-1)
         asking = x if last is None else x[..., -last:, :]
         return Projections(
@@ -186,9 +197,12 @@ class EncoderLayer(nn.Module):
         logits = query @ jnp.swapaxes(key, -1, -2) / np.sqrt(query.shape[-1])
         weights = drop(jax.nn.softmax(logits, axis=-1))
         mixed = jnp.swapaxes(weights @ value, -2, -3)
-        x = self.norm_1(x + drop(self.out(mixed.reshape(x.shape))))
-        hidden = drop(gelu(self.expand(x)))
-        return self.norm_2(x + drop(self.contract(hidden)))
+        x = x + drop(self.out(mixed.reshape(x.shape)))
+        feed = lambda y: drop(self.contract(drop(gelu(self.expand(y)))))  # noqa: E731
+        if self.norm == "pre":
+            return x + feed(self.norm_2(x))
+        x = self.norm_1(x)
+        return self.norm_2(x + feed(x))
 
     def __call__(
         self,

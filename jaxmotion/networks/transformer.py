@@ -19,6 +19,7 @@ Source: Chen et al. 2024 (CAMDM), section 3.2 and figure 2; sizes of the release
 """
 
 import dataclasses
+from typing import Literal
 
 import flax.linen as nn
 import jax
@@ -79,6 +80,7 @@ class CamdmTransformer(nn.Module):
       hidden: Channels of the feed-forward layers.
       dropout: Rate, after the positions and in every layer.
       frames_per_token: Frames of one token; 1 in the paper.
+      norm: "post" in the paper; "pre" (ours) has one more norm before the output.
     """
 
     features: int
@@ -92,6 +94,7 @@ class CamdmTransformer(nn.Module):
     hidden: int = 1024
     dropout: float = 0.2
     frames_per_token: int = 1
+    norm: Literal["post", "pre"] = "post"
 
     def setup(self):
         """Makes embeddings and layers."""
@@ -104,9 +107,13 @@ class CamdmTransformer(nn.Module):
         self.embed_past = nn.Dense(self.width)
         self.embed_noisy = nn.Dense(self.width)
         self.layers = [
-            blocks.EncoderLayer(self.width, self.heads, self.hidden, self.dropout)
+            blocks.EncoderLayer(
+                self.width, self.heads, self.hidden, self.dropout, self.norm
+            )
             for _ in range(self.depth)
         ]
+        if self.norm == "pre":
+            self.norm_out = nn.LayerNorm(epsilon=1e-5)
         self.out = nn.Dense(self.features * self.frames_per_token)
         self.drop = nn.Dropout(self.dropout)
 
@@ -213,6 +220,8 @@ class CamdmTransformer(nn.Module):
             x = first.attend(x, projections, train=train)
         for i, layer in enumerate(self.layers[1:], start=2):
             x = layer(x, train=train, last=outputs if i == self.depth else None)
+        if self.norm == "pre":
+            x = self.norm_out(x)
         return self.out(x).reshape(*batch, self.future, self.features)
 
     def __call__(

@@ -44,6 +44,9 @@ class Config:
       hidden: Channels of the feed-forward layers.
       dropout: Rate.
       frames_per_token: Frames of one token; ours, 1 in the paper.
+      norm: Layer norms of the transformer behind each sum ("post", the paper's) or
+        before each branch ("pre", ours: learns the legs' phase in a tenth of the
+        steps).
       rotation_layout: 6D as two rows (released code) or two columns.
       heading: Frame of a sample. "random": axes turned by a random yaw (released
         code). "facing": +z is where the character faces in the last past pose (ours:
@@ -77,6 +80,7 @@ class Config:
     hidden: int = 1024
     dropout: float = 0.2
     frames_per_token: int = 1
+    norm: Literal["post", "pre"] = "post"
     rotation_layout: Literal["rows", "columns"] = "rows"
     heading: Literal["random", "facing"] = "random"
     rotation_scale: float = 1.0

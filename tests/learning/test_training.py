@@ -106,6 +106,23 @@ def test_gradient_is_clipped_and_weights_decay():
     np.testing.assert_allclose(change["a"], [-0.1, 0.1], rtol=1e-6)
 
 
+def test_muon_moves_matrices_orthogonally_and_vectors_as_nadam_does():
+    """The first update of a matrix has equal singular values; Liu et al.'s scale."""
+    optimizer = training.muon_cosine(learning_rate=0.01, num_steps=10, max_norm=1.0)
+    gradient = np.random.default_rng(0).normal(size=(6, 4)).astype(np.float32)
+    params = {"w": jnp.zeros((6, 4)), "b": jnp.zeros(3)}
+    grads = {"w": jnp.asarray(gradient), "b": jnp.array([1.0, -2.0, 0.5])}
+    change, _ = optimizer.update(grads, optimizer.init(params), params)
+    sizes = np.linalg.svd(change["w"], compute_uv=False)
+    # Five Newton-Schulz iterations bring singular values to 1 +- 0.3.
+    np.testing.assert_allclose(sizes, 0.01 * 0.2 * np.sqrt(6), rtol=0.35)
+    left, _, right = np.linalg.svd(gradient, full_matrices=False)
+    along = np.diag(left.T @ np.asarray(change["w"]) @ right.T)
+    np.testing.assert_allclose(-along, sizes, rtol=0.5)
+    nadam = 0.01 * (0.9 * 0.1 / (1 - 0.9**2) + 1)
+    np.testing.assert_allclose(change["b"], [-nadam, nadam, -nadam], rtol=1e-4)
+
+
 def test_state_starts_with_its_average_at_the_parameters():
     _, state, _ = parts(1)
     assert state.step == 0

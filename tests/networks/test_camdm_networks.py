@@ -28,6 +28,7 @@ KINDS = {
     "transformer": transformer.CamdmTransformer(**SIZES),
     "one layer": transformer.CamdmTransformer(**(SIZES | {"depth": 1})),
     "two frames a token": transformer.CamdmTransformer(**SIZES, frames_per_token=2),
+    "pre-norm": transformer.CamdmTransformer(**SIZES, norm="pre"),
     "mlp": ablation.CamdmMlp(**SIZES),
     "single token": ablation.SingleTokenTransformer(**SIZES),
 }

@@ -111,3 +111,33 @@ def test_gelu_is_that_of_float64():
     exact = torch.nn.functional.gelu(torch.from_numpy(x)).numpy()
     found = blocks.gelu(jnp.asarray(x, jnp.float32))
     np.testing.assert_allclose(found, exact, atol=1e-6)
+
+
+def test_pre_norm_layer():
+    """Against PyTorch's own layer with norm_first, with its random weights."""
+    theirs = torch.nn.TransformerEncoderLayer(
+        16, 2, 24, dropout=0.0, activation="gelu", norm_first=True, batch_first=True
+    ).eval()
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in theirs.parameters():
+            parameter.normal_(std=0.5, generator=generator)
+    get = lambda name: np.array(theirs.get_parameter(name).detach())  # noqa: E731
+    dense = lambda weight, bias: {"kernel": weight.T, "bias": bias}  # noqa: E731
+    weight, bias = get("self_attn.in_proj_weight"), get("self_attn.in_proj_bias")
+    params = {
+        "query": dense(weight[:16], bias[:16]),
+        "key_value": dense(weight[16:], bias[16:]),
+    }
+    names = {"out": "self_attn.out_proj", "expand": "linear1", "contract": "linear2"}
+    for ours, name in names.items():
+        params[ours] = dense(get(f"{name}.weight"), get(f"{name}.bias"))
+    for i in (1, 2):
+        scale, bias = get(f"norm{i}.weight"), get(f"norm{i}.bias")
+        params[f"norm_{i}"] = {"scale": scale, "bias": bias}
+    x = np.random.default_rng(0).normal(size=(3, 7, 16)).astype(np.float32)
+    layer = blocks.EncoderLayer(16, 2, 24, 0.0, "pre")
+    ours = layer.apply({"params": params}, x, train=False)
+    with torch.no_grad():
+        expected = theirs(torch.from_numpy(x)).numpy()
+    np.testing.assert_allclose(ours, expected, atol=2e-5)
