@@ -53,9 +53,9 @@ class Config:
     Attributes:
       out: Folder for rollout.bvh, rollout.gif, rollout.html, metrics.json and
         checkpoints.
-      from_scratch: Start from random parameters and train for 6000 steps (10 to 20
+      from_scratch: Start from random parameters and train for 4000 steps (about 12
         minutes on two cores) instead of starting from the shipped model.
-      steps: Optimiser steps, rounded down to fifties; None for 400, or 6000 from
+      steps: Optimiser steps, rounded down to fifties; None for 400, or 4000 from
         scratch.
       batch: Windows a step.
       minutes: Minutes of walking to generate.
@@ -92,7 +92,7 @@ def start_model(args: Config, clips, key):
 
 def train(args: Config, clips, model, params, key):
     """Trains on the clips; returns the averaged parameters and the losses."""
-    steps = args.steps or (6000 if args.from_scratch else 400)
+    steps = args.steps or (4000 if args.from_scratch else 400)
     optimizer = training.muon_cosine(
         learning_rate=1e-3 if args.from_scratch else 3e-4,
         num_steps=steps,

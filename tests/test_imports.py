@@ -40,7 +40,8 @@ LEARNING_FOR_SYSTEMS = {"losses", "checkpoint"}
 # Third party -> where it may be imported (prefixes of paths below the root).
 ANYWHERE = {"jax", "jaxtyping", "numpy"}
 DOORS = {
-    "flax": ("jaxmotion/networks/",),
+    # A baseline is one file, with its own network.
+    "flax": ("jaxmotion/networks/", "experiments/baselines/"),
     "optax": ("jaxmotion/learning/training.py",),
     "orbax": ("jaxmotion/learning/checkpoint.py",),
     "tensorflow_datasets": ("jaxmotion/data/builders/",),

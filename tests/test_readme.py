@@ -106,6 +106,7 @@ def test_our_own_options_are_off_by_default():
         ("frames_per_token", 1),
         ("heading", "random"),
         ("rotation_scale", 1.0),
+        ("norm", "post"),
     ):
         assert getattr(config, name) == off
         assert f"`{name}={small[name]}`".replace("'", '"') in README or (

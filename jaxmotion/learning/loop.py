@@ -19,7 +19,7 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxmotion.learning import checkpoint
-from jaxmotion.learning.training import Info, TrainState
+from jaxmotion.learning.training import Info
 from jaxmotion.typing import Key
 
 
@@ -128,13 +128,13 @@ def _forget_lost_steps(path: Path, done: int) -> None:
 
 
 def train(
-    run_chunk: Callable[[TrainState, Key, Any], tuple[TrainState, Info]],
-    state: TrainState,
+    run_chunk: Callable[[Any, Key, Any], tuple[Any, Info]],
+    state: Any,
     key: Key,
     data: Any,
     *,
     loop: Loop,
-) -> TrainState:
+) -> Any:
     """Trains to `loop.num_steps`, from a new or a restored state.
 
     The first Ctrl-C lets the running chunk end and saves it. A kill at any moment

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int
 from jaxmotion.typing import Key, Params
 
 Info = dict[str, Array]
+Optimizer = optax.GradientTransformation
 
 
 # Unchecked, because checkpointing maps a state to the same tree of other things.
@@ -56,9 +57,7 @@ class Loss(Protocol):
 class Update(Protocol):
     """One optimiser step."""
 
-    def __call__(
-        self, state: TrainState, key: Key, batch: Any, /
-    ) -> tuple[TrainState, Info]:
+    def __call__(self, state: Any, key: Key, batch: Any, /) -> tuple[Any, Info]:
         """Returns the next state and named values to report."""
         ...
 
@@ -121,6 +120,20 @@ def muon_cosine(
     rate = _warmup_cosine(learning_rate, num_steps, warmup_steps, final_fraction)
     clip = [] if max_norm is None else [optax.clip_by_global_norm(max_norm)]
     return optax.chain(*clip, optax.contrib.muon(rate, consistent_rms=0.2))
+
+
+def radam(*, learning_rate: float = 1e-4) -> optax.GradientTransformation:
+    """Rectified Adam at a constant rate, AAMDM's optimiser.
+
+    Args:
+      learning_rate: The rate.
+
+    Returns:
+      The optimiser.
+
+    Source: Liu et al. 2020; Li et al. 2024 (AAMDM), section 4.
+    """
+    return optax.radam(learning_rate)
 
 
 def _warmup_cosine(
@@ -201,11 +214,12 @@ def train_chunk(
     *,
     num_steps: int,
     mesh: Mesh | None = None,
-) -> Callable[[TrainState, Key, Any], tuple[TrainState, Info]]:
+) -> Callable[[Any, Key, Any], tuple[Any, Info]]:
     """Many updates as one compiled program.
 
     Args:
-      update: From `make_update`.
+      update: From `make_update` or `adversarial.make_gan_update`; its state has the
+        number of updates made as `step`.
       sample_batch: `(key, data) -> batch`; leaves of the batch have the batch axis
         first.
       num_steps: Updates a call.
@@ -217,8 +231,8 @@ def train_chunk(
       (its buffers are gone afterwards). Each value of info has one row a step.
     """
 
-    def run(state: TrainState, key: Key, data: Any) -> tuple[TrainState, Info]:
-        def one(state: TrainState, _) -> tuple[TrainState, Info]:
+    def run(state: Any, key: Key, data: Any) -> tuple[Any, Info]:
+        def one(state: Any, _) -> tuple[Any, Info]:
             key_batch, key_loss = jax.random.split(jax.random.fold_in(key, state.step))
             batch = sample_batch(key_batch, data)
             if mesh is not None:

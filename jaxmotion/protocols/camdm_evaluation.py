@@ -129,6 +129,7 @@ def evaluate_run(
     protocol.check_ticks(commands.label.shape[1], fps=fps, skip=SKIP)
     states = protocol.start_states(run.held_out, model, labels, field=field, seed=seed)
     key_fit, key_roll = jax.random.split(jax.random.key(seed))
+    print(f"training the style recogniser for {recognizer_steps} steps", flush=True)
     recognizer = camdm_styles.fit_recognizer(
         key_fit, run.train, field=field, num_steps=recognizer_steps
     )
@@ -150,12 +151,14 @@ def evaluate_run(
 def _timed_rollouts(
     run: Run, key: Key, states: Any, commands: trajectory.Command, chunk: int | None
 ) -> Any:
-    """Frames of the characters; prints how long they took, compilation included."""
+    """Frames of the characters; says how many, and how long they took in all."""
+    number, ticks = commands.label.shape
+    print(f"{number} rollouts of {ticks} ticks, as one program", flush=True)
     begun = time.perf_counter()
     frames = protocol.steered_rollouts(
         run.params, key, states, commands, model=run.model, chunk=chunk
     )
     jax.block_until_ready(frames)
     taken = time.perf_counter() - begun
-    print(f"{commands.label.shape[0]} rollouts in {taken:.0f} s")
+    print(f"rolled out in {taken:.0f} s, compilation included", flush=True)
     return frames

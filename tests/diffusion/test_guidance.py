@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import chain, guidance
+from jaxmotion.diffusion import chain, guidance, tables
 from jaxmotion.diffusion import schedule as S
 
 
@@ -120,3 +120,28 @@ def test_python_numbers_are_leaves():
 def test_conditions_that_differ(null, message):
     with pytest.raises(ValueError, match=message):
         guidance.classifier_free(network, COND, null, 1.0)
+
+
+@pytest.mark.parametrize("t", [1, 3, 5])
+def test_gradient_guidance_of_a_linear_denoiser(t):
+    """Oracle in float64: x_0 = A x_t + b, J = |x_0 - g|^2 / 2."""
+    rng = np.random.default_rng(0)
+    a, b, g, x = rng.normal(size=(3, 3)), *rng.normal(size=(3, 3))
+    table = tables.cosine_schedule(5)
+    as32 = lambda y: jnp.asarray(y, jnp.float32)  # noqa: E731
+    denoise = lambda key, x_t, t: as32(a) @ x_t + as32(b)  # noqa: E731
+    objective = lambda x_0: 0.5 * jnp.sum(jnp.square(x_0 - as32(g)))  # noqa: E731
+    guided = guidance.gradient_guidance(table, denoise, objective, scale=0.3)
+    x_0 = a @ x + b
+    expected = x_0 - 0.3 * (1 - np.float64(table.beta[t])) * a.T @ (x_0 - g)
+    found = guided(jax.random.key(0), as32(x), jnp.array(t))
+    np.testing.assert_allclose(found, expected, rtol=2e-5, atol=1e-6)
+
+
+def test_gradient_guidance_passes_the_key_and_vanishes_with_its_scale():
+    table = tables.cosine_schedule(5)
+    denoise = lambda key, x_t, t: jnp.tanh(x_t + jax.random.normal(key, (3,)))  # noqa: E731
+    guided = guidance.gradient_guidance(table, denoise, jnp.sum, scale=0.0)
+    key, x, t = jax.random.key(3), random(0, (3,)), jnp.array(2)
+    expected = denoise(jax.random.clone(key), x, t)
+    np.testing.assert_array_equal(guided(key, x, t), expected)

@@ -143,6 +143,8 @@ def test_encode_and_denoise_are_the_plain_network(name):
         tokens = tokens + blocks.sinusoidal_positions(*tokens.shape)
         for layer in net.layers:
             tokens = layer(tokens, train=False)
+        if net.norm == "pre":
+            tokens = net.norm_out(tokens)
         out = net.out(tokens[-net.num_outputs :])
         return out.reshape(net.future, net.features)
 

@@ -137,7 +137,7 @@ def test_pre_norm_layer():
         params[f"norm_{i}"] = {"scale": scale, "bias": bias}
     x = np.random.default_rng(0).normal(size=(3, 7, 16)).astype(np.float32)
     layer = blocks.EncoderLayer(16, 2, 24, 0.0, "pre")
-    ours = layer.apply({"params": params}, x, train=False)
+    ours = layer.apply({"params": params}, jnp.asarray(x), train=False)
     with torch.no_grad():
         expected = theirs(torch.from_numpy(x)).numpy()
     np.testing.assert_allclose(ours, expected, atol=2e-5)
