@@ -36,7 +36,9 @@ class Train:
       data: Clips from prepare_data.py.
       out: Run folder: checkpoints, config.json, losses.jsonl.
       preset: "small" for a CPU or a short run, or "paper" (whose authors train with
-        --optimizer adamw --learning-rate 1e-4 --batch 512).
+        --optimizer adamw --learning-rate 1e-4 --batch 512), or "planted" for a second
+        training of a small model in which feet learn to stand.
+      init: Run folder or exported model to start from; None for random parameters.
       contents: Use only clips of these contents (for Bandai-Namco walk, run ...);
         none: all clips.
       label: Field of the clips that is the style.
@@ -60,7 +62,8 @@ class Train:
 
     data: Path = Path("data/bandai2.npz")
     out: Path = Path("runs/camdm")
-    preset: Literal["small", "paper"] = "small"
+    preset: Literal["small", "planted", "paper"] = "small"
+    init: Path | None = None
     contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right", "run")
     label: str = "style"
     held_out: float = 0.1
@@ -102,7 +105,9 @@ def train(args: Train) -> None:
     )
     if args.mirror:  # first, for it may add labels: left of what was only right
         clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
-    model = model_of(args, clips)
+    model, params = model_of(args, clips), None
+    if args.init:
+        model, params = camdm_training.continued(model, args.init)
     run, state, key, data = camdm_training.start(
         clips,
         model,
@@ -117,6 +122,7 @@ def train(args: Train) -> None:
         chunk=args.chunk,
         devices=args.devices,
         seed=args.seed,
+        params=params,
     )
     config = camdm_model.to_json(model) | {
         "experiment": camdm_runs.arguments_json(args)

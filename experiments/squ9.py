@@ -27,7 +27,7 @@ from jaxmotion.learning import adversarial, loop, training
 from jaxmotion.systems import aamdm, aamdm_loss
 from jaxmotion.viz import scatter
 
-CENTRES = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(9, 2)
+CENTRES = np.stack(np.meshgrid(*2 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(9, 2)
 SIGMA = 0.1
 SCALE = float(np.sqrt(2 / 3 + SIGMA**2))  # standard deviation of a coordinate
 

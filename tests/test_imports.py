@@ -119,7 +119,8 @@ def test_third_parties_come_through_their_doors(path):
         head = name.split(".")[0]
         known = {*sys.stdlib_module_names, *ANYWHERE, "jaxmotion"}
         # Scripts import the modules beside them by their bare names.
-        if head in known or (path in SCRIPTS and path.with_stem(head).exists()):
+        beside = path.with_stem(head).exists() or path.with_name(head).is_dir()
+        if head in known or (path in SCRIPTS and beside):
             continue
         where = f"{relative(path)}:{line} imports {name}"
         assert head in DOORS, where

@@ -15,6 +15,9 @@ INTERNAL = {"Hierarchy"}
 # What may stand before `key`: parameters and states, and what a function composes.
 BEFORE_KEY = {
     "params",
+    "other",  # the other player's, in adversarial training
+    "generator",
+    "discriminator",
     "state",
     "table",
     "schedule",

@@ -76,7 +76,7 @@ def posterior_sample(
 
 @jax.jit
 def discriminator_loss(
-    real_logits: Float[Array, "*batch"], fake_logits: Float[Array, "*batch"]
+    real_logits: Float[Array, "*reals"], fake_logits: Float[Array, "*fakes"]
 ) -> Float[Array, ""]:
     """Non-saturating loss of the discriminator.
 

@@ -153,7 +153,7 @@ def _timed_rollouts(
 ) -> Any:
     """Frames of the characters; says how many, and how long they took in all."""
     number, ticks = commands.label.shape
-    print(f"{number} rollouts of {ticks} ticks, as one program", flush=True)
+    print(f"{number} rollouts of {ticks} ticks, in one program", flush=True)
     begun = time.perf_counter()
     frames = protocol.steered_rollouts(
         run.params, key, states, commands, model=run.model, chunk=chunk

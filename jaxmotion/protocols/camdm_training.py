@@ -14,8 +14,8 @@ from jaxmotion.data.clips import Clips
 from jaxmotion.learning import checkpoint, training
 from jaxmotion.motion import skeleton
 from jaxmotion.systems import camdm, camdm_loss
-from jaxmotion.systems.camdm_model import Model
-from jaxmotion.typing import Key
+from jaxmotion.systems.camdm_model import Model, load, to_json
+from jaxmotion.typing import Key, Params
 
 # Sizes and weights of `camdm.Config`, by name.
 PRESETS = {
@@ -40,6 +40,14 @@ PRESETS = {
         weight_foot=5.0,
     ),
 }
+# A second, short training of a "small" model: displacements weigh 40 times more against
+# features, so that feet stand still.
+PRESETS["planted"] = PRESETS["small"] | dict(
+    weight_data=1.0,
+    weight_velocity=5.0,
+    weight_position_velocity=20.0,
+    weight_foot=20.0,
+)
 OPTIMIZERS = {"muon": training.muon_cosine, "adamw": training.adamw_cosine}
 
 
@@ -80,6 +88,41 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
     )
 
 
+def continued(model: Model, path: Path) -> tuple[Model, Params]:
+    """Another run's network and averaged parameters, with this model's loss weights.
+
+    Args:
+      model: The model to train.
+      path: Run folder or exported model to start from.
+
+    Returns:
+      The other model with the weights replaced, and its parameters.
+
+    Raises:
+      ValueError: if skeleton, styles or sizes differ; names which.
+    """
+    first, params, _ = load(path)
+    weights = {
+        name: value
+        for name, value in dataclasses.asdict(model.config).items()
+        if name.startswith("weight_")
+    }
+    # The mean rotation is part of what the network has learned.
+    mean = first.config.rotation_mean
+    wanted = dataclasses.replace(model.config, rotation_mean=mean)
+    found = dataclasses.replace(
+        first, config=dataclasses.replace(first.config, **weights)
+    )
+    expected = to_json(dataclasses.replace(model, config=wanted))
+    differ = [k for k, v in to_json(found).items() if v != expected[k]]
+    if set(differ) - {"source"}:
+        raise ValueError(
+            f"{path}: expected a model with the skeleton, labels and config of the one "
+            f"to train, found another {', '.join(differ)}"
+        )
+    return dataclasses.replace(found, source=model.source), params
+
+
 def start(
     clips: Clips,
     model: Model,
@@ -95,6 +138,7 @@ def start(
     chunk: int,
     devices: int = 1,
     seed: int = 0,
+    params: Params | None = None,
 ) -> tuple[Callable, training.TrainState, Key, Any]:
     """All that `loop.train` needs: a new run, or the newest checkpoint of an old one.
 
@@ -112,6 +156,7 @@ def start(
       chunk: Steps of one compiled call.
       devices: Split each batch over so many; 1 for no mesh.
       seed: Of the parameters and of all that training draws.
+      params: Where a new run starts; None for random parameters.
 
     Returns:
       The compiled chunk, the state, the key, and the data on the device.
@@ -139,9 +184,9 @@ def start(
         return motion, clips.labels[field][clip]
 
     key_init, key_train = jax.random.split(jax.random.key(seed))
-    state = training.init_train_state(
-        camdm.init(key_init, model.config), transformation
-    )
+    if params is None:
+        params = camdm.init(key_init, model.config)
+    state = training.init_train_state(params, transformation)
     if checkpoint.latest_step(checkpoints) is not None:
         state = checkpoint.restore(checkpoints, state)
     run = training.train_chunk(update, sample_batch, num_steps=chunk, mesh=mesh)

@@ -5,7 +5,7 @@ import pytest
 
 from jaxmotion.evaluation import modes
 
-CENTRES = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(9, 2)
+CENTRES = np.stack(np.meshgrid(*2 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(9, 2)
 
 
 def points(choose, *, number=4000, steps=6, sigma=0.1):
