@@ -67,7 +67,7 @@ def trained(script, data, tmp_path_factory, quick_compile):
     "command, words",
     [
         ("", ["train", "evaluate", "rollout", "Examples:", "--data data/bandai2.npz"]),
-        ("train", ["(default: 24000)", "in (0, 1)", "Windows a step", "Example:"]),
+        ("train", ["(default: 11000)", "in (0, 1)", "Windows a step", "Example:"]),
         ("evaluate", ["(default: 60.0)", "seconds", "Metres a second", "Example:"]),
         ("rollout", ["(default: 20.0)", "seconds", "Metres a second", "Example:"]),
     ],
