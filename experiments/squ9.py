@@ -47,7 +47,7 @@ class Config:
     """
 
     out: Path = Path("runs/squ9")
-    steps: int = 4000
+    steps: int = 3000
     batch: int = 256
     width: int = 128
     sequences: int = 1000
