@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmotion.diffusion import chain, schedule, tables
+from jaxmotion.diffusion import chain, guidance, schedule, tables
 from jaxmotion.networks import mlp
+from jaxmotion.systems import aamdm_control
 from jaxmotion.typing import Key, Params
 
 
@@ -77,14 +78,27 @@ def loss(params: Params, key: Key, windows: Array, *, config: Config):
     return jnp.mean(jnp.abs(found - noise)), {}
 
 
-def stepper(params: Params, *, config: Config):
-    """The sampler `step(key, previous) -> next`; its noise has variance beta."""
+def stepper(params: Params, *, config: Config, scale: float = 0.0):
+    """The sampler `step(key, previous, goal) -> next`; its noise has variance beta.
+
+    With a goal for the path features every prediction of the clean frame moves down
+    the gradient of their distance, by `scale` (eq. 13 of AAMDM).
+    """
     table = tables.cosine_schedule(config.num_steps)
 
-    def step(key: Key, previous: Array) -> Array:
-        def reverse(key: Key, x_t: Array, t: Array) -> Array:
+    def step(key: Key, previous: Array, goal: Array | None = None) -> Array:
+        def denoise(key: Key, x_t: Array, t: Array) -> Array:
+            del key
             noise = network(config).apply({"params": params}, x_t, t, previous)
-            x_0 = schedule.x0_from_noise(table, noise, x_t, t)
+            return schedule.x0_from_noise(table, noise, x_t, t)
+
+        if goal is not None:
+            denoise = guidance.gradient_guidance(
+                table, denoise, aamdm_control.path_objective(goal), scale=scale
+            )
+
+        def reverse(key: Key, x_t: Array, t: Array) -> Array:
+            x_0 = denoise(key, x_t, t)
             mean = schedule.posterior(table, x_0, x_t, t).mean
             spread = jnp.sqrt(table.beta[t]) * (t > 1)
             return mean + spread * jax.random.normal(key, x_t.shape)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxmotion.systems import aamdm_control
 from jaxmotion.typing import Key, Params
 
 
@@ -127,12 +128,24 @@ def loss(params: Params, key: Key, windows: Array, *, config: Config):
     return value + config.weight_kl * kl, {"value": value, "kl": kl}
 
 
-def stepper(params: Params, *, config: Config):
-    """The sampler `step(key, previous) -> next`: a latent from the prior, decoded."""
+def stepper(params: Params, *, config: Config, candidates: int = 32):
+    """The sampler `step(key, previous, goal) -> next`: a latent, decoded.
+
+    With a goal for the path features, it is the best of several latents drawn for the
+    frame: the paper's control by sampling, with a horizon of one frame.
+    """
     _, decoder = _nets(config)
 
-    def step(key: Key, previous: Array) -> Array:
+    def decode(key: Key, previous: Array) -> Array:
         latent = jax.random.normal(key, (*previous.shape[:-1], config.latent))
         return decoder.apply({"params": params["decoder"]}, latent, previous)
+
+    def step(key: Key, previous: Array, goal: Array | None = None) -> Array:
+        if goal is None:
+            return decode(key, previous)
+        keys = jax.random.split(key, candidates)
+        frames = jax.vmap(lambda k: decode(k, previous))(keys)
+        values = jax.vmap(aamdm_control.path_objective(goal))(frames)
+        return frames[jnp.argmin(values)]
 
     return step

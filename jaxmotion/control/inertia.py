@@ -26,8 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
-from jaxmotion.control import rotation_vector
-from jaxmotion.motion import rotation
+from jaxmotion.motion import rotation, rotation_vector
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.motion.spring import spring
 

@@ -33,6 +33,28 @@ class WindowIndex:
     length: int = jax.tree.static()
 
 
+def window_starts(
+    offsets: Int[np.ndarray, "boundaries"], length: int, *, stride: int = 1
+) -> tuple[Int[np.ndarray, "windows"], Int[np.ndarray, "windows"]]:
+    """First frame and clip of all windows that lie within one clip.
+
+    Args:
+      offsets: First frame of each clip, and the number of frames at the end.
+      length: Frames a window.
+      stride: Frames between the starts of windows of one clip.
+
+    Returns:
+      Starts, counted over all clips, and the clip of each; empty if none is long
+      enough.
+    """
+    starts = [
+        np.arange(a, b - length + 1, stride)
+        for a, b in zip(offsets[:-1], offsets[1:], strict=True)
+    ]
+    owner = np.repeat(np.arange(len(starts)), [s.size for s in starts])
+    return np.concatenate(starts), owner
+
+
 def window_index(
     clips: Clips,
     length: int,
@@ -65,13 +87,9 @@ def window_index(
             f"{name} has {lengths[first]} frames, a window needs {length} "
             f"({too_short.size} of {lengths.size} clips are too short)"
         )
-    starts = [
-        np.arange(a, b - length + 1, stride)
-        for a, b in zip(offsets[:-1], offsets[1:], strict=True)
-    ]
-    owner = np.repeat(np.arange(len(starts)), [s.size for s in starts])
+    starts, owner = window_starts(offsets, length, stride=stride)
     return WindowIndex(
-        starts=jnp.asarray(np.concatenate(starts), jnp.int32),
+        starts=jnp.asarray(starts, jnp.int32),
         clips=jnp.asarray(owner, jnp.int32),
         length=length,
     )

@@ -17,6 +17,14 @@ from jaxtyping import Array, Float, Int
 from jaxmotion.networks import blocks
 
 
+def _step_embedding(
+    width: int, num_steps: int, t: Int[Array, "..."], batch: tuple[int, ...]
+) -> Array:
+    """Embedding of the step, one a sample; a submodule of the caller."""
+    step = blocks.TimeEmbedding(width)(num_steps)[t]
+    return jnp.broadcast_to(step, (*batch, width))
+
+
 class ConditionedMlp(nn.Module):
     """Maps a noisy vector, its step and a condition to a vector.
 
@@ -55,9 +63,7 @@ class ConditionedMlp(nn.Module):
         Returns:
           A vector of `features` channels.
         """
-        batch = x_t.shape[:-1]
-        step = blocks.TimeEmbedding(self.time_width)(self.num_steps)[t]
-        step = jnp.broadcast_to(step, (*batch, self.time_width))
+        step = _step_embedding(self.time_width, self.num_steps, t, x_t.shape[:-1])
         given = [x_t, condition, step] + ([] if latent is None else [latent])
         given = jnp.concatenate(given, axis=-1)
         h = nn.silu(nn.Dense(self.width)(given))
@@ -102,9 +108,7 @@ class PairDiscriminator(nn.Module):
         Returns:
           The logit.
         """
-        batch = x_t.shape[:-1]
-        step = blocks.TimeEmbedding(self.time_width)(self.num_steps)[t]
-        step = jnp.broadcast_to(step, (*batch, self.time_width))
+        step = _step_embedding(self.time_width, self.num_steps, t, x_t.shape[:-1])
         h = jnp.concatenate([x_prev, x_t, condition, step], axis=-1)
         for _ in range(self.depth):
             h = nn.leaky_relu(nn.Dense(self.width)(h), 0.2)

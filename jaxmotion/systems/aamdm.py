@@ -7,7 +7,10 @@ first steps, a diffusion model its last ones; both see the previous frame:
     x_0 = reverse_chain(ancestral_step(table, polish), key, x_p, start=p)
 
 The frame is any vector: the learned 64-dimensional embedding of a pose, or a point of
-the toy problem.
+the toy problem. What the chain denoises is the frame itself, as in the paper, or its
+change: at 60 frames a second a frame is nearly the one before it, and beside the noise
+of the paper's last steps what is left to choose vanishes; a change, scaled to unit
+variance, does not.
 
 Source: Li et al. 2024, "AAMDM: Accelerated Auto-regressive Motion Diffusion Model",
 sections 3.2-3.5. Sizes and the schedule are ours, since the paper gives none.
@@ -18,6 +21,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmotion.diffusion import chain, guidance, tables
@@ -38,6 +42,8 @@ class Config:
       drafts: Steps of the generator, the first of the chain (paper: 3).
       polishes: Steps of the diffusion model, the last of the chain (paper: 2).
       schedule: "cosine", or "vp" (which keeps less of the sample at each step).
+      target: What the chain denoises: the "frame" (paper), or its "change" since the
+        previous one divided by the deviation of changes (ours).
       latent: Channels of the generator's latent.
       width: Channels of a hidden layer.
       depth: Hidden layers.
@@ -52,6 +58,7 @@ class Config:
     drafts: int = 3
     polishes: int = 2
     schedule: Literal["cosine", "vp"] = "cosine"
+    target: Literal["frame", "change"] = "frame"
     latent: int = 64
     width: int = 512
     depth: int = 4
@@ -113,15 +120,73 @@ def init(key: Key, config: Config) -> Params:
       {"polisher", "generator", "discriminator"}.
     """
     key_p, key_g, key_d = jax.random.split(key, 3)
-    x = jax.numpy.zeros(config.features)
-    z = jax.numpy.zeros(config.latent)
-    t = jax.numpy.ones((), jax.numpy.int32)
+    x = jnp.zeros(config.features)
+    z = jnp.zeros(config.latent)
+    t = jnp.ones((), jnp.int32)
     net, judge = network(config), discriminator(config)
     return {
         "polisher": net.init(key_p, x, t, x)["params"],
         "generator": net.init(key_g, x, t, x, z)["params"],
         "discriminator": judge.init(key_d, x, x, t, x)["params"],
     }
+
+
+def to_target(
+    frame: Float[Array, "*batch features"],
+    previous: Float[Array, "*batch features"],
+    change: Float[Array, " features"] | None,
+) -> Float[Array, "*batch features"]:
+    """What the chain denoises for a frame.
+
+    Args:
+      frame: The frame.
+      previous: The one before.
+      change: Deviation of each channel's changes; None for `target` "frame".
+
+    Returns:
+      The frame, or its scaled change.
+    """
+    if change is None:
+        return frame
+    return (frame - previous) / change.reshape((1,) * (frame.ndim - 1) + (-1,))
+
+
+def from_target(
+    x_0: Float[Array, "*batch features"],
+    previous: Float[Array, "*batch features"],
+    change: Float[Array, " features"] | None,
+) -> Float[Array, "*batch features"]:
+    """Inverse of `to_target`.
+
+    Args:
+      x_0: What the chain denoised.
+      previous: The frame before.
+      change: As in `to_target`.
+
+    Returns:
+      The frame.
+    """
+    if change is None:
+        return x_0
+    return previous + x_0 * change.reshape((1,) * (x_0.ndim - 1) + (-1,))
+
+
+def check_change(config: Config, change: Array | None) -> None:
+    """Raises unless the scale of changes is there exactly if it is needed.
+
+    Args:
+      config: The method.
+      change: Deviation of each channel's changes, or None.
+
+    Raises:
+      ValueError: if it is missing, or given for nothing.
+    """
+    if (change is None) != (config.target == "frame"):
+        found = "none" if change is None else f"shape {change.shape}"
+        raise ValueError(
+            f"target is {config.target!r}, but the scale of changes is {found}: "
+            "expected one for 'change' and none for 'frame'"
+        )
 
 
 def draft(
@@ -169,17 +234,25 @@ def polish(
 Transition = Callable[..., Float[Array, "*batch features"]]
 
 
-def transition(params: Params, *, config: Config) -> Transition:
+def transition(
+    params: Params, *, config: Config, change: Float[Array, " features"] | None = None
+) -> Transition:
     """The sampler of the next frame.
 
     Args:
-      params: Of the generator and the polisher; the discriminator's are not used.
+      params: Of the generator and the polisher; the discriminator's are not used, and
+        one that takes no steps may be missing.
       config: The method.
+      change: Deviation of each channel's changes; for `target` "change" only.
 
     Returns:
       `step(key, previous, *, objective=None, scale=0.0) -> next`. With an objective
       of the predicted frame every step is guided down its gradient (eq. 13).
+
+    Raises:
+      ValueError: if `change` does not fit the target.
     """
+    check_change(config, change)
 
     def step(
         key: Key,
@@ -193,16 +266,22 @@ def transition(params: Params, *, config: Config) -> Transition:
         def part(denoise: Denoiser, x: Array, start: int, stop: int) -> Array:
             if objective is not None:
                 denoise = guidance.gradient_guidance(
-                    table, denoise, objective, scale=scale
+                    table,
+                    denoise,
+                    lambda x_0: objective(from_target(x_0, previous, change)),
+                    scale=scale,
                 )
             step = chain.ancestral_step(table, denoise)
             return chain.reverse_chain(step, key_chain, x, start=start, stop=stop)
 
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, previous.shape, previous.dtype)
-        drafter = draft(params["generator"], previous, config=config)
-        x = part(drafter, x, config.num_steps, config.polishes)
-        polisher = polish(params["polisher"], previous, config=config)
-        return part(polisher, x, config.polishes, 0)
+        if config.drafts:
+            drafter = draft(params["generator"], previous, config=config)
+            x = part(drafter, x, config.num_steps, config.polishes)
+        if config.polishes:
+            polisher = polish(params["polisher"], previous, config=config)
+            x = part(polisher, x, config.polishes, 0)
+        return from_target(x, previous, change)
 
     return step

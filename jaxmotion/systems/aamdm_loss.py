@@ -13,10 +13,16 @@ from jaxmotion.systems.aamdm import Config
 from jaxmotion.typing import Key, Params
 
 Frames = Float[Array, "batch frames features"]
+Scale = Float[Array, " features"] | None
 
 
 def polisher_loss(
-    params: Params, key: Key, windows: Frames, *, config: Config
+    params: Params,
+    key: Key,
+    windows: Frames,
+    *,
+    config: Config,
+    change: Scale = None,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """Loss of the diffusion model on windows, fed with its own predictions.
 
@@ -29,38 +35,50 @@ def polisher_loss(
       key: Consumed.
       windows: Frames of the data, `config.window` + 1 each.
       config: The method.
+      change: Deviation of each channel's changes; for `target` "change" only. Errors
+        are then measured in it.
 
     Returns:
       The weighted sum, and its terms "value" and "velocity".
     """
-    table = config.table()
+    aamdm.check_change(config, change)
+    table, net = config.table(), aamdm.network(config)
     size, frames, _ = windows.shape
     key_t, key_noise = jax.random.split(key)
     steps = jax.random.randint(key_t, (frames, size), 1, config.num_steps + 1)
-    noise = jax.random.normal(key_noise, windows.shape)
-    noisy = schedule.q_sample(table, windows, steps.T, noise)
+    noise = jnp.swapaxes(jax.random.normal(key_noise, windows.shape), 0, 1)
 
-    def predict(previous: Array, given: tuple[Array, Array]) -> tuple[Array, Array]:
-        x_t, t = given
-        net = aamdm.network(config)
-        prediction = net.apply({"params": params}, x_t, t, previous)
+    def predict(previous: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
+        frame, noise, t = given
+        x_0 = aamdm.to_target(frame, jax.lax.stop_gradient(previous), change)
+        x_t = schedule.q_sample(table, x_0, t, noise)
+        found = net.apply({"params": params}, x_t, t, previous)
+        prediction = aamdm.from_target(found, previous, change)
         return prediction, prediction
 
-    first = windows[:, 0]
-    rest = (jnp.swapaxes(noisy, 0, 1)[1:], steps[1:])
-    _, predictions = jax.lax.scan(predict, first, rest)
-    predictions = jnp.swapaxes(predictions, 0, 1)
-    whole = jnp.concatenate([first[:, None], predictions], axis=1)
-    change = jnp.diff(whole, axis=1) - jnp.diff(windows, axis=1)
+    over_time = jnp.swapaxes(windows, 0, 1)
+    given = (over_time[1:], noise[1:], steps[1:])
+    _, predictions = jax.lax.scan(predict, over_time[0], given)
+    error = predictions - over_time[1:]
+    if change is not None:
+        error = error / change.reshape(1, 1, -1)
+    # The first frame is given: its error is zero.
+    velocity = jnp.diff(jnp.concatenate([jnp.zeros_like(error[:1]), error]), axis=0)
     terms = {
-        "value": jnp.mean(jnp.abs(predictions - windows[:, 1:])),
-        "velocity": jnp.mean(jnp.abs(change)),
+        "value": jnp.mean(jnp.abs(error)),
+        "velocity": jnp.mean(jnp.abs(velocity)),
     }
     return terms["value"] + config.weight_velocity * terms["velocity"], terms
 
 
 def discriminator_loss(
-    params: Params, generator: Params, key: Key, windows: Frames, *, config: Config
+    params: Params,
+    generator: Params,
+    key: Key,
+    windows: Frames,
+    *,
+    config: Config,
+    change: Scale = None,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """The discriminator's loss on the last frames of windows, with its R1 penalty.
 
@@ -70,11 +88,12 @@ def discriminator_loss(
       key: Consumed.
       windows: Frames of the data, at least three each; the last three are used.
       config: The method.
+      change: Deviation of each channel's changes; for `target` "change" only.
 
     Returns:
       The loss, and "adversarial" and "r1".
     """
-    previous, t, x_prev, x_t, fake = _pairs(generator, key, windows, config=config)
+    previous, t, x_prev, x_t, fake = _pairs(generator, key, windows, config, change)
     net = aamdm.discriminator(config)
     judge = lambda x: net.apply({"params": params}, x, x_t, t, previous)  # noqa: E731
     adversarial = gan.discriminator_loss(judge(x_prev), judge(fake))
@@ -84,7 +103,13 @@ def discriminator_loss(
 
 
 def generator_loss(
-    params: Params, discriminator: Params, key: Key, windows: Frames, *, config: Config
+    params: Params,
+    discriminator: Params,
+    key: Key,
+    windows: Frames,
+    *,
+    config: Config,
+    change: Scale = None,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """The generator's loss on the last frames of windows.
 
@@ -94,29 +119,32 @@ def generator_loss(
       key: Consumed.
       windows: Frames of the data, at least three each; the last three are used.
       config: The method.
+      change: Deviation of each channel's changes; for `target` "change" only.
 
     Returns:
       The loss, and nothing more.
     """
-    previous, t, _, x_t, fake = _pairs(params, key, windows, config=config)
+    previous, t, _, x_t, fake = _pairs(params, key, windows, config, change)
     net = aamdm.discriminator(config)
     logits = net.apply({"params": discriminator}, fake, x_t, t, previous)
     return gan.generator_loss(logits), {}
 
 
 def _pairs(
-    generator: Params, key: Key, windows: Frames, *, config: Config
+    generator: Params, key: Key, windows: Frames, config: Config, change: Scale
 ) -> tuple[Array, ...]:
     """Previous frame, step, real x_{t-1}, x_t, and generated x_{t-1}."""
+    aamdm.check_change(config, change)
     table, size = config.table(), windows.shape[0]
     names = ("own", "choice", "t", "pair", "latent", "posterior")
     keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
-    before, previous, x_0 = (windows[:, i] for i in (-3, -2, -1))
-    own = _own(generator, keys["own"], before, previous, config=config)
+    before, previous, frame = (windows[:, i] for i in (-3, -2, -1))
+    own = _own(generator, keys["own"], before, previous, config, change)
     choice = jax.random.bernoulli(keys["choice"], config.own_previous, (size, 1))
     previous = jnp.where(choice, jax.lax.stop_gradient(own), previous)
 
     t = jax.random.randint(keys["t"], (size,), 1, config.num_steps + 1)
+    x_0 = aamdm.to_target(frame, previous, change)
     x_prev, x_t = gan.q_pair(table, keys["pair"], x_0, t)
     prediction = aamdm.draft(generator, previous, config=config)(keys["latent"], x_t, t)
     fake = gan.posterior_sample(table, keys["posterior"], prediction, x_t, t)
@@ -124,11 +152,18 @@ def _pairs(
 
 
 def _own(
-    generator: Params, key: Key, before: Array, frame: Array, *, config: Config
+    generator: Params,
+    key: Key,
+    before: Array,
+    frame: Array,
+    config: Config,
+    change: Scale,
 ) -> Array:
     """The generator's prediction of a frame from a noised one and the frame before."""
     key_t, key_noise, key_latent = jax.random.split(key, 3)
     t = jax.random.randint(key_t, frame.shape[:1], 1, config.num_steps + 1)
     noise = jax.random.normal(key_noise, frame.shape)
-    x_t = schedule.q_sample(config.table(), frame, t, noise)
-    return aamdm.draft(generator, before, config=config)(key_latent, x_t, t)
+    x_0 = aamdm.to_target(frame, before, change)
+    x_t = schedule.q_sample(config.table(), x_0, t, noise)
+    found = aamdm.draft(generator, before, config=config)(key_latent, x_t, t)
+    return aamdm.from_target(found, before, change)

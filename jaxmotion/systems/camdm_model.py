@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
 from jaxmotion.learning import checkpoint
-from jaxmotion.motion.skeleton import Skeleton, check_parents
-from jaxmotion.systems import camdm
+from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.systems import camdm, model_json
 from jaxmotion.typing import Params
 
 
@@ -65,12 +63,7 @@ def to_json(model: Model) -> dict[str, Any]:
     return {
         "system": "camdm",
         "config": dataclasses.asdict(model.config),
-        "skeleton": {
-            "offsets": np.asarray(model.bones.offsets, np.float64).tolist(),
-            "parents": list(model.bones.parents),
-            "names": list(model.bones.names),
-            "feet": list(model.bones.feet),
-        },
+        "skeleton": model_json.skeleton_to_json(model.bones),
         "labels": list(model.labels),
         "source": model.source,
     }
@@ -98,20 +91,13 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
     if unknown:
         raise ValueError(f"{where}: field 'config' has unknown {sorted(unknown)}")
     try:
-        bones = value["skeleton"]
         config = {
             name: tuple(x) if isinstance(x, list) else x
             for name, x in value["config"].items()
         }
-        check_parents(tuple(bones["parents"]))
         model = Model(
             config=camdm.Config(**config),
-            bones=Skeleton(
-                offsets=jnp.asarray(bones["offsets"], jnp.float32),
-                parents=tuple(bones["parents"]),
-                names=tuple(bones["names"]),
-                feet=tuple(bones["feet"]),
-            ),
+            bones=model_json.skeleton_from_json(value["skeleton"]),
             labels=tuple(value["labels"]),
             source=value["source"],
         )

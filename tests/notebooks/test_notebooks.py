@@ -8,7 +8,6 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-SHIPPED = ROOT / "jaxmotion" / "assets" / "walker.npz"
 
 
 def code_cells(path):
@@ -65,7 +64,6 @@ def test_gaussian_oracle(no_screen, capsys):
     assert "recursion" in capsys.readouterr().out
 
 
-@pytest.mark.skipif(not SHIPPED.is_file(), reason=f"no {SHIPPED.name} in this checkout")
 def test_steer_a_character(no_screen, capsys):
     import numpy as np
 

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxmotion.control import rotation_vector
+from jaxmotion.motion import rotation_vector
 
 
 def test_rotation_vectors_agree_with_scipy():

@@ -1,0 +1,147 @@
+"""Pose vectors and path features of clips, ready for AAMDM's training.
+
+The last part of every clip is held out, behind a gap of a second: frames next to each
+other are nearly the same.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.data import simulation, windows
+from jaxmotion.data.clips import Clips
+from jaxmotion.motion import path_features, pose
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PoseData:
+    """Frames of clips behind each other.
+
+    Attributes:
+      poses: Pose vectors.
+      paths: Path features.
+      offsets: First frame of each clip, and the number of frames at the end.
+      fps: Frames a second.
+    """
+
+    poses: Float[Array, "frames features"]
+    paths: Float[Array, "frames 12"]
+    offsets: Int[Array, "boundaries"]
+    fps: float = jax.tree.static()
+
+    @property
+    def num_frames(self) -> int:
+        """Frames of all clips together."""
+        return self.poses.shape[0]
+
+
+def starts(data: PoseData, length: int, *, stride: int = 1) -> Int[Array, " windows"]:
+    """First frames of all windows that lie within one clip.
+
+    Args:
+      data: The frames.
+      length: Frames a window.
+      stride: Frames between the starts of windows of one clip.
+
+    Returns:
+      The starts.
+
+    Raises:
+      ValueError: if no clip is long enough.
+    """
+    found, _ = windows.window_starts(np.asarray(data.offsets), length, stride=stride)
+    if not found.size:
+        longest = int(np.diff(np.asarray(data.offsets)).max())
+        raise ValueError(
+            f"no clip has the {length} frames of a window: the longest has {longest}"
+        )
+    return jnp.asarray(found, jnp.int32)
+
+
+def take(data: PoseData, spans: list[tuple[int, int]]) -> PoseData:
+    """Parts of the frames, each a clip of its own.
+
+    Args:
+      data: The frames.
+      spans: First frame and the frame behind the last of each part.
+
+    Returns:
+      Those parts.
+    """
+    frames = np.concatenate([np.arange(a, b) for a, b in spans])
+    lengths = [b - a for a, b in spans]
+    return PoseData(
+        poses=data.poses[frames],
+        paths=data.paths[frames],
+        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
+        fps=data.fps,
+    )
+
+
+def split_ends(data: PoseData, fraction: float) -> tuple[PoseData, PoseData]:
+    """Holds out the end of every clip.
+
+    Args:
+      data: The frames.
+      fraction: Part of each clip to hold out, in (0, 1); the second before it is in
+        neither part.
+
+    Returns:
+      The training part and the held-out part.
+
+    Raises:
+      ValueError: if the fraction is out of range, or a part would be empty.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise ValueError(f"fraction should be between 0 and 1, found {fraction}")
+    offsets = np.asarray(data.offsets)
+    gap = round(data.fps)
+    train, held = [], []
+    for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
+        cut = b - round((b - a) * fraction)
+        if cut - gap > a:
+            train.append((a, cut - gap))
+            held.append((cut, b))
+    if not train:
+        raise ValueError("no clip is long enough to hold a part of it out")
+    return take(data, train), take(data, held)
+
+
+def pose_data(clips: Clips, *, fps: float = 60.0) -> tuple[PoseData, tuple[str, ...]]:
+    """Resamples clips and describes their frames.
+
+    Args:
+      clips: The clips; those too short for a simulation bone are left out.
+      fps: Frames a second that are wanted.
+
+    Returns:
+      The frames, and the names of the clips that were used.
+
+    Raises:
+      ValueError: if the skeleton lacks a joint, the rate cannot be reached, or all
+        clips are too short.
+    """
+    bones, offsets = clips.skeleton, np.asarray(clips.offsets)
+    least = simulation.least_frames(fps)
+    rows, names = [], []
+    for i in range(clips.num_clips):
+        motion = windows.cut(clips, offsets[i], int(offsets[i + 1] - offsets[i]))
+        motion = simulation.upsample(motion, fps)
+        if motion.root_position.shape[0] < least:
+            continue
+        bone = simulation.simulation_bone(bones, motion)
+        poses = pose.pose_vectors(bones, motion, bone)
+        paths = path_features.path_features(bone, fps=fps)
+        rows.append((poses, paths))
+        names.append(clips.clip_names[i])
+    if not rows:
+        raise ValueError(f"no clip has {least} frames at {fps:g} frames a second")
+    poses, paths = (jnp.concatenate(x) for x in zip(*rows, strict=True))
+    lengths = [len(row[0]) for row in rows]
+    boundaries = jnp.asarray(np.cumsum([0, *lengths]), jnp.int32)
+    data = PoseData(poses=poses, paths=paths, offsets=boundaries, fps=float(fps))
+    return data, tuple(names)

@@ -1,0 +1,172 @@
+"""Spaces in which characters are generated frame by frame.
+
+A *frame* here is a vector of unit variance in each channel. Its first 12 channels are
+always the path features, so that one objective steers in every space. Two kinds:
+
+* embedded: path features and the autoencoder's latent, 12 + 52;
+* full pose: path features and the pose vector itself, 12 + 338 for 22 joints.
+
+Source: Li et al. 2024 (AAMDM), sections 3.1 and 4.3 (the ablation without embedding).
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.motion import features
+from jaxmotion.systems import aamdm_embedding as embedding
+from jaxmotion.systems.aamdm_embedding import PATH
+from jaxmotion.typing import Params
+
+# Channels that hardly vary, such as the lengths of bones, must not be blown up.
+_LEAST_POSE = 1e-3
+_LEAST_LATENT = 1e-3
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Autoencoder:
+    """A trained autoencoder.
+
+    Attributes:
+      params: Its parameters.
+      statistics: Of its training frames.
+      config: Its sizes.
+    """
+
+    params: Params
+    statistics: embedding.Statistics
+    config: embedding.Config = jax.tree.static()
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Space:
+    """How frames are made and read.
+
+    Attributes:
+      normalizer: Of the channels before they are scaled.
+      change: Deviation of each channel's change from frame to frame.
+      autoencoder: Of an embedded space; None for full poses.
+    """
+
+    normalizer: features.Normalizer
+    change: Float[Array, " channels"]
+    autoencoder: Autoencoder | None
+
+    @property
+    def num_features(self) -> int:
+        """Channels of a frame."""
+        return self.normalizer.mean.shape[0]
+
+
+def _raw(
+    autoencoder: Autoencoder | None,
+    poses: Float[Array, "*batch features"],
+    paths: Float[Array, "*batch 12"],
+) -> Float[Array, "*batch channels"]:
+    if autoencoder is None:
+        return jnp.concatenate([paths, poses], axis=-1)
+    return embedding.encode(
+        autoencoder.params,
+        autoencoder.statistics,
+        poses,
+        paths,
+        config=autoencoder.config,
+    )
+
+
+def fit_space(
+    poses: Float[Array, "frames features"],
+    paths: Float[Array, "frames 12"],
+    neighbours: Float[Array, "pairs"],
+    *,
+    autoencoder: Autoencoder | None,
+) -> Space:
+    """The space of training frames.
+
+    Args:
+      poses: Pose vectors of all clips.
+      paths: Path features.
+      neighbours: Frames that are followed by another of the same clip.
+      autoencoder: Of an embedded space; None for full poses.
+
+    Returns:
+      The space.
+    """
+    raw = _raw(autoencoder, poses, paths)
+    latent = raw.shape[-1] - PATH
+    least = _LEAST_POSE if autoencoder is None else _LEAST_LATENT
+    floor = jnp.concatenate([jnp.full(PATH, 1e-3), jnp.full(latent, least)])
+    normalizer = features.fit_normalizer(raw, floor=floor)
+    frames = features.normalize(normalizer, raw)
+    step = frames[neighbours + 1] - frames[neighbours]
+    change = jnp.maximum(jnp.sqrt(jnp.mean(step**2, axis=0)), 1e-4)
+    return Space(normalizer=normalizer, change=change, autoencoder=autoencoder)
+
+
+def to_frames(
+    space: Space,
+    poses: Float[Array, "*batch features"],
+    paths: Float[Array, "*batch 12"],
+) -> Float[Array, "*batch channels"]:
+    """Frames of poses.
+
+    Args:
+      space: The space.
+      poses: Pose vectors.
+      paths: Path features.
+
+    Returns:
+      Frames, of unit variance over the training data.
+    """
+    return features.normalize(space.normalizer, _raw(space.autoencoder, poses, paths))
+
+
+def to_poses(
+    space: Space, frames: Float[Array, "*batch channels"]
+) -> Float[Array, "*batch features"]:
+    """Pose vectors of frames.
+
+    Args:
+      space: The space.
+      frames: Frames.
+
+    Returns:
+      Pose vectors in their own units.
+    """
+    raw = features.denormalize(space.normalizer, frames)
+    if space.autoencoder is None:
+        return raw[..., PATH:]
+    own = space.autoencoder
+    return embedding.decode(own.params, own.statistics, raw, config=own.config)
+
+
+def to_paths(
+    space: Space, frames: Float[Array, "*batch channels"]
+) -> Float[Array, "*batch 12"]:
+    """Path features of frames.
+
+    Args:
+      space: The space.
+      frames: Frames.
+
+    Returns:
+      Path features: metres, and directions.
+    """
+    return features.denormalize(path_normalizer(space), frames[..., :PATH])
+
+
+def path_normalizer(space: Space) -> features.Normalizer:
+    """How path features are scaled in frames.
+
+    Args:
+      space: The space.
+
+    Returns:
+      Of the first 12 channels.
+    """
+    own = space.normalizer
+    return features.Normalizer(mean=own.mean[:PATH], std=own.std[:PATH])
