@@ -3,10 +3,10 @@
 Example:
   python benchmarks/rollout_batch.py --system camdm --characters 1 16 256
   python benchmarks/rollout_batch.py --characters 64 --chunks 1 4 16 0 --staggered
+  python benchmarks/rollout_batch.py --system aamdm --characters 1 64 4096
 """
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,12 +16,12 @@ import suite
 import timing
 import tyro
 import workload
+import workload_aamdm
 
 from jaxmotion.control import rollout
-from jaxmotion.data.clips import Clips
-from jaxmotion.systems import camdm_control, camdm_model
-from jaxmotion.typing import Params
 
+# Characters at a time unless told: what was fastest on two cores.
+CHUNKS = {"camdm": (4,), "aamdm": (64,)}
 COLUMNS = {
     "characters": "characters",
     "chunk": "chunk",
@@ -38,107 +38,86 @@ COLUMNS = {
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Rollouts of the procedural walker, for several numbers of characters.
+    """Rollouts of a character, for several numbers of characters.
 
     All seconds and characters of a rollout are one compiled program ("traces" counts
     how often it was traced). Frames a second are those of all characters together;
     "x real time" is how much faster than its clock each character runs.
 
     Attributes:
-      system: What to measure.
+      system: What to measure: CAMDM steers the procedural walker by plans of 45
+        frames; AAMDM makes every frame, free, and is compared with a Python loop over
+        its jitted networks.
       characters: Characters that are rolled out together.
       seconds: Length of a rollout.
-      run: Model of the procedural walker (run folder or exported file); None for
-        random parameters of the paper's network, which take the same time as trained
-        ones.
+      run: Trained model: for CAMDM a run folder or exported file of the procedural
+        walker, for AAMDM a run folder; None for random parameters, which take the same
+        time as trained ones.
       chunks: Characters at a time, in batches of 16 and more; 0 for all at once.
         Several compare.
-      staggered: Change commands at other ticks for each character; without it they
-        all plan at the same ticks, which is the cheapest.
+      staggered: CAMDM: change commands at other ticks for each character; without it
+        they all plan at the same ticks, which is the cheapest.
       arguments: Pass the parameters as arguments; without it they are constants of
         the program, as in deployment.
-      frames_per_token: Of the network with random parameters; 1 is the paper's.
-      width: Likewise, channels of a token.
+      frames_per_token: CAMDM, of the network with random parameters; 1 is the paper's.
+      width: Likewise, channels of a token (CAMDM; None: 256), or of a hidden layer
+        (AAMDM; None: 256).
       runs: Timed rollouts of each size.
       limit: Seconds of timed rollouts of each size, at most, but three rollouts.
       out: Folder for rollout_batch.json.
       gate: Report to compare with; exit status 1 if something is worse.
     """
 
-    system: Literal["camdm"] = "camdm"
+    system: Literal["camdm", "aamdm"] = "camdm"
     characters: tuple[int, ...] = (1, 16, 256)
     seconds: float = 2.0
     run: Path | None = None
-    chunks: tuple[int, ...] = (4,)
+    chunks: tuple[int, ...] | None = None
     staggered: bool = False
     arguments: bool = False
     frames_per_token: int = 1
-    width: int = 256
+    width: int | None = None
     runs: int = 50
     limit: float = 30.0
     out: Path = Path("runs/benchmarks")
     gate: Path | None = None
 
 
-def program(
-    model: camdm_model.Model, params: Params, chunk: int | None, arguments: bool
-) -> tuple[Callable, tuple, list[int]]:
-    """The rollout as a jitted function.
-
-    Args:
-      model: The model.
-      params: Its parameters.
-      chunk: Characters at a time; None for all.
-      arguments: Whether the parameters are arguments, not constants.
-
-    Returns:
-      The function, its first arguments, and a list that grows with every trace.
-    """
-    traces: list[int] = []
-
-    def run(params: Params, key, states, commands):
-        traces.append(1)
-        controller = camdm_control.controller(params, model.bones, config=model.config)
-        return rollout.rollout(controller, key, states, commands, chunk=chunk)
-
-    if arguments:
-        return jax.jit(run), (params,), traces
-    return jax.jit(lambda *given: run(params, *given)), (), traces
-
-
 def case(
-    args: Config,
-    model: camdm_model.Model,
-    params: Params,
-    clips: Clips,
-    number: int,
-    chunk: int | None,
+    args: Config, load: workload.Load, number: int, chunk: int | None
 ) -> dict[str, Any]:
     """Measures one number of characters and one chunk.
 
     Args:
       args: The settings.
-      model: The model.
-      params: Its parameters.
-      clips: Where the characters start.
+      load: What is rolled out.
       number: Characters.
       chunk: Characters at a time; None for all.
 
     Returns:
       One row of the report.
     """
-    function, first, traces = program(model, params, chunk, args.arguments)
-    states, commands = workload.steered(
-        model, clips, number, seconds=args.seconds, staggered=args.staggered
-    )
-    given = (*first, jax.random.key(0), states, commands)
+    traces: list[int] = []
+
+    def roll(params, key, states, commands):
+        traces.append(1)
+        return rollout.rollout(
+            load.controller(params), key, states, commands, chunk=chunk
+        )
+
+    states, commands = load.start(number)
+    given = (jax.random.key(0), states, commands)
+    if args.arguments:
+        function, given = jax.jit(roll), (load.params, *given)
+    else:
+        function = jax.jit(lambda *rest: roll(load.params, *rest))
     run, compile_s = timing.compile_program(function, *given)
     times = timing.time_calls(
         lambda: run(*given), runs=args.runs, limit_s=args.limit, warmup=1, least=3
     )
     _, frames = run(*given)
     p50, p95 = np.percentile(times, [50, 95])
-    rate = 1000 * frames.planned.size / p50
+    rate = 1000 * number * commands.label.shape[1] / p50
     return {
         "characters": number,
         "chunk": chunk or number,
@@ -147,9 +126,9 @@ def case(
         "p50_ms": float(p50),
         "p95_ms": float(p95),
         "runs": len(times),
-        "plans": float(frames.planned.sum() / number),
+        "plans": load.plans(frames) / number,
         "frames_per_second": float(rate),
-        "realtime": float(rate / number / model.config.fps),
+        "realtime": float(rate / number / load.fps),
     }
 
 
@@ -200,23 +179,46 @@ def main() -> None:
     """Measures and writes the report."""
     args = tyro.cli(Config, description=__doc__)
     suite.prepare(args.out, args.gate)
-    cases = [(n, chunk) for n in args.characters for chunk in chunks_of(n, args.chunks)]
-    clips = workload.make_clips()
-    model, params = workload.walker_model(
-        clips, args.run, width=args.width, frames_per_token=args.frames_per_token
-    )
-    rows = []
+    chunks = CHUNKS[args.system] if args.chunks is None else args.chunks
+    cases = [(n, chunk) for n in args.characters for chunk in chunks_of(n, chunks)]
+    rows, more = [], {}
+    if args.system == "camdm":
+        load = workload.camdm_load(
+            args.run,
+            width=args.width or 256,
+            frames_per_token=args.frames_per_token,
+            seconds=args.seconds,
+            staggered=args.staggered,
+        )
+    else:
+        load = workload_aamdm.make_load(
+            args.run, width=args.width or 256, seconds=args.seconds
+        )
     for number, chunk in cases:
-        rows.append(case(args, model, params, clips, number, chunk))
+        rows.append(case(args, load, number, chunk))
         print(f"{number} characters: {rows[-1]['frames_per_second']:,.0f} frames/s")
     suite.print_table(rows, COLUMNS)
+    metrics = [metric for row in rows for metric in metrics_of(args.system, row)]
+    if args.system == "aamdm":
+        rate = workload_aamdm.python_loop(load, limit_s=args.limit)
+        print(f"Python loop over the jitted networks: {rate:,.1f} frames/s")
+        metrics.append(
+            suite.Metric("aamdm Python loop", rate, "frames/s", "higher", 0.6)
+        )
+        more["python_loop_frames_per_second"] = rate
+        alone = [row for row in rows if row["characters"] == 1]
+        for row in alone:
+            ratio = row["frames_per_second"] / rate
+            more["times_python_loop"] = ratio
+            print(f"one character, as one program: {ratio:.1f} times the loop")
     suite.report(
         "rollout_batch",
-        [metric for row in rows for metric in metrics_of(args.system, row)],
+        metrics,
         args.out,
         gate=args.gate,
         rows=rows,
         settings=suite.settings(args),
+        **more,
     )
 
 

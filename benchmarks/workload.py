@@ -1,5 +1,7 @@
 """What the benchmarks run: the paper's network, conditions, a walker to steer."""
 
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -7,12 +9,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion.control.rollout import Controller
 from jaxmotion.data import procedural
 from jaxmotion.data.clips import Clips
 from jaxmotion.motion import trajectory
 from jaxmotion.protocols import camdm as protocol
 from jaxmotion.systems import camdm, camdm_control, camdm_model
 from jaxmotion.typing import Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Load:
+    """What a benchmark of rollouts runs.
+
+    Attributes:
+      params: Parameters of the networks.
+      controller: Makes the run-time of parameters.
+      start: States and commands of a number of characters.
+      plans: How often networks made something, in all frames together.
+      fps: Ticks a second.
+      config: Of the system.
+    """
+
+    params: Params
+    controller: Callable[[Params], Controller]
+    start: Callable[[int], tuple[Any, trajectory.Command]]
+    plans: Callable[[Any], float]
+    fps: float
+    config: Any
 
 
 def paper_config(
@@ -132,6 +156,36 @@ def steered(
     rows = jnp.asarray(places[:, None] + np.arange(ticks))
     picked = jax.tree.map(lambda x: jax.vmap(lambda y, i: y[i])(x, rows), commands)
     return states, picked
+
+
+def camdm_load(
+    run: Path | None, *, seconds: float, staggered: bool, **sizes: Any
+) -> Load:
+    """Steered walkers.
+
+    Args:
+      run: As of `walker_model`.
+      seconds: As of `steered`.
+      staggered: As of `steered`.
+      **sizes: Of `paper_config`, without a run.
+
+    Returns:
+      The load.
+    """
+    clips = make_clips()
+    model, params = walker_model(clips, run, **sizes)
+    return Load(
+        params=params,
+        controller=lambda params: camdm_control.controller(
+            params, model.bones, config=model.config
+        ),
+        start=lambda number: steered(
+            model, clips, number, seconds=seconds, staggered=staggered
+        ),
+        plans=lambda frames: float(frames.planned.sum()),
+        fps=model.config.fps,
+        config=model.config,
+    )
 
 
 def make_clips() -> Clips:

@@ -97,6 +97,41 @@ def skate_ratio(
 
 
 @jax.jit
+def skating_frame_ratio(
+    foot_positions: Float[Array, "*batch frames feet 3"],
+    fps: Scalar,
+    *,
+    height: Scalar = 0.025,
+    min_speed: Scalar = 0.2,
+) -> Float[Array, "*batch"]:
+    """Part of the frames in which any foot skates, by MANN's measure of skating.
+
+    A foot at height h that moves at v on the ground skates by v (2 - 2^(h / H)), with
+    h / H clipped to [0, 1]: fully on the ground, not at all from H on. A frame counts
+    if that exceeds `min_speed`.
+
+    Args:
+      foot_positions: World positions of feet or toes, metres, ground at y = 0.
+      fps: Frames a second.
+      height: H, metres.
+      min_speed: Metres a second, exclusive; ours, since the source sums the measure.
+
+    Returns:
+      Ratio in [0, 1].
+
+    Raises:
+      ValueError: if there are fewer than two frames.
+
+    Source: Zhang et al. 2018 (MANN), section 8; cited for AAMDM's "footskating frame
+      ratio" by Li et al. 2024.
+    """
+    speed = _foot_steps(foot_positions) * fps
+    level = jnp.clip(foot_positions[..., :-1, :, 1] / height, 0.0, 1.0)
+    skates = speed * (2.0 - 2.0**level) > min_speed
+    return jnp.mean(jnp.any(skates, axis=-1), axis=-1)
+
+
+@jax.jit
 def foot_slide_camdm_release(
     foot_positions: Float[Array, "*batch frames feet 3"],
     root_position: Float[Array, "*batch frames 3"],

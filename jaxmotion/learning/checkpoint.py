@@ -150,7 +150,11 @@ def _check_shapes(folder: Path, step: int, like: Any, found: Any) -> None:
 
 
 def restore_part(
-    folder: str | Path, like: dict[str, Any], step: int | None = None
+    folder: str | Path,
+    like: dict[str, Any],
+    step: int | None = None,
+    *,
+    within: str | None = None,
 ) -> dict[str, Any]:
     """Some fields of a saved state, such as the averaged parameters alone.
 
@@ -159,6 +163,8 @@ def restore_part(
       like: Field names to nested dicts of arrays (or ShapeDtypeStructs), of the same
         structure and shapes.
       step: Which; None for the newest.
+      within: Field of the state whose fields they are, such as "generator"; None for
+        the state itself.
 
     Returns:
       Those fields.
@@ -169,18 +175,22 @@ def restore_part(
     """
     folder = Path(folder)
     step = _newest(folder, step)
+    whole = like if within is None else {within: like}
     part = ocp.args.PyTreeRestore(
-        item=like,
-        restore_args=ocp.checkpoint_utils.construct_restore_args(like),
+        item=whole,
+        restore_args=ocp.checkpoint_utils.construct_restore_args(whole),
         partial_restore=True,
     )
     saved = folder.absolute() / str(step) / "state"
     try:
         with ocp.PyTreeCheckpointer() as reader:
             stored = reader.metadata(saved).item_metadata.tree
+            if within is not None:
+                stored = stored.get(within) or {}
             # Orbax would hand back what `like` has where the disk has nothing.
             _check_part(folder, step, like, {name: stored.get(name) for name in like})
             found = reader.restore(saved, args=part)
+        found = found if within is None else found[within]
         return jax.tree.map(jax.numpy.asarray, found)
     except CheckpointError:
         raise

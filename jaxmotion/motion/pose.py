@@ -227,6 +227,39 @@ def place(
     return root, rotation.rot6d_from_matrix(matrix)
 
 
+def integrate_root(
+    poses: Float[Array, "frames features"],
+    frame: PlanarFrame,
+    *,
+    num_joints: int,
+    fps: float,
+) -> PlanarFrame:
+    """Path of the simulation bone that pose vectors mean.
+
+    A pose's velocity is what leads to it: that of the first pose has no effect.
+
+    Args:
+      poses: Pose vectors, one a frame.
+      frame: The simulation bone of the first frame.
+      num_joints: J.
+      fps: Frames a second.
+
+    Returns:
+      The simulation bone of every frame, world.
+
+    Source: Holden et al. 2020, released code.
+    """
+
+    def step(frame: PlanarFrame, parts: tuple[Array, Array]) -> tuple:
+        following = advance_frame(frame, *parts, fps=fps)
+        return following, following
+
+    parts = unpack(pose_layout(num_joints), poses[1:])
+    moves = (parts["root_velocity"], parts["root_angular_velocity"])
+    _, rest = jax.lax.scan(step, frame, moves)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), frame, rest)
+
+
 def motion_from_poses(
     poses: Float[Array, "frames features"],
     frame: PlanarFrame,
@@ -234,9 +267,7 @@ def motion_from_poses(
     num_joints: int,
     fps: float,
 ) -> Motion:
-    """Integrates the root's velocities of pose vectors into a motion.
-
-    A pose's velocity is what leads to it: that of the first pose has no effect.
+    """Pose vectors as a motion: the root's velocities are integrated.
 
     Args:
       poses: Pose vectors, one a frame.
@@ -249,14 +280,6 @@ def motion_from_poses(
 
     Source: Holden et al. 2020, released code.
     """
-
-    def step(frame: PlanarFrame, parts: tuple[Array, Array]) -> tuple:
-        following = advance_frame(frame, *parts, fps=fps)
-        return following, following
-
-    parts = unpack(pose_layout(num_joints), poses[1:])
-    moves = (parts["root_velocity"], parts["root_angular_velocity"])
-    _, rest = jax.lax.scan(step, frame, moves)
-    frames = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), frame, rest)
-    root, rot6d = place(poses, frames, num_joints=num_joints)
+    bone = integrate_root(poses, frame, num_joints=num_joints, fps=fps)
+    root, rot6d = place(poses, bone, num_joints=num_joints)
     return Motion(root_position=root, joint_rotation=rot6d, fps=fps)

@@ -162,10 +162,12 @@ def load_params(
       CheckpointError: if there is none, or it is of another stage or size.
     """
     check_stage(folder, stage)
-    like = {"ema_params": jax.eval_shape(init)}
-    like = {"generator": like} if adversarial else like
-    found = checkpoint.restore_part(folder / "checkpoints", like)
-    return (found["generator"] if adversarial else found)["ema_params"]
+    found = checkpoint.restore_part(
+        folder / "checkpoints",
+        {"ema_params": jax.eval_shape(init)},
+        within="generator" if adversarial else None,
+    )
+    return found["ema_params"]
 
 
 def frame_windows(

@@ -1,0 +1,144 @@
+"""What the benchmark of AAMDM rolls out, and the Python loop it is compared with."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import workload
+
+from jaxmotion.data import procedural
+from jaxmotion.diffusion import schedule
+from jaxmotion.motion import trajectory
+from jaxmotion.protocols import aamdm_chains, aamdm_data, aamdm_runs
+from jaxmotion.systems import aamdm, aamdm_control, aamdm_embedding, aamdm_space
+from jaxmotion.typing import Params
+
+FPS = 60.0
+
+
+def _random(width: int) -> tuple[aamdm.Config, Params, aamdm_space.Space, Any, int]:
+    """A character of the procedural walker with untrained networks."""
+    clips = procedural.make_clips(minutes=1)
+    joints = clips.skeleton.num_joints
+    data, _ = aamdm_data.pose_data(clips, fps=FPS)
+    sizes = aamdm_embedding.Config(num_joints=joints, fps=FPS)
+    own = aamdm_space.Autoencoder(
+        params=aamdm_embedding.init(jax.random.key(0), sizes),
+        statistics=aamdm_embedding.fit_statistics(data.poses, data.paths, config=sizes),
+        config=sizes,
+    )
+    space = aamdm_space.fit_space(
+        data.poses, data.paths, aamdm_data.starts(data, 2), autoencoder=own
+    )
+    config = aamdm.Config(features=space.num_features, width=width)
+    return config, aamdm.init(jax.random.key(1), config), space, data, joints
+
+
+def _trained(folder: Path) -> tuple[aamdm.Config, Params, aamdm_space.Space, Any, int]:
+    """Likewise, of a run folder."""
+    run = aamdm_runs.load_run(folder)
+    space = aamdm_runs.load_space(run, "embedded")
+    params, config = aamdm_chains.load_networks(
+        run, "embedded", space, drafts=3, polishes=2
+    )
+    return config, params, space, run.held_out, run.bones.num_joints
+
+
+def make_load(run: Path | None, *, width: int, seconds: float) -> workload.Load:
+    """Free characters, each frame generated in 3 + 2 steps.
+
+    Args:
+      run: Run folder; None for random parameters.
+      width: Channels of a hidden layer, without a run.
+      seconds: Length of a rollout.
+
+    Returns:
+      The load; its parameters are the networks' and the space.
+    """
+    config, params, space, data, joints = _trained(run) if run else _random(width)
+
+    def controller(params: Params) -> Any:
+        step = aamdm.transition(params["networks"], config=config)
+        return aamdm_control.controller(
+            aamdm_control.guided(step, scale=0.0),
+            params["space"],
+            num_joints=joints,
+            fps=FPS,
+            steered=False,
+        )
+
+    def start(number: int) -> tuple[Any, trajectory.Command]:
+        rows = jnp.arange(number) * 7 % data.num_frames
+        states = jax.vmap(
+            lambda pose, path: aamdm_control.init_state(
+                space, pose, path, num_joints=joints
+            )
+        )(data.poses[rows], data.paths[rows])
+        shape = (number, round(seconds * FPS))
+        facing = jnp.broadcast_to(jnp.array([0.0, 1.0]), (*shape, 2))
+        return states, trajectory.Command(
+            velocity=facing, facing=facing, label=jnp.zeros(shape, jnp.int32)
+        )
+
+    return workload.Load(
+        params={"networks": params, "space": space},
+        controller=controller,
+        start=start,
+        plans=lambda frames: float(frames.path[..., 0].size),
+        fps=FPS,
+        config=config,
+    )
+
+
+def python_loop(load: workload.Load, *, limit_s: float) -> float:
+    """Frames a second of one character in a Python loop over its jitted networks.
+
+    The networks, the posterior of a step and the decoding of a frame are each jitted;
+    the loops over frames and steps, and what is between, are Python.
+
+    Args:
+      load: From `make_load`.
+      limit_s: Seconds to run for, at most.
+
+    Returns:
+      Frames a second.
+    """
+    params, config = load.params["networks"], load.config
+    net, table = aamdm.network(config), config.table()
+    draft = jax.jit(
+        lambda x, t, previous, z: net.apply(
+            {"params": params["generator"]}, x, t, previous, z
+        )
+    )
+    polish = jax.jit(
+        lambda x, t, previous: net.apply({"params": params["polisher"]}, x, t, previous)
+    )
+    show = jax.jit(load.controller(load.params).advance)
+    states, commands = load.start(1)
+    state, command = jax.tree.map(lambda x: x[0], (states, commands))
+    command = jax.tree.map(lambda x: x[0], command)
+
+    def frame(key: jax.Array, state: Any) -> Any:
+        key_start, key_chain = jax.random.split(key)
+        x = jax.random.normal(key_start, state.frame.shape)
+        for t in range(config.num_steps, 0, -1):
+            key_net, key_noise = jax.random.split(jax.random.fold_in(key_chain, t))
+            if t > config.polishes:
+                latent = jax.random.normal(key_net, (config.latent,))
+                x_0 = draft(x, t, state.frame, latent)
+            else:
+                x_0 = polish(x, t, state.frame)
+            mean, variance = schedule.posterior(table, x_0, x, t)
+            x = mean + jnp.sqrt(variance) * jax.random.normal(key_noise, x.shape)
+        return show(dataclasses.replace(state, frame=x), command)[0]
+
+    key = jax.random.key(0)
+    state = jax.block_until_ready(frame(key, state))
+    count, begun = 0, time.perf_counter()
+    while count < 300 and time.perf_counter() - begun < limit_s:
+        state = jax.block_until_ready(frame(jax.random.fold_in(key, count), state))
+        count += 1
+    return count / (time.perf_counter() - begun)

@@ -1,0 +1,245 @@
+"""AAMDM and what it is compared with, on prepared clips: train, evaluate, roll out.
+
+Examples:
+  python experiments/prepare_data.py lafan1 --manual-dir ../shared/data/lafan1 --out data/lafan1.npz
+  python experiments/aamdm.py train --data data/lafan1.npz --out runs/aamdm
+  python experiments/aamdm.py evaluate --run runs/aamdm
+  python experiments/aamdm.py rollout --run runs/aamdm --seconds 20
+"""  # noqa: E501
+
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import jax
+import tyro
+from baselines import rows, tables
+
+from jaxmotion.learning import loop
+from jaxmotion.motion import skeleton
+from jaxmotion.protocols import (
+    aamdm_evaluation,
+    aamdm_runs,
+    aamdm_stages,
+    artifacts,
+)
+
+Steering = Literal["forward", "strafe", "stop_and_go"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train the rows of AAMDM's tables; what a folder has already is not trained again.
+
+    Example: python experiments/aamdm.py train --data data/lafan1.npz --out runs/aamdm
+
+    Attributes:
+      data: Clips from prepare_data.py.
+      out: Run folder.
+      rows: What to train; none: all rows of both tables. "aamdm" alone is the system.
+      field: Label field by which clips are chosen.
+      labels: Labels of the clips to use; none: all clips.
+      fps: Frames a second to which clips are resampled.
+      held_out: Part of each clip, at its end, kept for evaluation.
+      mirror: Add a mirrored copy of every clip.
+      autoencoder_steps: Updates of the pose autoencoder.
+      polisher_steps: Updates of each diffusion model.
+      generator_steps: Updates of each denoising-diffusion GAN.
+      baseline_steps: Updates of each other method.
+      full_pose_steps: Updates of the diffusion model of the full-pose row, which are
+        five times as dear.
+      batch: Windows an update.
+      width: Channels of networks in the embedded space.
+      full_width: Channels of networks in the full pose space.
+      schedule: Of the noise.
+      seed: Of everything random.
+    """
+
+    data: Path = Path("data/lafan1.npz")
+    out: Path = Path("runs/aamdm")
+    rows: tuple[str, ...] = ()
+    field: str = "theme"
+    labels: tuple[str, ...] = ("walk", "run")
+    fps: float = 60.0
+    held_out: float = 0.1
+    mirror: bool = True
+    autoencoder_steps: int = 20000
+    polisher_steps: int = 6000
+    generator_steps: int = 8000
+    baseline_steps: int = 8000
+    full_pose_steps: int = 2000
+    batch: int = 64
+    width: int = 256
+    full_width: int = 512
+    schedule: Literal["cosine", "vp"] = "cosine"
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Roll out every trained row, free and steered, and write the paper's tables.
+
+    Example: python experiments/aamdm.py evaluate --run runs/aamdm
+
+    Attributes:
+      run: Run folder of `train`.
+      rows: Which rows; none: all that were trained.
+      out: Folder for metrics.json and table.md; None for <run>/evaluation.
+      rollouts: Characters; a multiple of 4.
+      seconds: Length of each rollout, seconds (the paper: 1000 frames).
+      preset: Commands of the steered rollouts.
+      speed: Metres a second that are commanded.
+      scale: Strength of the guidance, epsilon of eq. 13.
+      long_minutes: Length of the long rollouts of the row "aamdm"; 0 for none.
+      long_rollouts: Their number.
+      seed: Of poses, noise and pairs.
+    """
+
+    run: Path = Path("runs/aamdm")
+    rows: tuple[str, ...] = ()
+    out: Path | None = None
+    rollouts: int = 32
+    seconds: float = 1000 / 60
+    preset: Steering = "forward"
+    speed: float = 1.2
+    scale: float = 1.0
+    long_minutes: float = 10.0
+    long_rollouts: int = 16
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """Roll out one character; writes BVH, GIF and HTML.
+
+    Example: python experiments/aamdm.py rollout --run runs/aamdm --seconds 20
+
+    Attributes:
+      run: Run folder of `train`.
+      row: Which method.
+      steered: Whether it is steered.
+      seconds: Length.
+      preset: Commands.
+      speed: Metres a second that are commanded.
+      scale: Strength of the guidance, epsilon of eq. 13.
+      out: Folder; None for <run>/rollout.
+      seed: Of the start pose and the noise.
+    """
+
+    run: Path = Path("runs/aamdm")
+    row: str = "aamdm"
+    steered: bool = True
+    seconds: float = 20.0
+    preset: Steering = "forward"
+    speed: float = 1.2
+    scale: float = 1.0
+    out: Path | None = None
+    seed: int = 0
+
+
+def train(args: Train) -> None:
+    """Trains, stage by stage."""
+    names = args.rows or rows.ALL
+    rows.check(names)
+    loop.check_writable(args.out)
+    run = aamdm_runs.prepare(
+        args.out,
+        args.data,
+        field=args.field,
+        labels=args.labels,
+        fps=args.fps,
+        held_out=args.held_out,
+        mirrored=args.mirror,
+    )
+    print(f"{run.train.num_frames} training frames, {run.held_out.num_frames} held out")
+    sizes = rows.Sizes(
+        width=args.width, full_width=args.full_width, schedule=args.schedule
+    )
+
+    def budget(steps: int, **more) -> aamdm_stages.Budget:
+        return aamdm_stages.Budget(
+            steps=steps, batch=args.batch, seed=args.seed, **more
+        )
+
+    adversarial = budget(args.generator_steps, optimizer="radam", learning_rate=2e-4)
+    spaces = {}
+    for name in names:
+        where, begun = rows.space_of(name), time.perf_counter()
+        if where not in spaces:
+            autoencoder = None
+            if where == "embedded":
+                steps = budget(args.autoencoder_steps, learning_rate=1e-3)
+                autoencoder = aamdm_runs.train_autoencoder(run, steps)
+            spaces[where] = aamdm_runs.make_space(run, autoencoder)
+        steps = args.full_pose_steps if name == "full_pose" else args.polisher_steps
+        rows.train_row(
+            name,
+            run,
+            spaces[where],
+            sizes,
+            polisher=budget(steps),
+            generator=adversarial,
+            baseline=budget(args.baseline_steps, learning_rate=1e-3),
+        )
+        print(f"{name}: {time.perf_counter() - begun:.0f} s", flush=True)
+
+
+def evaluate(args: Evaluate) -> None:
+    """Writes the tables."""
+    rows.check(args.rows)
+    out = args.out or args.run / "evaluation"
+    loop.check_writable(out)
+    run = aamdm_runs.load_run(args.run)
+    table, report = tables.evaluate(run, args)
+    artifacts.write_table(out, table, report)
+    for line in report["orderings"]:
+        print(line)
+
+
+def rollout(args: Rollout) -> None:
+    """Writes rollout.bvh, rollout.gif and rollout.html."""
+    rows.check((args.row,))
+    run = aamdm_runs.load_run(args.run)
+    out = args.out or args.run / "rollout"
+    loop.check_writable(out)
+    space = aamdm_runs.load_space(run, rows.space_of(args.row))
+    step = rows.load_row(args.row, run, space, scale=args.scale)
+    states = aamdm_evaluation.start_states(run, space, 1, seed=args.seed)
+    ticks = round(args.seconds * run.train.fps)
+    given = aamdm_evaluation.commands(
+        run, 1, ticks, preset=args.preset, speed=args.speed
+    )
+    roll = aamdm_evaluation.roller(run, space, step, steered=args.steered)
+    _, frames = roll(jax.random.key(args.seed), states, given)
+    motion = skeleton.Motion(
+        root_position=frames.root_position[0],
+        joint_rotation=frames.joint_rotation[0],
+        fps=run.train.fps,
+    )
+    title = f"{args.row}{'' if args.steered else ', not steered'} ({run.source})"
+    artifacts.write_rollout(
+        out, run.bones, motion, frames.desired_velocity[0], title=title
+    )
+
+
+Command = (
+    Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Rollout, tyro.conf.subcommand("rollout")]
+)
+
+
+def main() -> None:
+    """Parses the command line and runs the command."""
+    args = tyro.cli(Command, description=__doc__)
+    run = {Train: train, Evaluate: evaluate, Rollout: rollout}
+    run[type(args)](args)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (OSError, ValueError, loop.TrainingDiverged) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,203 @@
+"""The rows of AAMDM's tables: how each is trained, and its stepper.
+
+aamdm               2 polishes after 3 drafts, in the embedded space
+polish1_draft3 ...  other numbers of steps (its table 2)
+full_pose           2 and 3 without the embedding
+change              2 and 3 on scaled changes of the frame (ours)
+amdm5, amdm200      AMDM in the full pose space
+mvae                Motion VAE in the full pose space
+lmm                 Learned Motion Matching in the embedded space
+"""
+
+import dataclasses
+import functools
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+
+from baselines import amdm, lmm, mvae
+from jaxmotion.learning import training
+from jaxmotion.protocols import aamdm_chains, aamdm_stages
+from jaxmotion.protocols.aamdm_runs import Run, SpaceName
+from jaxmotion.protocols.aamdm_stages import Budget
+from jaxmotion.systems import aamdm, aamdm_control, aamdm_space
+from jaxmotion.systems.aamdm_control import Stepper
+from jaxmotion.systems.aamdm_space import Space
+
+TABLE_1 = ("aamdm", "amdm5", "amdm200", "lmm", "mvae")
+TABLE_2 = tuple(
+    f"polish{polishes}_draft{drafts}"
+    for polishes, drafts in ((0, 3), (1, 3), (10, 3), (2, 2), (2, 4), (2, 10))
+)
+ALL = (*TABLE_1, *TABLE_2, "full_pose")
+_CHAIN = re.compile(r"polish(\d+)_draft(\d+)$")
+_BASELINES = {"amdm5": amdm, "amdm200": amdm, "lmm": lmm, "mvae": mvae}
+# Frames of the windows that each baseline is trained on.
+_WINDOWS = {"amdm5": 3, "amdm200": 3, "lmm": 20, "mvae": 8}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sizes:
+    """Sizes of the rows' networks; ours.
+
+    Attributes:
+      width: Of networks in the embedded space.
+      full_width: Of networks in the full pose space.
+      schedule: Of AAMDM's chains.
+    """
+
+    width: int = 256
+    full_width: int = 512
+    schedule: str = "cosine"
+
+
+def space_of(name: str) -> SpaceName:
+    """In which space a row works."""
+    full = ("full_pose", "amdm5", "amdm200", "mvae")
+    return "full_pose" if name in full else "embedded"
+
+
+def is_chain(name: str) -> bool:
+    """Whether a row is AAMDM with some numbers of steps."""
+    return name in ("aamdm", "full_pose", "change") or bool(_CHAIN.match(name))
+
+
+def check(names: tuple[str, ...]) -> None:
+    """Raises unless all rows are known; names those there are."""
+    for name in names:
+        if name not in _BASELINES and not is_chain(name):
+            raise ValueError(
+                f"unknown row {name!r}: there are {', '.join(ALL)}, change, and "
+                "polish<n>_draft<m>"
+            )
+
+
+def _steps(name: str) -> tuple[int, int]:
+    """Polishes and drafts of a chain."""
+    found = _CHAIN.match(name)
+    return (int(found[1]), int(found[2])) if found else (2, 3)
+
+
+def _target(name: str) -> Literal["frame", "change"]:
+    return "change" if name == "change" else "frame"
+
+
+def _config(name: str, space: Space, sizes: Sizes) -> Any:
+    """Configuration of a row's networks."""
+    full = space_of(name) == "full_pose"
+    common = dict(
+        features=space.num_features, width=sizes.full_width if full else sizes.width
+    )
+    if is_chain(name):
+        polishes, drafts = _steps(name)
+        return aamdm.Config(
+            **common,
+            polishes=polishes,
+            drafts=drafts,
+            schedule=sizes.schedule,
+            target=_target(name),
+        )
+    if name == "lmm":
+        return lmm.Config(**common | {"width": 512}, queries=12)
+    if name == "mvae":
+        return mvae.Config(**common | {"width": 256})
+    return amdm.Config(**common, num_steps=int(name.removeprefix("amdm")))
+
+
+def _folder(run: Run, name: str) -> Path:
+    return run.folder / space_of(name) / name
+
+
+def _baseline_loss(name: str, run: Run, space: Space, config: Any):
+    """The loss `(params, key, windows)` of a baseline."""
+    loss = functools.partial(_BASELINES[name].loss, config=config)
+    if name != "lmm":
+        return loss
+    frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
+    return functools.partial(loss, change=space.change, database=frames[::4])
+
+
+def train_baseline(
+    name: str, run: Run, space: Space, sizes: Sizes, budget: Budget
+) -> None:
+    """Trains a row that is not AAMDM."""
+    config = _config(name, space, sizes)
+    optimizer = aamdm_stages.make_optimizer(budget)
+    params = _BASELINES[name].init(jax.random.key(budget.seed), config)
+    loss = _baseline_loss(name, run, space, config)
+    frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
+    sample, arrays = aamdm_stages.frame_windows(
+        frames, run.train, _WINDOWS[name], batch=budget.batch
+    )
+    aamdm_stages.fit(
+        _folder(run, name),
+        training.init_train_state(params, optimizer),
+        training.make_update(loss, optimizer, ema_decay=budget.ema),
+        sample,
+        arrays,
+        stage=name,
+        budget=budget,
+        config={"config": dataclasses.asdict(config), "source": run.source},
+    )
+
+
+def train_row(
+    name: str,
+    run: Run,
+    space: Space,
+    sizes: Sizes,
+    *,
+    polisher: Budget,
+    generator: Budget,
+    baseline: Budget,
+) -> None:
+    """Trains what a row needs and does not have yet."""
+    if not is_chain(name):
+        train_baseline(name, run, space, sizes, baseline)
+        return
+    config, where = _config(name, space, sizes), space_of(name)
+    if config.polishes:
+        aamdm_chains.train_polisher(run, where, space, config, polisher)
+    if config.drafts:
+        aamdm_chains.train_generator(run, where, space, config, generator)
+
+
+def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
+    """The stepper of a trained row.
+
+    Args:
+      name: Of the row.
+      run: The run.
+      space: The row's space.
+      scale: Strength of the guidance, for those that are guided.
+
+    Returns:
+      `step(key, previous, goal)`.
+
+    Raises:
+      CheckpointError: if the row was not trained, or its folder holds another.
+    """
+    if is_chain(name):
+        polishes, drafts = _steps(name)
+        transition = aamdm_chains.load_chain(
+            run,
+            space_of(name),
+            space,
+            drafts=drafts,
+            polishes=polishes,
+            target=_target(name),
+        )
+        return aamdm_control.guided(transition, scale=scale)
+    module, folder = _BASELINES[name], _folder(run, name)
+    stored = aamdm_stages.check_stage(folder, name)["config"]
+    config = module.Config(**stored)
+    params = aamdm_stages.load_params(
+        folder, name, lambda: module.init(jax.random.key(0), config)
+    )
+    if name == "lmm":
+        return lmm.stepper(params, config=config, change=space.change)
+    if name == "mvae":
+        return mvae.stepper(params, config=config)
+    return amdm.stepper(params, config=config, scale=scale)

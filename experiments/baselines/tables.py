@@ -1,0 +1,178 @@
+"""AAMDM's tables 1 and 2, measured, and which orderings of the paper hold here."""
+
+import platform
+from typing import Any
+
+import jax
+import numpy as np
+
+from baselines import rows
+from jaxmotion.evaluation import table
+from jaxmotion.learning import checkpoint
+from jaxmotion.protocols import aamdm_evaluation, aamdm_rows, aamdm_runs
+from jaxmotion.systems.aamdm_control import Frame
+
+Row = dict[str, table.Cell]
+
+
+def trained_rows(run: aamdm_runs.Run, spaces: dict, scale: float) -> dict[str, Any]:
+    """Steppers of all rows that the folder has."""
+    found = {}
+    for name in rows.ALL:
+        where = rows.space_of(name)
+        try:
+            if where not in spaces:
+                spaces[where] = aamdm_runs.load_space(run, where)
+            found[name] = rows.load_row(name, run, spaces[where], scale=scale)
+        except checkpoint.CheckpointError:
+            print(f"{name}: not trained here, left out")
+    return found
+
+
+def _skip(frames: Frame, ticks: int) -> Frame:
+    """Leaves out the start, where the data's own pose still shows."""
+    return jax.tree.map(lambda x: x[:, ticks:], frames)
+
+
+def measure(
+    name: str,
+    run: aamdm_runs.Run,
+    space: Any,
+    step: Any,
+    reference: aamdm_rows.Reference,
+    args: Any,
+) -> Row:
+    """One row: free, steered, and frames a second."""
+    fps, ticks = run.train.fps, round(args.seconds * run.train.fps)
+    skip = round(fps)
+    given = aamdm_evaluation.commands(
+        run, args.rollouts, ticks + skip, preset=args.preset, speed=args.speed
+    )
+    row: Row = {}
+    for i, steered in enumerate((False, True)):
+        key, key_pairs = jax.random.split(jax.random.key(args.seed + i))
+        states = aamdm_evaluation.start_states(
+            run, space, args.rollouts, seed=args.seed
+        )
+        roll = aamdm_evaluation.roller(run, space, step, steered=steered)
+        frames = _skip(roll(key, states, given)[1], skip)
+        found = aamdm_rows.free_row(key_pairs, run.bones, reference, frames, fps=fps)
+        if steered:
+            wanted = ("fid", "ffr_mann", "ffr_gmd", "diverged")
+            found = {f"{k}_uc": found[k] for k in wanted if k in found}
+            found |= aamdm_rows.control_row(frames, fps=fps)
+        row |= found
+    ticks = 20 if name == "amdm200" else 300
+    rate = aamdm_evaluation.frames_per_second(run, space, step, ticks=ticks)
+    print(f"{name}: {rate:.0f} frames/s", flush=True)
+    return row | {"fps": table.Cell(value=rate, samples=5)}
+
+
+def data_rows(
+    run: aamdm_runs.Run, reference: aamdm_rows.Reference, args: Any
+) -> dict[str, Row]:
+    """Rows of real frames: those trained on, and those held out."""
+    found = {}
+    ticks = round(args.seconds * run.train.fps)
+    # The held-out ends of clips are short: windows of three seconds.
+    for name, data, length in (
+        ("data (trained on)", run.train, ticks),
+        ("data (held out, 3 s)", run.held_out, round(3 * run.train.fps)),
+    ):
+        frames = aamdm_evaluation.data_frames(
+            run, data, args.rollouts, length, seed=args.seed
+        )
+        key = jax.random.key(args.seed)
+        found[name] = aamdm_rows.free_row(
+            key, run.bones, reference, frames, fps=run.train.fps
+        )
+    return found
+
+
+def long_rollouts(
+    run: aamdm_runs.Run,
+    space: Any,
+    step: Any,
+    reference: aamdm_rows.Reference,
+    args: Any,
+) -> dict[str, Any]:
+    """Health of rollouts of many minutes, free and steered."""
+    ticks = round(args.long_minutes * 60 * run.train.fps)
+    number, found = args.long_rollouts, {"ticks": ticks}
+    given = aamdm_evaluation.commands(
+        run, number, ticks, preset=args.preset, speed=args.speed
+    )
+    states = aamdm_evaluation.start_states(run, space, number, seed=args.seed)
+    for steered in (False, True):
+        roll = aamdm_evaluation.roller(run, space, step, steered=steered)
+        frames = roll(jax.random.key(args.seed), states, given)[1]
+        positions = aamdm_evaluation.positions_of(run.bones, frames)
+        found["steered" if steered else "free"] = aamdm_rows.long_health(
+            positions,
+            frames.desired_velocity if steered else None,
+            reference,
+            fps=run.train.fps,
+        )
+        print(f"{number} rollouts of {ticks} frames, steered {steered}: {found}")
+    return found
+
+
+def orderings(found: dict[str, Row]) -> list[str]:
+    """Which orderings of the paper's tables hold here."""
+
+    def value(row: str, column: str) -> float:
+        cell = found.get(row, {}).get(column)
+        return float("nan") if cell is None else cell.value
+
+    fid = {name: value(name, "fid") for name in rows.ALL}
+    ratio = value("aamdm", "fps") / value("amdm200", "fps")
+    diverged = value("polish0_draft3", "diverged")
+    checks = {
+        "FID of AMDM200 < AAMDM < AMDM5": (
+            fid["amdm200"] < fid["aamdm"] < fid["amdm5"],
+            f"{fid['amdm200']:.3g}, {fid['aamdm']:.3g}, {fid['amdm5']:.3g}",
+        ),
+        "FID of AAMDM below LMM's and MVAE's": (
+            fid["aamdm"] < min(fid["lmm"], fid["mvae"]),
+            f"{fid['aamdm']:.3g}, {fid['lmm']:.3g}, {fid['mvae']:.3g}",
+        ),
+        "AAMDM at least 25 times as fast as AMDM200": (ratio >= 25, f"{ratio:.1f}"),
+        "no polishing steps diverge": (diverged > 0, f"{diverged:.0f} rollouts"),
+        "more polishing, lower FID (1, 2, 10)": (
+            fid["polish10_draft3"] < fid["aamdm"] < fid["polish1_draft3"],
+            f"{fid['polish1_draft3']:.3g}, {fid['aamdm']:.3g}, "
+            f"{fid['polish10_draft3']:.3g}",
+        ),
+        "FID without the embedding is the worst": (
+            fid["full_pose"] > np.nanmax([fid[k] for k in (*rows.TABLE_2, "aamdm")]),
+            f"{fid['full_pose']:.3g}",
+        ),
+    }
+    return [
+        f"{'reproduced' if holds else 'NOT reproduced'}: {claim} ({shown})"
+        for claim, (holds, shown) in checks.items()
+    ]
+
+
+def evaluate(run: aamdm_runs.Run, args: Any) -> tuple[dict[str, Row], dict[str, Any]]:
+    """The table, and what belongs beside it."""
+    spaces: dict[str, Any] = {}
+    steppers = trained_rows(run, spaces, args.scale)
+    if args.rows:
+        steppers = {name: steppers[name] for name in args.rows}
+    reference = aamdm_rows.make_reference(run.bones, run.train)
+    found = data_rows(run, reference, args)
+    for name, step in steppers.items():
+        space = spaces[rows.space_of(name)]
+        found[name] = measure(name, run, space, step, reference, args)
+    report = {
+        "source": run.source,
+        "orderings": orderings(found),
+        "jax": jax.__version__,
+        "machine": f"{platform.machine()}, {jax.devices()[0]}",
+    }
+    if args.long_minutes and "aamdm" in steppers:
+        report["long"] = long_rollouts(
+            run, spaces["embedded"], steppers["aamdm"], reference, args
+        )
+    return found, report
