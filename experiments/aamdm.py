@@ -49,11 +49,13 @@ class Train:
       generator_steps: Updates of each denoising-diffusion GAN.
       baseline_steps: Updates of each other method.
       full_pose_steps: Updates of the diffusion model of the full-pose row, which are
-        five times as dear.
+        dearer.
       batch: Windows an update.
-      width: Channels of networks in the embedded space.
-      full_width: Channels of networks in the full pose space.
+      width: Channels of the networks of AAMDM and AMDM (Learned Motion Matching has
+        512, Motion VAE 256, as published).
       schedule: Of the noise.
+      previous_noise: Largest deviation of the noise on given previous frames in
+        training, in deviations of the data.
       seed: Of everything random.
     """
 
@@ -66,14 +68,14 @@ class Train:
     held_out: float = 0.1
     mirror: bool = True
     autoencoder_steps: int = 20000
-    polisher_steps: int = 6000
+    polisher_steps: int = 5000
     generator_steps: int = 8000
     baseline_steps: int = 8000
-    full_pose_steps: int = 2000
+    full_pose_steps: int = 3000
     batch: int = 64
     width: int = 256
-    full_width: int = 512
     schedule: Literal["cosine", "vp"] = "cosine"
+    previous_noise: float = 0.05
     seed: int = 0
 
 
@@ -100,7 +102,7 @@ class Evaluate:
     run: Path = Path("runs/aamdm")
     rows: tuple[str, ...] = ()
     out: Path | None = None
-    rollouts: int = 32
+    rollouts: int = 16
     seconds: float = 1000 / 60
     preset: Steering = "forward"
     speed: float = 1.2
@@ -155,7 +157,9 @@ def train(args: Train) -> None:
     )
     print(f"{run.train.num_frames} training frames, {run.held_out.num_frames} held out")
     sizes = rows.Sizes(
-        width=args.width, full_width=args.full_width, schedule=args.schedule
+        width=args.width,
+        schedule=args.schedule,
+        previous_noise=args.previous_noise,
     )
 
     def budget(steps: int, **more) -> aamdm_stages.Budget:
@@ -170,7 +174,9 @@ def train(args: Train) -> None:
         if where not in spaces:
             autoencoder = None
             if where == "embedded":
-                steps = budget(args.autoencoder_steps, learning_rate=1e-3)
+                steps = budget(
+                    args.autoencoder_steps, optimizer="adamw", learning_rate=1e-3
+                )
                 autoencoder = aamdm_runs.train_autoencoder(run, steps)
             spaces[where] = aamdm_runs.make_space(run, autoencoder)
         steps = args.full_pose_steps if name == "full_pose" else args.polisher_steps

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from jaxmotion.data.clips import Clips, clips_from_motions
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.motion.trajectory import PlanarFrame, Trajectory
 
@@ -73,3 +74,16 @@ def path(position, yaw) -> Trajectory:
 
 def frames(position, yaw) -> PlanarFrame:
     return PlanarFrame(origin=float32(position), facing=float32(directions(yaw)))
+
+
+def clips(lengths, fps=60.0, names=NAMES) -> Clips:
+    """Clips of those numbers of frames, in which everything moves."""
+    motions = [motion(*wander(n, fps, seed=i), fps) for i, n in enumerate(lengths)]
+    words = [("walk", "run")[i % 2] for i in range(len(lengths))]
+    return clips_from_motions(
+        motions,
+        skeleton(names),
+        names=[f"clip{i}" for i in range(len(lengths))],
+        labels={"theme": words},
+        source="made in the tests",
+    )

@@ -22,7 +22,7 @@ from jaxmotion.learning import training
 from jaxmotion.protocols import aamdm_chains, aamdm_stages
 from jaxmotion.protocols.aamdm_runs import Run, SpaceName
 from jaxmotion.protocols.aamdm_stages import Budget
-from jaxmotion.systems import aamdm, aamdm_control, aamdm_space
+from jaxmotion.systems import aamdm, aamdm_control, aamdm_loss, aamdm_space
 from jaxmotion.systems.aamdm_control import Stepper
 from jaxmotion.systems.aamdm_space import Space
 
@@ -34,8 +34,8 @@ TABLE_2 = tuple(
 ALL = (*TABLE_1, *TABLE_2, "full_pose")
 _CHAIN = re.compile(r"polish(\d+)_draft(\d+)$")
 _BASELINES = {"amdm5": amdm, "amdm200": amdm, "lmm": lmm, "mvae": mvae}
-# Frames of the windows that each baseline is trained on.
-_WINDOWS = {"amdm5": 3, "amdm200": 3, "lmm": 20, "mvae": 8}
+# Frames of the windows that each baseline is trained on, and which is the first given.
+_WINDOWS = {"amdm5": (3, 1), "amdm200": (3, 1), "lmm": (20, 0), "mvae": (8, 0)}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,14 +43,14 @@ class Sizes:
     """Sizes of the rows' networks; ours.
 
     Attributes:
-      width: Of networks in the embedded space.
-      full_width: Of networks in the full pose space.
+      width: Channels of the networks of AAMDM and AMDM.
       schedule: Of AAMDM's chains.
+      previous_noise: Noise on given previous frames in training, for all rows alike.
     """
 
     width: int = 256
-    full_width: int = 512
     schedule: str = "cosine"
+    previous_noise: float = 0.05
 
 
 def space_of(name: str) -> SpaceName:
@@ -86,10 +86,7 @@ def _target(name: str) -> Literal["frame", "change"]:
 
 def _config(name: str, space: Space, sizes: Sizes) -> Any:
     """Configuration of a row's networks."""
-    full = space_of(name) == "full_pose"
-    common = dict(
-        features=space.num_features, width=sizes.full_width if full else sizes.width
-    )
+    common = dict(features=space.num_features, width=sizes.width)
     if is_chain(name):
         polishes, drafts = _steps(name)
         return aamdm.Config(
@@ -97,6 +94,7 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
             polishes=polishes,
             drafts=drafts,
             schedule=sizes.schedule,
+            previous_noise=sizes.previous_noise,
             target=_target(name),
         )
     if name == "lmm":
@@ -128,9 +126,19 @@ def train_baseline(
     params = _BASELINES[name].init(jax.random.key(budget.seed), config)
     loss = _baseline_loss(name, run, space, config)
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
-    sample, arrays = aamdm_stages.frame_windows(
-        frames, run.train, _WINDOWS[name], batch=budget.batch
+    length, given = _WINDOWS[name]
+    windows, arrays = aamdm_stages.frame_windows(
+        frames, run.train, length, batch=budget.batch
     )
+
+    def sample(key: jax.Array, arrays: Any) -> jax.Array:
+        key_windows, key_noise = jax.random.split(key)
+        found = windows(key_windows, arrays)
+        noise = aamdm_loss.random_noise(
+            key_noise, found[:, given].shape, largest=sizes.previous_noise
+        )
+        return found.at[:, given].add(noise)
+
     aamdm_stages.fit(
         _folder(run, name),
         training.init_train_state(params, optimizer),

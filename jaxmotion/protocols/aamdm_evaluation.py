@@ -71,7 +71,13 @@ def commands(
 
 
 def roller(
-    run: Run, space: Space, step: Stepper, *, steered: bool, chunk: int | None = None
+    run: Run,
+    space: Space,
+    step: Stepper,
+    *,
+    steered: bool,
+    bounded: bool = True,
+    chunk: int | None = None,
 ) -> Callable[[Key, CharacterState, Command], tuple[CharacterState, Frame]]:
     """Rollouts as one jitted function.
 
@@ -80,6 +86,7 @@ def roller(
       space: The space.
       step: Makes the next frame.
       steered: Whether commands matter.
+      bounded: Whether frames are kept within the bounds of the data.
       chunk: Characters at a time; None for all.
 
     Returns:
@@ -91,6 +98,7 @@ def roller(
         num_joints=run.bones.num_joints,
         fps=run.train.fps,
         steered=steered,
+        bounded=bounded,
     )
     return jax.jit(functools.partial(rollout.rollout, driver, chunk=chunk))
 

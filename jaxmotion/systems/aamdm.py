@@ -49,6 +49,9 @@ class Config:
       depth: Hidden layers.
       window: Frames that the diffusion model predicts in a row in training (paper).
       weight_velocity: Weight of the differences of neighbouring frames.
+      previous_noise: Largest deviation of the noise that is added in training to the
+        previous frames of the data, in units of the target's scale; ours, so that a
+        rollout finds back when it has left the data. 0 for none.
       own_previous: Probability that the GAN's previous frame in training is the
         generator's own prediction of it.
       weight_r1: Weight of the discriminator's gradient penalty, gamma.
@@ -64,6 +67,7 @@ class Config:
     depth: int = 4
     window: int = 10
     weight_velocity: float = 0.1
+    previous_noise: float = 0.0
     own_previous: float = 0.5
     weight_r1: float = 0.05
 

@@ -230,6 +230,7 @@ def controller(
     num_joints: int,
     fps: float,
     steered: bool = True,
+    bounded: bool = True,
     half_life: float = 0.27,
 ) -> Controller:
     """The run-time as the three functions that `rollout.rollout` composes.
@@ -240,6 +241,7 @@ def controller(
       num_joints: Joints of the skeleton.
       fps: Frames a second.
       steered: Whether commands matter; if not, none of the steering is compiled in.
+      bounded: Whether frames are kept within the bounds of the data; ours.
       half_life: Of the springs that turn a command into a path, seconds.
 
     Returns:
@@ -254,7 +256,10 @@ def controller(
         if steered:
             path = aamdm_space.path_normalizer(space)
             goal = features.normalize(path, wanted(state, command))
-        return dataclasses.replace(state, frame=step(key, state.frame, goal))
+        frame = step(key, state.frame, goal)
+        if bounded:
+            frame = aamdm_space.keep_within(space, frame)
+        return dataclasses.replace(state, frame=frame)
 
     def show(state: CharacterState, command: Command) -> tuple[CharacterState, Frame]:
         return advance(

@@ -16,6 +16,29 @@ Frames = Float[Array, "batch frames features"]
 Scale = Float[Array, " features"] | None
 
 
+def _shaken(key: Key, frame: Array, config: Config, change: Scale) -> Array:
+    noise = random_noise(key, frame.shape, largest=config.previous_noise)
+    return frame + (noise if change is None else noise * change.reshape(1, -1))
+
+
+def random_noise(
+    key: Key, shape: tuple[int, int], *, largest: float
+) -> Float[Array, "batch features"]:
+    """Noise of a different size for each row, uniform up to the largest.
+
+    Args:
+      key: Consumed.
+      shape: Rows and channels.
+      largest: Largest deviation.
+
+    Returns:
+      The noise.
+    """
+    key_size, key_noise = jax.random.split(key)
+    size = largest * jax.random.uniform(key_size, (shape[0], 1))
+    return size * jax.random.normal(key_noise, shape)
+
+
 def polisher_loss(
     params: Params,
     key: Key,
@@ -44,6 +67,10 @@ def polisher_loss(
     aamdm.check_change(config, change)
     table, net = config.table(), aamdm.network(config)
     size, frames, _ = windows.shape
+    if config.previous_noise:
+        key, key_shake = jax.random.split(key)
+        first = _shaken(key_shake, windows[:, 0], config, change)
+        windows = windows.at[:, 0].set(first)
     key_t, key_noise = jax.random.split(key)
     steps = jax.random.randint(key_t, (frames, size), 1, config.num_steps + 1)
     noise = jnp.swapaxes(jax.random.normal(key_noise, windows.shape), 0, 1)
@@ -139,6 +166,9 @@ def _pairs(
     names = ("own", "choice", "t", "pair", "latent", "posterior")
     keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
     before, previous, frame = (windows[:, i] for i in (-3, -2, -1))
+    if config.previous_noise:
+        keys["own"], key_shake = jax.random.split(keys["own"])
+        previous = _shaken(key_shake, previous, config, change)
     own = _own(generator, keys["own"], before, previous, config, change)
     choice = jax.random.bernoulli(keys["choice"], config.own_previous, (size, 1))
     previous = jnp.where(choice, jax.lax.stop_gradient(own), previous)

@@ -23,6 +23,7 @@ from jaxmotion.typing import Params
 # Channels that hardly vary, such as the lengths of bones, must not be blown up.
 _LEAST_POSE = 1e-3
 _LEAST_LATENT = 1e-3
+_TAIL = 0.005
 
 
 @jax.tree_util.register_dataclass
@@ -49,11 +50,16 @@ class Space:
     Attributes:
       normalizer: Of the channels before they are scaled.
       change: Deviation of each channel's change from frame to frame.
+      low: Least value of each channel that a frame is let take: the lowest half per
+        cent of the data lie below it.
+      high: Greatest value, likewise.
       autoencoder: Of an embedded space; None for full poses.
     """
 
     normalizer: features.Normalizer
     change: Float[Array, " channels"]
+    low: Float[Array, " channels"]
+    high: Float[Array, " channels"]
     autoencoder: Autoencoder | None
 
     @property
@@ -104,7 +110,39 @@ def fit_space(
     frames = features.normalize(normalizer, raw)
     step = frames[neighbours + 1] - frames[neighbours]
     change = jnp.maximum(jnp.sqrt(jnp.mean(step**2, axis=0)), 1e-4)
-    return Space(normalizer=normalizer, change=change, autoencoder=autoencoder)
+    some = frames[:: max(len(frames) // 20_000, 1)]
+    low, high = jnp.quantile(some, jnp.array([_TAIL, 1.0 - _TAIL]), axis=0)
+    return Space(
+        normalizer=normalizer,
+        change=change,
+        low=low,
+        high=high,
+        autoencoder=autoencoder,
+    )
+
+
+def keep_within(
+    space: Space, frames: Float[Array, "*batch channels"]
+) -> Float[Array, "*batch channels"]:
+    """Frames kept within the bounds of the data, channel by channel.
+
+    A network that has drifted to where no data are may go ever farther; held at the
+    bounds it comes back.
+
+    Args:
+      space: The space.
+      frames: Frames.
+
+    Returns:
+      Frames.
+
+    Source: ours.
+    """
+    return jnp.clip(frames, _like(space.low, frames), _like(space.high, frames))
+
+
+def _like(vector: Array, frames: Array) -> Array:
+    return vector.reshape((1,) * (frames.ndim - 1) + (-1,))
 
 
 def to_frames(

@@ -25,6 +25,23 @@ def test_all_windows_and_no_other(walker, stride):
     assert index.length == length
 
 
+@pytest.mark.parametrize(
+    ("length", "stride", "starts", "owners"),
+    [
+        (3, 1, [0, 1, 2, 7, 8], [0, 0, 0, 2, 2]),
+        (3, 2, [0, 2, 7], [0, 0, 2]),
+        (2, 3, [0, 3, 5, 7], [0, 0, 1, 2]),
+        (5, 1, [0], [0]),
+        (6, 1, [], []),
+    ],
+)
+def test_starts_leave_out_what_is_too_short(length, stride, starts, owners):
+    """Of clips of five, two and four frames."""
+    offsets = np.array([0, 5, 7, 11])
+    found = windows.window_starts(offsets, length, stride=stride)
+    assert [x.tolist() for x in found] == [starts, owners]
+
+
 def test_a_window_as_long_as_the_shortest_clip(walker):
     index = windows.window_index(walker, 80)
     assert np.bincount(index.clips).tolist() == [1, 6, 11, 16]

@@ -52,6 +52,56 @@ def test_skate_ratio_counts_frames_with_any_low_fast_foot():
     np.testing.assert_allclose(both, [2 / 5, 0.0])
 
 
+def sliding(speed, height, frames=5):
+    """Two feet: one slides along the ground at a height, one stands still beside it."""
+    along = speed * np.arange(frames) / 60.0
+    moving = np.stack([0.6 * along, np.full(frames, height), 0.8 * along], -1)
+    standing = np.broadcast_to([0.3, 0.0, 0.0], (frames, 3))
+    return jnp.asarray(np.stack([moving, standing], 1), jnp.float32)
+
+
+# At half the height H a foot skates by 2 - sqrt(2) = 0.586 of its speed.
+@pytest.mark.parametrize(
+    ("speed", "height", "skates"),
+    [
+        (0.21, 0.0, 1.0),
+        (0.19, 0.0, 0.0),
+        (0.21, -0.01, 1.0),
+        (0.35, 0.0125, 1.0),
+        (0.33, 0.0125, 0.0),
+        (9.0, 0.025, 0.0),
+        (9.0, 0.4, 0.0),
+    ],
+)
+def test_frames_skate_by_speed_and_height(speed, height, skates):
+    feet = sliding(speed, height)
+    assert contact.skating_frame_ratio(feet, 60.0) == skates
+    slower = contact.skating_frame_ratio(feet, 30.0, min_speed=0.1)
+    assert slower == skates
+    twice = feet * jnp.array([1.0, 2.0, 1.0]).reshape(1, 1, 3)
+    assert contact.skating_frame_ratio(twice, 60.0, height=0.05) == skates
+
+
+def test_skating_frames_are_those_of_the_definition():
+    rng = np.random.default_rng(4)
+    feet = rng.normal(size=(3, 50, 2, 3)) * [0.01, 0.02, 0.01]
+    feet = np.cumsum(feet, axis=1) * [1.0, 0.5, 1.0]
+    expected = []
+    for rollout in feet:
+        skating = 0
+        for now, after in zip(rollout[:-1], rollout[1:], strict=True):
+            for foot in range(2):
+                dx, _, dz = (after - now)[foot] * 30.0
+                part = min(max(now[foot, 1] / 0.025, 0.0), 1.0)
+                if np.hypot(dx, dz) * (2.0 - 2.0**part) > 0.2:
+                    skating += 1
+                    break
+        expected.append(skating / 49)
+    found = contact.skating_frame_ratio(jnp.asarray(feet, jnp.float32), 30.0)
+    assert 0.1 < min(expected) and max(expected) < 1.0
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
 def test_released_foot_slide_is_that_of_the_definition():
     feet, root = clip(1)
     want = oracle.foot_slide_release(feet.astype(float), root.astype(float), 0.01)
@@ -71,5 +121,6 @@ def test_released_foot_slide_is_a_ratio():
 
 
 def test_one_frame_is_refused():
-    with pytest.raises(ValueError, match="expected at least 2"):
-        contact.slide_distance(jnp.zeros((1, 2, 3)), 30.0)
+    for measure in (contact.slide_distance, contact.skating_frame_ratio):
+        with pytest.raises(ValueError, match="expected at least 2"):
+            measure(jnp.zeros((1, 2, 3)), 30.0)

@@ -78,6 +78,26 @@ def test_restore_part(folder):
     )
 
 
+def test_restore_part_of_a_part(tmp_path):
+    """What one of two players left, without the other's."""
+    folder = tmp_path / "checkpoints"
+    players = {"generator": state_of(4), "discriminator": state_of(5, width=6)}
+    checkpoint.save(folder, 1, players, {})
+    for name, width in (("generator", 4), ("discriminator", 6)):
+        own = state_of(0, width=width).ema_params
+        found = checkpoint.restore_part(
+            folder, {"ema_params": jax.eval_shape(lambda x=own: x)}, within=name
+        )
+        assert list(found) == ["ema_params"]
+        jax.tree.map(
+            np.testing.assert_array_equal, found["ema_params"], players[name].ema_params
+        )
+    like = {"ema_params": state_of(0).ema_params}
+    for within in ("discriminator", "judge", None):
+        with pytest.raises(checkpoint.CheckpointError, match=f"{folder}.*step 1"):
+            checkpoint.restore_part(folder, like, within=within)
+
+
 def test_of_another_model(folder):
     wide = state_of(0, width=5)
     named = f"{folder}.*step 3"

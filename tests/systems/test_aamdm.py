@@ -16,6 +16,8 @@ from tests import tiny
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
 CONFIG = aamdm.Config(features=3, latent=2, width=16, depth=2, window=4)
+CHANGING = dataclasses.replace(CONFIG, target="change")
+CHANGE = jnp.array([0.5, 0.1, 2.0])
 
 
 @functools.cache
@@ -111,3 +113,126 @@ def test_each_player_moves_only_itself():
     _, grad = jax.value_and_grad(make, has_aux=True)(*given)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(grad))
     assert any(np.abs(x).max() > 0 for x in jax.tree.leaves(grad))
+
+
+# --- changes as the target ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (2, 5)])
+def test_a_change_is_scaled_and_comes_back(shape):
+    frame, previous = normal(*shape, 3), normal(*shape, 3, seed=1)
+    x_0 = aamdm.to_target(frame, previous, CHANGE)
+    for i, scale in enumerate((0.5, 0.1, 2.0)):
+        step = np.float64(frame - previous)[..., i] / scale
+        np.testing.assert_allclose(x_0[..., i], step, rtol=1e-5, atol=1e-6)
+    found = aamdm.from_target(x_0, previous, CHANGE)
+    np.testing.assert_allclose(found, frame, rtol=1e-5, atol=1e-6)
+
+
+def test_without_a_scale_the_target_is_the_frame():
+    frame, previous = normal(5, 3), normal(5, 3, seed=1)
+    for through in (aamdm.to_target, aamdm.from_target):
+        np.testing.assert_array_equal(through(frame, previous, None), frame)
+
+
+@pytest.mark.parametrize(
+    ("config", "change", "message"),
+    [
+        (CHANGING, None, "'change'.*is none"),
+        (CONFIG, CHANGE, r"'frame'.*shape \(3,\)"),
+    ],
+)
+def test_the_scale_of_changes_must_fit_the_target(config, change, message):
+    params, windows, key = parameters(), normal(8, 5, 3), jax.random.key(0)
+    given = dict(config=config, change=change)
+    players = params["generator"], params["discriminator"]
+    for make in (
+        lambda: aamdm.check_change(config, change),
+        lambda: aamdm.transition(params, **given),
+        lambda: aamdm_loss.polisher_loss(params["polisher"], key, windows, **given),
+        lambda: aamdm_loss.generator_loss(*players, key, windows, **given),
+        lambda: aamdm_loss.discriminator_loss(*players[::-1], key, windows, **given),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+    aamdm.check_change(CHANGING, CHANGE)
+    aamdm.check_change(CONFIG, None)
+
+
+def test_the_chain_of_changes_is_added_to_the_previous_frame():
+    params, key, previous = parameters(), jax.random.key(1), normal(3)
+    step = aamdm.transition(params, config=CHANGING, change=CHANGE)
+    found = jax.jit(step)(key, previous)
+
+    key_start, key_chain = jax.random.split(jax.random.clone(key))
+    x = jax.random.normal(key_start, (3,))
+    for t in range(5, 0, -1):
+        name, make = ("generator", aamdm.draft), ("polisher", aamdm.polish)
+        part = name if t > 2 else make
+        denoise = part[1](params[part[0]], previous, config=CHANGING)
+        reverse = chain.ancestral_step(CHANGING.table(), denoise)
+        x = reverse(jax.random.fold_in(key_chain, t), x, jnp.array(t))
+    expected = np.float64(previous) + np.float64(x) * [0.5, 0.1, 2.0]
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_guidance_sees_frames_and_not_changes():
+    """An objective that is flat where frames lie, and steep at their changes."""
+    step = aamdm.transition(parameters(), config=CHANGING, change=CHANGE)
+
+    @jax.jit
+    def guided(previous):
+        objective = lambda x: jnp.sum(jnp.where(x < 50.0, x**2, 0.0))  # noqa: E731
+        key = jax.random.key(3)
+        return step(key, previous, objective=objective, scale=0.1)
+
+    plain = jax.jit(step)
+    for place, moves in ((100.0, False), (0.0, True)):
+        previous = jnp.full(3, place)
+        gap = np.abs(guided(previous) - plain(jax.random.key(3), previous)).max()
+        assert (gap > 1e-3) == moves
+
+
+class Constant:
+    """A network that predicts the same whatever it sees."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def apply(self, params, x_t, t, previous):
+        return jnp.broadcast_to(self.value, x_t.shape)
+
+
+def test_windows_of_an_even_change_cost_who_predicts_it_nothing(monkeypatch):
+    pace = jnp.array([1.0, -2.0, 0.5])
+    start = normal(6, 1, 3)
+    frames = jnp.arange(5.0).reshape(1, 5, 1) * (pace * CHANGE).reshape(1, 1, 3)
+    windows = start + frames
+    given = dict(config=CHANGING, change=CHANGE)
+
+    def loss(wrong):
+        made = Constant((pace + wrong).reshape(1, 3))
+        monkeypatch.setattr(aamdm, "network", lambda config: made)
+        return aamdm_loss.polisher_loss({}, jax.random.key(0), windows, **given)
+
+    value, terms = loss(0.0)
+    np.testing.assert_allclose(value, 0.0, atol=1e-5)
+    # An error of 0.3 deviations a frame adds up over the four frames of the window.
+    value, terms = loss(0.3)
+    np.testing.assert_allclose(terms["value"], 0.3 * (1 + 2 + 3 + 4) / 4, rtol=1e-4)
+    np.testing.assert_allclose(terms["velocity"], 0.3, rtol=1e-4)
+    np.testing.assert_allclose(value, 0.75 + 0.1 * 0.3, rtol=1e-4)
+
+
+def test_players_of_changes_move_only_themselves():
+    params, windows = parameters(), normal(8, 3, 3)
+    given = dict(config=CHANGING, change=CHANGE)
+    for loss, names in (
+        (aamdm_loss.discriminator_loss, ("discriminator", "generator")),
+        (aamdm_loss.generator_loss, ("generator", "discriminator")),
+    ):
+        of = jax.jit(jax.grad(functools.partial(loss, **given), has_aux=True))
+        own, other = (params[name] for name in names)
+        grad, _ = of(own, other, jax.random.key(0), windows)
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(grad))
+        assert any(np.abs(x).max() > 0 for x in jax.tree.leaves(grad))

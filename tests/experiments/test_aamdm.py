@@ -1,0 +1,270 @@
+"""experiments/aamdm.py: train, evaluate and roll out on clips that the tests make."""
+
+import importlib.util
+import json
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxmotion.data import bvh_text, clips_io, procedural
+from jaxmotion.learning import checkpoint
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "experiments" / "aamdm.py"
+SETTINGS = (
+    "--field style --labels --rows aamdm lmm --autoencoder-steps 100 "
+    "--polisher-steps 100 --generator-steps 100 --baseline-steps 100 --batch 8 "
+    "--width 32"
+)
+STAGES = {
+    "autoencoder": "autoencoder",
+    "embedded/T5/polisher": "polisher",
+    "embedded/T5/generator": "generator",
+    "embedded/lmm": "lmm",
+}
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+
+@pytest.fixture(scope="module")
+def call():
+    """Runs a command line in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(SCRIPT.parent))
+        spec = importlib.util.spec_from_file_location("aamdm_script", SCRIPT)
+        module = importlib.util.module_from_spec(spec)
+        patch.setitem(sys.modules, "aamdm_script", module)
+        spec.loader.exec_module(module)
+
+        def run(line):
+            patch.setattr(sys, "argv", [str(SCRIPT), *line.split()])
+            module.main()
+
+        yield run
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "clips.npz"
+    clips_io.save_clips(path, procedural.make_clips(minutes=2))
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(call, data, tmp_path_factory, quick_compile):
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    call(f"train --data {data} --out {folder} {SETTINGS}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def evaluated(call, trained):
+    call(
+        f"evaluate --run {trained} --rollouts 4 --seconds 2 --long-minutes 0.1 "
+        "--long-rollouts 2"
+    )
+    return trained / "evaluation"
+
+
+def losses(folder):
+    return {name: (folder / name / "losses.jsonl").read_text() for name in STAGES}
+
+
+# --- training ----------------------------------------------------------------------
+
+
+def test_training_leaves_every_stage(trained, data):
+    config = json.loads((trained / "config.json").read_text())
+    assert config["system"] == "aamdm" and config["data"] == str(data)
+    assert config["labels"] == [] and config["fps"] == 60.0
+    # Sixteen clips and their mirror images.
+    assert len(config["clips"]) == 32
+    for name, stage in STAGES.items():
+        checkpoints = trained / name / "checkpoints"
+        assert checkpoint.latest_step(checkpoints) == 100
+        value = checkpoint.load_config(checkpoints)
+        assert (value["system"], value["stage"]) == ("aamdm", stage)
+        assert "procedural" in value["source"]
+    for text in losses(trained).values():
+        rows = [json.loads(line) for line in text.splitlines()]
+        assert [row["step"] for row in rows] == [100]
+        for row in rows:
+            own = [value for name, value in row.items() if "loss" in name]
+            assert own and np.isfinite(own).all()
+
+
+def test_what_is_trained_is_not_trained_again(call, trained, data):
+    before = losses(trained)
+    call(f"train --data {data} --out {trained} {SETTINGS}")
+    assert losses(trained) == before
+    for name in STAGES:
+        assert checkpoint.latest_step(trained / name / "checkpoints") == 100
+
+
+# --- evaluation --------------------------------------------------------------------
+
+FREE = {"diverged", "div", "fid", "ffr_mann", "ffr_gmd", "speed_m/s"}
+STEERED = {"diverged_uc", "te_promised", "te_realised", "trajectory_error_deg", "fps"}
+
+
+def test_an_evaluation_has_the_data_and_the_trained_rows(evaluated):
+    found = json.loads((evaluated / "metrics.json").read_text())
+    rows = found["rows"]
+    assert set(rows) == {"data (trained on)", "data (held out)", "aamdm", "lmm"}
+    for name in ("data (trained on)", "data (held out)"):
+        assert FREE < set(rows[name])
+        assert rows[name]["diverged"]["value"] == 0
+        assert rows[name]["diverged"]["samples"] == 4
+    for name in ("aamdm", "lmm"):
+        assert STEERED < set(rows[name])
+        assert rows[name]["fps"]["value"] > 0
+        assert rows[name]["diverged"]["samples"] == 4
+        whole = rows[name]["diverged"]["value"] == 0
+        assert (set(rows[name]) >= FREE) == whole
+    assert 0.0 < rows["data (trained on)"]["speed_m/s"]["value"] < 2.0
+    assert "procedural" in found["source"]
+
+
+def test_claims_about_rows_that_are_missing_do_not_hold(evaluated):
+    found = json.loads((evaluated / "metrics.json").read_text())
+    assert len(found["orderings"]) == 6
+    assert all(line.startswith("NOT reproduced") for line in found["orderings"])
+
+
+def test_long_rollouts_are_counted(evaluated):
+    found = json.loads((evaluated / "metrics.json").read_text())["long"]
+    assert found["ticks"] == 360
+    for kind in ("free", "steered"):
+        assert found[kind]["rollouts"] == 2
+        for failure in ("diverged", "frozen"):
+            assert 0 <= found[kind][failure] <= 2
+
+
+def test_the_table_has_a_line_for_each_row(evaluated):
+    found = json.loads((evaluated / "metrics.json").read_text())["rows"]
+    lines = (evaluated / "table.md").read_text().splitlines()
+    assert [line.split("|")[1].strip() for line in lines[2:]] == list(found)
+    assert len({line.count("|") for line in lines}) == 1
+
+
+# --- rollouts ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "title"),
+    [("", "aamdm ("), ("--row lmm --no-steered", "lmm, not steered (")],
+)
+def test_a_rollout_is_written_as_bvh_gif_and_page(
+    call, trained, tmp_path, options, title
+):
+    out = tmp_path / "seen"
+    call(f"rollout --run {trained} --seconds 1 --out {out} {options}")
+    motion = bvh_text.read_bvh(out / "rollout.bvh")
+    assert motion.values.shape[0] == 60 and np.isfinite(motion.values).all()
+    with Image.open(out / "rollout.gif") as image:
+        assert image.n_frames > 1
+    text = (out / "rollout.html").read_text()
+    shown = json.loads(re.search(r"^const data = (.*);$", text, re.M).group(1))
+    assert len(shown["positions"]) == len(shown["commanded"]) == 60
+    assert title in text and "procedural" in text
+
+
+# --- errors ------------------------------------------------------------------------
+
+BAD = [
+    ("train --data {data} --out {out} --rows amdm6", "unknown row 'amdm6'.*lmm"),
+    ("train --data {gone} --out {out} {settings}", "gone.npz"),
+    ("train --data {data} --out {file}/below {settings}", "plain/below"),
+    ("train --data {data} --out {out} --field mood", "field 'mood'"),
+    ("train --data {data} --out {out} {settings} --fps 24", "resampled to 24"),
+    ("train --data {data} --out {run} {settings} --fps 120", "{run}.*'fps': 120"),
+    ("train --data {data} --out {run} {settings} --width 48", "T5/polisher.*config"),
+    ("evaluate --run {empty}", "{empty}"),
+    ("evaluate --run {gone}", "{gone}"),
+    ("evaluate --run {run} --rows amdm6", "unknown row 'amdm6'"),
+    ("evaluate --run {run} --rows mvae", "mvae"),
+    ("evaluate --run {run} --out {file}/below", "plain/below"),
+    ("evaluate --run {run} --seconds 60 --rows lmm", "3600 frames of a window"),
+    ("rollout --run {empty}", "{empty}"),
+    ("rollout --run {run} --row amdm6", "unknown row 'amdm6'"),
+    ("rollout --run {run} --row mvae", "full_pose.*no checkpoint"),
+    ("rollout --run {run} --row polish1_draft3", "T4.*no checkpoint"),
+    ("rollout --run {run} --seconds 0", "0.0 s"),
+]
+
+
+@pytest.mark.parametrize(("line", "message"), BAD)
+def test_what_is_wrong_is_said_in_one_line(
+    call, trained, data, tmp_path, monkeypatch, line, message
+):
+    """`sys.exit` of a string prints it and exits with 1."""
+    (tmp_path / "plain").write_text("")
+    (tmp_path / "empty").mkdir()
+    places = dict(
+        gone=tmp_path / "gone.npz",
+        out=tmp_path / "out",
+        file=tmp_path / "plain",
+        empty=tmp_path / "empty",
+        run=trained,
+        data=data,
+        settings=SETTINGS,
+    )
+    monkeypatch.setattr(sys, "argv", [str(SCRIPT), *line.format(**places).split()])
+    before = losses(trained)
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(str(SCRIPT), run_name="__main__")
+    assert isinstance(stop.value.code, str)
+    assert stop.value.code.startswith("error: ") and "\n" not in stop.value.code
+    assert re.search(message.format(**places), stop.value.code)
+    assert losses(trained) == before
+
+
+def run(line):
+    command = [sys.executable, str(SCRIPT), *line.split()]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+def test_from_a_shell_an_error_is_one_line(tmp_path):
+    done = run(f"evaluate --run {tmp_path / 'gone'}")
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith("error: ")
+    assert "gone" in done.stderr and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("", ["train", "evaluate", "rollout", "--data data/lafan1.npz"]),
+        ("train", ["(default: 60.0)", "Windows an update", "Example:"]),
+        ("evaluate", ["seconds", "Metres a second", "epsilon", "Example:"]),
+        ("rollout", ["(default: 20.0)", "Metres a second", "Example:"]),
+    ],
+)
+def test_help_has_defaults_units_and_an_example(call, capsys, command, words):
+    with pytest.raises(SystemExit) as stop:
+        call(f"{command} --help")
+    assert stop.value.code == 0
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    for word in words:
+        assert word in text
+
+
+@pytest.mark.slow
+def test_from_a_shell_train_twice_evaluate_and_roll_out(data, tmp_path):
+    folder = tmp_path / "run"
+    for line in (
+        f"train --data {data} --out {folder} {SETTINGS}",
+        f"train --data {data} --out {folder} {SETTINGS} --rows change",
+        f"evaluate --run {folder} --rollouts 4 --seconds 2 --long-minutes 0",
+        f"rollout --run {folder} --row change --seconds 1",
+    ):
+        done = run(line)
+        assert done.returncode == 0, done.stderr
+    assert (folder / "evaluation" / "table.md").exists()
+    assert bvh_text.read_bvh(folder / "rollout" / "rollout.bvh").values.shape[0] == 60
