@@ -29,6 +29,7 @@ class Load:
       plans: How often networks made something, in all frames together.
       fps: Ticks a second.
       config: Of the system.
+      joints: Of the skeleton.
     """
 
     params: Params
@@ -37,6 +38,7 @@ class Load:
     plans: Callable[[Any], float]
     fps: float
     config: Any
+    joints: int
 
 
 def paper_config(
@@ -185,6 +187,7 @@ def camdm_load(
         plans=lambda frames: float(frames.planned.sum()),
         fps=model.config.fps,
         config=model.config,
+        joints=model.bones.num_joints,
     )
 
 

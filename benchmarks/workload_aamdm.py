@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import workload
 
 from jaxmotion.data import procedural
 from jaxmotion.diffusion import schedule
-from jaxmotion.motion import trajectory
+from jaxmotion.motion import pose, trajectory
+from jaxmotion.motion.layout import unpack
 from jaxmotion.protocols import aamdm_chains, aamdm_data, aamdm_runs
 from jaxmotion.systems import aamdm, aamdm_control, aamdm_embedding, aamdm_space
 from jaxmotion.typing import Params
@@ -90,50 +92,83 @@ def make_load(run: Path | None, *, width: int, seconds: float) -> workload.Load:
         plans=lambda frames: float(frames.path[..., 0].size),
         fps=FPS,
         config=config,
+        joints=joints,
     )
 
 
-def python_loop(load: workload.Load, *, limit_s: float) -> float:
+def _networks(load: workload.Load) -> dict[str, Callable]:
+    """The three networks, each jitted: draft, polish, and the decoder of poses."""
+    params, config = load.params["networks"], load.config
+    net, space = aamdm.network(config), load.params["space"]
+    return {
+        "draft": jax.jit(
+            lambda x, t, previous, z: net.apply(
+                {"params": params["generator"]}, x, t, previous, z
+            )
+        ),
+        "polish": jax.jit(
+            lambda x, t, previous: net.apply(
+                {"params": params["polisher"]}, x, t, previous
+            )
+        ),
+        "decode": jax.jit(lambda x: aamdm_space.to_poses(space, x)),
+    }
+
+
+def _show(load: workload.Load, decode: Callable, joints: int, state: Any) -> Any:
+    """Decodes a frame, moves the bone on, and places the pose, operation by operation."""
+    vector = decode(state.frame)
+    parts = unpack(pose.pose_layout(joints), vector)
+    moved, turned = parts["root_velocity"], parts["root_angular_velocity"]
+    bone = pose.advance_frame(state.bone, moved, turned, fps=FPS)
+    shown = pose.place(vector, bone, num_joints=joints)
+    return dataclasses.replace(state, bone=bone), shown
+
+
+def python_loop(load: workload.Load, *, limit_s: float, glue: bool) -> float:
     """Frames a second of one character in a Python loop over its jitted networks.
 
-    The networks, the posterior of a step and the decoding of a frame are each jitted;
-    the loops over frames and steps, and what is between, are Python.
+    The loops over frames and over steps are Python. The networks are jitted, and so are
+    the posterior of a step and the placing of a pose, which the library jits itself.
 
     Args:
       load: From `make_load`.
       limit_s: Seconds to run for, at most.
+      glue: Jit what lies between the networks too: a whole step, and all that follows
+        the last one. Without it that is called operation by operation.
 
     Returns:
       Frames a second.
     """
-    params, config = load.params["networks"], load.config
-    net, table = aamdm.network(config), config.table()
-    draft = jax.jit(
-        lambda x, t, previous, z: net.apply(
-            {"params": params["generator"]}, x, t, previous, z
-        )
-    )
-    polish = jax.jit(
-        lambda x, t, previous: net.apply({"params": params["polisher"]}, x, t, previous)
-    )
-    show = jax.jit(load.controller(load.params).advance)
+    config, table, nets = load.config, load.config.table(), _networks(load)
     states, commands = load.start(1)
     state, command = jax.tree.map(lambda x: x[0], (states, commands))
     command = jax.tree.map(lambda x: x[0], command)
+    joints = load.joints
+
+    def step(key: jax.Array, x: jax.Array, t: int, previous: jax.Array) -> jax.Array:
+        key_net, key_noise = jax.random.split(jax.random.fold_in(key, t))
+        if t > config.polishes:
+            latent = jax.random.normal(key_net, (config.latent,))
+            x_0 = nets["draft"](x, t, previous, latent)
+        else:
+            x_0 = nets["polish"](x, t, previous)
+        mean, variance = schedule.posterior(table, x_0, x, t)
+        return mean + jnp.sqrt(variance) * jax.random.normal(key_noise, x.shape)
+
+    if glue:
+        step = jax.jit(step, static_argnums=2)
+        advance = jax.jit(load.controller(load.params).advance)
+        show = lambda state: advance(state, command)  # noqa: E731
+    else:
+        show = lambda state: _show(load, nets["decode"], joints, state)  # noqa: E731
 
     def frame(key: jax.Array, state: Any) -> Any:
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, state.frame.shape)
         for t in range(config.num_steps, 0, -1):
-            key_net, key_noise = jax.random.split(jax.random.fold_in(key_chain, t))
-            if t > config.polishes:
-                latent = jax.random.normal(key_net, (config.latent,))
-                x_0 = draft(x, t, state.frame, latent)
-            else:
-                x_0 = polish(x, t, state.frame)
-            mean, variance = schedule.posterior(table, x_0, x, t)
-            x = mean + jnp.sqrt(variance) * jax.random.normal(key_noise, x.shape)
-        return show(dataclasses.replace(state, frame=x), command)[0]
+            x = step(key_chain, x, t, state.frame)
+        return show(dataclasses.replace(state, frame=x))[0]
 
     key = jax.random.key(0)
     state = jax.block_until_ready(frame(key, state))

@@ -48,8 +48,9 @@ class Train:
       polisher_steps: Updates of each diffusion model.
       generator_steps: Updates of each denoising-diffusion GAN.
       baseline_steps: Updates of each other method.
+      mvae_steps: Updates of Motion VAE, which are dearer: in about the same time.
       full_pose_steps: Updates of the diffusion model of the full-pose row, which are
-        dearer.
+        dearer: in about the same time.
       batch: Windows an update.
       width: Channels of the networks of AAMDM and AMDM (Learned Motion Matching has
         512, Motion VAE 256, as published).
@@ -71,7 +72,8 @@ class Train:
     polisher_steps: int = 5000
     generator_steps: int = 8000
     baseline_steps: int = 8000
-    full_pose_steps: int = 3000
+    mvae_steps: int = 2500
+    full_pose_steps: int = 1500
     batch: int = 64
     width: int = 256
     schedule: Literal["cosine", "vp"] = "cosine"
@@ -187,7 +189,7 @@ def train(args: Train) -> None:
             sizes,
             polisher=budget(steps),
             generator=adversarial,
-            baseline=budget(args.baseline_steps, learning_rate=1e-3),
+            baseline=budget(args.baseline_steps, optimizer="adamw", learning_rate=1e-3),
         )
         print(f"{name}: {time.perf_counter() - begun:.0f} s", flush=True)
 

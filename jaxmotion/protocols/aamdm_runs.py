@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.data import clips_io, mirror, selection
-from jaxmotion.learning import training
+from jaxmotion.learning import checkpoint, training
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.protocols import aamdm_data, aamdm_stages
 from jaxmotion.protocols.aamdm_data import PoseData
@@ -228,7 +228,7 @@ def _space(run: Run, autoencoder: Autoencoder | None) -> Space:
 
 
 def make_space(run: Run, autoencoder: Autoencoder | None) -> Space:
-    """Makes a space of the run and stores it.
+    """Makes a space of the run and stores it; one that is there is loaded.
 
     Args:
       run: The run.
@@ -237,8 +237,10 @@ def make_space(run: Run, autoencoder: Autoencoder | None) -> Space:
     Returns:
       The space.
     """
+    name: SpaceName = "full_pose" if autoencoder is None else "embedded"
+    if checkpoint.latest_step(run.folder / name / "checkpoints") is not None:
+        return load_space(run, name)
     space = jax.jit(functools.partial(_space, run))(autoencoder)
-    name = "full_pose" if autoencoder is None else "embedded"
     aamdm_stages.save_space(run.folder / name, space, {"source": run.source})
     return space
 

@@ -257,6 +257,7 @@ def transition(
       ValueError: if `change` does not fit the target.
     """
     check_change(config, change)
+    table = config.table()
 
     def step(
         key: Key,
@@ -265,8 +266,6 @@ def transition(
         objective: Objective | None = None,
         scale: float | Float[Array, ""] = 0.0,
     ) -> Float[Array, "*batch features"]:
-        table = config.table()
-
         def part(denoise: Denoiser, x: Array, start: int, stop: int) -> Array:
             if objective is not None:
                 denoise = guidance.gradient_guidance(

@@ -187,7 +187,7 @@ def advance(
     *,
     num_joints: int,
     fps: float,
-    wanted: Float[Array, " 12"],
+    wanted: Float[Array, " 12"] | None,
 ) -> tuple[CharacterState, Frame]:
     """Decodes the character's frame, moves its bone on, and shows it.
 
@@ -197,7 +197,7 @@ def advance(
       command: What the user wants now.
       num_joints: Joints of the skeleton.
       fps: Frames a second.
-      wanted: Path features that were asked for.
+      wanted: Path features that were asked for; None for those that the frame has.
 
     Returns:
       The state after the tick, and what it shows.
@@ -208,6 +208,7 @@ def advance(
     bone = pose.advance_frame(state.bone, moved, turned, fps=fps)
     velocity = ground.out_of_frame(moved[::2], bone.facing)
     root, rot6d = pose.place(vector, bone, num_joints=num_joints)
+    path = aamdm_space.to_paths(space, state.frame)
     state = CharacterState(
         frame=state.frame, bone=bone, velocity=velocity, turn_rate=turned[1]
     )
@@ -216,8 +217,8 @@ def advance(
         joint_rotation=rot6d,
         bone=bone,
         velocity=velocity,
-        path=aamdm_space.to_paths(space, state.frame),
-        wanted=wanted,
+        path=path,
+        wanted=path if wanted is None else wanted,
         desired_velocity=command.velocity,
         desired_facing=command.facing,
     )
@@ -268,7 +269,7 @@ def controller(
             command,
             num_joints=num_joints,
             fps=fps,
-            wanted=wanted(state, command),
+            wanted=wanted(state, command) if steered else None,
         )
 
     return Controller(

@@ -168,6 +168,13 @@ def test_a_space_of_a_run_is_read_back(run, space):
         aamdm_runs.load_space(run, "embedded")
 
 
+def test_a_space_that_is_there_is_loaded(run, space, monkeypatch):
+    monkeypatch.setattr(checkpoint, "save", lambda *a, **k: pytest.fail("saved"))
+    again = aamdm_runs.make_space(run, None)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(space), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize(("drafts", "polishes"), [(3, 2), (4, 1), (5, 0), (0, 5)])
 def test_chains_of_one_length_share_their_networks(run, space, chain, drafts, polishes):
     params, config = aamdm_chains.load_networks(

@@ -199,7 +199,7 @@ class Constant:
     def __init__(self, value):
         self.value = value
 
-    def apply(self, params, x_t, t, previous):
+    def apply(self, params, x_t, t, previous, latent=None):
         return jnp.broadcast_to(self.value, x_t.shape)
 
 
@@ -224,15 +224,52 @@ def test_windows_of_an_even_change_cost_who_predicts_it_nothing(monkeypatch):
     np.testing.assert_allclose(value, 0.75 + 0.1 * 0.3, rtol=1e-4)
 
 
-def test_players_of_changes_move_only_themselves():
-    params, windows = parameters(), normal(8, 3, 3)
-    given = dict(config=CHANGING, change=CHANGE)
-    for loss, names in (
-        (aamdm_loss.discriminator_loss, ("discriminator", "generator")),
-        (aamdm_loss.generator_loss, ("generator", "discriminator")),
-    ):
-        of = jax.jit(jax.grad(functools.partial(loss, **given), has_aux=True))
-        own, other = (params[name] for name in names)
-        grad, _ = of(own, other, jax.random.key(0), windows)
-        assert all(np.isfinite(x).all() for x in jax.tree.leaves(grad))
-        assert any(np.abs(x).max() > 0 for x in jax.tree.leaves(grad))
+# --- noise on given frames ---------------------------------------------------------
+
+
+def test_each_row_has_noise_of_a_size_of_its_own():
+    found = aamdm_loss.random_noise(jax.random.key(0), (2000, 200), largest=0.3)
+    size = np.std(found, axis=1)
+    expected = 0.3 * np.array([0.1, 0.5, 0.9])
+    np.testing.assert_allclose(np.quantile(size, [0.1, 0.5, 0.9]), expected, rtol=0.1)
+    assert size.max() < 0.3 * 1.3
+    none = aamdm_loss.random_noise(jax.random.key(0), (20, 3), largest=0.0)
+    np.testing.assert_array_equal(none, 0.0)
+
+
+@pytest.mark.parametrize("largest", [0.0, 0.2])
+def test_given_frames_are_shaken_in_units_of_the_target(monkeypatch, largest):
+    """Who adds the right change keeps the error of the first frame to the end."""
+    pace = jnp.array([1.0, -2.0, 0.5])
+    frames = jnp.arange(5.0).reshape(1, 5, 1) * (pace * CHANGE).reshape(1, 1, 3)
+    windows = jnp.broadcast_to(frames, (3000, 5, 3))
+    made = Constant(pace.reshape(1, 3))
+    monkeypatch.setattr(aamdm, "network", lambda config: made)
+    config = dataclasses.replace(CHANGING, previous_noise=largest)
+    given = dict(config=config, change=CHANGE)
+    _, terms = aamdm_loss.polisher_loss({}, jax.random.key(0), windows, **given)
+    error = largest / 2 * np.sqrt(2 / np.pi)
+    np.testing.assert_allclose(terms["value"], error, rtol=0.05, atol=1e-5)
+    np.testing.assert_allclose(terms["velocity"], error / 4, rtol=0.05, atol=1e-5)
+
+
+@pytest.mark.parametrize(("config", "change"), [(CONFIG, None), (CHANGING, CHANGE)])
+def test_players_are_given_shaken_frames(monkeypatch, config, change):
+    seen = []
+
+    class Judge:
+        def apply(self, params, x, x_t, t, previous):
+            seen.append(previous)
+            return jnp.zeros(len(x))
+
+    monkeypatch.setattr(aamdm, "discriminator", lambda config: Judge())
+    monkeypatch.setattr(aamdm, "network", lambda config: Constant(jnp.zeros((1, 3))))
+    windows = jnp.broadcast_to(normal(1, 3, 3), (3000, 3, 3))
+    for largest in (0.0, 0.2):
+        own = dataclasses.replace(config, previous_noise=largest, own_previous=0.0)
+        given = dict(config=own, change=change)
+        aamdm_loss.generator_loss({}, {}, jax.random.key(0), windows, **given)
+        noise = np.abs(np.float64(seen.pop()) - np.float64(windows[:, -2])).mean(0)
+        units = np.ones(3) if change is None else np.float64(change)
+        expected = largest / 2 * np.sqrt(2 / np.pi) * units
+        np.testing.assert_allclose(noise, expected, rtol=0.1, atol=1e-6)

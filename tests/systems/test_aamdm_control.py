@@ -46,8 +46,14 @@ def space():
     own = np.random.default_rng(3)
     mean, std = own.normal(size=12 + SIZE), own.uniform(0.5, 2.0, 12 + SIZE)
     normalizer = features.Normalizer(mean=person.float32(mean), std=person.float32(std))
-    change = jnp.ones(12 + SIZE)
-    return aamdm_space.Space(normalizer=normalizer, change=change, autoencoder=None)
+    one = jnp.ones(12 + SIZE)
+    return aamdm_space.Space(
+        normalizer=normalizer,
+        change=one,
+        low=-30 * one,
+        high=30 * one,
+        autoencoder=None,
+    )
 
 
 def start(path_seed=4):
@@ -217,6 +223,7 @@ def test_only_steered_characters_have_a_goal(steered):
     found, shown = rollout.tick(made, jax.random.key(0), state, given)
     if not steered:
         assert goals and all(goal is None for goal in goals)
+        np.testing.assert_array_equal(shown.wanted, shown.path)
         return
     wanted = wanted_path(state, given, half_life=0.4)
     np.testing.assert_allclose(shown.wanted, wanted, atol=1e-5)
@@ -225,6 +232,15 @@ def test_only_steered_characters_have_a_goal(steered):
     expected = (wanted - own.mean[:12]) / own.std[:12]
     np.testing.assert_allclose(goals[-1], expected, atol=1e-5)
     np.testing.assert_array_equal(planned.frame, state.frame)
+
+
+def test_frames_stay_within_the_bounds_of_the_data():
+    far = jnp.linspace(-99.0, 99.0, 12 + SIZE)
+    state, given = character([0.0, 1.0], 0.5), command([1.0, 0.0], 1.5)
+    for options, bound in ((dict(), 30.0), (dict(bounded=False), 99.0)):
+        made = driver(lambda key, previous, goal: far, steered=False, **options)
+        found = rollout.tick(made, jax.random.key(0), state, given)[0].frame
+        np.testing.assert_allclose(found, np.clip(far, -bound, bound))
 
 
 def test_an_unsteered_character_ignores_its_commands():

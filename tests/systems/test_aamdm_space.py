@@ -104,6 +104,20 @@ def test_change_is_the_deviation_of_neighbours_within_clips(kind):
     assert np.any(across[:12] > 1.1 * expected[:12])
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_bounds_leave_out_half_a_per_cent_at_each_end(kind):
+    space, found = space_of(kind), frames_of(kind)
+    low, high = np.quantile(found, [0.005, 0.995], axis=0)
+    np.testing.assert_allclose(space.low, low, atol=1e-3)
+    np.testing.assert_allclose(space.high, high, atol=1e-3)
+    for shape in ((), (2, 3)):
+        middle = jnp.broadcast_to((space.low + space.high) / 2, (*shape, len(low)))
+        for offset, expected in ((0.0, middle), (99.0, space.high), (-99.0, space.low)):
+            kept = aamdm_space.keep_within(space, middle + offset)
+            assert kept.shape == middle.shape
+            np.testing.assert_array_equal(kept, np.broadcast_to(expected, kept.shape))
+
+
 def test_channels_that_hardly_vary_are_not_blown_up():
     poses, paths = walks()
     tiny_change = 1e-6 * jnp.arange(sum(LENGTHS))
