@@ -116,7 +116,7 @@ def _networks(load: workload.Load) -> dict[str, Callable]:
 
 
 def _show(load: workload.Load, decode: Callable, joints: int, state: Any) -> Any:
-    """Decodes a frame, moves the bone on, and places the pose, operation by operation."""
+    """Decodes a frame, moves the bone on, and places the pose, one call at a time."""
     vector = decode(state.frame)
     parts = unpack(pose.pose_layout(joints), vector)
     moved, turned = parts["root_velocity"], parts["root_angular_velocity"]

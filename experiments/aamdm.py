@@ -47,8 +47,9 @@ class Train:
       autoencoder_steps: Updates of the pose autoencoder.
       polisher_steps: Updates of each diffusion model.
       generator_steps: Updates of each denoising-diffusion GAN.
-      baseline_steps: Updates of each other method.
-      mvae_steps: Updates of Motion VAE, which are dearer: in about the same time.
+      amdm_steps: Updates of each AMDM.
+      window_steps: Updates of Motion VAE and of Learned Motion Matching, which are
+        dearer since they run through windows.
       full_pose_steps: Updates of the diffusion model of the full-pose row, which are
         dearer: in about the same time.
       batch: Windows an update.
@@ -71,8 +72,8 @@ class Train:
     autoencoder_steps: int = 20000
     polisher_steps: int = 5000
     generator_steps: int = 8000
-    baseline_steps: int = 8000
-    mvae_steps: int = 2500
+    amdm_steps: int = 8000
+    window_steps: int = 2500
     full_pose_steps: int = 1500
     batch: int = 64
     width: int = 256
@@ -189,7 +190,11 @@ def train(args: Train) -> None:
             sizes,
             polisher=budget(steps),
             generator=adversarial,
-            baseline=budget(args.baseline_steps, optimizer="adamw", learning_rate=1e-3),
+            baseline=budget(
+                args.window_steps if name in ("mvae", "lmm") else args.amdm_steps,
+                optimizer="adamw",
+                learning_rate=1e-3,
+            ),
         )
         print(f"{name}: {time.perf_counter() - begun:.0f} s", flush=True)
 
