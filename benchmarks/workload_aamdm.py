@@ -23,7 +23,7 @@ FPS = 60.0
 
 def _random(width: int) -> tuple[aamdm.Config, Params, aamdm_space.Space, Any, int]:
     """A character of the procedural walker with untrained networks."""
-    clips = procedural.make_clips(minutes=1)
+    clips = procedural.make_clips(minutes=1.0)
     joints = clips.skeleton.num_joints
     data, _ = aamdm_data.pose_data(clips, fps=FPS)
     sizes = aamdm_embedding.Config(num_joints=joints, fps=FPS)

@@ -96,7 +96,8 @@ class Evaluate:
       seconds: Length of each rollout, seconds (the paper: 1000 frames).
       preset: Commands of the steered rollouts.
       speed: Metres a second that are commanded.
-      scale: Strength of the guidance, epsilon of eq. 13.
+      scale: Strength of AAMDM's guidance, epsilon of eq. 13.
+      amdm_scale: Likewise, of AMDM's.
       long_minutes: Length of the long rollouts of the row "aamdm"; 0 for none.
       long_rollouts: Their number.
       seed: Of poses, noise and pairs.
@@ -109,7 +110,8 @@ class Evaluate:
     seconds: float = 1000 / 60
     preset: Steering = "forward"
     speed: float = 1.2
-    scale: float = 1.0
+    scale: float = 10.0
+    amdm_scale: float = 1.0
     long_minutes: float = 10.0
     long_rollouts: int = 16
     seed: int = 0
@@ -139,7 +141,7 @@ class Rollout:
     seconds: float = 20.0
     preset: Steering = "forward"
     speed: float = 1.2
-    scale: float = 1.0
+    scale: float = 10.0
     out: Path | None = None
     seed: int = 0
 

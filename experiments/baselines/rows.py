@@ -100,7 +100,8 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
     if name == "lmm":
         return lmm.Config(**common | {"width": 512}, queries=12)
     if name == "mvae":
-        return mvae.Config(**common | {"width": 256})
+        # With the published weight 1 the latent dies: of 350 channels most are smooth.
+        return mvae.Config(**common | {"width": 256}, weight_kl=0.01)
     return amdm.Config(**common, num_steps=int(name.removeprefix("amdm")))
 
 

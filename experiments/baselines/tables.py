@@ -9,22 +9,33 @@ import numpy as np
 from baselines import rows
 from jaxmotion.evaluation import table
 from jaxmotion.learning import checkpoint
-from jaxmotion.protocols import aamdm_evaluation, aamdm_rows, aamdm_runs
+from jaxmotion.protocols import (
+    aamdm_evaluation,
+    aamdm_rows,
+    aamdm_runs,
+    camdm_runs,
+)
 from jaxmotion.systems.aamdm_control import Frame
 
 Row = dict[str, table.Cell]
 
 
-def trained_rows(run: aamdm_runs.Run, spaces: dict, scale: float) -> dict[str, Any]:
-    """Steppers of all rows that the folder has."""
-    found = {}
-    for name in rows.ALL:
+def trained_rows(
+    run: aamdm_runs.Run, names: tuple[str, ...], args: Any
+) -> dict[str, tuple[Any, Any]]:
+    """Steppers and spaces of rows; without names, of all that the folder has."""
+    found, spaces = {}, {}
+    for name in names or (*rows.ALL, "change"):
         where = rows.space_of(name)
+        scale = args.amdm_scale if name.startswith("amdm") else args.scale
         try:
             if where not in spaces:
                 spaces[where] = aamdm_runs.load_space(run, where)
-            found[name] = rows.load_row(name, run, spaces[where], scale=scale)
+            step = rows.load_row(name, run, spaces[where], scale=scale)
+            found[name] = (step, spaces[where])
         except checkpoint.CheckpointError:
+            if names:
+                raise
             print(f"{name}: not trained here, left out")
     return found
 
@@ -47,7 +58,7 @@ def _unbounded(
     frames = roll(jax.random.key(args.seed), states, given)[1]
     positions = aamdm_evaluation.positions_of(run.bones, frames)
     found = aamdm_rows.long_health(positions, None, reference, fps=run.train.fps)
-    return table.Cell(value=found["diverged"], samples=found["rollouts"])
+    return table.Cell(value=float(found["diverged"]), samples=found["rollouts"])
 
 
 def measure(
@@ -76,7 +87,8 @@ def measure(
         if steered:
             wanted = ("fid", "ffr_mann", "ffr_gmd", "diverged")
             found = {f"{k}_uc": found[k] for k in wanted if k in found}
-            found |= aamdm_rows.control_row(frames, fps=fps)
+            if not found["diverged_uc"].value:
+                found |= aamdm_rows.control_row(frames, fps=fps)
         row |= found
     ticks = 20 if name == "amdm200" else 300
     rate = aamdm_evaluation.frames_per_second(run, space, step, ticks=ticks)
@@ -151,7 +163,7 @@ def orderings(found: dict[str, Row]) -> list[str]:
             f"{fid['amdm200']:.3g}, {fid['aamdm']:.3g}, {fid['amdm5']:.3g}",
         ),
         "FID of AAMDM below LMM's and MVAE's": (
-            fid["aamdm"] < min(fid["lmm"], fid["mvae"]),
+            fid["aamdm"] < fid["lmm"] and fid["aamdm"] < fid["mvae"],
             f"{fid['aamdm']:.3g}, {fid['lmm']:.3g}, {fid['mvae']:.3g}",
         ),
         "AAMDM at least 25 times as fast as AMDM200": (ratio >= 25, f"{ratio:.1f}"),
@@ -174,23 +186,19 @@ def orderings(found: dict[str, Row]) -> list[str]:
 
 def evaluate(run: aamdm_runs.Run, args: Any) -> tuple[dict[str, Row], dict[str, Any]]:
     """The table, and what belongs beside it."""
-    spaces: dict[str, Any] = {}
-    steppers = trained_rows(run, spaces, args.scale)
-    if args.rows:
-        steppers = {name: steppers[name] for name in args.rows}
+    steppers = trained_rows(run, args.rows, args)
     reference = aamdm_rows.make_reference(run.bones, run.train)
     found = data_rows(run, reference, args)
-    for name, step in steppers.items():
-        space = spaces[rows.space_of(name)]
+    for name, (step, space) in steppers.items():
         found[name] = measure(name, run, space, step, reference, args)
     report = {
+        "arguments": camdm_runs.arguments_json(args),
         "source": run.source,
         "orderings": orderings(found),
         "jax": jax.__version__,
         "machine": f"{platform.machine()}, {jax.devices()[0]}",
     }
     if args.long_minutes and "aamdm" in steppers:
-        report["long"] = long_rollouts(
-            run, spaces["embedded"], steppers["aamdm"], reference, args
-        )
+        step, space = steppers["aamdm"]
+        report["long"] = long_rollouts(run, space, step, reference, args)
     return found, report

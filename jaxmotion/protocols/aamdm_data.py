@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.data import simulation, windows
-from jaxmotion.data.clips import Clips
+from jaxmotion.data.clips import Clips, clip_motion
 from jaxmotion.motion import path_features, pose
 
 
@@ -103,7 +103,7 @@ def split_ends(data: PoseData, fraction: float) -> tuple[PoseData, PoseData]:
     train, held = [], []
     for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
         cut = b - round((b - a) * fraction)
-        if cut - gap > a:
+        if a < cut - gap and cut < b:
             train.append((a, cut - gap))
             held.append((cut, b))
     if not train:
@@ -125,11 +125,13 @@ def pose_data(clips: Clips, *, fps: float = 60.0) -> tuple[PoseData, tuple[str, 
       ValueError: if the skeleton lacks a joint, the rate cannot be reached, or all
         clips are too short.
     """
-    bones, offsets = clips.skeleton, np.asarray(clips.offsets)
+    bones = clips.skeleton
     least = simulation.least_frames(fps)
     rows, names = [], []
     for i in range(clips.num_clips):
-        motion = windows.cut(clips, offsets[i], int(offsets[i + 1] - offsets[i]))
+        motion = clip_motion(clips, i)
+        if motion.root_position.shape[0] < 2:
+            continue
         motion = simulation.upsample(motion, fps)
         if motion.root_position.shape[0] < least:
             continue

@@ -116,8 +116,8 @@ def free_row(
 
     Returns:
       div and fid over groups; ffr_mann, ffr_gmd, speed, acceleration and jerk over
-      rollouts; diverged, the number of rollouts with numbers that no body shows. Of
-      diverged rollouts nothing else is counted.
+      rollouts; diverged, the number of rollouts with numbers that no body shows. If
+      any diverged there is no other column.
 
     Raises:
       ValueError: if the groups do not divide the rollouts.
@@ -135,7 +135,7 @@ def free_row(
         health.has_diverged(positions, fps=fps, min_root=0.1, max_root=2.5 * height)
     )
     count = int(diverged.sum())
-    row = {"diverged": table.Cell(value=count, samples=diverged.size)}
+    row = {"diverged": table.Cell(value=float(count), samples=diverged.size)}
     if count:
         return row
     embedded = _character_features(reference, frames, positions)

@@ -34,6 +34,8 @@ from jaxmotion.systems import (
 )
 from jaxmotion.systems.aamdm_space import Autoencoder, Space
 
+# What a JSON or an archive of another kind leads to.
+_WRONG = (AttributeError, TypeError, ValueError)
 SpaceName = Literal["embedded", "full_pose"]
 
 
@@ -170,7 +172,7 @@ def load_run(folder: Path) -> Run:
         )
     except KeyError as error:
         raise ValueError(f"{path}: field {error} is missing") from error
-    except (OSError, TypeError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, zipfile.BadZipFile, *_WRONG) as error:
         raise ValueError(
             f"{folder}: no run folder of `experiments/aamdm.py train`: {error}"
         ) from error

@@ -206,7 +206,8 @@ def save_space(folder: Path, space: Space, config: dict[str, Any]) -> None:
       config: JSON of what it was made from.
     """
     value = {"system": "aamdm", "stage": "space"} | config
-    checkpoint.save(folder / "checkpoints", 0, space, value)
+    leaves = {str(i): x for i, x in enumerate(jax.tree.leaves(space))}
+    checkpoint.save(folder / "checkpoints", 0, leaves, value)
 
 
 def load_space(folder: Path, like: Callable[[], Space]) -> Space:
@@ -223,4 +224,14 @@ def load_space(folder: Path, like: Callable[[], Space]) -> Space:
       CheckpointError: if there is none, or it is of another kind.
     """
     check_stage(folder, "space")
-    return checkpoint.restore(folder / "checkpoints", jax.eval_shape(like))
+    structure = []
+
+    def leaves() -> dict[str, Array]:
+        found, tree = jax.tree.flatten(like())
+        structure.append(tree)
+        return {str(i): x for i, x in enumerate(found)}
+
+    stored = checkpoint.restore(folder / "checkpoints", jax.eval_shape(leaves))
+    return jax.tree.unflatten(
+        structure[0], [stored[str(i)] for i in range(len(stored))]
+    )

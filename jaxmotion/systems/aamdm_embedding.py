@@ -113,7 +113,8 @@ def fit_statistics(
     Returns:
       The statistics.
 
-    Source: Holden et al. 2020, released code: train_decompressor, database.
+    Source: Holden et al. 2020, released code: train_decompressor, database. Differs:
+      the deviation of a kind is the mean of its channels', there of all its numbers.
     """
     own = features.fit_normalizer(poses)
     spread = jnp.sqrt(jnp.mean((poses - own.mean[None]) ** 2, axis=0))

@@ -13,7 +13,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxmotion.motion import features
 from jaxmotion.systems import aamdm_embedding as embedding
@@ -87,7 +87,7 @@ def _raw(
 def fit_space(
     poses: Float[Array, "frames features"],
     paths: Float[Array, "frames 12"],
-    neighbours: Float[Array, "pairs"],
+    neighbours: Int[Array, "pairs"],
     *,
     autoencoder: Autoencoder | None,
 ) -> Space:

@@ -102,12 +102,12 @@ def test_data_pass_through_jit():
 
 
 def test_frames_are_the_pose_vectors_of_each_clip_alone():
-    clips = person.clips((70, 40, 65))
+    clips = person.clips((79, 40, 79))
     data, names = aamdm_data.pose_data(clips, fps=60.0)
     assert names == ("clip0", "clip2")
-    assert data.offsets.tolist() == [0, 70, 135]
-    assert data.fps == 60.0 and data.poses.shape == (135, 98)
-    for i, (a, b) in ((0, (0, 70)), (2, (70, 135))):
+    assert data.offsets.tolist() == [0, 79, 158]
+    assert data.fps == 60.0 and data.poses.shape == (158, 98)
+    for i, (a, b) in ((0, (0, 79)), (2, (79, 158))):
         motion = clip_motion(clips, i)
         bone = simulation.simulation_bone(clips.skeleton, motion)
         poses = pose.pose_vectors(clips.skeleton, motion, bone)
