@@ -47,10 +47,11 @@ def test_programs_run_as_they_stand(tmp_path):
 
 
 @pytest.mark.parametrize("words", SCRIPTS, ids=lambda words: " ".join(words[1:3]))
-def test_commands_parse(words):
+def test_commands_parse(words, monkeypatch):
     """The script exists and knows the arguments."""
     _, script, *arguments = words
     path = ROOT / script
+    monkeypatch.syspath_prepend(str(path.parent))
     spec = importlib.util.spec_from_file_location(f"readme_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
     # A dataclass looks itself up in its module.

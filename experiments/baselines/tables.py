@@ -87,7 +87,7 @@ def measure(
         if steered:
             wanted = ("fid", "ffr_mann", "ffr_gmd", "diverged")
             found = {f"{k}_uc": found[k] for k in wanted if k in found}
-            if not found["diverged_uc"].value:
+            if "fid_uc" in found:
                 found |= aamdm_rows.control_row(frames, fps=fps)
         row |= found
     ticks = 20 if name == "amdm200" else 300

@@ -117,7 +117,7 @@ def free_row(
     Returns:
       div and fid over groups; ffr_mann, ffr_gmd, speed, acceleration and jerk over
       rollouts; diverged, the number of rollouts with numbers that no body shows. If
-      any diverged there is no other column.
+      a position is not finite there is no other column.
 
     Raises:
       ValueError: if the groups do not divide the rollouts.
@@ -134,9 +134,8 @@ def free_row(
     diverged = np.asarray(
         health.has_diverged(positions, fps=fps, min_root=0.1, max_root=2.5 * height)
     )
-    count = int(diverged.sum())
-    row = {"diverged": table.Cell(value=float(count), samples=diverged.size)}
-    if count:
+    row = {"diverged": table.Cell(value=float(diverged.sum()), samples=diverged.size)}
+    if not bool(jnp.all(jnp.isfinite(positions))):
         return row
     embedded = _character_features(reference, frames, positions)
     parts = embedded[:, ::STRIDE].reshape(groups, -1, embedded.shape[-1])
