@@ -207,7 +207,7 @@ def evaluate(args: Evaluate) -> None:
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
     run = aamdm_runs.load_run(args.run)
-    table, report = tables.evaluate(run, args)
+    table, report = tables.evaluate(run, args, out)
     artifacts.write_table(out, table, report)
     for line in report["orderings"]:
         print(line)

@@ -1,6 +1,8 @@
 """AAMDM's tables 1 and 2, measured, and which orderings of the paper hold here."""
 
+import json
 import platform
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -184,13 +186,16 @@ def orderings(found: dict[str, Row]) -> list[str]:
     ]
 
 
-def evaluate(run: aamdm_runs.Run, args: Any) -> tuple[dict[str, Row], dict[str, Any]]:
-    """The table, and what belongs beside it."""
+def evaluate(
+    run: aamdm_runs.Run, args: Any, out: Path
+) -> tuple[dict[str, Row], dict[str, Any]]:
+    """The table, and what belongs beside it; rows.json has what is done so far."""
     steppers = trained_rows(run, args.rows, args)
     reference = aamdm_rows.make_reference(run.bones, run.train)
     found = data_rows(run, reference, args)
     for name, (step, space) in steppers.items():
         found[name] = measure(name, run, space, step, reference, args)
+        (out / "rows.json").write_text(json.dumps(table.to_json(found), indent=1))
     report = {
         "arguments": camdm_runs.arguments_json(args),
         "source": run.source,
