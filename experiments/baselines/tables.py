@@ -35,9 +35,11 @@ def trained_rows(
                 spaces[where] = aamdm_runs.load_space(run, where)
             step = rows.load_row(name, run, spaces[where], scale=scale)
             found[name] = (step, spaces[where])
-        except checkpoint.CheckpointError:
+        except checkpoint.CheckpointError as error:
             if names:
-                raise
+                raise checkpoint.CheckpointError(
+                    f"row {name!r} was not trained: {error}"
+                ) from error
             print(f"{name}: not trained here, left out")
     return found
 

@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "experiments" / "aamdm.py"
 SETTINGS = (
     "--field style --labels --rows aamdm lmm --autoencoder-steps 100 "
-    "--polisher-steps 100 --generator-steps 100 --baseline-steps 100 --batch 8 "
+    "--polisher-steps 100 --generator-steps 100 --window-steps 100 --batch 8 "
     "--width 32"
 )
 STAGES = {
