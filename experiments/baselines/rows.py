@@ -110,12 +110,11 @@ def _folder(run: Run, name: str) -> Path:
     return run.folder / space_of(name) / name
 
 
-def _baseline_loss(name: str, run: Run, space: Space, config: Any):
+def _baseline_loss(name: str, frames: jax.Array, space: Space, config: Any):
     """The loss `(params, key, windows)` of a baseline."""
     loss = functools.partial(_BASELINES[name].loss, config=config)
     if name != "lmm":
         return loss
-    frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     return functools.partial(loss, change=space.change, database=frames[::4])
 
 
@@ -126,8 +125,8 @@ def train_baseline(
     config = _config(name, space, sizes)
     optimizer = aamdm_stages.make_optimizer(budget)
     params = _BASELINES[name].init(jax.random.key(budget.seed), config)
-    loss = _baseline_loss(name, run, space, config)
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
+    loss = _baseline_loss(name, frames, space, config)
     length, given = _WINDOWS[name]
     windows, arrays = aamdm_stages.frame_windows(
         frames, run.train, length, batch=budget.batch

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
 from jaxmotion.motion import rotation
-from jaxmotion.motion.facing import hip_facing
+from jaxmotion.motion.facing import hip_facing, plain_names
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.trajectory import Trajectory
 
@@ -85,7 +85,7 @@ def chest_joint(skeleton: Skeleton) -> int:
     Raises:
       ValueError: if there is none; names the joints.
     """
-    plain = [name.lower().split(":")[-1].replace("_", "") for name in skeleton.names]
+    plain = plain_names(skeleton)
     for name in _CHESTS:
         if name in plain:
             return plain.index(name)

@@ -19,6 +19,18 @@ _HIPS = (
 )
 
 
+def plain_names(skeleton: Skeleton) -> list[str]:
+    """Joint names in lower case, without separators and rig prefix.
+
+    Args:
+      skeleton: The bones.
+
+    Returns:
+      One name a joint: "spine2" of "mixamorig:Spine_2".
+    """
+    return [name.lower().split(":")[-1].replace("_", "") for name in skeleton.names]
+
+
 def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
     """Finds the hip joints by their names.
 
@@ -36,7 +48,7 @@ def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
 
     Source: the joints that CAMDM's code takes the facing from.
     """
-    plain = [name.lower().split(":")[-1].replace("_", "") for name in skeleton.names]
+    plain = plain_names(skeleton)
     for left, right in _HIPS:
         if left in plain and right in plain:
             return plain.index(left), plain.index(right)

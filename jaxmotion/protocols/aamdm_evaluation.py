@@ -77,7 +77,6 @@ def roller(
     *,
     steered: bool,
     bounded: bool = True,
-    chunk: int | None = None,
 ) -> Callable[[Key, CharacterState, Command], tuple[CharacterState, Frame]]:
     """Rollouts as one jitted function.
 
@@ -87,7 +86,6 @@ def roller(
       step: Makes the next frame.
       steered: Whether commands matter.
       bounded: Whether frames are kept within the bounds of the data.
-      chunk: Characters at a time; None for all.
 
     Returns:
       `roll(key, states, commands) -> (states, frames)`.
@@ -100,9 +98,10 @@ def roller(
         steered=steered,
         bounded=bounded,
     )
-    return jax.jit(functools.partial(rollout.rollout, driver, chunk=chunk))
+    return jax.jit(functools.partial(rollout.rollout, driver))
 
 
+@jax.jit
 def positions_of(bones: skeleton.Skeleton, frames: Frame) -> jax.Array:
     """World positions of the joints in rollouts.
 

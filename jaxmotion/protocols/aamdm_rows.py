@@ -29,6 +29,7 @@ from jaxmotion.motion import features, ground, path_features, pose, skeleton
 from jaxmotion.motion.layout import unpack
 from jaxmotion.motion.trajectory import Trajectory
 from jaxmotion.protocols.aamdm_data import PoseData
+from jaxmotion.protocols.aamdm_evaluation import positions_of
 from jaxmotion.systems.aamdm_control import Frame
 from jaxmotion.typing import Key
 
@@ -127,9 +128,7 @@ def free_row(
             f"{frames.root_position.shape[0]} rollouts in {groups} groups: expected a "
             "number that they divide"
         )
-    positions = jax.jit(
-        lambda x: skeleton.forward_kinematics(bones, x.root_position, x.joint_rotation)
-    )(frames)
+    positions = positions_of(bones, frames)
     height = reference.root_height
     diverged = np.asarray(
         health.has_diverged(positions, fps=fps, min_root=0.1, max_root=2.5 * height)

@@ -121,7 +121,7 @@ def wanted_path(
     Returns:
       Path features in the axes of the character's bone.
 
-    Source: Holden et al. 2020, released code (controller); FACTS of the springs.
+    Source: Holden et al. 2020, released code (controller).
     """
     times = jnp.array(path_features.path_offsets(fps)) / fps
     over = lambda x: jnp.broadcast_to(x, (times.shape[0], *x.shape))  # noqa: E731

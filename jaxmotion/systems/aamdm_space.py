@@ -21,8 +21,7 @@ from jaxmotion.systems.aamdm_embedding import PATH
 from jaxmotion.typing import Params
 
 # Channels that hardly vary, such as the lengths of bones, must not be blown up.
-_LEAST_POSE = 1e-3
-_LEAST_LATENT = 1e-3
+_LEAST = 1e-3
 _TAIL = 0.005
 
 
@@ -103,10 +102,7 @@ def fit_space(
       The space.
     """
     raw = _raw(autoencoder, poses, paths)
-    latent = raw.shape[-1] - PATH
-    least = _LEAST_POSE if autoencoder is None else _LEAST_LATENT
-    floor = jnp.concatenate([jnp.full(PATH, 1e-3), jnp.full(latent, least)])
-    normalizer = features.fit_normalizer(raw, floor=floor)
+    normalizer = features.fit_normalizer(raw, floor=_LEAST)
     frames = features.normalize(normalizer, raw)
     step = frames[neighbours + 1] - frames[neighbours]
     change = jnp.maximum(jnp.sqrt(jnp.mean(step**2, axis=0)), 1e-4)
