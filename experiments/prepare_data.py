@@ -1,4 +1,6 @@
-"""Reads a published motion set, or generates one, into one npz file of clips.
+"""Reads a published motion set, or generates one, into one npz file.
+
+The file holds clips, or for humanml3d and kit_ml feature vectors with captions.
 
 The sets are third-party recordings: get them from their publishers, mind their
 licences, and keep what this script writes out of the repository. World coordinates
@@ -7,6 +9,7 @@ licences, and keep what this script writes out of the repository. World coordina
 Example:
   python experiments/prepare_data.py procedural --out data/walker.npz
   python experiments/prepare_data.py lafan1 --manual-dir raw/lafan1 --out data/l.npz
+  python experiments/prepare_data.py kit_ml --manual-dir raw/KIT-ML --out data/k.npz
 """
 
 import dataclasses
@@ -19,10 +22,21 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from jaxmotion.data import clips_io, mirror, resample, selection
+from jaxmotion.data import clips_io, mirror, resample, selection, text_motion_io
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
+from jaxmotion.data.text_motion import TextMotions
 
-Source = Literal["bandai_namco/1", "bandai_namco/2", "lafan1", "style100", "procedural"]
+Source = Literal[
+    "bandai_namco/1",
+    "bandai_namco/2",
+    "lafan1",
+    "style100",
+    "humanact12",
+    "humanml3d",
+    "kit_ml",
+    "procedural",
+]
+TEXT_SOURCES = ("humanml3d", "kit_ml")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +49,9 @@ class Config:
     """File to write (.npz)."""
     manual_dir: Path | None = None
     """Folder with the files as their publisher lays them out (zips or unzipped)."""
-    fps: float = 30.0
-    """Frames a second of the result; other rates are resampled."""
+    fps: float | None = None
+    """Frames a second of the result; other rates are resampled. By default 30, for
+    humanact12 its own 20; sets with captions keep theirs."""
     mirror: bool = False
     """Add the left-right mirror image of every clip (style100: of symmetric styles,
     under the same label; the others swap left and right in their labels)."""
@@ -46,6 +61,9 @@ class Config:
     """Replace --out, and read the published files again."""
     seed: int = 0
     """Seed of the procedural walker."""
+    cut_fps: float = 20.0
+    """Frames a second by which the times of captions cut clips; the released loaders
+    take 20 for kit_ml too, whose rate is 12.5."""
 
 
 def check_config(config: Config) -> None:
@@ -58,10 +76,18 @@ def check_config(config: Config) -> None:
       FileNotFoundError: if the folder of the published files is missing.
       FileExistsError: if the output exists and is not to be replaced.
       OSError: if the output cannot be written.
-      ValueError: if the rate is not positive.
+      ValueError: if a rate is not positive, or a setting does not apply to the set.
     """
-    if not (np.isfinite(config.fps) and config.fps > 0):
-        raise ValueError(f"--fps should be positive, found {config.fps}")
+    for name in ("fps", "cut_fps"):
+        rate = getattr(config, name)
+        if rate is not None and not (np.isfinite(rate) and rate > 0):
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} should be positive, found {rate}")
+    if config.source in TEXT_SOURCES and (config.mirror or config.fps is not None):
+        raise ValueError(
+            f"{config.source} is published with mirror images and at its own rate: "
+            "--mirror and --fps do not apply"
+        )
     if config.source != "procedural":
         if config.manual_dir is None:
             raise FileNotFoundError(f"{config.source} needs --manual-dir")
@@ -77,8 +103,8 @@ def check_config(config: Config) -> None:
     probe.unlink()
 
 
-def read_published(config: Config) -> Clips:
-    """Clips of a published set, by way of its tensorflow-datasets builder.
+def read_published(config: Config) -> Clips | TextMotions:
+    """A published set, by way of its tensorflow-datasets builder.
 
     Args:
       config: The settings.
@@ -86,15 +112,27 @@ def read_published(config: Config) -> Clips:
     Returns:
       The clips at the rate of the set.
     """
-    from jaxmotion.data.builders import bandai_namco, base, lafan1, style100
+    from jaxmotion.data.builders import (
+        bandai_namco,
+        base,
+        humanact12,
+        humanml3d,
+        lafan1,
+        style100,
+    )
 
     name, _, variant = config.source.partition("/")
     if name == "style100":
         variant = "mirror" if config.mirror else "original"
+    if name in TEXT_SOURCES:
+        variant = name
     classes = {
         "bandai_namco": bandai_namco.BandaiNamco,
         "lafan1": lafan1.Lafan1,
         "style100": style100.Style100,
+        "humanact12": humanact12.Humanact12,
+        "humanml3d": humanml3d.HumanML3D,
+        "kit_ml": humanml3d.HumanML3D,
     }
     folder = config.tfds_dir or config.out.parent / "tfds"
     builder = classes[name](
@@ -103,6 +141,8 @@ def read_published(config: Config) -> Clips:
     if builder.data_path.exists() and not config.overwrite:
         print(f"reusing  {builder.data_path}; --overwrite reads --manual-dir again")
     base.prepare(builder, config.manual_dir, overwrite=config.overwrite)
+    if name in TEXT_SOURCES:
+        return humanml3d.text_motions_from_source(builder, cut_fps=config.cut_fps)
     return base.clips_from_source(builder)
 
 
@@ -158,6 +198,30 @@ def describe(clips: Clips, path: Path) -> str:
     return "\n".join([*lines, f"written  {path}, {path.stat().st_size / 1e6:.1f} MB"])
 
 
+def describe_texts(motions: TextMotions, path: Path) -> str:
+    """Counts of clips with captions.
+
+    Args:
+      motions: The clips.
+      path: The file.
+
+    Returns:
+      Lines to print.
+    """
+    lengths = np.diff(motions.offsets)
+    splits = [f"{name} {motions.clips_of(name).size}" for name in motions.split_names]
+    lines = [
+        f"source   {motions.source}",
+        f"clips    {motions.num_clips} ({lengths.min()} to {lengths.max()} frames)",
+        f"splits   {', '.join(splits)}",
+        f"captions {len(motions.captions)}",
+        f"frames   {lengths.sum()} at {motions.fps:g} fps, "
+        f"{motions.num_features} features",
+        f"written  {path}, {path.stat().st_size / 1e6:.1f} MB",
+    ]
+    return "\n".join(lines)
+
+
 def main(config: Config) -> None:
     """Prepares the data and prints what it is.
 
@@ -172,7 +236,13 @@ def main(config: Config) -> None:
         clips = procedural.make_clips(seed=config.seed)
     else:
         clips = read_published(config)
-    clips = at_rate(clips, config.fps)
+    if isinstance(clips, TextMotions):
+        text_motion_io.save_text_motions(config.out, clips)
+        print(describe_texts(clips, config.out))
+        print(f"took     {time.time() - start:.1f} s")
+        return
+    default = clips.fps if config.source == "humanact12" else 30.0
+    clips = at_rate(clips, config.fps or default)
     if config.mirror and config.source != "style100":
         clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
     clips_io.save_clips(config.out, clips)

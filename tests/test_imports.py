@@ -20,6 +20,8 @@ MAY_IMPORT = {
     "learning": {"typing", "motion", "networks"},
     "control": {"typing", "motion"},
     "data": {"typing", "motion"},
+    # Sentences to vectors: tokenizers, weights from a folder, and their network.
+    "text": {"typing", "networks"},
     # learning.checkpoint: a model is loaded as a value (systems/camdm_model.py).
     "systems": {"typing", "diffusion", "motion", "networks", "control", "learning"},
     # What an experiment measures and leaves behind: a method, its data, its pictures.
@@ -32,6 +34,7 @@ MAY_IMPORT = {
         "learning",
         "systems",
         "viz",
+        "text",
     },
     "viz": {"typing", "motion"},
 }
@@ -50,7 +53,11 @@ DOORS = {
     "PIL": ("jaxmotion/viz/",),
     "tqdm": ("jaxmotion/learning/loop.py", "experiments/", "benchmarks/"),
     "tyro": ("experiments/", "benchmarks/"),
-    "torch": ("benchmarks/",),
+    # Published weights of PyTorch, read without running code (weights_only).
+    "torch": ("benchmarks/", "jaxmotion/learning/published.py"),
+    "safetensors": ("jaxmotion/text/", "jaxmotion/learning/published.py"),
+    "tokenizers": ("jaxmotion/text/",),
+    "wordllama": ("jaxmotion/text/",),
 }
 
 

@@ -1,7 +1,7 @@
 """Parts of clips and clips put together: by label, by chance, one set after another."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -69,6 +69,49 @@ def relabel(clips: Clips, field: str) -> Clips:
     )
     labels = {**clips.labels, field: jnp.asarray(compact, jnp.int32)}
     return dataclasses.replace(clips, labels=labels, label_names=label_names)
+
+
+def merge_labels(clips: Clips, field: str, merge: Mapping[str, str]) -> Clips:
+    """Gives clips of some labels another one, for sets that name one thing twice.
+
+    Args:
+      clips: The clips.
+      field: Label field.
+      merge: Label to take away, and the label its clips get.
+
+    Returns:
+      The same clips; labels that no clip has any more are gone.
+
+    Raises:
+      ValueError: if the field or a label is unknown; lists the known ones.
+    """
+    words = clips.names(field)
+    numbers = np.arange(len(words))
+    for old, new in merge.items():
+        source, target = _label_numbers(clips, field, (old, new))
+        numbers[source] = target
+    labels = jnp.asarray(numbers[np.asarray(clips.labels[field])], jnp.int32)
+    changed = dataclasses.replace(clips, labels=clips.labels | {field: labels})
+    return relabel(changed, field)
+
+
+def frequent_labels(clips: Clips, field: str, *, least: int) -> tuple[str, ...]:
+    """Labels that at least so many clips have.
+
+    Args:
+      clips: The clips.
+      field: Label field.
+      least: Clips.
+
+    Returns:
+      The labels, in their order.
+
+    Raises:
+      ValueError: if the field is unknown.
+    """
+    words = clips.names(field)
+    counts = np.bincount(np.asarray(clips.labels[field]), minlength=len(words))
+    return tuple(w for w, n in zip(words, counts, strict=True) if n >= least)
 
 
 def split_clips(

@@ -5,6 +5,8 @@ cross entropy, Adam 1e-3.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -55,6 +57,24 @@ def recognizer_input(
     return local.reshape(*local.shape[:-2], -1)
 
 
+def cross_entropy(
+    logits: Float[Array, "batch classes"], labels: Int[Array, " batch"]
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Mean cross entropy, and how often the largest logit is the right one.
+
+    Args:
+      logits: One row a sample.
+      labels: Its class.
+
+    Returns:
+      The loss in nats, and the accuracy.
+    """
+    log_probability = jax.nn.log_softmax(logits)
+    losses = -jnp.take_along_axis(log_probability, labels[:, None], axis=-1)
+    accuracy = jnp.mean(jnp.argmax(logits, axis=-1) == labels)
+    return jnp.mean(losses), {"accuracy": accuracy}
+
+
 def init_recognizer(key: Key, config: RecognizerConfig) -> Params:
     """Initial parameters.
 
@@ -91,10 +111,7 @@ def recognizer_loss(
     _, logits = Recognizer(config.num_classes).apply(
         {"params": params}, x, train=True, rngs={"dropout": key}
     )
-    log_probability = jax.nn.log_softmax(logits)
-    losses = -jnp.take_along_axis(log_probability, labels[:, None], axis=-1)
-    accuracy = jnp.mean(jnp.argmax(logits, axis=-1) == labels)
-    return jnp.mean(losses), {"accuracy": accuracy}
+    return cross_entropy(logits, labels)
 
 
 def recognize(
@@ -140,13 +157,53 @@ def train_recognizer(
     Returns:
       The moving average of the parameters, and losses and accuracies by step.
     """
-    key_init, key_train = jax.random.split(key)
-    optimizer = training.adamw_cosine(
-        learning_rate=learning_rate, num_steps=num_steps, weight_decay=1e-4
+    return train_classifier(
+        key,
+        lambda key: init_recognizer(key, config),
+        functools.partial(recognizer_loss, config=config),
+        (x, labels),
+        num_steps=num_steps,
+        batch=batch,
+        learning_rate=learning_rate,
+        weight_decay=1e-4,
     )
 
-    def loss(params, key, batch):
-        return recognizer_loss(params, key, batch, config=config)
+
+def train_classifier(
+    key: Key,
+    init: Callable[[Key], Params],
+    loss: training.Loss,
+    data: tuple[Float[Array, "samples frames channels"], Int[Array, " samples"]],
+    *,
+    num_steps: int,
+    batch: int,
+    learning_rate: float,
+    weight_decay: float = 0.0,
+    max_norm: float | None = None,
+) -> tuple[Params, dict[str, Array]]:
+    """Trains any classifier of motions as one compiled program.
+
+    Args:
+      key: Consumed.
+      init: Initial parameters from a key.
+      loss: Loss of a batch of samples and classes.
+      data: Samples, and their classes.
+      num_steps: Updates.
+      batch: Samples an update, drawn with replacement.
+      learning_rate: Of Adam, with cosine decay to a tenth.
+      weight_decay: Decoupled.
+      max_norm: Clip the gradient to this global norm; None to leave it.
+
+    Returns:
+      The moving average of the parameters, and losses and accuracies by step.
+    """
+    key_init, key_train = jax.random.split(key)
+    optimizer = training.adamw_cosine(
+        learning_rate=learning_rate,
+        num_steps=num_steps,
+        weight_decay=weight_decay,
+        max_norm=max_norm,
+    )
 
     def sample_batch(key: Key, data: tuple[Array, Array]) -> tuple[Array, Array]:
         x, labels = data
@@ -155,6 +212,6 @@ def train_recognizer(
 
     update = training.make_update(loss, optimizer, ema_decay=0.99)
     run = training.train_chunk(update, sample_batch, num_steps=num_steps)
-    state = training.init_train_state(init_recognizer(key_init, config), optimizer)
-    state, info = run(state, key_train, (x, labels))
+    state = training.init_train_state(init(key_init), optimizer)
+    state, info = run(state, key_train, data)
     return state.ema_params, info

@@ -18,8 +18,8 @@ from jaxmotion.motion.layout import FeatureLayout as FeatureLayout
 from jaxmotion.motion.layout import feature_layout as feature_layout
 from jaxmotion.motion.layout import pack as pack
 from jaxmotion.motion.layout import unpack as unpack
-from jaxmotion.motion.skeleton import Motion
-from jaxmotion.motion.trajectory import PlanarFrame
+from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.trajectory import PlanarFrame, root_trajectory
 
 RotationLayout = Literal["rows", "columns"]
 
@@ -142,6 +142,28 @@ def to_frame(motion: Motion, frame: PlanarFrame) -> Motion:
     """
     zero = jnp.zeros_like(frame.origin)
     return _move(motion, frame.facing, -frame.origin, zero, ground.into_frame)
+
+
+def to_first_pose(bones: Skeleton, motion: Motion) -> Motion:
+    """Moves motions so that they start at the ground's origin facing +z.
+
+    Args:
+      bones: The skeleton.
+      motion: In the world.
+
+    Returns:
+      The same motions elsewhere; heights stay.
+    """
+    first = Motion(
+        root_position=motion.root_position[..., :1, :],
+        joint_rotation=motion.joint_rotation[..., :1, :, :],
+        fps=motion.fps,
+    )
+    path = root_trajectory(bones, first)
+    return to_frame(
+        motion,
+        PlanarFrame(origin=path.position[..., 0, :], facing=path.facing[..., 0, :]),
+    )
 
 
 @jax.jit

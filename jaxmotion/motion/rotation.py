@@ -36,6 +36,85 @@ def safe_normalize(
     return jnp.where(is_zero, fallback, x / length)
 
 
+def _dot(a: Array, b: Array) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    pairs = ((1, 2), (2, 0), (0, 1))
+    return jnp.stack([a[i] * b[j] - a[j] * b[i] for i, j in pairs])
+
+
+def _axes_and_lengths(rot6d: Array) -> tuple[Array, Array, Array, Array]:
+    """Two orthonormal columns, and the lengths they had; 0 where a fallback stands."""
+    first, second = rot6d[:3], rot6d[3:]
+    square = _dot(first, first)
+    is_zero = square < _TINY
+    x = first / jnp.sqrt(jnp.where(is_zero, 1.0, square))[None]
+    ones = jnp.ones_like(square)
+    x = jnp.where(is_zero[None], jnp.stack([ones, 0 * ones, 0 * ones]), x)
+    length_x = jnp.sqrt(jnp.where(is_zero, 0.0, square))
+    y = second - _dot(x, second)[None] * x
+    # A fallback orthogonal to x: the coordinate axis that x is least aligned with.
+    least = jnp.argmin(jnp.abs(x), axis=0)
+    axis = jnp.stack([jnp.where(least == i, ones, 0 * ones) for i in range(3)])
+    other = axis - _dot(x, axis)[None] * x
+    other = other / jnp.sqrt(_dot(other, other))[None]
+    square = _dot(y, y)
+    is_zero = square < _TINY
+    length_y = jnp.sqrt(jnp.where(is_zero, 0.0, square))
+    y = y / jnp.sqrt(jnp.where(is_zero, 1.0, square))[None]
+    y = jnp.where(is_zero[None], other, y)
+    # Again, because the first pass cancels where the two vectors are nearly parallel:
+    # at 1e-4 rad one pass leaves axes 0.2 off orthogonal, two leave rounding error.
+    y = y - _dot(x, y)[None] * x
+    return x, y / jnp.sqrt(_dot(y, y))[None], length_x, length_y
+
+
+@jax.custom_vjp
+def columns_from_rot6d(rot6d: Float[Array, "6 *batch"]) -> Float[Array, "3 3 *batch"]:
+    """`matrix_from_rot6d` with the batch behind: for long chains of such products.
+
+    The compiler makes loops over the last axis, and three numbers are too short for
+    one: with the batch there, kinematics and its gradient are several times as fast.
+    The gradient is written out, since the compiler's version computes the roots again
+    for each of its terms. It is 0 where a fallback stands.
+
+    Args:
+      rot6d: Two columns, not necessarily orthonormal.
+
+    Returns:
+      Rotation matrices; rows first, then columns.
+    """
+    x, y, _, _ = _axes_and_lengths(rot6d)
+    return jnp.stack([x, y, _cross(x, y)], axis=1)
+
+
+def _columns_forward(rot6d: Array) -> tuple[Array, tuple[Array, ...]]:
+    x, y, length_x, length_y = _axes_and_lengths(rot6d)
+    return jnp.stack([x, y, _cross(x, y)], axis=1), (rot6d, x, y, length_x, length_y)
+
+
+def _columns_backward(kept: tuple[Array, ...], given: Array) -> tuple[Array]:
+    rot6d, x, y, length_x, length_y = kept
+
+    def across(axis: Array, length: Array, gradient: Array) -> Array:
+        """Through the division by a length: what is not along the axis."""
+        safe = jnp.where(length > 0, length, 1.0)
+        part = gradient - _dot(axis, gradient)[None] * axis
+        return jnp.where((length > 0)[None], part / safe[None], 0.0)
+
+    second, of_z = rot6d[3:], given[:, 2]
+    of_y = across(y, length_y, given[:, 1] + _cross(of_z, x))
+    along = _dot(x, of_y)[None]
+    of_x = given[:, 0] + _cross(y, of_z) - _dot(x, second)[None] * of_y
+    of_first = across(x, length_x, of_x - along * second)
+    return (jnp.concatenate([of_first, of_y - along * x]),)
+
+
+columns_from_rot6d.defvjp(_columns_forward, _columns_backward)
+
+
 @jax.jit
 def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3 3"]:
     """Rotation matrix whose first two columns are Gram-Schmidt of the six numbers.
@@ -51,21 +130,9 @@ def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3
 
     Source: Zhou et al. 2019, eq. 15.
     """
-    first, second = rot6d[..., :3], rot6d[..., 3:]
-    x = safe_normalize(first, jnp.array([1.0, 0.0, 0.0], rot6d.dtype))
-    y = second - jnp.sum(x * second, axis=-1, keepdims=True) * x
-    # A fallback orthogonal to x: the coordinate axis that x is least aligned with.
-    axis = jnp.eye(3, dtype=rot6d.dtype)[jnp.argmin(jnp.abs(x), axis=-1)]
-    other = axis - jnp.sum(x * axis, axis=-1, keepdims=True) * x
-    other = other / jnp.linalg.norm(other, axis=-1, keepdims=True)
-    square = jnp.sum(y * y, axis=-1, keepdims=True)
-    is_zero = square < _TINY
-    y = jnp.where(is_zero, other, y / jnp.sqrt(jnp.where(is_zero, 1.0, square)))
-    # Again, because the first pass cancels where the two vectors are nearly parallel:
-    # at 1e-4 rad one pass leaves axes 0.2 off orthogonal, two leave rounding error.
-    y = y - jnp.sum(x * y, axis=-1, keepdims=True) * x
-    y = y / jnp.linalg.norm(y, axis=-1, keepdims=True)
-    return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)
+    return jnp.moveaxis(
+        columns_from_rot6d(jnp.moveaxis(rot6d, -1, 0)), (0, 1), (-2, -1)
+    )
 
 
 @jax.jit

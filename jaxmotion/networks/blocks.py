@@ -6,8 +6,8 @@ epsilon 1e-5) and exact GELU:
     h = norm_1(x + out(softmax(q k^T / sqrt(d)) v))        q, k, v = projections of x
     y = norm_2(h + W_2 gelu(W_1 h))
 
-With norm="pre" the branches read normalised tokens and add to plain ones, which trains
-several times faster from scratch (Xiong et al. 2020, "On Layer Normalization in the
+EMDM's has SELU in its place. With norm="pre" the branches read normalised tokens and
+add to plain ones, which trains several times faster from scratch (Xiong et al. 2020, "On Layer Normalization in the
 Transformer Architecture"):
 
     h = x + out(softmax(q k^T / sqrt(d)) v)                q, k, v of norm_1(x)
@@ -23,7 +23,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 
 def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
@@ -64,6 +64,25 @@ def add_rows(
     return x + jnp.broadcast_to(rows, x.shape)
 
 
+def fold_frames(x: Float[Array, "*batch frames features"], n: int) -> Array:
+    """Puts n neighbouring frames into one row.
+
+    Args:
+      x: Frames; their number is a multiple of n.
+      n: Frames a row.
+
+    Returns:
+      Rows of n times as many features.
+
+    Raises:
+      ValueError: if the number of frames is not a multiple of n.
+    """
+    frames, features = x.shape[-2:]
+    if frames % n:
+        raise ValueError(f"{frames} frames are no multiple of frames_per_token {n}")
+    return x.reshape(*x.shape[:-2], frames // n, n * features)
+
+
 def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Exact GELU: x times the normal distribution's probability of less than x.
 
@@ -80,6 +99,9 @@ def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     Source: Hendrycks & Gimpel 2016; PyTorch's formula.
     """
     return x * (0.5 + 0.5 * jax.lax.erf(x * np.float32(np.sqrt(0.5))))
+
+
+_ACTIVATIONS = {"gelu": gelu, "selu": nn.selu}
 
 
 class Projections(NamedTuple):
@@ -122,7 +144,7 @@ class TimeEmbedding(nn.Module):
 
 
 class EncoderLayer(nn.Module):
-    """Transformer encoder layer without an attention mask.
+    """Transformer encoder layer.
 
     Attributes:
       width: Channels of a token.
@@ -130,6 +152,7 @@ class EncoderLayer(nn.Module):
       hidden: Channels of the feed-forward layer.
       dropout: Rate on attention weights, and on the three branch outputs.
       norm: "post", or "pre"; see the module's docstring.
+      activation: Of the feed-forward layer.
     """
 
     width: int
@@ -137,6 +160,7 @@ class EncoderLayer(nn.Module):
     hidden: int
     dropout: float
     norm: Literal["post", "pre"] = "post"
+    activation: Literal["gelu", "selu"] = "gelu"
 
     def setup(self):
         """Makes projections, feed-forward layers and norms."""
@@ -179,6 +203,7 @@ class EncoderLayer(nn.Module):
         projections: Projections,
         *,
         train: bool,
+        mask: Bool[Array, "*batch tokens"] | None = None,
     ) -> Float[Array, "*batch queries width"]:
         """The rest of the layer for the tokens that the queries came from.
 
@@ -186,6 +211,7 @@ class EncoderLayer(nn.Module):
           x: Tokens of the queries.
           projections: Queries of those tokens, keys and values of all tokens.
           train: Whether to drop.
+          mask: Tokens that may be attended to; None for all.
 
         Returns:
           Tokens of the next layer.
@@ -195,10 +221,14 @@ class EncoderLayer(nn.Module):
         # [heads, tokens, channels] once, so that both products are plain matmuls.
         query, key, value = (jnp.swapaxes(y, -2, -3) for y in (query, key, value))
         logits = query @ jnp.swapaxes(key, -1, -2) / np.sqrt(query.shape[-1])
+        if mask is not None:
+            seen = jnp.broadcast_to(mask[..., None, None, :], logits.shape)
+            logits = jnp.where(seen, logits, jnp.finfo(logits.dtype).min)
         weights = drop(jax.nn.softmax(logits, axis=-1))
         mixed = jnp.swapaxes(weights @ value, -2, -3)
         x = x + drop(self.out(mixed.reshape(x.shape)))
-        feed = lambda y: drop(self.contract(drop(gelu(self.expand(y)))))  # noqa: E731
+        act = _ACTIVATIONS[self.activation]
+        feed = lambda y: drop(self.contract(drop(act(self.expand(y)))))  # noqa: E731
         if self.norm == "pre":
             return x + feed(self.norm_2(x))
         x = self.norm_1(x)
@@ -210,6 +240,7 @@ class EncoderLayer(nn.Module):
         *,
         train: bool,
         last: int | None = None,
+        mask: Bool[Array, "*batch tokens"] | None = None,
     ) -> Float[Array, "*batch out width"]:
         """The whole layer.
 
@@ -217,11 +248,15 @@ class EncoderLayer(nn.Module):
           x: Tokens.
           train: Whether to drop.
           last: Return only the last so many tokens; None for all.
+          mask: Tokens that may be attended to; None for all.
 
         Returns:
           Tokens of the next layer.
         """
         projections = self.project(x, last=last)
         return self.attend(
-            x if last is None else x[..., -last:, :], projections, train=train
+            x if last is None else x[..., -last:, :],
+            projections,
+            train=train,
+            mask=mask,
         )

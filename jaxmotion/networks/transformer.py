@@ -46,25 +46,6 @@ class Context:
     steps: Float[Array, "*stack steps width"]
 
 
-def fold_frames(x: Float[Array, "*batch frames features"], n: int) -> Array:
-    """Puts n neighbouring frames into one row.
-
-    Args:
-      x: Frames; their number is a multiple of n.
-      n: Frames a row.
-
-    Returns:
-      Rows of n times as many features.
-
-    Raises:
-      ValueError: if the number of frames is not a multiple of n.
-    """
-    frames, features = x.shape[-2:]
-    if frames % n:
-        raise ValueError(f"{frames} frames are no multiple of frames_per_token {n}")
-    return x.reshape(*x.shape[:-2], frames // n, n * features)
-
-
 class CamdmTransformer(nn.Module):
     """The denoiser.
 
@@ -156,9 +137,9 @@ class CamdmTransformer(nn.Module):
         tokens = jnp.concatenate(
             [
                 self.embed_label(label)[..., None, :],
-                self.embed_path(fold_frames(path, n)),
-                self.embed_facing(fold_frames(facing, n)),
-                self.embed_past(fold_frames(kept, n)),
+                self.embed_path(blocks.fold_frames(path, n)),
+                self.embed_facing(blocks.fold_frames(facing, n)),
+                self.embed_past(blocks.fold_frames(kept, n)),
             ],
             axis=-2,
         )
@@ -193,7 +174,7 @@ class CamdmTransformer(nn.Module):
         batch, outputs = x_t.shape[:-2], self.num_outputs
         step = jnp.broadcast_to(context.steps[t], (*batch, self.width))
         noisy = blocks.add_rows(
-            self.embed_noisy(fold_frames(x_t, self.frames_per_token)),
+            self.embed_noisy(blocks.fold_frames(x_t, self.frames_per_token)),
             self.positions()[-outputs:],
         )
         ends = jnp.concatenate(

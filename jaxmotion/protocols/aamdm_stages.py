@@ -1,173 +1,25 @@
-"""Stages of AAMDM's training and what each leaves behind.
+"""AAMDM's stages: its windows of frames, and its space on disk."""
 
-Every stage has a folder of its own with checkpoints and losses. Its JSON says which
-stage it is, so that one cannot be taken for another.
-"""
-
-import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from jaxmotion.learning import checkpoint, loop, training
+from jaxmotion.learning import checkpoint
+from jaxmotion.protocols import stages
 from jaxmotion.protocols.aamdm_data import PoseData, starts
+from jaxmotion.protocols.stages import Budget as Budget
+from jaxmotion.protocols.stages import make_optimizer as make_optimizer
 from jaxmotion.systems.aamdm_space import Space
-from jaxmotion.typing import Key, Params
+from jaxmotion.typing import Key
 
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Budget:
-    """How a stage is trained.
-
-    Attributes:
-      steps: Updates.
-      batch: Windows an update (paper: 64).
-      optimizer: "muon" or "adamw" with cosine decay, or the paper's "radam".
-      learning_rate: Of the optimiser (paper: 1e-4 for a million updates).
-      ema: Decay of the parameters' moving average.
-      chunk: Updates of one compiled call.
-      save_every: Updates between checkpoints.
-      seed: Of parameters and batches.
-    """
-
-    steps: int
-    batch: int = 64
-    optimizer: Literal["muon", "adamw", "radam"] = "muon"
-    learning_rate: float = 2e-3
-    ema: float = 0.999
-    chunk: int = 100
-    save_every: int = 1000
-    seed: int = 0
-
-
-def make_optimizer(budget: Budget) -> training.Optimizer:
-    """The optimiser of a budget.
-
-    Args:
-      budget: How a stage is trained.
-
-    Returns:
-      The optimiser.
-    """
-    if budget.optimizer == "radam":
-        return training.radam(learning_rate=budget.learning_rate)
-    make = {"muon": training.muon_cosine, "adamw": training.adamw_cosine}
-    return make[budget.optimizer](
-        learning_rate=budget.learning_rate,
-        num_steps=budget.steps,
-        warmup_steps=min(100, budget.steps // 10),
-        final_fraction=0.05,
-    )
-
-
-def check_stage(folder: Path, stage: str) -> dict[str, Any]:
-    """JSON of a stage's newest checkpoint.
-
-    Args:
-      folder: The stage's folder.
-      stage: Which stage it must be.
-
-    Returns:
-      The JSON object.
-
-    Raises:
-      CheckpointError: if there is no checkpoint, or it is of another stage or system;
-        names the folder.
-    """
-    value = checkpoint.load_config(folder / "checkpoints")
-    for field, expected in (("system", "aamdm"), ("stage", stage)):
-        if value.get(field) != expected:
-            raise checkpoint.CheckpointError(
-                f"{folder}: field {field!r} is {value.get(field)!r}, expected "
-                f"{expected!r}: the checkpoint is of another stage"
-            )
-    return value
-
-
-def fit(
-    folder: Path,
-    state: Any,
-    update: Callable,
-    sample_batch: Callable[[Key, Any], Any],
-    data: Any,
-    *,
-    stage: str,
-    budget: Budget,
-    config: dict[str, Any],
-    show: tuple[str, ...] = ("loss",),
-) -> Any:
-    """Trains a stage, from its newest checkpoint if there is one.
-
-    Args:
-      folder: The stage's folder.
-      state: Of a new run.
-      update: Of the state by a batch.
-      sample_batch: `(key, data) -> batch`.
-      data: Arrays.
-      stage: Its name.
-      budget: How long.
-      config: JSON of what rebuilds the stage's networks.
-      show: Names on the progress bar.
-
-    Returns:
-      The last state.
-
-    Raises:
-      CheckpointError: if the folder holds another stage, or other sizes.
-      ValueError: if the checkpoint has other settings; names the field.
-      TrainingDiverged: if a loss is not finite.
-    """
-    value = {"system": "aamdm", "stage": stage} | config
-    if checkpoint.latest_step(folder / "checkpoints") is not None:
-        found = check_stage(folder, stage)
-        differ = sorted(k for k in value if found.get(k) != value[k])
-        if differ:
-            raise ValueError(
-                f"{folder}: trained with other {', '.join(differ)}: expected "
-                f"{[value[k] for k in differ]}, found {[found.get(k) for k in differ]}"
-            )
-        state = checkpoint.restore(folder / "checkpoints", state)
-    run = training.train_chunk(update, sample_batch, num_steps=budget.chunk)
-    settings = loop.Loop(
-        num_steps=budget.steps,
-        chunk=budget.chunk,
-        save_every=budget.save_every,
-        folder=folder,
-        config=value,
-        show=show,
-    )
-    key = jax.random.fold_in(jax.random.key(budget.seed), 1)
-    return loop.train(run, state, key, data, loop=settings)
-
-
-def load_params(
-    folder: Path, stage: str, init: Callable[[], Params], *, adversarial: bool = False
-) -> Params:
-    """Averaged parameters of a stage.
-
-    Args:
-      folder: The stage's folder.
-      stage: Which stage it must be.
-      init: Makes parameters of the same shapes; never run.
-      adversarial: Whether the stage trained a generator against a discriminator.
-
-    Returns:
-      The parameters.
-
-    Raises:
-      CheckpointError: if there is none, or it is of another stage or size.
-    """
-    check_stage(folder, stage)
-    found = checkpoint.restore_part(
-        folder / "checkpoints",
-        {"ema_params": jax.eval_shape(init)},
-        within="generator" if adversarial else None,
-    )
-    return found["ema_params"]
+check_stage = functools.partial(stages.check_stage, system="aamdm")
+fit = functools.partial(stages.fit, system="aamdm")
+load_params = functools.partial(stages.load_params, system="aamdm")
 
 
 def frame_windows(

@@ -1,9 +1,12 @@
 """What an experiment leaves behind: a rollout to look at, and a table to cite."""
 
 import json
+import os
+import platform
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -17,19 +20,21 @@ def write_rollout(
     folder: Path,
     bones: skeleton.Skeleton,
     motion: skeleton.Motion,
-    desired_velocity: Float[Array, "frames 2"],
+    desired_velocity: Float[Array, "frames 2"] | None,
     *,
     title: str,
+    name: str = "rollout",
 ) -> None:
-    """Writes rollout.bvh, rollout.gif and rollout.html.
+    """Writes a motion as BVH, GIF and HTML.
 
     Args:
       folder: Where to; it must exist.
       bones: The skeleton.
       motion: Frames of one character, world.
       desired_velocity: What was commanded, metres a second; its integral is drawn as
-        the commanded path.
+        the commanded path. None if nothing was.
       title: Of the pictures.
+      name: Of the files, without their ends.
 
     Raises:
       OSError: if a file cannot be written.
@@ -38,16 +43,19 @@ def write_rollout(
     from jaxmotion.viz import animation, html
 
     fps = motion.fps
-    bvh.write_bvh(folder / "rollout.bvh", bvh.bvh_from_motion(bones, motion))
+    bvh.write_bvh(folder / f"{name}.bvh", bvh.bvh_from_motion(bones, motion))
     positions = np.asarray(skeleton.joint_positions(bones, motion))
     walked = positions[:, 0, ::2]
-    commanded = np.asarray(presets.integrate_path(desired_velocity, fps)) + walked[0]
+    commanded = None
+    if desired_velocity is not None:
+        path = presets.integrate_path(desired_velocity, fps)
+        commanded = np.asarray(path) + walked[0]
     shown = dict(
         fps=fps, names=bones.names, commanded=commanded, walked=walked, title=title
     )
-    animation.save_gif(folder / "rollout.gif", positions, bones.parents, **shown)
-    html.save_html(folder / "rollout.html", positions, bones.parents, **shown)
-    print(f"wrote rollout.bvh, rollout.gif and rollout.html to {folder}")
+    animation.save_gif(folder / f"{name}.gif", positions, bones.parents, **shown)
+    html.save_html(folder / f"{name}.html", positions, bones.parents, **shown)
+    print(f"wrote {name}.bvh, {name}.gif and {name}.html to {folder}")
 
 
 def write_table(
@@ -65,3 +73,19 @@ def write_table(
     text = table.to_markdown(rows)
     (folder / "table.md").write_text(text + "\n")
     print(text)
+
+
+def provenance() -> dict[str, Any]:
+    """What a table was made with.
+
+    Returns:
+      Versions, processor, its number of cores, and devices, as a JSON object.
+    """
+    return {
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+        "devices": [str(device) for device in jax.devices()],
+    }

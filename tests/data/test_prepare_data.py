@@ -1,13 +1,14 @@
 import importlib.util
 import os
+import pickle
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jaxmotion.data import clips_io
-from tests.data import test_builders
+from jaxmotion.data import clips_io, text_motion_io
+from tests.data import test_builders, test_text_builders
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "prepare_data.py"
 
@@ -51,6 +52,37 @@ def test_published_clips_are_written_mirrored_and_resampled(
     assert clips_io.load_clips(out).clip_names == ("dataset-2_walk_elderly_001",)
 
 
+def test_sets_with_captions_are_written(script, tmp_path, capsys):
+    test_text_builders.put(tmp_path, 251, inner=".")
+    out = tmp_path / "data" / "k.npz"
+    options = {"source": "kit_ml", "out": out, "manual_dir": tmp_path / "raw"}
+    script.main(script.Config(**options, cut_fps=12.5))
+    found = text_motion_io.load_text_motions(out)
+    assert (found.num_clips, found.num_features, found.fps) == (6, 251, 12.5)
+    printed = capsys.readouterr().out
+    # One clip was cut by its caption, to frames 12..42.
+    for word in ("clips    6", "train 4, val 1, test 1", "captions 7", "frames   509"):
+        assert word in printed
+    for change in ({"mirror": True}, {"fps": 20.0}):
+        with pytest.raises(ValueError, match="--mirror and --fps do not apply"):
+            script.main(script.Config(**options, overwrite=True, **change))
+
+
+def test_humanact12_keeps_its_rate(script, tmp_path):
+    bones = np.random.default_rng(9).normal(size=(24, 3)) * 0.2
+    pose, joints = test_text_builders.smpl_clip(0, 4, bones)
+    (tmp_path / "raw").mkdir()
+    content = {"poses": [pose], "joints3D": [joints], "y": [2]}
+    (tmp_path / "raw" / "humanact12poses.pkl").write_bytes(pickle.dumps(content))
+    out = tmp_path / "a.npz"
+    script.main(
+        script.Config(source="humanact12", out=out, manual_dir=tmp_path / "raw")
+    )
+    found = clips_io.load_clips(out)
+    assert (found.fps, found.num_frames) == (20.0, 4)
+    assert found.clip_names == ("clip0000_run",)
+
+
 def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
     base = {"source": "bandai_namco/2", "manual_dir": raw, "out": tmp_path / "o.npz"}
     (tmp_path / "file").write_text("")
@@ -60,6 +92,7 @@ def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
         ({"out": tmp_path / "file" / "o.npz"}, OSError, "file"),
         ({"out": tmp_path}, IsADirectoryError, "is a folder"),
         ({"fps": 0.0}, ValueError, "--fps"),
+        ({"cut_fps": -1.0}, ValueError, "--cut-fps"),
     ]
     for change, error, message in cases:
         with pytest.raises(error, match=message):

@@ -129,7 +129,7 @@ def test_encode_and_denoise_are_the_plain_network(name):
     net, variables = KINDS[name], parameters(name)
 
     def plain(net, x_t, t, past, path, facing, label, keep_past):
-        fold = lambda x: transformer.fold_frames(x, net.frames_per_token)  # noqa: E731
+        fold = lambda x: blocks.fold_frames(x, net.frames_per_token)  # noqa: E731
         tokens = jnp.concatenate(
             [
                 net.embed_time(net.num_steps)[t][None],
@@ -171,10 +171,10 @@ def test_dropout_only_in_training_and_by_its_key(name):
 
 def test_frames_fold_in_order_and_must_divide():
     x = jnp.arange(12.0).reshape(6, 2)
-    folded = transformer.fold_frames(x, 3)
+    folded = blocks.fold_frames(x, 3)
     np.testing.assert_array_equal(folded, np.arange(12.0).reshape(2, 6))
     with pytest.raises(ValueError, match="6 frames are no multiple.*4"):
-        transformer.fold_frames(x, 4)
+        blocks.fold_frames(x, 4)
 
 
 def test_positions_are_sines_and_cosines():

@@ -1,0 +1,212 @@
+"""EMDM and what it is compared with: train, evaluate, sample.
+
+Examples:
+  python experiments/prepare_data.py bandai_namco/1 --manual-dir ../shared/data/bandai_namco --out data/bandai1.npz
+  python experiments/prepare_data.py bandai_namco/2 --manual-dir ../shared/data/bandai_namco --out data/bandai2.npz
+  python experiments/emdm.py train --task action --out runs/emdm_action
+  python experiments/emdm.py evaluate --run runs/emdm_action
+  python experiments/emdm.py sample --run runs/emdm_action --action bow
+  python experiments/emdm.py train --task text --out runs/emdm_text
+  python experiments/emdm.py sample --run runs/emdm_text --text "an elderly person walks and turns left"
+"""  # noqa: E501
+
+import dataclasses
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from emdm_tasks import evaluation, sampling, setup
+
+from jaxmotion.learning import loop
+from jaxmotion.protocols import emdm_runs, stages
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train rows of EMDM's tables; what a folder has already is not trained again.
+
+    Example: python experiments/emdm.py train --task action --out runs/emdm_action
+
+    Attributes:
+      task: What motions are made from.
+      data: Clips from prepare_data.py, of one skeleton; for texts also one file of text
+        motions (humanml3d, kit_ml).
+      out: Run folder.
+      rows: What to train; "emdm" alone is the system.
+      field: Label field that is the action.
+      merge: Labels that name the same action as others, "old=new".
+      least: Fewest clips of an action.
+      encoder: Of texts: "wordllama", "hashed", or a folder with CLIP's weights.
+      unseen: "content/style" pairs whose clips are kept for evaluation (texts).
+      frames: Longest motion; None for 60 (actions) or 120 (texts).
+      fps: Frames a second; None for 15 (actions) or 20 (texts).
+      held_out: Part of the clips kept for evaluation.
+      steps: Updates of each GAN.
+      ddpm_steps: Updates of each diffusion model, which are cheaper.
+      batch: Motions an update.
+      width: Channels of a token.
+      depth: Layers.
+      hidden: Channels of the feed-forward layers.
+      dropout: Rate (paper: 0.1; short trainings do without).
+      frames_per_token: Frames of one token (paper: 1).
+      discriminator_width: Channels of the discriminator's first layers.
+      recon: Weight R of the features' error; None for 1 (actions) or 100 (texts).
+      geometry: Joints relative to the "root" (as released) or in the "world".
+      learning_rate: Of the generator.
+      seed: Of everything random.
+    """
+
+    task: emdm_runs.TaskName = "action"
+    data: tuple[Path, ...] = (Path("data/bandai1.npz"), Path("data/bandai2.npz"))
+    out: Path = Path("runs/emdm_action")
+    rows: tuple[str, ...] = ("emdm",)
+    field: str = "content"
+    merge: tuple[str, ...] = (
+        "bye=wave-right-hand",
+        "byebye=wave-both-hands",
+        "dash=run",
+    )
+    least: int = 10
+    encoder: str = "wordllama"
+    unseen: tuple[str, ...] = (
+        "walk-turn-left/elderly",
+        "run/feminine",
+        "wave-both-hands/exhausted",
+        "raise-up-right-hand/youthful",
+    )
+    frames: int | None = None
+    fps: float | None = None
+    held_out: float = 0.1
+    steps: int = 4000
+    ddpm_steps: int = 6000
+    batch: int = 32
+    width: int = 128
+    depth: int = 4
+    hidden: int = 384
+    dropout: float = 0.0
+    frames_per_token: int = 4
+    discriminator_width: int = 128
+    recon: float | None = None
+    geometry: Literal["root", "world"] = "root"
+    learning_rate: float = 2e-3
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Score every trained row beside real motions; writes metrics.json and table.md.
+
+    Example: python experiments/emdm.py evaluate --run runs/emdm_action
+
+    Attributes:
+      run: Run folder of `train`.
+      rows: Which rows and samplers (ddim_10); none: all that were trained.
+      out: Folder; None for <run>/evaluation.
+      samples: Motions of a replication (actions: rounded down to as many of each).
+      replications: Sets of motions of each row.
+      long_replications: Likewise, of rows with 500 network calls and more.
+      scale: Of classifier-free guidance; None for 1 (actions) or 2.5 (texts), the
+        paper's.
+      evaluator_steps: Updates of the recogniser or the text-motion evaluator.
+      matcher: Published weights of the text-motion evaluator; None trains one here.
+      seed: Of noise and pairs.
+    """
+
+    run: Path = Path("runs/emdm_action")
+    rows: tuple[str, ...] = ()
+    out: Path | None = None
+    samples: int = 1000
+    replications: int = 20
+    long_replications: int = 2
+    scale: float | None = None
+    evaluator_steps: int = 1500
+    matcher: Path | None = None
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """Make motions; writes BVH, GIF and HTML of each.
+
+    Example: python experiments/emdm.py sample --run runs/emdm_action --action bow
+
+    Attributes:
+      run: Run folder of `train`.
+      row: Which model.
+      action: Action, for a run of actions; several make several motions.
+      text: Sentence, for a run of texts; several make several motions.
+      frames: Length; None for the model's longest.
+      scale: Of classifier-free guidance; None for 1 (actions) or 2.5 (texts).
+      out: Folder; None for <run>/samples.
+      seed: Of the noise.
+    """
+
+    run: Path = Path("runs/emdm_action")
+    row: str = "emdm"
+    action: tuple[str, ...] = ()
+    text: tuple[str, ...] = ()
+    frames: int | None = None
+    scale: float | None = None
+    out: Path | None = None
+    seed: int = 0
+
+
+def train(args: Train) -> None:
+    """Trains row by row."""
+    emdm_runs.check_rows(args.rows)
+    loop.check_writable(args.out)
+    task = setup.prepare(args)
+    for row in args.rows:
+        if row in emdm_runs.SAMPLERS:
+            raise ValueError(
+                f"row {row!r} samples {emdm_runs.SAMPLERS[row][0]!r}: train that"
+            )
+        begun = time.perf_counter()
+        latent = emdm_runs.row_config(task.base, row).latent
+        budget = stages.Budget(
+            steps=args.steps if latent else args.ddpm_steps,
+            batch=args.batch,
+            learning_rate=args.learning_rate,
+            seed=args.seed,
+        )
+        judge = dataclasses.replace(budget, optimizer="adam", learning_rate=2e-4)
+        emdm_runs.train_row(args.out, task, row, generator=budget, discriminator=judge)
+        print(f"{row}: {time.perf_counter() - begun:.0f} s", flush=True)
+
+
+def evaluate(args: Evaluate) -> None:
+    """Writes the table."""
+    emdm_runs.check_rows(args.rows)
+    out = args.out or args.run / "evaluation"
+    loop.check_writable(out)
+    evaluation.evaluate(args, out)
+
+
+def sample(args: Sample) -> None:
+    """Writes one motion for each action or sentence."""
+    out = args.out or args.run / "samples"
+    loop.check_writable(out)
+    sampling.sample(args, out)
+
+
+Command = (
+    Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Sample, tyro.conf.subcommand("sample")]
+)
+
+
+def main() -> None:
+    """Parses the command line and runs the command."""
+    args = tyro.cli(Command, description=__doc__)
+    run = {Train: train, Evaluate: evaluate, Sample: sample}
+    run[type(args)](args)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (OSError, ValueError, loop.TrainingDiverged) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,94 @@
+"""Scores of motions made from actions, or from nothing."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from emdm_tasks.judge import Judge
+from emdm_tasks.scores import cells
+from jaxmotion.motion import skeleton
+from jaxmotion.protocols import emdm_action
+from jaxmotion.systems import emdm, emdm_motion
+
+
+def make_judge(args: Any) -> Judge:
+    """The recogniser of a run, and real motions' scores.
+
+    Motions made from nothing are compared with real ones of all actions; they have no
+    accuracy and no multimodality.
+
+    Args:
+      args: Of `emdm.py evaluate`.
+
+    Returns:
+      The judge.
+
+    Raises:
+      ValueError: if the run has other data, or there are too few samples.
+    """
+    run = emdm_action.load_run(args.run)
+    number = len(run.actions)
+    each = args.samples // number
+    if each < 2:
+        raise ValueError(
+            f"samples is {args.samples}, expected at least 2 for each of {number} "
+            "actions"
+        )
+    recognizer = emdm_action.load_recognizer(
+        run, num_steps=args.evaluator_steps, seed=0
+    )
+    wanted = jnp.repeat(jnp.arange(number), each)
+    key_reference, key_real = jax.random.split(jax.random.key(args.seed))
+    key_motion, key_state = jax.random.split(key_reference)
+    truth = emdm_action.real_positions(run, run.train, key_motion, wanted)
+    reference = emdm_action.moments(run, recognizer)(key_state, truth)
+    score = emdm_action.scorer(run, recognizer, reference)
+
+    def score_real(part) -> dict:
+        def once(key: Array) -> dict[str, Array]:
+            key_motion, key_score = jax.random.split(key)
+            positions = emdm_action.real_positions(run, part, key_motion, wanted)
+            return score(key_score, positions, wanted)
+
+        keys = jax.random.split(key_real, args.replications)
+        return cells([once(key) for key in keys])
+
+    conditional = run.config["task"] == "action"
+    config = emdm_action.make_task(
+        run, emdm.Config(features=1), conditional=conditional
+    ).base
+    vectors = jax.nn.one_hot(wanted, config.condition_size)
+    conditions = emdm.make_condition(vectors, config=config)
+
+    def score_row(key: Array, many) -> dict[str, Array]:
+        key_sample, key_score = jax.random.split(key)
+        x = many(key_sample, conditions, scale)
+        motion = emdm_motion.to_motion(x, run.representation)
+        positions = skeleton.joint_positions(run.clips.skeleton, motion)
+        found = score(key_score, positions, wanted)
+        if not conditional:
+            found = {
+                k: found[k] for k in found if k not in ("accuracy", "multimodality")
+            }
+        return found
+
+    scale = None if args.scale in (None, 1.0) else jnp.float32(args.scale)
+    return Judge(
+        real={
+            "real (training clips)": score_real(run.train),
+            "real (held-out clips)": score_real(run.held_out),
+        },
+        score=score_row,
+        scale=scale,
+        one=jax.tree.map(lambda x: x[0], conditions),
+        samples=each * number,
+        describe={
+            "recognizer": "GRU 2 x 128, tanh 30, joint positions; trained on "
+            f"{run.clips.source}, {args.evaluator_steps} updates, seed 0",
+            "reference": f"{each * number} real motions of training clips, actions "
+            "uniform",
+            "ground height m": emdm_action.ground_height(run),
+        },
+    )

@@ -1,0 +1,117 @@
+"""The table of a run: rows beside real motions, with intervals over replications."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from emdm_tasks import actions, texts
+from emdm_tasks.scores import cells
+from jaxmotion.evaluation.table import Cell
+from jaxmotion.protocols import artifacts, emdm_runs
+from jaxmotion.protocols.camdm_runs import arguments_json
+from jaxmotion.systems import emdm
+
+# Rows with so many network calls a motion are replicated less often.
+_LONG = 500
+_CHUNK = 32
+
+
+def calls(config: emdm.Config, row: str) -> int:
+    """Network calls of one motion.
+
+    Args:
+      config: Of the row.
+      row: Its name.
+
+    Returns:
+      Steps of its sampler.
+    """
+    return emdm_runs.SAMPLERS[row][1] if row in emdm_runs.SAMPLERS else config.num_steps
+
+
+def trained_rows(folder: Path) -> tuple[str, ...]:
+    """Rows and samplers that a run folder can show.
+
+    Args:
+      folder: The run folder.
+
+    Returns:
+      Their names.
+    """
+    rows = [row for row in emdm_runs.ROWS if (folder / row / "checkpoints").is_dir()]
+    more = [name for name, (row, _) in emdm_runs.SAMPLERS.items() if row in rows]
+    return (*rows, *more)
+
+
+def milliseconds_a_frame(
+    sample: emdm.Sample, condition: emdm.Condition, scale: Array | None, frames: int
+) -> Cell:
+    """Time of one motion at batch 1, per frame, as the paper gives it.
+
+    Args:
+      sample: The sampler; its parameters are constants of the program.
+      condition: Of one motion.
+      scale: Of the guidance.
+      frames: Of a motion.
+
+    Returns:
+      Median over calls for two seconds, at least 3; ends of the middle half.
+    """
+    run = jax.jit(lambda key: sample(key, condition, scale=scale))
+    jax.block_until_ready(run(jax.random.key(0)))
+    times: list[float] = []
+    while len(times) < 3 or (sum(times) < 2.0 and len(times) < 200):
+        begun = time.perf_counter()
+        jax.block_until_ready(run(jax.random.key(len(times))))
+        times.append(time.perf_counter() - begun)
+    low, middle, high = np.quantile(times, [0.25, 0.5, 0.75]) * 1000 / frames
+    return Cell(
+        value=float(middle), low=float(low), high=float(high), samples=len(times)
+    )
+
+
+def evaluate(args: Any, out: Path) -> None:
+    """Scores every row and writes the table.
+
+    Args:
+      args: Of `emdm.py evaluate`.
+      out: Folder for metrics.json and table.md.
+
+    Raises:
+      ValueError: if nothing was trained, or a row was not.
+    """
+    value = emdm_runs.read_config(args.run)
+    rows = args.rows or trained_rows(args.run)
+    if not rows:
+        raise ValueError(f"{args.run}: no row was trained")
+    kind = texts if value["task"] == "text" else actions
+    judge = kind.make_judge(args)
+    found: dict[str, dict[str, Cell]] = dict(judge.real)
+    for row in rows:
+        begun = time.perf_counter()
+        params, config = emdm_runs.load_row(args.run, row)
+        sample = emdm_runs.row_sampler(params, config, row)
+        number = calls(config, row)
+        count = args.long_replications if number >= _LONG else args.replications
+        scale = judge.scale
+        many = emdm_runs.sample_many(sample, chunk=_CHUNK)
+        score: Callable[[Array], Any] = lambda key: judge.score(key, many)  # noqa: B023, E731
+        keys = jax.random.split(jax.random.key(args.seed + 1), args.replications)
+        results = [score(key) for key in keys[:count]]
+        found[row] = cells(results) | {
+            "ms a frame": milliseconds_a_frame(sample, judge.one, scale, config.frames),
+            "network calls": Cell(value=number),
+        }
+        seconds = time.perf_counter() - begun
+        print(f"{row}: {count} x {judge.samples}, {seconds:.0f} s", flush=True)
+    report = {
+        "arguments": arguments_json(args),
+        "run": value,
+        "evaluator": judge.describe,
+    } | artifacts.provenance()
+    artifacts.write_table(out, found, report)

@@ -1,0 +1,31 @@
+"""What scores the rows of one run."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from jaxtyping import Array
+
+from jaxmotion.evaluation.table import Cell
+from jaxmotion.systems import emdm
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Judge:
+    """An evaluator with the rows of real motions.
+
+    Attributes:
+      real: Rows of real motions.
+      score: `(key, many) -> scores` of one replication of what `many` samples.
+      scale: Of the guidance; None for none.
+      one: Condition of one motion, to measure times with.
+      samples: Motions of a replication.
+      describe: JSON that says what the evaluator is.
+    """
+
+    real: dict[str, dict[str, Cell]]
+    score: Callable[[Array, Callable[..., Array]], dict[str, Array]]
+    scale: Array | None
+    one: emdm.Condition
+    samples: int
+    describe: dict[str, Any]

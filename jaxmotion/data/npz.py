@@ -1,0 +1,99 @@
+"""Named arrays on disk: one npz file without pickles, written whole or not at all."""
+
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+
+import numpy as np
+
+
+def write_npz(path: str | os.PathLike, fields: Mapping[str, np.ndarray]) -> None:
+    """Writes arrays; the file appears under its name only when it is whole.
+
+    Args:
+      path: File to write; its folder is made if need be.
+      fields: The arrays.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    path = os.fspath(path)
+    os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
+    temporary = f"{path}.{os.getpid()}.partial"
+    try:
+        with open(temporary, "wb") as file:
+            np.savez(file, **fields)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        if os.path.exists(temporary):
+            os.remove(temporary)
+
+
+def _read_arrays(path: str, what: str) -> dict[str, np.ndarray]:
+    """All arrays of the file."""
+    try:
+        file = np.load(path, allow_pickle=False)
+        if not isinstance(file, np.lib.npyio.NpzFile):
+            raise ValueError("an array, not an npz archive")
+        with file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no {what} file {path!r}") from None
+    except (ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
+        raise ValueError(
+            f"{path}: not a {what} file, or a damaged one ({error})"
+        ) from None
+
+
+def read_npz(
+    path: str | os.PathLike,
+    wanted: Mapping[str, tuple[str, int]],
+    *,
+    what: str,
+    format_name: str,
+    version: int,
+) -> dict[str, np.ndarray]:
+    """Reads what `write_npz` wrote; each array of the expected kind.
+
+    Args:
+      path: The file.
+      wanted: For each field the kind of its numbers ("f" float, "i" integer, "U" text)
+        and how many axes it has.
+      what: What the file holds, for messages.
+      format_name: Expected value of its field "format".
+      version: Expected value of its field "version".
+
+    Returns:
+      All its arrays.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is damaged, foreign, of another version, or lacks a field; names
+        the file and the field.
+    """
+    path = os.fspath(path)
+    fields = _read_arrays(path, what)
+    if str(fields.get("format")) != format_name:
+        raise ValueError(
+            f"{path}: not a {what} file: its field 'format' should be {format_name!r}; "
+            f"it has the fields {', '.join(sorted(fields)) or 'none'}"
+        )
+    found_version = fields.get("version")
+    if found_version is None or found_version.ndim or found_version != version:
+        raise ValueError(
+            f"{path}: version {found_version} of the {what} format, expected "
+            f"{version}; prepare the data again"
+        )
+    for name, (kind, axes) in wanted.items():
+        if name not in fields:
+            raise ValueError(f"{path}: field {name!r} is missing")
+        found = fields[name]
+        if found.dtype.kind != kind or found.ndim != axes:
+            raise ValueError(
+                f"{path}: field {name!r} should have {axes} axes of kind {kind!r}, "
+                f"found shape {found.shape} of {found.dtype}"
+            )
+    return fields

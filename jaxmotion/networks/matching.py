@@ -1,0 +1,233 @@
+"""Encoders of motions and sentences into one space, the evaluator of text-to-motion.
+
+A motion's features go by strided convolutions to movements of `UNIT` frames and then
+through a bidirectional GRU; a sentence's words go through another. The final states
+of both directions become the embedding. Layers, their order and their widths are the
+published ones, so that published weights fit (`learning/published.py`).
+
+The GRU of Flax is PyTorch's: with gates r, z and candidate n,
+
+    n = tanh(W_in x + b_in + r (W_hn h + b_hn)),   h' = (1 - z) n + z h,
+
+but r and z have one bias where PyTorch adds two.
+
+Source: Guo et al. 2022 (T2M), text and motion feature extractors; released code.
+"""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+UNIT = 4  # frames of a movement: two convolutions of stride 2
+
+_XAVIER = nn.initializers.xavier_normal()
+_SLOPE = 0.2
+
+
+class MovementEncoder(nn.Module):
+    """Two convolutions of width 4 and stride 2, and a linear layer.
+
+    Attributes:
+      width: Channels of each layer.
+      dropout: Rate after each convolution.
+    """
+
+    width: int = 512
+    dropout: float = 0.2
+
+    def setup(self):
+        """Makes the layers."""
+        halve = dict(strides=(2,), padding=((1, 1),), kernel_init=_XAVIER)
+        self.convolution_1 = nn.Conv(self.width, (4,), **halve)
+        self.convolution_2 = nn.Conv(self.width, (4,), **halve)
+        self.out = nn.Dense(self.width, kernel_init=_XAVIER)
+        self.drop = nn.Dropout(self.dropout)
+
+    def __call__(
+        self, x: Float[Array, "batch frames channels"], *, train: bool = False
+    ) -> Float[Array, "batch units width"]:
+        """Encodes movements.
+
+        Args:
+          x: Frames; those beyond the last whole movement are dropped.
+          train: Whether to drop; needs rngs={"dropout": key}.
+
+        Returns:
+          One row for `UNIT` frames. A row sees 3 frames on each side of its own.
+        """
+        for convolution in (self.convolution_1, self.convolution_2):
+            x = self.drop(convolution(x), deterministic=not train)
+            x = nn.leaky_relu(x, _SLOPE)
+        return self.out(x)
+
+
+class SequenceEncoder(nn.Module):
+    """Linear layer, bidirectional GRU with learned first states, and two layers more.
+
+    Attributes:
+      width: Channels of the GRU, one direction.
+      embedding: Channels of the result.
+    """
+
+    width: int
+    embedding: int
+
+    def setup(self):
+        """Makes the layers."""
+        self.input = nn.Dense(self.width, kernel_init=_XAVIER)
+        self.start = self.param("start", nn.initializers.normal(1.0), (2, self.width))
+        self.forward = nn.RNN(nn.GRUCell(self.width), return_carry=True)
+        self.backward = nn.RNN(nn.GRUCell(self.width), return_carry=True, reverse=True)
+        self.hidden = nn.Dense(self.width, kernel_init=_XAVIER)
+        self.norm = nn.LayerNorm(epsilon=1e-5)
+        self.out = nn.Dense(self.embedding, kernel_init=_XAVIER)
+
+    def __call__(
+        self, x: Float[Array, "batch rows channels"], length: Int[Array, " batch"]
+    ) -> Float[Array, "batch embedding"]:
+        """Embeds sequences of different lengths.
+
+        Args:
+          x: Sequences; rows at and after a sequence's length are not read.
+          length: In 1..rows.
+
+        Returns:
+          Embeddings.
+        """
+        x = self.input(x)
+        states = []
+        for start, pass_over in zip(
+            self.start, (self.forward, self.backward), strict=True
+        ):
+            carry = jnp.broadcast_to(start[None], (x.shape[0], self.width))
+            state, _ = pass_over(x, initial_carry=carry, seq_lengths=length)
+            states.append(state)
+        x = self.norm(self.hidden(jnp.concatenate(states, axis=-1)))
+        return self.out(nn.leaky_relu(x, _SLOPE))
+
+
+class TextEncoder(nn.Module):
+    """Word vectors, plus a linear layer of their tags, through a sequence encoder.
+
+    Attributes:
+      width: Channels of the GRU, one direction.
+      embedding: Channels of the result.
+    """
+
+    width: int = 512
+    embedding: int = 512
+
+    @nn.compact
+    def __call__(
+        self,
+        vectors: Float[Array, "batch slots word"],
+        tags: Float[Array, "batch slots classes"],
+        words: Int[Array, " batch"],
+    ) -> Float[Array, "batch embedding"]:
+        """Embeds sentences of different lengths.
+
+        Args:
+          vectors: Word vectors.
+          tags: One-hot parts of speech.
+          words: Of each sentence, with its marks of start and end; in 1..slots.
+
+        Returns:
+          Embeddings.
+        """
+        tagged = nn.Dense(vectors.shape[-1], kernel_init=_XAVIER, name="tags")(tags)
+        encoder = SequenceEncoder(self.width, self.embedding, name="sequence")
+        return encoder(vectors + tagged, words)
+
+
+class Matcher(nn.Module):
+    """Both towers: motions and sentences to embeddings that can be compared.
+
+    Attributes:
+      movement_width: Channels of a movement.
+      motion_width: Channels of the motions' GRU, one direction.
+      text_width: Channels of the sentences' GRU, one direction.
+      embedding: Channels of an embedding.
+      dropout: Rate in the movement encoder.
+    """
+
+    movement_width: int = 512
+    motion_width: int = 1024
+    text_width: int = 512
+    embedding: int = 512
+    dropout: float = 0.2
+
+    def setup(self):
+        """Makes the three encoders."""
+        self.movement = MovementEncoder(self.movement_width, self.dropout)
+        self.motion = SequenceEncoder(self.motion_width, self.embedding)
+        self.text = TextEncoder(self.text_width, self.embedding)
+
+    def embed_motion(
+        self,
+        features: Float[Array, "batch frames channels"],
+        frames: Int[Array, " batch"],
+        *,
+        train: bool = False,
+    ) -> Float[Array, "batch embedding"]:
+        """Embeds motions of different lengths.
+
+        Only whole movements count, and what follows them is read as zeros. As in the
+        source the last movement's convolutions reach into that padding, so motions
+        that are to be compared are padded to one length (there 196 frames).
+
+        Args:
+          features: Normalised to mean 0 and deviation 1, without contact labels.
+          frames: Of each motion, at least `UNIT`.
+          train: Whether to drop; needs rngs={"dropout": key}.
+
+        Returns:
+          Embeddings.
+        """
+        units = frames // UNIT
+        inside = jnp.arange(features.shape[1])[None] < UNIT * units[:, None]
+        features = jnp.where(inside[..., None], features, 0.0)
+        return self.motion(self.movement(features, train=train), units)
+
+    def embed_text(
+        self,
+        vectors: Float[Array, "batch slots word"],
+        tags: Float[Array, "batch slots classes"],
+        words: Int[Array, " batch"],
+    ) -> Float[Array, "batch embedding"]:
+        """Embeds sentences of different lengths.
+
+        Args:
+          vectors: As `TextEncoder`.
+          tags: As `TextEncoder`.
+          words: As `TextEncoder`.
+
+        Returns:
+          Embeddings.
+        """
+        return self.text(vectors, tags, words)
+
+    def __call__(
+        self,
+        features: Float[Array, "batch frames channels"],
+        frames: Int[Array, " batch"],
+        vectors: Float[Array, "batch slots word"],
+        tags: Float[Array, "batch slots classes"],
+        words: Int[Array, " batch"],
+        *,
+        train: bool = False,
+    ) -> tuple[Float[Array, "batch embedding"], Float[Array, "batch embedding"]]:
+        """Both embeddings; see the two methods.
+
+        Args:
+          features: As `embed_motion`.
+          frames: As `embed_motion`.
+          vectors: As `embed_text`.
+          tags: As `embed_text`.
+          words: As `embed_text`.
+          train: Whether to drop; needs rngs={"dropout": key}.
+
+        Returns:
+          Embeddings of the sentences and of the motions.
+        """
+        motion = self.embed_motion(features, frames, train=train)
+        return self.embed_text(vectors, tags, words), motion

@@ -1,0 +1,301 @@
+"""A folder of EMDM: the data it was made from, and what was trained on them.
+
+    data.npz, config.json     clips or text motions as they are used, and their making
+    <row>/                    one trained model each: EMDM, its comparators, ablations
+    recognizer/ or matcher/   the evaluator
+
+A row is a change of the base configuration; DDIM-10 is no row of its own but another
+way to sample "ddpm_1000".
+"""
+
+import dataclasses
+import functools
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxmotion.learning import adversarial, training
+from jaxmotion.protocols import stages
+from jaxmotion.protocols.stages import Budget
+from jaxmotion.systems import emdm, emdm_loss
+from jaxmotion.systems.emdm import Config
+from jaxmotion.typing import Key, Params
+
+TaskName = Literal["action", "text", "none"]
+
+_FLAT = dict(weight_position=0.0, weight_velocity=0.0, weight_foot=0.0)
+_DDPM = dict(latent=0, schedule="cosine", weight_recon=1.0)
+# Changes of the base configuration, by row.
+ROWS: dict[str, dict[str, Any]] = {
+    "emdm": {},
+    "emdm_5": dict(num_steps=5),
+    "emdm_2": dict(num_steps=2),
+    "emdm_1": dict(num_steps=1),
+    "naive": dict(discriminator_condition=False, weight_recon=0.0, **_FLAT),
+    "ddpm_50": dict(num_steps=50, **_DDPM),
+    "ddpm_1000": dict(num_steps=1000, **_DDPM),
+    "recon_0": dict(weight_recon=0.0, **_FLAT),
+    "recon_1": dict(weight_recon=1.0, **_FLAT),
+    "recon_10": dict(weight_recon=10.0, **_FLAT),
+    "recon_100": dict(weight_recon=100.0, **_FLAT),
+    "no_r1": dict(weight_r1=0.0),
+}
+# Ways to sample that need no training of their own: row, steps to visit.
+SAMPLERS: dict[str, tuple[str, int]] = {"ddim_10": ("ddpm_1000", 10)}
+
+
+def check_rows(names: tuple[str, ...]) -> None:
+    """Raises unless all are rows or samplers.
+
+    Args:
+      names: Names.
+
+    Raises:
+      ValueError: names the first unknown one and those there are.
+    """
+    known = (*ROWS, *SAMPLERS)
+    for name in names:
+        if name not in known:
+            raise ValueError(
+                f"unknown row {name!r}: expected one of {', '.join(known)}"
+            )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Task:
+    """What models are trained on, the same for all rows.
+
+    Attributes:
+      base: Configuration of the row "emdm".
+      data: Arrays on the device.
+      batch: `(key, data, size) -> Batch`.
+      geometry: For the losses of joints; None if there are none.
+      describe: JSON that says what the data are; stored with each checkpoint.
+    """
+
+    base: Config
+    data: Any
+    batch: Callable[[Key, Any, int], emdm_loss.Batch]
+    geometry: emdm_loss.Geometry | None
+    describe: dict[str, Any]
+
+
+def row_config(base: Config, row: str) -> Config:
+    """Configuration of a row.
+
+    Args:
+      base: Of the row "emdm".
+      row: Its name, or a sampler's.
+
+    Returns:
+      The configuration.
+
+    Raises:
+      ValueError: if there is no such row.
+    """
+    check_rows((row,))
+    trained = SAMPLERS[row][0] if row in SAMPLERS else row
+    return dataclasses.replace(base, **ROWS[trained])
+
+
+def _config_json(config: Config) -> dict[str, Any]:
+    return {"config": dataclasses.asdict(config)}
+
+
+def gan_update(
+    optimizers: tuple[training.Optimizer, training.Optimizer],
+    *,
+    config: Config,
+    geometry: emdm_loss.Geometry | None,
+    ema: float,
+) -> training.Update:
+    """One update of the discriminator, then of the generator; R1 every k-th time.
+
+    Args:
+      optimizers: The generator's and the discriminator's.
+      config: The method.
+      geometry: As of `emdm_loss.generator_loss`.
+      ema: Decay of the generator's average.
+
+    Returns:
+      `update(state, key, batch) -> (state, info)` of a `GanState`.
+    """
+
+    def update(state: Any, key: Key, batch: emdm_loss.Batch) -> tuple[Any, dict]:
+        penalized = state.step % config.r1_every == 0
+        judge = functools.partial(
+            emdm_loss.discriminator_loss, config=config, penalized=penalized
+        )
+        make = functools.partial(
+            emdm_loss.generator_loss, config=config, geometry=geometry
+        )
+        both = adversarial.make_gan_update(judge, make, optimizers, ema_decay=ema)
+        return both(state, key, batch)
+
+    return update
+
+
+def train_row(
+    folder: Path,
+    task: Task,
+    row: str,
+    *,
+    generator: Budget,
+    discriminator: Budget,
+) -> None:
+    """Trains a row, from its newest checkpoint if there is one.
+
+    Args:
+      folder: The run folder.
+      task: Data and configuration.
+      row: Its name.
+      generator: How long, and the generator's optimiser.
+      discriminator: The discriminator's optimiser; its steps are the generator's.
+
+    Raises:
+      ValueError: if the row has a checkpoint of other sizes or data.
+      TrainingDiverged: if a loss is not finite.
+    """
+    config = row_config(task.base, row)
+    flat = not (config.weight_position or config.weight_velocity or config.weight_foot)
+    geometry = None if flat else task.geometry
+    params = emdm.init(jax.random.key(generator.seed), config)
+    optimizer = stages.make_optimizer(generator)
+    if config.latent:
+        judge = stages.make_optimizer(discriminator)
+        state = adversarial.GanState(
+            generator=training.init_train_state(params["generator"], optimizer),
+            discriminator=training.init_train_state(params["discriminator"], judge),
+        )
+        update = gan_update(
+            (optimizer, judge), config=config, geometry=geometry, ema=generator.ema
+        )
+        show = ("loss", "discriminator/loss")
+    else:
+        state = training.init_train_state(params["generator"], optimizer)
+        loss = functools.partial(
+            emdm_loss.diffusion_loss, config=config, geometry=geometry
+        )
+        update = training.make_update(loss, optimizer, ema_decay=generator.ema)
+        show = ("loss",)
+    stages.fit(
+        folder / row,
+        state,
+        update,
+        lambda key, data: task.batch(key, data, generator.batch),
+        task.data,
+        system="emdm",
+        stage=row,
+        budget=generator,
+        config=_config_json(config) | task.describe,
+        show=show,
+    )
+
+
+def load_row(folder: Path, row: str) -> tuple[Params, Config]:
+    """Averaged parameters of a row's generator, and its configuration.
+
+    Args:
+      folder: The run folder.
+      row: Its name, or a sampler's.
+
+    Returns:
+      Both.
+
+    Raises:
+      CheckpointError: if the row was not trained here.
+    """
+    check_rows((row,))
+    trained = SAMPLERS[row][0] if row in SAMPLERS else row
+    value = stages.check_stage(folder / trained, trained, system="emdm")
+    config = Config(**value["config"])
+    params = stages.load_params(
+        folder / trained,
+        trained,
+        lambda: emdm.init(jax.random.key(0), config)["generator"],
+        system="emdm",
+        adversarial=bool(config.latent),
+    )
+    return params, config
+
+
+def row_sampler(params: Params, config: Config, row: str) -> emdm.Sample:
+    """The way a row samples.
+
+    Args:
+      params: Its generator's.
+      config: Its configuration.
+      row: Its name, or a sampler's.
+
+    Returns:
+      `sample(key, condition, *, scale=None)`.
+    """
+    if row not in SAMPLERS:
+        return emdm.sampler(params, config=config)
+    steps = emdm.ddim_steps(config.num_steps, SAMPLERS[row][1])
+    return emdm.sampler(params, config=config, step="ddim", steps=steps)
+
+
+def sample_many(
+    sample: emdm.Sample, *, chunk: int
+) -> Callable[[Key, emdm.Condition, Array | None], Array]:
+    """Samples of many conditions, in chunks that fit the cache, as one program.
+
+    Args:
+      sample: Of one condition.
+      chunk: Conditions at a time.
+
+    Returns:
+      `run(key, conditions, scale) -> [conditions, frames, features]`, jitted; the
+      motion of condition i depends on the key and i, not on the number of conditions.
+      With scale None there is no guidance.
+    """
+
+    def run(key: Key, conditions: emdm.Condition, scale: Array | None) -> Array:
+        number = conditions.keep.shape[0]
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(number))
+        one = lambda given: sample(given[0], given[1], scale=scale)  # noqa: E731
+        return jax.lax.map(one, (keys, conditions), batch_size=min(chunk, number))
+
+    return jax.jit(run)
+
+
+def write_config(folder: Path, value: dict[str, Any]) -> None:
+    """Writes how a run folder's data were made.
+
+    Args:
+      folder: The run folder.
+      value: A JSON object.
+    """
+    whole = {"system": "emdm"} | value
+    (folder / "config.json").write_text(json.dumps(whole, indent=1))
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Reads what `write_config` wrote.
+
+    Args:
+      folder: The run folder.
+
+    Returns:
+      The JSON object.
+
+    Raises:
+      ValueError: if it is no run folder of EMDM; names the file and the field.
+    """
+    path = folder / "config.json"
+    try:
+        value = json.loads(path.read_text())
+        found = value.get("system")
+    except (OSError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"{folder}: no run folder of `experiments/emdm.py train`: {error}"
+        ) from error
+    if found != "emdm":
+        raise ValueError(f"{path}: field 'system' is {found!r}, expected 'emdm'")
+    return value

@@ -1,0 +1,1 @@
+"""Sentences as vectors: tokenizers, published weights from a folder, cached results."""

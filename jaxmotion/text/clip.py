@@ -1,0 +1,300 @@
+"""CLIP's text tower from a local folder in the layout of the Hugging Face hub.
+
+The folder holds model.safetensors, config.json and tokenizer.json; the image tower in
+the weights, if any, is not read. Nothing is downloaded.
+
+Source: layout of the released ViT-B/32 on the hub (openai/clip-vit-base-patch32).
+"""
+
+import dataclasses
+import functools
+import json
+import os
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.networks.clip import EPSILON, ClipText
+from jaxmotion.text import files
+from jaxmotion.typing import Params
+
+START, END = "<|startoftext|>", "<|endoftext|>"
+_BATCH = 64
+_STEP = 16  # lengths are multiples of it, so that few are compiled
+
+# Attribute of the network -> field of the text tower's config.
+_SIZES = {
+    "vocabulary": "vocab_size",
+    "context": "max_position_embeddings",
+    "width": "hidden_size",
+    "depth": "num_hidden_layers",
+    "heads": "num_attention_heads",
+    "hidden": "intermediate_size",
+    "dimensions": "projection_dim",
+}
+# Fields that the network has no choice of.
+_FIXED = {"hidden_act": "quick_gelu", "layer_norm_eps": EPSILON}
+# Old configs say 2, and their code then takes the largest id.
+_OLD_END = 2
+
+# Name of a parameter -> key in the weights.
+_MODULES = {
+    "token_embedding": "text_model.embeddings.token_embedding",
+    "position_embedding": "text_model.embeddings.position_embedding",
+    "norm_out": "text_model.final_layer_norm",
+    "projection": "text_projection",
+}
+_IN_LAYER = {
+    "query": "self_attn.q_proj",
+    "key": "self_attn.k_proj",
+    "value": "self_attn.v_proj",
+    "out": "self_attn.out_proj",
+    "expand": "mlp.fc1",
+    "contract": "mlp.fc2",
+    "norm_1": "layer_norm1",
+    "norm_2": "layer_norm2",
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class ClipModel:
+    """A text tower with its tokenizer.
+
+    Attributes:
+      network: The module.
+      params: Its parameters, float32.
+      tokenizer: Of the package `tokenizers`.
+      fingerprint: Eight hexadecimal digits that change with weights and tokenizer.
+    """
+
+    network: ClipText
+    params: Params
+    tokenizer: Any
+    fingerprint: str
+
+
+def load_clip(folder: str | os.PathLike) -> ClipModel:
+    """Reads a text tower.
+
+    Args:
+      folder: With model.safetensors, config.json and tokenizer.json. Sizes that the
+        config does not name are those of ViT-B/32, as on the hub.
+
+    Returns:
+      The model.
+
+    Raises:
+      FileNotFoundError: if a file is missing; names all that are.
+      ModuleNotFoundError: if `tokenizers` or `safetensors` is not installed.
+      ValueError: if a file is damaged or does not fit the others; names its fields or
+        keys (five at most), what was expected and what was found.
+    """
+    folder = Path(folder)
+    names = ("config.json", "tokenizer.json", "model.safetensors")
+    absent = [name for name in names if not (folder / name).is_file()]
+    if absent:
+        raise FileNotFoundError(f"{folder} has no {', '.join(absent)}")
+    config, vocabulary, weights = (folder / name for name in names)
+    network, config_end = _read_config(config)
+    tokenizer = files.read_tokenizer(vocabulary)
+    end = _check_tokenizer(vocabulary, tokenizer, network)
+    if config_end not in (None, _OLD_END, end):
+        raise ValueError(
+            f"{config}: eos_token_id is {config_end}, but {END} is {end} in "
+            f"{vocabulary.name}"
+        )
+    network = network.clone(end_of_text=end)
+    params = _read_weights(weights, network)
+    digest = zlib.crc32(vocabulary.read_bytes())
+    for leaf in jax.tree.leaves(params):
+        digest = zlib.crc32(np.asarray(leaf), digest)
+    return ClipModel(
+        network=network, params=params, tokenizer=tokenizer, fingerprint=f"{digest:08x}"
+    )
+
+
+def _read_config(path: Path) -> tuple[ClipText, Any]:
+    """The network of a config, and the end-of-text id that it names, if any."""
+    try:
+        config = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not JSON ({error})") from None
+    text = config.get("text_config", config) if isinstance(config, dict) else None
+    if not isinstance(text, dict):
+        raise ValueError(f"{path}: neither it nor its text_config is a JSON object")
+    # The projection belongs to the whole model, whose config overrules the tower's.
+    found = dict(text)
+    if "projection_dim" in config:
+        found["projection_dim"] = config["projection_dim"]
+    wrong = [
+        f"{field} should be a positive integer, found {found[field]!r}"
+        for field in _SIZES.values()
+        if field in found and not (type(found[field]) is int and found[field] > 0)
+    ]
+    wrong += [
+        f"{field} should be {expected!r}, found {found[field]!r}"
+        for field, expected in _FIXED.items()
+        if found.get(field, expected) != expected
+    ]
+    if wrong:
+        raise ValueError(f"{path}: {'; '.join(wrong)}")
+    network = ClipText(
+        **{name: found[field] for name, field in _SIZES.items() if field in found}
+    )
+    if network.width % network.heads:
+        raise ValueError(
+            f"{path}: {network.heads} heads do not divide hidden_size {network.width}"
+        )
+    return network, found.get("eos_token_id")
+
+
+def _check_tokenizer(path: Path, tokenizer: Any, network: ClipText) -> int:
+    """Id of the end of a text; raises if the tokenizer is not one of CLIP's."""
+    for token in (START, END):
+        if tokenizer.token_to_id(token) is None:
+            raise ValueError(f"{path}: knows no token {token}")
+    if (largest := max(tokenizer.get_vocab().values())) >= network.vocabulary:
+        raise ValueError(
+            f"{path}: token id {largest} is beyond vocab_size {network.vocabulary}"
+        )
+    return tokenizer.token_to_id(END)
+
+
+def _keys(network: ClipText) -> Iterator[tuple[tuple, str, tuple[int, ...], bool]]:
+    """Path, key in the weights, shape there, and whether it is transposed there."""
+    shapes = jax.eval_shape(
+        network.init, jax.random.key(0), jnp.zeros((1, 1), jnp.int32)
+    )["params"]
+    for path, leaf in jax.tree_util.tree_leaves_with_path(shapes):
+        *modules, kind = (str(entry.key) for entry in path)
+        if len(modules) == 2:
+            layer = modules[0].removeprefix("layers_")
+            stem = f"text_model.encoder.layers.{layer}.{_IN_LAYER[modules[1]]}"
+        else:
+            stem = _MODULES[modules[0]]
+        transposed = kind == "kernel"  # a linear layer of PyTorch is [out, in]
+        key = f"{stem}.{'bias' if kind == 'bias' else 'weight'}"
+        shape = leaf.shape[::-1] if transposed else leaf.shape
+        yield (*modules, kind), key, shape, transposed
+
+
+def _read_weights(path: Path, network: ClipText) -> Params:
+    """Parameters of the network, float32."""
+    safetensors = files.require("safetensors")
+    try:
+        # Not "numpy", which has no bfloat16 in older versions.
+        file = safetensors.safe_open(path, framework="flax")
+    except safetensors.SafetensorError as error:
+        raise ValueError(f"{path}: not safetensors, or damaged ({error})") from None
+    params, wrong = {}, []
+    with file:
+        stored = set(file.keys())
+        for modules, key, shape, transposed in _keys(network):
+            if key not in stored:
+                wrong.append(f"{key} is missing")
+                continue
+            found = tuple(file.get_slice(key).get_shape())
+            if found != shape:
+                wrong.append(f"{key} has shape {found}, expected {shape}")
+            if wrong:
+                continue
+            leaf = jnp.asarray(file.get_tensor(key), jnp.float32)
+            at = params
+            for name in modules[:-1]:
+                at = at.setdefault(name, {})
+            at[modules[-1]] = leaf.T if transposed else leaf
+    if wrong:
+        more = "; ..." if len(wrong) > 5 else ""
+        raise ValueError(
+            f"{path}: {len(wrong)} keys do not fit: {'; '.join(wrong[:5])}{more}"
+        )
+    return params
+
+
+def tokenize(
+    model: ClipModel, texts: Sequence[str], *, max_tokens: int | None = None
+) -> Int[np.ndarray, "texts tokens"]:
+    """Token ids of texts, with the tokens of start and end.
+
+    Args:
+      model: Of which the tokenizer and the context are used.
+      texts: Some sentences.
+      max_tokens: Cut longer texts to so many tokens, those of start and end included;
+        22 in EMDM and MDM (HumanML3D). None: a text beyond the context is an error.
+
+    Returns:
+      Rows of one length, filled up with the end-of-text token.
+
+    Raises:
+      ValueError: if max_tokens is not in 3..context, or a text is too long or contains
+        a token of start or end; names the text, the limit and its length.
+    """
+    network = model.network
+    if max_tokens is not None and not 3 <= max_tokens <= network.context:
+        raise ValueError(
+            f"max_tokens should be in 3..{network.context}, found {max_tokens}"
+        )
+    start, end = model.tokenizer.token_to_id(START), network.end_of_text
+    rows = []
+    encodings = model.tokenizer.encode_batch(list(texts), add_special_tokens=False)
+    for index, encoding in enumerate(encodings):
+        inner = encoding.ids
+        if start in inner or end in inner:
+            raise ValueError(
+                f"text {index}, {texts[index]!r}, contains {START}, {END} or what the "
+                "tokenizer does not know"
+            )
+        if max_tokens is not None:
+            inner = inner[: max_tokens - 2]
+        if len(inner) + 2 > network.context:
+            raise ValueError(
+                f"text {index} has {len(inner) + 2} tokens, with start and end; the "
+                f"limit is {network.context} (max_tokens cuts): {texts[index]!r}"
+            )
+        rows.append([start, *inner, end])
+    ids = np.full((len(rows), max(map(len, rows), default=0)), end, np.int32)
+    for row, found in zip(ids, rows, strict=True):
+        row[: len(found)] = found
+    return ids
+
+
+@functools.partial(jax.jit, static_argnames="network")
+def _forward(
+    params: Params, ids: Int[Array, "batch tokens"], *, network: ClipText
+) -> Float[Array, "batch dimensions"]:
+    return network.apply({"params": params}, ids)
+
+
+def encode(
+    model: ClipModel, texts: Sequence[str], *, max_tokens: int | None = None
+) -> Float[np.ndarray, "texts dimensions"]:
+    """Vectors of texts, not normalised: what EMDM and MDM take as condition.
+
+    Args:
+      model: The text tower.
+      texts: Some sentences.
+      max_tokens: See `tokenize`, also for what is raised.
+
+    Returns:
+      One vector a text, float32.
+    """
+    network, ids = model.network, tokenize(model, texts, max_tokens=max_tokens)
+    vectors = np.zeros((len(ids), network.dimensions), np.float32)
+    # Whole batches of like and few lengths: little padding, few programs to compile.
+    lengths = 1 + np.sum(ids != network.end_of_text, axis=-1)
+    order = np.argsort(lengths, kind="stable")
+    for first in range(0, len(ids), _BATCH):
+        rows = order[first : first + _BATCH]
+        tokens = min(-(-lengths[rows[-1]] // _STEP) * _STEP, network.context)
+        batch = np.full((min(len(ids), _BATCH), tokens), network.end_of_text, np.int32)
+        part = ids[rows, :tokens]
+        batch[: len(rows), : part.shape[1]] = part
+        found = _forward(model.params, jnp.asarray(batch), network=network)
+        vectors[rows] = np.asarray(found)[: len(rows)]
+    return vectors

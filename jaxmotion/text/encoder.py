@@ -1,0 +1,275 @@
+"""One interface for all text encoders, and a cache of what they found.
+
+Three kinds, by what they need: CLIP (what the papers use) needs its weights in a
+folder; WordLlama needs a package, and forgets the order of words; hashed n-grams need
+nothing, and know no synonyms.
+"""
+
+import dataclasses
+import functools
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxmotion.text import clip, hashing, wordllama
+
+_FORMAT = "jaxmotion-text-vectors"
+_VERSION = 1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TextEncoder:
+    """A function from texts to vectors, with its name.
+
+    Attributes:
+      name: For tables of results, and to tell caches apart: other vectors, other name.
+      dimensions: Components of a vector.
+      embed: The function itself; `encode` checks what goes in and comes out.
+    """
+
+    name: str
+    dimensions: int
+    embed: Callable[[Sequence[str]], np.ndarray]
+
+    def encode(self, texts: Sequence[str]) -> Float[np.ndarray, "texts dimensions"]:
+        """Vectors of texts.
+
+        Args:
+          texts: Some sentences; runs of white space count as one space.
+
+        Returns:
+          One vector a text, float32.
+
+        Raises:
+          ValueError: if a text is empty, or the encoder cannot take it; names it.
+        """
+        plain = plain_texts(texts)
+        if not plain:
+            return np.zeros((0, self.dimensions), np.float32)
+        vectors = self.embed(plain)
+        expected = (len(plain), self.dimensions)
+        if vectors.shape != expected or vectors.dtype != np.float32:
+            raise ValueError(
+                f"{self.name} should return float32 of shape {expected}, found "
+                f"{vectors.dtype} of {vectors.shape}"
+            )
+        return vectors
+
+
+def plain_texts(texts: Sequence[str]) -> list[str]:
+    """Texts with single spaces between words.
+
+    Args:
+      texts: Some sentences.
+
+    Returns:
+      As many texts.
+
+    Raises:
+      ValueError: if it is one string, or a text is empty; gives the text's index.
+    """
+    if isinstance(texts, str):
+        raise ValueError(f"expected a sequence of texts, found one: {texts!r}")
+    plain = [" ".join(text.split()) for text in texts]
+    if "" in plain:
+        index = plain.index("")
+        raise ValueError(f"text {index} is empty: {texts[index]!r}")
+    return plain
+
+
+def hashed_encoder(*, dimensions: int) -> TextEncoder:
+    """Hashed n-grams; see `jaxmotion.text.hashing`.
+
+    Args:
+      dimensions: Components of a vector.
+
+    Returns:
+      The encoder.
+    """
+    return TextEncoder(
+        name=f"hashed n-grams {dimensions}",
+        dimensions=dimensions,
+        embed=functools.partial(hashing.encode, dimensions=dimensions),
+    )
+
+
+def wordllama_encoder() -> TextEncoder:
+    """WordLlama; see `jaxmotion.text.wordllama`, also for what is raised.
+
+    Returns:
+      The encoder.
+    """
+    model = wordllama.load_wordllama()
+    dimensions = model.embedding.shape[1]
+    return TextEncoder(
+        name=f"WordLlama {dimensions} (bag of tokens)",
+        dimensions=dimensions,
+        embed=functools.partial(wordllama.encode, model),
+    )
+
+
+def clip_encoder(
+    folder: str | os.PathLike, *, max_tokens: int | None = None
+) -> TextEncoder:
+    """CLIP's text tower; see `jaxmotion.text.clip`, also for what is raised.
+
+    Args:
+      folder: With its weights, config and tokenizer.
+      max_tokens: Cut longer texts to so many tokens (22 in EMDM and MDM on HumanML3D);
+        None: a text beyond the context is an error.
+
+    Returns:
+      The encoder. Its name has the folder's, and a fingerprint of what is in it.
+    """
+    model = clip.load_clip(folder)
+    network, called = model.network, Path(folder).resolve().name
+    cut = "" if max_tokens is None else f", {max_tokens} tokens"
+    return TextEncoder(
+        name=f"CLIP {network.dimensions} ({called} {model.fingerprint}{cut})",
+        dimensions=network.dimensions,
+        embed=functools.partial(clip.encode, model, max_tokens=max_tokens),
+    )
+
+
+def make_encoder(name: str) -> TextEncoder:
+    """The encoder that a user asks for.
+
+    Args:
+      name: "wordllama", "hashed" (256 components), or a folder with CLIP's files.
+
+    Returns:
+      The encoder.
+
+    Raises:
+      ModuleNotFoundError: if a package is missing; says how to install it.
+      ValueError: if it is none of the three; see also `clip.load_clip`.
+    """
+    if name == "wordllama":
+        return wordllama_encoder()
+    if name == "hashed":
+        return hashed_encoder(dimensions=256)
+    if not Path(name).is_dir():
+        raise ValueError(
+            f"text encoder should be 'wordllama', 'hashed' or a folder with CLIP's "
+            f"weights; {name!r} is neither, and no such folder exists"
+        )
+    return clip_encoder(name)
+
+
+class UniqueTexts(NamedTuple):
+    """Every text once: the vectors of all are vectors[index].
+
+    Attributes:
+      vectors: One row a different text, in the order of first appearance.
+      index: Row of each text.
+    """
+
+    vectors: Float[np.ndarray, "unique dimensions"]
+    index: Int[np.ndarray, " texts"]
+
+
+def encode_unique(
+    encoder: TextEncoder,
+    texts: Sequence[str],
+    *,
+    cache: str | os.PathLike | None = None,
+) -> UniqueTexts:
+    """Encodes every text once, and none that the cache has.
+
+    Args:
+      encoder: The encoder.
+      texts: Some sentences, with repetitions.
+      cache: An npz file, made or extended with what was missing; one for each encoder.
+
+    Returns:
+      Vectors of the different texts, and where each text is among them.
+
+    Raises:
+      OSError: if the cache cannot be written.
+      ValueError: if a text is empty (gives its index), or the cache is damaged, foreign
+        or of another encoder (names file and field).
+    """
+    plain = plain_texts(texts)
+    rows = {text: row for row, text in enumerate(dict.fromkeys(plain))}
+    known = {}
+    if cache is not None and os.path.exists(cache):
+        known = _read_cache(os.fspath(cache), encoder)
+    missing = [text for text in rows if text not in known]
+    known.update(zip(missing, encoder.encode(missing), strict=True))
+    if cache is not None and missing:
+        _write_cache(os.fspath(cache), encoder, known)
+    vectors = np.zeros((len(rows), encoder.dimensions), np.float32)
+    for text, row in rows.items():
+        vectors[row] = known[text]
+    return UniqueTexts(vectors, np.array([rows[text] for text in plain], np.int32))
+
+
+def _write_cache(path: str, encoder: TextEncoder, known: dict[str, np.ndarray]) -> None:
+    """Writes vectors; the file appears under its name only when it is whole."""
+    header = {"format": _FORMAT, "version": _VERSION, "encoder": encoder.name}
+    # Texts as JSON: NumPy's strings all take the room of the longest.
+    text = json.dumps(header | {"texts": list(known)}).encode()
+    os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
+    temporary = f"{path}.{os.getpid()}.partial"
+    try:
+        with open(temporary, "wb") as file:
+            np.savez(
+                file,
+                header=np.frombuffer(text, np.uint8),
+                vectors=np.stack(list(known.values())),
+            )
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        if os.path.exists(temporary):
+            os.remove(temporary)
+
+
+def _read_cache(path: str, encoder: TextEncoder) -> dict[str, np.ndarray]:
+    """Texts and vectors of a cache; checks every field."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header, vectors = json.loads(file["header"].tobytes()), file["vectors"]
+        found = {key: header[key] for key in ("format", "version", "encoder", "texts")}
+    except (
+        AttributeError,  # an array, not an archive
+        EOFError,
+        KeyError,
+        TypeError,
+        ValueError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        raise ValueError(
+            f"{path}: not a cache of text vectors, or a damaged one ({error})"
+        ) from None
+    wanted = {"format": _FORMAT, "version": _VERSION, "encoder": encoder.name}
+    for key, value in wanted.items():
+        if found[key] != value:
+            raise ValueError(
+                f"{path}: field {key!r} should be {value!r}, found {found[key]!r}; "
+                "give another file"
+            )
+    texts = found["texts"]
+    if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+        raise ValueError(f"{path}: field 'texts' should be a list of texts")
+    if len(set(texts)) != len(texts):
+        raise ValueError(f"{path}: field 'texts' has a text twice")
+    expected = (len(texts), encoder.dimensions)
+    if vectors.shape != expected or vectors.dtype != np.float32:
+        raise ValueError(
+            f"{path}: field 'vectors' should be float32 of shape {expected}, found "
+            f"{vectors.dtype} of {vectors.shape}"
+        )
+    if not np.isfinite(vectors).all():
+        text = texts[int(np.argwhere(~np.isfinite(vectors))[0, 0])]
+        raise ValueError(f"{path}: field 'vectors' is not finite for {text!r}")
+    return dict(zip(texts, vectors, strict=True))

@@ -1,0 +1,164 @@
+"""Files as published, written by PyTorch's layers or by hand, and bad ones."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from safetensors import numpy as safetensors
+
+from jaxmotion.learning import matching, published
+
+torch = pytest.importorskip("torch")
+from tests.reference import matching_torch  # noqa: E402
+
+CONFIG = matching.MatcherConfig(
+    num_features=7, movement_width=8, motion_width=6, text_width=5, embedding=4
+)
+
+
+@pytest.fixture(scope="module")
+def evaluator():
+    return matching_torch.Evaluator(CONFIG)
+
+
+@pytest.fixture
+def state(evaluator):
+    """As released: with the optimisers' states and counters beside the weights."""
+    optimizer = torch.optim.Adam(evaluator.text.parameters(), lr=1e-4)
+    for array in evaluator.text.parameters():
+        array.grad = torch.zeros_like(array)
+    optimizer.step()  # of no gradient: it only makes the state
+    return {
+        **evaluator.state_dicts(),
+        "opt_text_encoder": optimizer.state_dict(),
+        "epoch": 3,
+        "iter": 5,
+    }
+
+
+def save(state, folder):
+    path = folder / "finest.tar"
+    torch.save(state, path)
+    return path
+
+
+def flat(state):
+    return {
+        f"{module}.{name}": x.detach().numpy()
+        for module in ("movement_encoder", "motion_encoder", "text_encoder")
+        for name, x in state[module].items()
+    }
+
+
+def test_embeddings_are_pytorchs(evaluator, state, tmp_path):
+    params = published.load_matcher(save(state, tmp_path), config=CONFIG)
+    generator = np.random.default_rng(0)
+    frames, words = np.array([24, 8, 16]), np.array([2, 22, 9])
+    x = generator.normal(size=(3, 24, 7)).astype(np.float32)
+    x[np.arange(24)[None] >= frames[:, None]] = 0.0
+    vectors = generator.normal(size=(3, 22, 300)).astype(np.float32)
+    tags = np.eye(15, dtype=np.float32)[generator.integers(0, 15, (3, 22))]
+    motion = matching.embed_motion(
+        params, jnp.asarray(x), jnp.asarray(frames, jnp.int32), config=CONFIG
+    )
+    np.testing.assert_allclose(motion, evaluator.embed_motion(x, frames), atol=1e-5)
+    text = matching.embed_text(
+        params,
+        jnp.asarray(vectors),
+        jnp.asarray(tags),
+        jnp.asarray(words, jnp.int32),
+        config=CONFIG,
+    )
+    want = evaluator.embed_text(vectors, tags, words)
+    assert want.std() > 0.1
+    np.testing.assert_allclose(text, want, atol=1e-5)
+
+
+def test_parameters_are_those_of_the_network(state, tmp_path):
+    params = published.load_matcher(save(state, tmp_path), config=CONFIG)
+    ours = jax.eval_shape(lambda k: matching.init_matcher(k, CONFIG), jax.random.key(0))
+    shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    assert shapes(params) == shapes(ours)
+
+
+def test_safetensors_hold_the_same(state, tmp_path):
+    path = tmp_path / "evaluator.safetensors"
+    safetensors.save_file(flat(state), path)
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        published.load_matcher(path, config=CONFIG),
+        published.load_matcher(save(state, tmp_path), config=CONFIG),
+    )
+
+
+def test_one_error_names_every_misfit(state, tmp_path):
+    arrays = flat(state)
+    del arrays["motion_encoder.hidden"]
+    arrays["text_encoder.extra"] = np.zeros(2, np.float32)
+    arrays["text_encoder.pos_emb.bias"] = np.zeros(299, np.float32)
+    path = tmp_path / "evaluator.safetensors"
+    safetensors.save_file(arrays, path)
+    message = (
+        r"missing: motion_encoder\.hidden; unknown: text_encoder\.extra; "
+        r"of another shape: text_encoder\.pos_emb\.bias \(299,\) instead of \(300,\)"
+    )
+    with pytest.raises(ValueError, match=message):
+        published.load_matcher(path, config=CONFIG)
+    with pytest.raises(ValueError, match=r"main\.0\.weight \(8, 7, 4\) instead of"):
+        published.load_matcher(save(state, tmp_path))
+
+
+def test_foreign_files_are_refused(state, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no weights file"):
+        published.load_matcher(tmp_path / "none.tar")
+    for name in ("damaged.tar", "damaged.safetensors"):
+        (tmp_path / name).write_bytes(b"not weights")
+        with pytest.raises(ValueError, match="damaged"):
+            published.load_matcher(tmp_path / name)
+    del state["text_encoder"]
+    with pytest.raises(ValueError, match="text_encoder, found.*'motion_encoder'"):
+        published.load_matcher(save(state, tmp_path), config=CONFIG)
+    with pytest.raises(ValueError, match="found list"):
+        published.load_matcher(save([1], tmp_path), config=CONFIG)
+
+
+class Code:
+    """Unpickling it would print."""
+
+    def __reduce__(self):
+        return print, ("run",)
+
+
+def test_code_in_a_file_is_not_run(state, tmp_path, capsys):
+    with pytest.raises(ValueError, match="not a file of weights alone"):
+        published.load_matcher(save(state | {"epoch": Code()}, tmp_path), config=CONFIG)
+    assert capsys.readouterr().out == ""
+
+
+def write_glove(folder, words, rows):
+    np.save(folder / "our_vab_data.npy", rows)
+    (folder / "our_vab_words.txt").write_text("\n".join(words) + "\n", encoding="utf-8")
+
+
+def test_glove_by_word(tmp_path):
+    words = ["unk", "walk", "sos", "eos", "naïve"]
+    rows = np.random.default_rng(0).normal(size=(5, 300))
+    write_glove(tmp_path, words, rows)
+    vocabulary = published.load_glove(tmp_path)
+    vectors, tags, count = matching.encode_tokens(
+        ["walk/VERB", "zzz/NOUN", "naïve/ADJ"], vocabulary
+    )
+    assert count == 5
+    want = rows[[2, 1, 0, 4, 3]].astype(np.float32)
+    np.testing.assert_array_equal(vectors[:5], want)
+    found = [matching.TAGS[i] for i in tags[:5].argmax(axis=-1)]
+    assert found == ["OTHER", "VERB", "OTHER", "ADJ", "OTHER"]
+
+
+def test_bad_glove_is_named(tmp_path):
+    write_glove(tmp_path, ["unk", "sos", "eos"], np.zeros((2, 300)))
+    with pytest.raises(ValueError, match=r"3 words.*\(3, 300\), found \(2, 300\)"):
+        published.load_glove(tmp_path)
+    write_glove(tmp_path, ["unk", "walk"], np.zeros((2, 300)))
+    with pytest.raises(ValueError, match="no sos, eos among"):
+        published.load_glove(tmp_path)
