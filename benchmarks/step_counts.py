@@ -1,7 +1,8 @@
 """Latency of one plan against the number of diffusion steps.
 
-Example:
+Examples:
   python benchmarks/step_counts.py --system camdm --steps 2 4 8 16 32 --batch 1 64
+  python benchmarks/step_counts.py --system emdm --steps 1 5 10 20 50 --batch 1 32
 """
 
 import dataclasses
@@ -16,6 +17,7 @@ import suite
 import timing
 import tyro
 import workload
+import workload_emdm
 from jaxtyping import Array
 
 from jaxmotion.systems import camdm
@@ -31,6 +33,7 @@ COLUMNS = {
     "p95_ms": "p95 ms",
     "runs": "runs",
     "frames_per_second": "frames/s",
+    "ms_per_frame": "ms/frame",
 }
 
 
@@ -50,20 +53,23 @@ class Config:
       chunk: Run batches of 16 and more in chunks of so many characters; 0 for all at
         once.
       frames_per_token: Frames of one token; 1 is the paper's network.
-      width: Channels of a token.
+      width: Channels of a token; None for 256 (camdm) or 128 (emdm, the size that
+        experiments/emdm.py trains).
+      paper: Measure EMDM's network of 12 layers and 1024 channels, one frame a token.
       runs: Timed calls of each program.
       limit: Seconds of timed calls of each program, at most.
       out: Folder for step_counts.json and step_counts.png.
       gate: Report to compare with; exit status 1 if something is worse.
     """
 
-    system: Literal["camdm"] = "camdm"
+    system: Literal["camdm", "emdm"] = "camdm"
     steps: tuple[int, ...] = (2, 4, 8, 16, 32)
     batch: tuple[int, ...] = (1, 64)
     arguments: bool = False
     chunk: int = 4
     frames_per_token: int = 1
-    width: int = 256
+    width: int | None = None
+    paper: bool = False
     runs: int = 50
     limit: float = 25.0
     out: Path = Path("runs/benchmarks")
@@ -103,29 +109,54 @@ def sampler(
     return jax.jit(functools.partial(plans, params)), given
 
 
+def program(args: Config, steps: int, batch: int) -> tuple[Callable, tuple, int]:
+    """What is timed.
+
+    Args:
+      args: The settings.
+      steps: Diffusion steps.
+      batch: Characters or motions.
+
+    Returns:
+      The jitted function, its arguments, and frames of a plan or motion.
+    """
+    if args.system == "emdm":
+        return workload_emdm.program(
+            steps=steps,
+            batch=batch,
+            width=args.width or 128,
+            paper=args.paper,
+            arguments=args.arguments,
+            chunk=args.chunk,
+        )
+    config = workload.paper_config(
+        steps=steps, width=args.width or 256, frames_per_token=args.frames_per_token
+    )
+    params = camdm.init(jax.random.key(0), config)
+    run, given = sampler(config, params, batch, args.chunk, args.arguments)
+    return run, given, config.future
+
+
 def case(args: Config, steps: int, batch: int) -> dict[str, Any]:
     """Measures one step count and batch.
 
     Args:
       args: The settings.
       steps: Diffusion steps.
-      batch: Characters.
+      batch: Characters or motions.
 
     Returns:
       One row of the report.
     """
-    config = workload.paper_config(
-        steps=steps, width=args.width, frames_per_token=args.frames_per_token
-    )
-    params = camdm.init(jax.random.key(0), config)
-    run, given = sampler(config, params, batch, args.chunk, args.arguments)
+    run, given, frames = program(args, steps, batch)
     found = timing.measure(run, *given, runs=args.runs, limit_s=args.limit)
     return {
         "batch": batch,
         "steps": steps,
         "network_calls": steps,
         **dataclasses.asdict(found),
-        "frames_per_second": 1000 * batch * config.future / found.p50_ms,
+        "frames_per_second": 1000 * batch * frames / found.p50_ms,
+        "ms_per_frame": found.p50_ms / (batch * frames),
     }
 
 

@@ -53,8 +53,11 @@ class Train:
       frames_per_token: Frames of one token (paper: 1).
       discriminator_width: Channels of the discriminator's first layers.
       recon: Weight R of the features' error; None for 1 (actions) or 100 (texts).
-      geometry: Joints relative to the "root" (as released) or in the "world".
-      learning_rate: Of the generator.
+      geometry: Joints of the losses relative to the "root" (as released) or in the
+        "world" (ours, with which roots keep to their path).
+      learning_rate: Of generators (Muon).
+      ddpm_rate: Of diffusion models (Muon).
+      discriminator_rate: Of the discriminator (Adam).
       seed: Of everything random.
     """
 
@@ -79,18 +82,20 @@ class Train:
     frames: int | None = None
     fps: float | None = None
     held_out: float = 0.1
-    steps: int = 4000
-    ddpm_steps: int = 6000
+    steps: int = 2500
+    ddpm_steps: int = 3700
     batch: int = 32
     width: int = 128
     depth: int = 4
     hidden: int = 384
     dropout: float = 0.0
     frames_per_token: int = 4
-    discriminator_width: int = 128
+    discriminator_width: int = 256
     recon: float | None = None
-    geometry: Literal["root", "world"] = "root"
+    geometry: Literal["root", "world"] = "world"
     learning_rate: float = 2e-3
+    ddpm_rate: float = 2e-3
+    discriminator_rate: float = 1e-3
     seed: int = 0
 
 
@@ -168,10 +173,12 @@ def train(args: Train) -> None:
         budget = stages.Budget(
             steps=args.steps if latent else args.ddpm_steps,
             batch=args.batch,
-            learning_rate=args.learning_rate,
+            learning_rate=args.learning_rate if latent else args.ddpm_rate,
             seed=args.seed,
         )
-        judge = dataclasses.replace(budget, optimizer="adam", learning_rate=2e-4)
+        judge = dataclasses.replace(
+            budget, optimizer="adam", learning_rate=args.discriminator_rate
+        )
         emdm_runs.train_row(args.out, task, row, generator=budget, discriminator=judge)
         print(f"{row}: {time.perf_counter() - begun:.0f} s", flush=True)
 

@@ -1,1 +1,98 @@
-"""x."""
+"""Motions to look at."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion.motion import humanml_skeleton, skeleton
+from jaxmotion.protocols import artifacts, emdm_action, emdm_runs, emdm_text
+from jaxmotion.systems import emdm, emdm_motion
+
+
+def sample(args: Any, out: Path) -> None:
+    """Makes one motion for each action or sentence, and writes it.
+
+    Args:
+      args: Of `emdm.py sample`.
+      out: Folder.
+
+    Raises:
+      ValueError: if an action is unknown, a text is empty or too long, the length is
+        out of range, or the run has another task.
+    """
+    task = emdm_runs.read_config(args.run).get("task")
+    given = {"action": args.action, "text": args.text}
+    for name, values in given.items():
+        if values and name != task:
+            raise ValueError(
+                f"{args.run} makes motions from {task!r}, not from {name!r}"
+            )
+    if task in given and not given[task]:
+        raise ValueError(f"expected --{task} for {args.run}")
+    (_from_texts if task == "text" else _from_actions)(args, out)
+
+
+def _generate(args: Any, vectors: Any, scale: float) -> np.ndarray:
+    """Features of one motion for each vector, cut to their length."""
+    params, config = emdm_runs.load_row(args.run, args.row)
+    length = config.frames if args.frames is None else args.frames
+    conditions = emdm.make_condition(
+        vectors, (length,) * vectors.shape[0], config=config
+    )
+    run = emdm_runs.sample_many(
+        emdm_runs.row_sampler(params, config, args.row), chunk=8
+    )
+    scale = scale if args.scale is None else args.scale
+    given = None if scale == 1.0 else jnp.float32(scale)
+    return run(jax.random.key(args.seed), conditions, given)[:, :length]
+
+
+def _file_name(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", text.lower()).strip("_")[:60]
+
+
+def _from_actions(args: Any, out: Path) -> None:
+    run = emdm_action.load_run(args.run)
+    for action in args.action:
+        if action not in run.actions:
+            raise ValueError(
+                f"unknown action {action!r}: expected one of {', '.join(run.actions)}"
+            )
+    numbers = jnp.asarray([run.actions.index(a) for a in args.action], jnp.int32)
+    vectors = jax.nn.one_hot(numbers, len(run.actions))
+    if not args.action:
+        vectors = jnp.zeros((1, 0))
+    motions = emdm_motion.to_motion(_generate(args, vectors, 1.0), run.representation)
+    for i, title in enumerate(args.action or ("motion",)):
+        motion = skeleton.Motion(
+            root_position=motions.root_position[i],
+            joint_rotation=motions.joint_rotation[i],
+            fps=run.clips.fps,
+        )
+        artifacts.write_rollout(
+            out,
+            run.clips.skeleton,
+            motion,
+            None,
+            title=f"{title}, {args.row} ({run.clips.source})",
+            name=_file_name(title),
+        )
+
+
+def _from_texts(args: Any, out: Path) -> None:
+    run = emdm_text.load_run(args.run)
+    if run.motions.num_features != 263:
+        raise ValueError("only motions of HumanML3D's 22 joints can be written as BVH")
+    x = _generate(args, emdm_text.encode(run, args.text), 2.5)
+    positions = emdm_text.joints(run, x)
+    for i, text in enumerate(args.text):
+        bones, motion = humanml_skeleton.motion_from_joints(
+            positions[i], run.motions.fps
+        )
+        artifacts.write_rollout(
+            out, bones, motion, None, title=text, name=_file_name(text)
+        )

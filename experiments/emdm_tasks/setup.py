@@ -3,9 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-from jaxmotion.data import clips_io
-from jaxmotion.protocols import emdm_action, emdm_data, emdm_runs
+from jaxmotion.data import clips_io, selection, text_motion_io
+from jaxmotion.data.text_motion import TextMotions
+from jaxmotion.protocols import emdm_action, emdm_data, emdm_runs, emdm_text
 from jaxmotion.systems import emdm
+
+# Frames of the shortest clip that gets a caption, as in HumanML3D.
+_SHORTEST = 40
 
 
 def base_config(args: Any, recon: float) -> emdm.Config:
@@ -60,12 +64,21 @@ def prepare(args: Any) -> emdm_runs.Task:
       OSError: if a file cannot be read.
       ValueError: if the folder's data were made otherwise, or an argument is wrong.
     """
+    return (_prepare_texts if args.task == "text" else _prepare_actions)(args)
+
+
+def _merges(pairs: tuple[str, ...]) -> dict[str, str]:
     merge = {}
-    for pair in args.merge:
+    for pair in pairs:
         old, equals, new = pair.partition("=")
         if not (old and equals and new):
             raise ValueError(f"merge {pair!r}: expected old=new")
         merge[old] = new
+    return merge
+
+
+def _prepare_actions(args: Any) -> emdm_runs.Task:
+    merge = _merges(args.merge)
     made = dict(
         task=args.task,
         data=[str(path) for path in args.data],
@@ -90,3 +103,46 @@ def prepare(args: Any) -> emdm_runs.Task:
     return emdm_action.make_task(
         run, base_config(args, 1.0), conditional=args.task == "action"
     )
+
+
+def _prepare_texts(args: Any) -> emdm_runs.Task:
+    made = dict(
+        task=args.task,
+        data=[str(path) for path in args.data],
+        encoder=args.encoder,
+        unseen=list(args.unseen),
+        fps=args.fps or 20.0,
+        frames=args.frames or 120,
+        held_out=args.held_out,
+    )
+    if not _same(args.out, made):
+        motions = _text_motions(args, made["fps"])
+        text_motion_io.save_text_motions(args.out / "data.npz", motions)
+        emdm_runs.write_config(args.out, made)
+    run = emdm_text.load_run(args.out)
+    counts = {s: run.motions.clips_of(s).size for s in run.motions.split_names}
+    print(
+        f"{run.motions.num_clips} clips {counts}, {len(run.vectors)} distinct "
+        f"captions, encoded by {run.encoder.name}"
+    )
+    return emdm_text.make_task(run, base_config(args, 100.0), frames=made["frames"])
+
+
+def _text_motions(args: Any, fps: float) -> TextMotions:
+    """Text motions of a file of them, or of labelled clips."""
+    if len(args.data) == 1 and text_motion_io.is_text_motions(args.data[0]):
+        return text_motion_io.load_text_motions(args.data[0])
+    clips = selection.concatenate([clips_io.load_clips(path) for path in args.data])
+    motions, error = emdm_text.from_labels(
+        clips,
+        unseen=args.unseen,
+        held_out=args.held_out,
+        least=_SHORTEST,
+        fps=fps,
+        seed=0,
+    )
+    print(
+        f"HumanML3D features of {motions.num_clips} clips; joints -> features -> "
+        f"joints: {error:.1e} m at most"
+    )
+    return motions

@@ -1,12 +1,11 @@
 """Clips on disk: one npz file without pickles, written whole or not at all."""
 
 import os
-import zipfile
-import zlib
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion.data import npz
 from jaxmotion.data.clips import Clips
 from jaxmotion.motion.skeleton import Skeleton, check_parents
 
@@ -43,7 +42,6 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
     Raises:
       OSError: if the file cannot be written.
     """
-    path = os.fspath(path)
     fields = {
         "format": np.array(_FORMAT),
         "version": np.array(_VERSION),
@@ -62,56 +60,16 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
     for field, names in clips.label_names:
         fields[f"label.{field}"] = np.asarray(clips.labels[field], np.int64)
         fields[f"names.{field}"] = _text(names)
-    os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
-    temporary = f"{path}.{os.getpid()}.partial"
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(file, **fields)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        if os.path.exists(temporary):
-            os.remove(temporary)
+    npz.write_npz(path, fields)
 
 
 def _read_fields(path: str) -> dict[str, np.ndarray]:
     """All arrays of the file, each of the expected kind and number of axes."""
-    try:
-        file = np.load(path, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ValueError("an array, not an npz archive")
-        with file:
-            fields = {name: file[name] for name in file.files}
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no clips file {path!r}") from None
-    except (ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{path}: not a clips file, or a damaged one ({error})"
-        ) from None
-    if str(fields.get("format")) != _FORMAT:
-        raise ValueError(
-            f"{path}: not a clips file: its field 'format' should be {_FORMAT!r}; "
-            f"it has the fields {', '.join(sorted(fields)) or 'none'}"
-        )
-    version = fields.get("version")
-    if version is None or version.ndim or version != _VERSION:
-        raise ValueError(
-            f"{path}: version {version} of the clips format, expected "
-            f"{_VERSION}; prepare the data again"
-        )
-    wanted = dict(_FIELDS)
-    for field in fields.get("label_fields", ()):
-        wanted |= {f"label.{field}": ("i", 1), f"names.{field}": ("U", 1)}
-    for name, (kind, axes) in wanted.items():
-        if name not in fields:
-            raise ValueError(f"{path}: field {name!r} is missing")
-        found = fields[name]
-        if found.dtype.kind != kind or found.ndim != axes:
-            raise ValueError(
-                f"{path}: field {name!r} should have {axes} axes of kind {kind!r}, "
-                f"found shape {found.shape} of {found.dtype}"
-            )
+    about = dict(what="clips", format_name=_FORMAT, version=_VERSION)
+    fields = npz.read_npz(path, _FIELDS, **about)
+    labels = {f"label.{field}": ("i", 1) for field in fields["label_fields"]}
+    names = {f"names.{field}": ("U", 1) for field in fields["label_fields"]}
+    npz.check_fields(path, fields, labels | names)
     return fields
 
 

@@ -87,6 +87,23 @@ def read_npz(
             f"{path}: version {found_version} of the {what} format, expected "
             f"{version}; prepare the data again"
         )
+    check_fields(path, fields, wanted)
+    return fields
+
+
+def check_fields(
+    path: str, fields: Mapping[str, np.ndarray], wanted: Mapping[str, tuple[str, int]]
+) -> None:
+    """Raises unless all arrays are there and of the expected kind.
+
+    Args:
+      path: The file, for messages.
+      fields: Its arrays.
+      wanted: As of `read_npz`.
+
+    Raises:
+      ValueError: names the file and the field.
+    """
     for name, (kind, axes) in wanted.items():
         if name not in fields:
             raise ValueError(f"{path}: field {name!r} is missing")
@@ -96,4 +113,3 @@ def read_npz(
                 f"{path}: field {name!r} should have {axes} axes of kind {kind!r}, "
                 f"found shape {found.shape} of {found.dtype}"
             )
-    return fields

@@ -1,6 +1,7 @@
 """Motions with captions on disk: one npz file."""
 
 import os
+import zipfile
 
 import numpy as np
 
@@ -131,3 +132,22 @@ def load_text_motions(path: str | os.PathLike) -> TextMotions:
     return TextMotions(
         **arrays, **texts, fps=float(fields["fps"]), source=str(fields["source"])
     )
+
+
+def is_text_motions(path: str | os.PathLike) -> bool:
+    """Whether a file says that it holds text motions; nothing else of it is checked.
+
+    Args:
+      path: A file.
+
+    Returns:
+      False also for what is no npz file.
+
+    Raises:
+      OSError: if it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return "format" in file and str(file["format"]) == _FORMAT
+    except (ValueError, EOFError, zipfile.BadZipFile):
+        return False

@@ -7,8 +7,8 @@ epsilon 1e-5) and exact GELU:
     y = norm_2(h + W_2 gelu(W_1 h))
 
 EMDM's has SELU in its place. With norm="pre" the branches read normalised tokens and
-add to plain ones, which trains several times faster from scratch (Xiong et al. 2020, "On Layer Normalization in the
-Transformer Architecture"):
+add to plain ones, which trains several times faster from scratch (Xiong et al. 2020,
+"On Layer Normalization in the Transformer Architecture"):
 
     h = x + out(softmax(q k^T / sqrt(d)) v)                q, k, v of norm_1(x)
     y = h + W_2 gelu(W_1 norm_2(h))

@@ -1,9 +1,10 @@
 """Motions of a skeleton as EMDM's features: rotations, and the root's way.
 
-A frame is one 6D rotation (two rows) a joint and a pseudo-joint (x, y, z, 0, 0, 0) for
-the root, as in the action-to-motion data of the released code. Ours: a motion starts at
-the ground's origin facing +z, heights stay, and features are standardised, with one
-deviation for all rotations, so that short trainings get along.
+A frame is one 6D rotation (two rows) a joint and a pseudo-joint for the root, as in the
+action-to-motion data of the released code. Ours: a motion starts at the ground's origin
+facing +z; the pseudo-joint is (step in x, y, step in z, 0, 0, 0), since an error of a
+step bends the path where one of a place would shake it; and features are standardised,
+with one deviation for all rotations.
 """
 
 import dataclasses
@@ -37,8 +38,17 @@ class Representation:
         return 6 * (self.bones.num_joints + 1)
 
 
+def _raw(motion: skeleton.Motion) -> Array:
+    """Features before they are standardised; the first step is from the origin."""
+    raw = features.motion_features(motion)
+    place = raw[..., -6:-3]
+    before = jnp.pad(place[..., :-1, :], [(0, 0)] * (place.ndim - 2) + [(1, 0), (0, 0)])
+    root = (place - before).at[..., 1].set(place[..., 1])
+    return jnp.concatenate([raw[..., :-6], root, raw[..., -3:]], axis=-1)
+
+
 def fit(
-    bones: skeleton.Skeleton, motions: skeleton.Motion, *, floor: float = 0.02
+    bones: skeleton.Skeleton, motions: skeleton.Motion, *, floor: float = 0.01
 ) -> Representation:
     """Mean and deviation of features: of each root channel, one for all rotations.
 
@@ -51,7 +61,7 @@ def fit(
     Returns:
       The representation.
     """
-    raw = features.motion_features(motions)
+    raw = _raw(motions)
     found = features.fit_normalizer(raw, floor=0.0)
     rotations = jnp.broadcast_to(jnp.mean(found.std[:-6]), (raw.shape[-1] - 6,))
     # The three zeros behind the root's position stay zeros.
@@ -76,9 +86,7 @@ def to_features(
     Returns:
       Features in the network's units.
     """
-    return features.normalize(
-        representation.normalizer, features.motion_features(motion)
-    )
+    return features.normalize(representation.normalizer, _raw(motion))
 
 
 def to_motion(
@@ -94,6 +102,9 @@ def to_motion(
       The motions, in metres.
     """
     raw = features.denormalize(representation.normalizer, x)
+    step = raw[..., -6:-3]
+    root = jnp.cumsum(step, axis=-2).at[..., 1].set(step[..., 1])
+    raw = jnp.concatenate([raw[..., :-6], root, raw[..., -3:]], axis=-1)
     return features.motion_from_features(raw, representation.fps)
 
 

@@ -1,0 +1,121 @@
+"""Scores of motions made from texts."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from emdm_tasks.judge import Judge
+from emdm_tasks.scores import cells
+from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
+from jaxmotion.evaluation import diversity, frechet
+from jaxmotion.protocols import emdm_text
+from jaxmotion.protocols import emdm_text_evaluation as protocol
+from jaxmotion.systems import emdm
+
+# Multimodality: sentences, motions of each, pairs of them.
+_SENTENCES, _REPEATS, _PAIRS = 16, 8, 10
+
+
+def make_judge(args: Any) -> Judge:
+    """The evaluator of a run, and real motions' scores.
+
+    Args:
+      args: Of `emdm.py evaluate`.
+
+    Returns:
+      The judge.
+
+    Raises:
+      ValueError: if the run has other data, or there are too few samples.
+    """
+    run = emdm_text.load_run(args.run)
+    frames, number = run.config["frames"], args.samples // 32 * 32
+    if number < 64:
+        raise ValueError(f"samples is {args.samples}, expected at least 64")
+    judge = (
+        protocol.published_evaluator(run, args.matcher)
+        if args.matcher
+        else protocol.train_evaluator(
+            run, frames=frames, num_steps=args.evaluator_steps, seed=0
+        )
+    )
+    arrays = {
+        split: text_arrays(run.motions, split=split, max_frames=frames)
+        for split in ("train", "test", "val")
+        if run.motions.clips_of(split).size
+    }
+    draw = jax.jit(sample_text_batch, static_argnames="batch")
+    embed = jax.jit(lambda x, frames: protocol.embed(run, judge, x, frames))
+    score = protocol.make_scorer(run, judge)
+
+    def moments(split: str) -> frechet.Moments:
+        key = jax.random.fold_in(jax.random.key(args.seed), len(split))
+        x, length, _ = draw(key, arrays[split], batch=number)
+        return frechet.moments(embed(x, length))
+
+    references = {split: moments(split) for split in arrays}
+
+    def score_real(split: str) -> dict:
+        def once(key: Array) -> dict[str, Array]:
+            key_draw, key_score = jax.random.split(key)
+            x, length, caption = draw(key_draw, arrays[split], batch=number)
+            return score(key_score, x, length, caption, references[split])
+
+        keys = jax.random.split(jax.random.key(args.seed + 7), args.replications)
+        return cells([once(key) for key in keys])
+
+    task = emdm_text.make_task(run, emdm.Config(features=1), frames=frames)
+    vectors, index = task.data[1:]
+
+    def conditions(caption: Array, length: Array) -> emdm.Condition:
+        return emdm.Condition(
+            vector=vectors[index[caption]],
+            keep=jnp.ones(caption.shape, bool),
+            mask=jnp.arange(frames)[None] < length[:, None],
+        )
+
+    scale = 2.5 if args.scale is None else args.scale
+    scale = None if scale == 1.0 else jnp.float32(scale)
+
+    def score_split(key: Array, many, split: str) -> dict[str, Array]:
+        key_draw, key_sample, key_score = jax.random.split(key, 3)
+        _, length, caption = draw(key_draw, arrays[split], batch=number)
+        x = many(key_sample, conditions(caption, length), scale)
+        return score(key_score, x, length, caption, references[split])
+
+    def score_row(key: Array, many) -> dict[str, Array]:
+        key_own, key_draw, key_sample, key_pairs, key_unseen = jax.random.split(key, 5)
+        found = score_split(key_own, many, "test")
+        _, length, caption = draw(key_draw, arrays["test"], batch=_SENTENCES)
+        length, caption = (jnp.repeat(v, _REPEATS) for v in (length, caption))
+        x = many(key_sample, conditions(caption, length), scale)
+        features = embed(x, length).reshape(_SENTENCES, _REPEATS, -1)
+        found["multimodality"] = diversity.multimodality(
+            key_pairs, features, num_pairs=_PAIRS
+        )
+        if "val" in arrays:
+            unseen = score_split(key_unseen, many, "val")
+            found["R-precision 3, unseen pairs"] = unseen["R-precision 3"]
+        return found
+
+    names = {
+        "train": "real (training clips)",
+        "test": "real (held-out clips)",
+        "val": "real (unseen pairs)",
+    }
+    one = conditions(jnp.zeros(1, jnp.int32), jnp.full(1, frames))
+    return Judge(
+        real={names[split]: score_real(split) for split in arrays},
+        score=score_row,
+        scale=scale,
+        one=jax.tree.map(lambda x: x[0], one),
+        samples=number,
+        describe={
+            "matcher": dataclasses.asdict(judge.config) | {"name": judge.name},
+            "texts": run.encoder.name,
+            "reference": f"{number} real motions of the same split",
+        },
+    )

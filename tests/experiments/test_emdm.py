@@ -1,0 +1,219 @@
+"""experiments/emdm.py: train, evaluate and sample, from actions, texts and nothing."""
+
+import dataclasses
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxmotion.data import bvh_text, clips_io, procedural
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "experiments" / "emdm.py"
+SIZES = (
+    "--steps 100 --ddpm-steps 100 --batch 8 --width 16 --hidden 16 --depth 1 "
+    "--discriminator-width 64 --merge"
+)
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+
+@pytest.fixture(scope="module")
+def call():
+    """Runs a command line in this process; sentences in single quotes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(SCRIPT.parent))
+        spec = importlib.util.spec_from_file_location("emdm_script", SCRIPT)
+        module = importlib.util.module_from_spec(spec)
+        patch.setitem(sys.modules, "emdm_script", module)
+        spec.loader.exec_module(module)
+
+        def run(line, *more):
+            patch.setattr(sys, "argv", [str(SCRIPT), *line.split(), *more])
+            module.main()
+
+        yield run
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """The walker with labels of the captions' grammar."""
+    path = tmp_path_factory.mktemp("data") / "clips.npz"
+    clips = procedural.make_clips(minutes=2.0)
+    numbers = np.arange(clips.num_clips)
+    labels = {
+        "content": jnp.asarray(numbers % 2, jnp.int32),
+        "style": jnp.asarray(numbers // 2 % 3, jnp.int32),
+    }
+    names = (("content", ("run", "walk")), ("style", ("elderly", "normal", "youthful")))
+    clips = dataclasses.replace(clips, labels=labels, label_names=names)
+    clips_io.save_clips(path, clips)
+    return path
+
+
+@pytest.fixture(scope="module")
+def actions(call, data, tmp_path_factory, quick_compile):
+    folder = tmp_path_factory.mktemp("runs") / "actions"
+    call(
+        f"train --task action --data {data} --out {folder} --least 2 --held-out 0.3 "
+        f"--frames 20 --rows emdm ddpm_50 {SIZES}"
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def texts(call, data, tmp_path_factory, quick_compile):
+    folder = tmp_path_factory.mktemp("runs") / "texts"
+    call(
+        f"train --task text --data {data} --out {folder} --encoder hashed --held-out 0.3 "
+        f"--unseen walk/elderly --frames 40 --rows emdm {SIZES}"
+    )
+    return folder
+
+
+def rows_of(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_actions_are_scored_beside_real_motions(call, actions):
+    call(f"evaluate --run {actions} --samples 40 --replications 2 --evaluator-steps 20")
+    report = rows_of(actions / "evaluation")
+    rows = report["rows"]
+    assert set(rows) == {
+        "real (training clips)",
+        "real (held-out clips)",
+        "emdm",
+        "ddpm_50",
+    }
+    for name, row in rows.items():
+        assert {"FID", "accuracy", "diversity", "multimodality"} <= set(row), name
+        assert 0 <= row["accuracy"]["value"] <= 1 and row["FID"]["value"] >= 0
+        assert row["FID"]["samples"] == 2 and row["FID"]["low"] is not None
+    assert rows["emdm"]["network calls"]["value"] == 10
+    assert rows["ddpm_50"]["network calls"]["value"] == 50
+    assert rows["emdm"]["ms a frame"]["value"] > 0
+    assert report["evaluator"]["recognizer"].startswith("GRU") and report["jax"]
+    assert "procedural" in report["evaluator"]["recognizer"].lower()
+
+
+def test_the_same_seed_gives_the_same_scores(call, actions, tmp_path):
+    for name in ("a", "b"):
+        call(
+            f"evaluate --run {actions} --samples 40 --replications 2 --rows emdm "
+            f"--evaluator-steps 20 --out {tmp_path / name}"
+        )
+    first, second = (rows_of(tmp_path / name)["rows"] for name in "ab")
+    for row in ("real (held-out clips)", "emdm"):
+        for column in ("FID", "accuracy", "diversity", "multimodality"):
+            assert first[row][column] == second[row][column]
+
+
+def test_samples_of_actions_are_motions(call, actions, tmp_path):
+    call(f"sample --run {actions} --action run walk --frames 12 --out {tmp_path}")
+    for name in ("run", "walk"):
+        document = bvh_text.read_text((tmp_path / f"{name}.bvh").read_text())
+        assert document is not None
+        assert (tmp_path / f"{name}.html").stat().st_size > 1000
+        with Image.open(tmp_path / f"{name}.gif") as image:
+            assert image.n_frames > 1
+
+
+def test_motions_from_nothing(call, data, tmp_path):
+    folder = tmp_path / "none"
+    call(
+        f"train --task none --data {data} --out {folder} --least 2 --held-out 0.3 "
+        f"--frames 20 {SIZES}"
+    )
+    call(f"evaluate --run {folder} --samples 20 --replications 2 --evaluator-steps 20")
+    row = rows_of(folder / "evaluation")["rows"]["emdm"]
+    assert "accuracy" not in row and row["FID"]["value"] >= 0
+    call(f"sample --run {folder} --out {tmp_path / 'out'}")
+    assert (tmp_path / "out" / "motion.bvh").exists()
+
+
+def test_texts_are_scored_and_sampled(call, texts, tmp_path):
+    call(f"evaluate --run {texts} --samples 64 --replications 2 --evaluator-steps 20")
+    rows = rows_of(texts / "evaluation")["rows"]
+    assert {"real (training clips)", "real (held-out clips)", "real (unseen pairs)"} < (
+        set(rows)
+    )
+    row = rows["emdm"]
+    for column in ("R-precision 1", "R-precision 3", "R-precision 3, unseen pairs"):
+        assert 0 <= row[column]["value"] <= 1
+    assert row["R-precision 1"]["value"] <= row["R-precision 3"]["value"]
+    assert {"FID", "MM-Dist", "diversity", "multimodality"} <= set(row)
+    report = rows_of(texts / "evaluation")
+    assert "hashed" in report["evaluator"]["texts"]
+    call(
+        f"sample --run {texts} --frames 24 --out {tmp_path}",
+        "--text",
+        "an elderly person walks",
+    )
+    names = {path.name for path in tmp_path.iterdir()}
+    stem = "an_elderly_person_walks"
+    assert {f"{stem}.bvh", f"{stem}.gif", f"{stem}.html"} == names
+
+
+def test_what_was_held_out_is_not_trained_on(texts):
+    with np.load(texts / "data.npz") as file:
+        split, names = file["split"], file["split_names"].tolist()
+        owner, captions = file["caption_clip"], file["captions"]
+    trained = captions[split[owner] == names.index("train")]
+    unseen = captions[split[owner] == names.index("val")]
+    assert unseen.size and not set(trained) & set(unseen)
+
+
+BAD = {
+    "sample --run {actions} --action jump": "unknown action 'jump'",
+    "sample --run {actions} --action run --frames 21": "21 frames, the model makes",
+    "sample --run {actions} --action run --frames 0": "0 frames, the model makes",
+    "sample --run {actions} --text walk": "not from 'text'",
+    "sample --run {actions}": "expected --action",
+    "sample --run {texts} --text TEXT:": "empty",
+    "sample --run {texts} --text TEXT:" + "very_" * 80: "expected at most 75",
+    "sample --run {texts} --text walk --row naive": "checkpoint",
+    "sample --run {texts} --text walk --row other": "unknown row 'other'",
+    "sample --run {data} --action run": "no run folder",
+    "train --task action --data {data} --out {actions} --least 2 --fps 10 --merge": (
+        "its data were made with"
+    ),
+    "train --task action --data {data} --out {new} --merge walk": "expected old=new",
+    "train --task action --data {data} --out {new} --merge hop=walk": "unknown content",
+    "train --task action --data {data} --out {new} --merge --least 999": "has 999 clips",
+    "train --task text --data {data} --out {new} --encoder nowhere": "'nowhere'",
+    "train --task text --data {data} --out {new} --unseen walk/x": "'walk/x'",
+    "train --out {new} --rows ddim_10": "samples 'ddpm_1000'",
+    "evaluate --run {actions} --samples 3": "samples is 3",
+    "evaluate --run {texts} --samples 3": "samples is 3",
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_bad_input_is_one_clear_error(call, line, actions, texts, data, tmp_path):
+    places = dict(actions=actions, texts=texts, data=data, new=tmp_path / "new")
+    words = line.format(**places).split()
+    words = [
+        word.removeprefix("TEXT:").replace("_", " ")
+        if word.startswith("TEXT:")
+        else word
+        for word in words
+    ]
+    with pytest.raises(ValueError, match="(?i)" + BAD[line].replace("--", "-.")):
+        call("", *words)
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate", "sample"])
+def test_help_says_what_every_option_does(command):
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), command, "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "Example:" in done.stdout and "--seed" in done.stdout
