@@ -20,7 +20,7 @@ import tyro
 from emdm_tasks import evaluation, sampling, setup
 
 from jaxmotion.learning import loop
-from jaxmotion.protocols import emdm_runs, stages
+from jaxmotion.protocols import emdm_rows, emdm_runs, stages
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Train:
         "world" (ours, with which roots keep to their path).
       learning_rate: Of generators (Muon).
       ddpm_rate: Of diffusion models (Muon).
-      discriminator_rate: Of the discriminator (Adam).
+      discriminator_rate: Of the discriminator (Adam, beta 0.5 and 0.9).
       seed: Of everything random.
     """
 
@@ -82,7 +82,7 @@ class Train:
     frames: int | None = None
     fps: float | None = None
     held_out: float = 0.1
-    steps: int = 2500
+    steps: int = 2000
     ddpm_steps: int = 3700
     batch: int = 32
     width: int = 128
@@ -90,12 +90,12 @@ class Train:
     hidden: int = 384
     dropout: float = 0.0
     frames_per_token: int = 4
-    discriminator_width: int = 256
+    discriminator_width: int = 128
     recon: float | None = None
     geometry: Literal["root", "world"] = "world"
     learning_rate: float = 2e-3
     ddpm_rate: float = 2e-3
-    discriminator_rate: float = 1e-3
+    discriminator_rate: float = 5e-4
     seed: int = 0
 
 
@@ -160,16 +160,16 @@ class Sample:
 
 def train(args: Train) -> None:
     """Trains row by row."""
-    emdm_runs.check_rows(args.rows)
+    emdm_rows.check_rows(args.rows)
     loop.check_writable(args.out)
     task = setup.prepare(args)
     for row in args.rows:
-        if row in emdm_runs.SAMPLERS:
+        if row in emdm_rows.SAMPLERS:
             raise ValueError(
-                f"row {row!r} samples {emdm_runs.SAMPLERS[row][0]!r}: train that"
+                f"row {row!r} samples {emdm_rows.SAMPLERS[row][0]!r}: train that"
             )
         begun = time.perf_counter()
-        latent = emdm_runs.row_config(task.base, row).latent
+        latent = emdm_rows.row_config(task.base, row).latent
         budget = stages.Budget(
             steps=args.steps if latent else args.ddpm_steps,
             batch=args.batch,
@@ -185,7 +185,7 @@ def train(args: Train) -> None:
 
 def evaluate(args: Evaluate) -> None:
     """Writes the table."""
-    emdm_runs.check_rows(args.rows)
+    emdm_rows.check_rows(args.rows)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
     evaluation.evaluate(args, out)

@@ -1,4 +1,4 @@
-"""One compilation serves all values: planner, rollout and chunk of training."""
+"""One compilation serves all values: planner, rollout, samplers, chunks of training."""
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from jaxmotion.control import rollout
+from jaxmotion.learning import adversarial, training
 from jaxmotion.motion.trajectory import Command, Trajectory
-from jaxmotion.systems import camdm, camdm_control, camdm_loss
+from jaxmotion.protocols import emdm_runs
+from jaxmotion.systems import camdm, camdm_control, camdm_loss, emdm, emdm_loss
 from tests import tiny
 
 chex = pytest.importorskip("chex")
@@ -99,3 +101,73 @@ def test_a_chunk_of_training_is_traced_once(monkeypatch):
         state, info = run(state, key, data)
         losses.append(float(info["loss"][0]))
     assert len(set(losses)) == 3
+
+
+EMDM = emdm.Config(
+    features=3,
+    frames=4,
+    condition_size=2,
+    num_steps=2,
+    latent=2,
+    width=8,
+    depth=1,
+    heads=2,
+    hidden=8,
+    discriminator_width=64,
+    r1_every=2,
+)
+
+
+@pytest.mark.parametrize("guided", [True, False])
+def test_a_sampler_of_whole_motions_is_traced_once(guided):
+    """Other parameters, keys, conditions, lengths and guidance scales."""
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def run(params, key, conditions, scale):
+        sample = emdm.sampler(params, config=EMDM)
+        return emdm_runs.sample_many(sample, chunk=2)(key, conditions, scale)
+
+    results = []
+    for seed in range(3):
+        vector = jnp.eye(2)[jnp.array([seed % 2, 1, 0])]
+        lengths = (4, 1 + seed, 2)
+        results.append(
+            run(
+                tiny.random_params(emdm.init, EMDM, seed=seed)["generator"],
+                jax.random.key(seed),
+                emdm.make_condition(vector, lengths, config=EMDM),
+                jnp.float32(0.5 + seed) if guided else None,
+            )
+        )
+    assert np.abs(results[1] - results[0]).max() > 1e-3
+
+
+def test_a_chunk_of_two_players_is_traced_once(monkeypatch):
+    """With and without the penalty, for a first and for a returned state."""
+    for name in ("generator_loss", "discriminator_loss"):
+        counted = chex.assert_max_traces(getattr(emdm_loss, name), n=1)
+        monkeypatch.setattr(emdm_loss, name, counted)
+    optimizers = (training.gan_adam(),) * 2
+    update = emdm_runs.gan_update(optimizers, config=EMDM, geometry=None, ema=0.5)
+    params = tiny.random_params(emdm.init, EMDM)
+    state = adversarial.GanState(
+        **{n: training.init_train_state(params[n], optimizers[0]) for n in params}
+    )
+
+    def draw(key, data):
+        return emdm_loss.Batch(
+            x_0=data + jax.random.normal(key, data.shape),
+            vector=jnp.eye(2),
+            mask=jnp.ones((2, 4), bool),
+        )
+
+    run = training.train_chunk(update, draw, num_steps=1)
+    infos = []
+    for seed in range(3):
+        data = jnp.full((2, 4, 3), float(seed), jnp.float32)
+        state, info = run(state, jax.random.key(seed), data)
+        infos.append(info)
+    assert len({float(info["loss"][0]) for info in infos}) == 3
+    due = [bool(info["discriminator/r1"][0] > 0) for info in infos]
+    assert due == [True, False, True]

@@ -10,6 +10,7 @@ from emdm_tasks.judge import Judge
 from emdm_tasks.scores import cells
 from jaxmotion.motion import skeleton
 from jaxmotion.protocols import emdm_action
+from jaxmotion.protocols import emdm_action_evaluation as protocol
 from jaxmotion.systems import emdm, emdm_motion
 
 
@@ -36,20 +37,18 @@ def make_judge(args: Any) -> Judge:
             f"samples is {args.samples}, expected at least 2 for each of {number} "
             "actions"
         )
-    recognizer = emdm_action.load_recognizer(
-        run, num_steps=args.evaluator_steps, seed=0
-    )
+    recognizer = protocol.load_recognizer(run, num_steps=args.evaluator_steps, seed=0)
     wanted = jnp.repeat(jnp.arange(number), each)
     key_reference, key_real = jax.random.split(jax.random.key(args.seed))
     key_motion, key_state = jax.random.split(key_reference)
-    truth = emdm_action.real_positions(run, run.train, key_motion, wanted)
-    reference = emdm_action.moments(run, recognizer)(key_state, truth)
-    score = emdm_action.scorer(run, recognizer, reference)
+    truth = protocol.real_positions(key_motion, wanted, run=run, part=run.train)
+    reference = protocol.moments(recognizer, run)(key_state, truth)
+    score = protocol.scorer(recognizer, run, reference)
 
     def score_real(part) -> dict:
         def once(key: Array) -> dict[str, Array]:
             key_motion, key_score = jax.random.split(key)
-            positions = emdm_action.real_positions(run, part, key_motion, wanted)
+            positions = protocol.real_positions(key_motion, wanted, run=run, part=part)
             return score(key_score, positions, wanted)
 
         keys = jax.random.split(key_real, args.replications)
@@ -89,6 +88,6 @@ def make_judge(args: Any) -> Judge:
             f"{run.clips.source}, {args.evaluator_steps} updates, seed 0",
             "reference": f"{each * number} real motions of training clips, actions "
             "uniform",
-            "ground height m": emdm_action.ground_height(run),
+            "ground height m": protocol.ground_height(run),
         },
     )

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from emdm_tasks import actions, texts
 from emdm_tasks.scores import cells
 from jaxmotion.evaluation.table import Cell
-from jaxmotion.protocols import artifacts, emdm_runs
+from jaxmotion.protocols import artifacts, emdm_rows, emdm_runs
 from jaxmotion.protocols.camdm_runs import arguments_json
 from jaxmotion.systems import emdm
 
@@ -31,7 +31,7 @@ def calls(config: emdm.Config, row: str) -> int:
     Returns:
       Steps of its sampler.
     """
-    return emdm_runs.SAMPLERS[row][1] if row in emdm_runs.SAMPLERS else config.num_steps
+    return emdm_rows.SAMPLERS[row][1] if row in emdm_rows.SAMPLERS else config.num_steps
 
 
 def trained_rows(folder: Path) -> tuple[str, ...]:
@@ -43,8 +43,8 @@ def trained_rows(folder: Path) -> tuple[str, ...]:
     Returns:
       Their names.
     """
-    rows = [row for row in emdm_runs.ROWS if (folder / row / "checkpoints").is_dir()]
-    more = [name for name, (row, _) in emdm_runs.SAMPLERS.items() if row in rows]
+    rows = [row for row in emdm_rows.ROWS if (folder / row / "checkpoints").is_dir()]
+    more = [name for name, (row, _) in emdm_rows.SAMPLERS.items() if row in rows]
     return (*rows, *more)
 
 

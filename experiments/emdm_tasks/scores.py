@@ -6,7 +6,6 @@ from jaxtyping import Array
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
 
-
 # Order of the columns; compiled programs return dictionaries in alphabetical order.
 _ORDER = (
     "R-precision 1",

@@ -5,7 +5,13 @@ from typing import Any
 
 from jaxmotion.data import clips_io, selection, text_motion_io
 from jaxmotion.data.text_motion import TextMotions
-from jaxmotion.protocols import emdm_action, emdm_data, emdm_runs, emdm_text
+from jaxmotion.protocols import (
+    emdm_action,
+    emdm_captioned,
+    emdm_data,
+    emdm_runs,
+    emdm_text,
+)
 from jaxmotion.systems import emdm
 
 # Frames of the shortest clip that gets a caption, as in HumanML3D.
@@ -133,7 +139,7 @@ def _text_motions(args: Any, fps: float) -> TextMotions:
     if len(args.data) == 1 and text_motion_io.is_text_motions(args.data[0]):
         return text_motion_io.load_text_motions(args.data[0])
     clips = selection.concatenate([clips_io.load_clips(path) for path in args.data])
-    motions, error = emdm_text.from_labels(
+    motions, error = emdm_captioned.from_labels(
         clips,
         unseen=args.unseen,
         held_out=args.held_out,

@@ -39,15 +39,14 @@ class SequenceDiscriminator(nn.Module):
     Attributes:
       num_steps: T.
       width: Channels of the first two layers; the others have its half, half, quarter
-        and sixteenth. A multiple of 32.
+        and sixteenth. A multiple of 64: norms have groups of 32 channels, as
+        published. (Few channels a group would leave little to tell motions by.)
       time_width: Channels of the step's embedding.
-      groups: Groups of the first norm; the second has half of them.
     """
 
     num_steps: int = 10
     width: int = 1024
     time_width: int = 128
-    groups: int = 32
 
     def setup(self):
         """Makes the layers."""
@@ -59,8 +58,9 @@ class SequenceDiscriminator(nn.Module):
             for n in (full, full, full // 2, full // 2, full // 4, full // 16)
         ]
         # Over the channels of one sample only, whatever the batch axes.
-        self.norm_1 = nn.GroupNorm(self.groups, epsilon=1e-5, reduction_axes=(-1,))
-        self.norm_2 = nn.GroupNorm(self.groups // 2, epsilon=1e-5, reduction_axes=(-1,))
+        over_channels = dict(group_size=32, epsilon=1e-5, reduction_axes=(-1,))
+        self.norm_1 = nn.GroupNorm(num_groups=None, **over_channels)
+        self.norm_2 = nn.GroupNorm(num_groups=None, **over_channels)
         self.out = nn.Dense(1)
 
     def __call__(

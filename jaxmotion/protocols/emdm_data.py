@@ -88,8 +88,8 @@ def action_arrays(clips: Clips, *, field: str, frames: int) -> ActionArrays:
     Raises:
       ValueError: if an action has no clip; names it.
     """
-    labels = np.asarray(clips.labels[field])
     names = clips.names(field)
+    labels = np.asarray(clips.labels[field])
     counts = np.bincount(labels, minlength=len(names))
     if not counts.all():
         raise ValueError(f"{field} {names[int(counts.argmin())]!r} has no clip")

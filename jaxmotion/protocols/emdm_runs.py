@@ -1,11 +1,8 @@
 """A folder of EMDM: the data it was made from, and what was trained on them.
 
-    data.npz, config.json     clips or text motions as they are used, and their making
-    <row>/                    one trained model each: EMDM, its comparators, ablations
-    recognizer/ or matcher/   the evaluator
-
-A row is a change of the base configuration; DDIM-10 is no row of its own but another
-way to sample "ddpm_1000".
+data.npz, config.json     clips or text motions as they are used, and their making
+<row>/                    one trained model each: EMDM, its comparators, ablations
+recognizer/ or matcher/   the evaluator
 """
 
 import dataclasses
@@ -21,49 +18,18 @@ from jaxtyping import Array
 
 from jaxmotion.learning import adversarial, training
 from jaxmotion.protocols import stages
+from jaxmotion.protocols.emdm_rows import (
+    SAMPLERS,
+    check_rows,
+    ddim_steps,
+    row_config,
+)
 from jaxmotion.protocols.stages import Budget
 from jaxmotion.systems import emdm, emdm_loss
 from jaxmotion.systems.emdm import Config
 from jaxmotion.typing import Key, Params
 
 TaskName = Literal["action", "text", "none"]
-
-_FLAT = dict(weight_position=0.0, weight_velocity=0.0, weight_foot=0.0)
-_DDPM = dict(latent=0, schedule="cosine", weight_recon=1.0)
-# Changes of the base configuration, by row.
-ROWS: dict[str, dict[str, Any]] = {
-    "emdm": {},
-    "emdm_5": dict(num_steps=5),
-    "emdm_2": dict(num_steps=2),
-    "emdm_1": dict(num_steps=1),
-    "naive": dict(discriminator_condition=False, weight_recon=0.0, **_FLAT),
-    "ddpm_50": dict(num_steps=50, **_DDPM),
-    "ddpm_1000": dict(num_steps=1000, **_DDPM),
-    "recon_0": dict(weight_recon=0.0, **_FLAT),
-    "recon_1": dict(weight_recon=1.0, **_FLAT),
-    "recon_10": dict(weight_recon=10.0, **_FLAT),
-    "recon_100": dict(weight_recon=100.0, **_FLAT),
-    "no_r1": dict(weight_r1=0.0),
-}
-# Ways to sample that need no training of their own: row, steps to visit.
-SAMPLERS: dict[str, tuple[str, int]] = {"ddim_10": ("ddpm_1000", 10)}
-
-
-def check_rows(names: tuple[str, ...]) -> None:
-    """Raises unless all are rows or samplers.
-
-    Args:
-      names: Names.
-
-    Raises:
-      ValueError: names the first unknown one and those there are.
-    """
-    known = (*ROWS, *SAMPLERS)
-    for name in names:
-        if name not in known:
-            raise ValueError(
-                f"unknown row {name!r}: expected one of {', '.join(known)}"
-            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,24 +49,6 @@ class Task:
     batch: Callable[[Key, Any, int], emdm_loss.Batch]
     geometry: emdm_loss.Geometry | None
     describe: dict[str, Any]
-
-
-def row_config(base: Config, row: str) -> Config:
-    """Configuration of a row.
-
-    Args:
-      base: Of the row "emdm".
-      row: Its name, or a sampler's.
-
-    Returns:
-      The configuration.
-
-    Raises:
-      ValueError: if there is no such row.
-    """
-    check_rows((row,))
-    trained = SAMPLERS[row][0] if row in SAMPLERS else row
-    return dataclasses.replace(base, **ROWS[trained])
 
 
 def _config_json(config: Config) -> dict[str, Any]:
@@ -209,11 +157,17 @@ def load_row(folder: Path, row: str) -> tuple[Params, Config]:
 
     Raises:
       CheckpointError: if the row was not trained here.
+      ValueError: if its configuration has other fields than this version's.
     """
     check_rows((row,))
     trained = SAMPLERS[row][0] if row in SAMPLERS else row
     value = stages.check_stage(folder / trained, trained, system="emdm")
-    config = Config(**value["config"])
+    try:
+        config = Config(**value["config"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(
+            f"{folder / trained}: field 'config' is not of this version: {error}"
+        ) from error
     params = stages.load_params(
         folder / trained,
         trained,
@@ -237,7 +191,7 @@ def row_sampler(params: Params, config: Config, row: str) -> emdm.Sample:
     """
     if row not in SAMPLERS:
         return emdm.sampler(params, config=config)
-    steps = emdm.ddim_steps(config.num_steps, SAMPLERS[row][1])
+    steps = ddim_steps(config.num_steps, SAMPLERS[row][1])
     return emdm.sampler(params, config=config, step="ddim", steps=steps)
 
 
@@ -294,7 +248,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         found = value.get("system")
     except (OSError, AttributeError, ValueError) as error:
         raise ValueError(
-            f"{folder}: no run folder of `experiments/emdm.py train`: {error}"
+            f"{path}: no run folder of `experiments/emdm.py train`: {error}"
         ) from error
     if found != "emdm":
         raise ValueError(f"{path}: field 'system' is {found!r}, expected 'emdm'")

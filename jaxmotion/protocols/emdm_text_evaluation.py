@@ -21,6 +21,7 @@ from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
 from jaxmotion.evaluation import diversity, frechet, matching
 from jaxmotion.learning import checkpoint, published, training
 from jaxmotion.learning import matching as evaluator
+from jaxmotion.protocols import stages
 from jaxmotion.protocols.emdm_text import TextRun
 from jaxmotion.typing import Key, Params
 
@@ -130,16 +131,11 @@ def train_evaluator(
             ),
         )
         checkpoint.save(folder, num_steps, {"params": params}, value)
-    found = checkpoint.load_config(folder)
-    for field, expected in value.items():
-        if found.get(field) != expected:
-            raise ValueError(
-                f"{folder}: field {field!r} is {found.get(field)!r}, expected "
-                f"{expected!r}"
-            )
-    like = jax.eval_shape(lambda: evaluator.init_matcher(jax.random.key(0), config))
+    params = stages.restore_evaluator(
+        folder, value, lambda: evaluator.init_matcher(jax.random.key(0), config)
+    )
     return Evaluator(
-        params=checkpoint.restore(folder, {"params": like})["params"],
+        params=params,
         config=config,
         mean=run.motions.mean,
         std=run.motions.std,

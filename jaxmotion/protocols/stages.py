@@ -86,6 +86,33 @@ def check_stage(folder: Path, stage: str, *, system: str) -> dict[str, Any]:
     return value
 
 
+def restore_evaluator(
+    folder: Path, value: dict[str, Any], init: Callable[[], Params]
+) -> Params:
+    """Parameters of an evaluator that must have been trained as told.
+
+    Args:
+      folder: Of its checkpoint.
+      value: JSON of how it must have been trained.
+      init: Makes parameters of the same shapes; never run.
+
+    Returns:
+      The parameters.
+
+    Raises:
+      CheckpointError: if there is none.
+      ValueError: if it was trained otherwise; names the field.
+    """
+    found = checkpoint.load_config(folder)
+    for field, expected in value.items():
+        if found.get(field) != expected:
+            raise ValueError(
+                f"{folder}: field {field!r} is {found.get(field)!r}, expected "
+                f"{expected!r}"
+            )
+    return checkpoint.restore(folder, {"params": jax.eval_shape(init)})["params"]
+
+
 def fit(
     folder: Path,
     state: Any,

@@ -297,23 +297,3 @@ def sampler(
         )
 
     return sample
-
-
-def ddim_steps(num_steps: int, count: int) -> tuple[int, ...]:
-    """Steps that "ddimN" of guided-diffusion visits: 1, 1 + T/N, ..., never T itself.
-
-    Args:
-      num_steps: T.
-      count: N, which divides T.
-
-    Returns:
-      The steps, increasing.
-
-    Raises:
-      ValueError: if N does not divide T.
-
-    Source: released code of MDM (there counted from 0).
-    """
-    if count < 1 or num_steps % count:
-        raise ValueError(f"{count} steps do not divide the {num_steps} of the model")
-    return tuple(range(1, num_steps + 1, num_steps // count))

@@ -114,6 +114,56 @@ def test_relabel_leaves_only_labels_that_occur():
     assert old.names("content") == ("turn-left", "walk")
 
 
+def labels_of(clips, field):
+    return [clips.names(field)[i] for i in np.asarray(clips.labels[field])]
+
+
+def test_merged_labels_are_one_and_the_old_word_is_gone():
+    clips = samples.clips()
+    found = selection.merge_labels(clips, "content", {"turn-left": "walk"})
+    assert found.names("content") == ("walk",)
+    assert labels_of(found, "content") == ["walk"] * 8
+    # Frames and other fields stay.
+    assert labels_of(found, "style") == labels_of(clips, "style")
+    np.testing.assert_array_equal(found.root_position, clips.root_position)
+    found = selection.merge_labels(clips, "style", {"old": "unused", "young": "unused"})
+    assert labels_of(found, "style") == ["unused"] * 8
+
+
+def test_merging_nothing_only_drops_labels_that_no_clip_has():
+    clips = samples.clips()
+    found = selection.merge_labels(clips, "style", {})
+    assert found.names("style") == ("young", "old")
+    assert labels_of(found, "style") == labels_of(clips, "style")
+
+
+@pytest.mark.parametrize(
+    ("field", "merge", "message"),
+    [
+        ("style", {"ancient": "old"}, "unknown style 'ancient'.*young, old, unused"),
+        ("style", {"old": "ancient"}, "unknown style 'ancient'.*young, old, unused"),
+        ("mood", {"old": "young"}, "unknown label field 'mood'.*style, content"),
+    ],
+)
+def test_labels_that_cannot_be_merged_are_named(field, merge, message):
+    with pytest.raises(ValueError, match=message):
+        selection.merge_labels(samples.clips(), field, merge)
+
+
+def test_frequent_labels_are_counted_in_clips():
+    clips = samples.clips()
+    for least, expected in (
+        (0, ("young", "old", "unused")),
+        (1, ("young", "old")),
+        (4, ("young", "old")),
+        (5, ()),
+    ):
+        assert selection.frequent_labels(clips, "style", least=least) == expected
+    assert selection.frequent_labels(clips, "content", least=4) == ("walk",)
+    with pytest.raises(ValueError, match="unknown label field 'mood'"):
+        selection.frequent_labels(clips, "mood", least=1)
+
+
 @pytest.mark.parametrize("fraction", [0.01, 0.25, 0.5, 0.99])
 def test_split_is_a_stratified_partition(fraction):
     clips = samples.clips()

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from jaxmotion.data import resample
+from jaxmotion.data.clips import clip_motion, clips_from_motions
 from jaxmotion.motion.skeleton import Motion
 from tests.data import samples
 
@@ -79,6 +80,40 @@ def test_nonsense_is_refused():
     empty = Motion(root_position=jnp.zeros((0, 3)), joint_rotation=jnp.zeros((0, 6, 6)))
     with pytest.raises(ValueError, match="no frames"):
         resample.resample(empty, 60.0)
+
+
+@pytest.mark.parametrize("fps", [10.0, 12.5, 30.0, 50.0])
+def test_clips_are_resampled_one_by_one(fps):
+    """Also those of one frame: none may take frames of its neighbours."""
+    motions = [samples.motion(n, i) for i, n in enumerate((1, 10, 1, 4, 10, 4))]
+    given = clips_from_motions(
+        motions,
+        samples.skeleton(),
+        names=[f"clip{i}" for i in range(6)],
+        labels={"style": ["a", "b"] * 3},
+        source="made up",
+    )
+    found = resample.resample_clips(given, fps)
+    assert found.fps == fps and found.num_clips == 6
+    assert found.clip_names == given.clip_names and found.source == given.source
+    assert found.label_names == given.label_names
+    np.testing.assert_array_equal(found.labels["style"], given.labels["style"])
+    for i, motion in enumerate(motions):
+        expected, own = resample.resample(motion, fps), clip_motion(found, i)
+        assert own.root_position.shape == expected.root_position.shape
+        np.testing.assert_allclose(own.root_position, expected.root_position, atol=2e-6)
+        np.testing.assert_allclose(
+            own.joint_rotation, expected.joint_rotation, atol=5e-6
+        )
+        np.testing.assert_allclose(
+            own.root_position[0], motion.root_position[0], atol=1e-6
+        )
+
+
+@pytest.mark.parametrize("fps", [0.0, -30.0, np.nan, np.inf, 1.0, 600.0])
+def test_rates_that_clips_cannot_have_are_refused(fps):
+    with pytest.raises(ValueError, match="fps is .*the clips have 30"):
+        resample.resample_clips(samples.clips(), float(fps))
 
 
 def test_slerp_of_equal_and_negated_quaternions():

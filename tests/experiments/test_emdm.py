@@ -71,8 +71,8 @@ def actions(call, data, tmp_path_factory, quick_compile):
 def texts(call, data, tmp_path_factory, quick_compile):
     folder = tmp_path_factory.mktemp("runs") / "texts"
     call(
-        f"train --task text --data {data} --out {folder} --encoder hashed --held-out 0.3 "
-        f"--unseen walk/elderly --frames 40 --rows emdm {SIZES}"
+        f"train --task text --data {data} --out {folder} --encoder hashed "
+        f"--held-out 0.3 --unseen walk/elderly --frames 40 --rows emdm {SIZES}"
     )
     return folder
 
@@ -183,9 +183,9 @@ BAD = {
     "train --task action --data {data} --out {actions} --least 2 --fps 10 --merge": (
         "its data were made with"
     ),
-    "train --task action --data {data} --out {new} --merge walk": "expected old=new",
-    "train --task action --data {data} --out {new} --merge hop=walk": "unknown content",
-    "train --task action --data {data} --out {new} --merge --least 999": "has 999 clips",
+    "train --data {data} --out {new} --merge walk": "expected old=new",
+    "train --data {data} --out {new} --merge hop=walk": "unknown content",
+    "train --data {data} --out {new} --merge --least 999": "has 999 clips",
     "train --task text --data {data} --out {new} --encoder nowhere": "'nowhere'",
     "train --task text --data {data} --out {new} --unseen walk/x": "'walk/x'",
     "train --out {new} --rows ddim_10": "samples 'ddpm_1000'",

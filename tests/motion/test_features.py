@@ -86,6 +86,54 @@ def test_frame_change_agrees_with_that_of_the_path():
     np.testing.assert_allclose(got.facing, want.facing, atol=1e-5)
 
 
+HIPS = skeleton.Skeleton(
+    offsets=jnp.array([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]], jnp.float32),
+    parents=(-1, 0, 0),
+    names=("Hips", "LeftUpLeg", "RightUpLeg"),
+)
+
+
+TO_FIRST = jax.jit(lambda world: features.to_first_pose(HIPS, world))
+
+
+@pytest.mark.parametrize("shape", [(5,), (2, 3, 5)])
+def test_motions_are_moved_to_their_own_first_pose(shape):
+    world = motion(shape)
+    found = TO_FIRST(world)
+    path = jax.jit(lambda m: trajectory.root_trajectory(HIPS, m))(found)
+    np.testing.assert_allclose(path.position[..., 0, :], 0.0, atol=1e-5)
+    ahead = np.broadcast_to([0.0, 1.0], path.facing[..., 0, :].shape)
+    np.testing.assert_allclose(path.facing[..., 0, :], ahead, atol=1e-5)
+    # Rigid and upright: heights, distances and limbs stay.
+    np.testing.assert_array_equal(
+        found.root_position[..., 1], world.root_position[..., 1]
+    )
+    np.testing.assert_array_equal(
+        found.joint_rotation[..., 1:, :], world.joint_rotation[..., 1:, :]
+    )
+    place = jax.jit(lambda m: skeleton.joint_positions(HIPS, m))
+    before, after = (
+        np.asarray(place(m)).reshape(*shape[:-1], -1, 3) for m in (world, found)
+    )
+    gaps = [x[..., :, None, :] - x[..., None, :, :] for x in (before, after)]
+    lengths = [np.linalg.norm(gap, axis=-1) for gap in gaps]
+    np.testing.assert_allclose(lengths[0], lengths[1], atol=1e-4)
+    assert found.fps == world.fps
+
+
+def test_where_a_motion_was_does_not_matter():
+    """A motion moved by any ground frame has the same first pose."""
+    world = motion((2, 5), seed=4)
+    elsewhere = features.from_frame(
+        world, frame([0.8, -2.0], [[3.0, 1.0], [0.0, -7.0]])
+    )
+    a, b = (TO_FIRST(m) for m in (world, elsewhere))
+    np.testing.assert_allclose(a.root_position, b.root_position, atol=1e-5)
+    np.testing.assert_allclose(a.joint_rotation, b.joint_rotation, atol=1e-5)
+    again = TO_FIRST(a)
+    np.testing.assert_allclose(again.root_position, a.root_position, atol=1e-5)
+
+
 @pytest.mark.parametrize("layout", ["rows", "columns"])
 def test_motion_features_hold_the_matrix_and_invert(layout):
     given = motion((2, 4))

@@ -76,6 +76,86 @@ def test_singular_rot6d_gives_a_rotation_and_a_finite_gradient(name):
     assert bool(jnp.all(jnp.isfinite(back)))
 
 
+def plain_gram_schmidt(rot6d):
+    """Of one vector of six numbers, left to the compiler's differentiation."""
+    first, second = rot6d[:3], rot6d[3:]
+    x = first / jnp.sqrt(jnp.sum(first**2))
+    y = second - jnp.sum(x * second) * x
+    y = y / jnp.sqrt(jnp.sum(y**2))
+    return jnp.stack([x, y, jnp.cross(x, y)], axis=1)
+
+
+def weighted(function, weights):
+    """A number that depends on all entries of all matrices."""
+    return lambda rot6d: jnp.sum(weights * function(rot6d))
+
+
+def test_written_gradient_of_rot6d_is_that_of_finite_differences():
+    rng = np.random.default_rng(9)
+    numbers, weights = 2.0 * rng.normal(size=(20, 6)), rng.normal(size=(20, 3, 3))
+    value = weighted(rotation.matrix_from_rot6d, float32(weights))
+    found = np.asarray(jax.grad(value)(float32(numbers)))
+    step = 1e-6
+    for row, weight, slopes in zip(numbers, weights, found, strict=True):
+        for i in range(6):
+            up, down = (row + sign * step * np.eye(6)[i] for sign in (1, -1))
+            change = reference.gram_schmidt(up) - reference.gram_schmidt(down)
+            expected = np.sum(weight * change) / (2 * step)
+            np.testing.assert_allclose(slopes[i], expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_written_gradient_of_columns_has_the_batch_behind(batch):
+    rng = np.random.default_rng(10)
+    numbers = float32(rng.normal(size=(*batch, 6)))
+    weights = float32(rng.normal(size=(*batch, 3, 3)))
+    behind = jnp.moveaxis(weights, (-2, -1), (0, 1))
+    given = jnp.moveaxis(numbers, -1, 0)
+    found = jax.jit(jax.grad(weighted(rotation.columns_from_rot6d, behind)))(given)
+    plain = plain_gram_schmidt
+    for _ in batch:
+        plain = jax.vmap(plain)
+    expected = jax.jit(jax.grad(weighted(plain, weights)))(numbers)
+    chex.assert_trees_all_close(
+        jnp.moveaxis(found, 0, -1), expected, rtol=1e-4, atol=1e-5
+    )
+    matrices = jax.jit(rotation.columns_from_rot6d)(given)
+    np.testing.assert_allclose(
+        jnp.moveaxis(matrices, (0, 1), (-2, -1)), jax.jit(plain)(numbers), atol=1e-5
+    )
+
+
+def test_gradient_of_a_gradient_is_that_of_the_plain_formula():
+    rng = np.random.default_rng(11)
+    numbers = float32(rng.normal(size=(10, 6)))
+    weights = float32(rng.normal(size=(10, 3, 3)))
+
+    def bent(function):
+        slope = jax.grad(weighted(function, weights))
+        return jax.jit(jax.grad(lambda x: jnp.sum(slope(x) ** 2)))
+
+    found = bent(rotation.matrix_from_rot6d)(numbers)
+    expected = np.asarray(bent(jax.vmap(plain_gram_schmidt))(numbers))
+    np.testing.assert_allclose(found, expected, rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", SINGULAR_ROT6D)
+def test_gradient_of_a_gradient_is_finite_where_rot6d_is_singular(name):
+    weights = float32(np.random.default_rng(0).normal(size=(3, 3)))
+    slope = jax.grad(weighted(rotation.matrix_from_rot6d, weights))
+    bent = jax.jit(jax.grad(lambda x: jnp.sum(slope(x) ** 2)))
+    assert np.isfinite(bent(float32(SINGULAR_ROT6D[name]))).all()
+
+
+def test_a_vector_that_a_fallback_replaces_has_no_gradient():
+    weights = float32(np.random.default_rng(0).normal(size=(3, 3)))
+    slope = jax.grad(weighted(rotation.matrix_from_rot6d, weights))
+    assert np.all(slope(jnp.zeros(6)) == 0.0)
+    for name, part in (("zero first", slice(0, 3)), ("parallel", slice(3, 6))):
+        found = np.asarray(slope(float32(SINGULAR_ROT6D[name])))
+        assert np.all(found[part] == 0.0) and np.any(found != 0.0)
+
+
 @pytest.mark.parametrize("angle", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
 def test_nearly_parallel_rot6d_is_still_a_rotation(angle):
     rng = np.random.default_rng(8)

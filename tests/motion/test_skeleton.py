@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -105,6 +107,134 @@ def test_gradient_agrees_with_finite_differences(bones):
     )
     zeros = jax.grad(energy, argnums=1)(float32(root), jnp.zeros_like(rot6d))
     assert bool(jnp.all(jnp.isfinite(zeros)))
+
+
+def plain_transforms(parents, offsets, root, matrices):
+    """Positions and world rotations of one pose, left to the compiler's gradient."""
+    positions, turns = [root], [matrices[0]]
+    for joint, parent in enumerate(parents[1:], start=1):
+        positions.append(positions[parent] + turns[parent] @ offsets[joint])
+        turns.append(turns[parent] @ matrices[joint])
+    return jnp.stack(positions), jnp.stack(turns)
+
+
+def energies(shape, parents=PARENTS):
+    """The same number of offsets, roots and rotations, by the library and plainly.
+
+    It depends on all positions and on all world rotations.
+    """
+    rng = np.random.default_rng(2)
+    of_positions = float32(rng.normal(size=(*shape, len(parents), 3)))
+    of_turns = float32(rng.normal(size=(*shape, len(parents), 3, 3)))
+    names = NAMES[: len(parents)]
+
+    def total(positions, turns):
+        return jnp.sum(of_positions * positions) + jnp.sum(of_turns * turns)
+
+    def written(offsets, root, rot6d):
+        bones = skeleton.Skeleton(offsets=offsets, parents=parents, names=names)
+        return total(*skeleton.global_transforms(bones, root, rot6d))
+
+    def plain(offsets, root, rot6d):
+        one = functools.partial(plain_transforms, parents, offsets)
+        for _ in shape:
+            one = jax.vmap(one)
+        return total(*one(root, rotation.matrix_from_rot6d(rot6d)))
+
+    return written, plain
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
+def test_written_gradient_is_that_of_a_plain_loop(shape):
+    root, _, rot6d = pose(8, shape)
+    # Not orthonormal, as a network gives them.
+    rot6d = rot6d + 0.3 * float32(np.random.default_rng(3).normal(size=rot6d.shape))
+    given = float32(OFFSETS), float32(root), rot6d
+    found, expected = (
+        jax.jit(jax.grad(energy, argnums=(0, 1, 2)))(*given)
+        for energy in energies(shape)
+    )
+    for name, a, b in zip(("offsets", "root", "rot6d"), found, expected, strict=True):
+        assert np.abs(b).max() > 0.1
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=5e-5, err_msg=name)
+    # The root is where it is told to be, whatever its offset.
+    np.testing.assert_array_equal(found[0][0], 0.0)
+
+
+@pytest.mark.parametrize("part", ["positions", "rotations", "both"])
+def test_written_gradient_is_that_of_finite_differences(part):
+    """In float64, by products of 4x4 matrices."""
+    root, _, _ = pose(9, ())
+    rng = np.random.default_rng(4)
+    numbers = rng.normal(size=(len(PARENTS), 6))
+    weights = rng.normal(size=(len(PARENTS), 3, 4))
+    weights[..., 3] *= part != "rotations"
+    weights[..., :3] *= part != "positions"
+
+    def oracle(offsets, root, numbers):
+        matrices = [reference.gram_schmidt(n) for n in numbers]
+        worlds = reference.world_transforms(offsets, PARENTS, root, matrices)
+        return np.sum(weights * worlds[:, :3])
+
+    def energy(offsets, root, rot6d):
+        bones = skeleton.Skeleton(offsets=offsets, parents=PARENTS, names=NAMES)
+        positions, turns = skeleton.global_transforms(bones, root, rot6d)
+        whole = jnp.concatenate([turns, positions[..., None]], axis=-1)
+        return jnp.sum(float32(weights) * whole)
+
+    given = OFFSETS, root, numbers
+    found = jax.jit(jax.grad(energy, argnums=(0, 1, 2)))(*map(float32, given))
+    for place, (array, slopes) in enumerate(zip(given, found, strict=True)):
+        for _ in range(6):
+            index = tuple(rng.integers(0, n) for n in array.shape)
+            ends = []
+            for sign in (1, -1):
+                moved = [np.array(x, np.float64) for x in given]
+                moved[place][index] += sign * 1e-6
+                ends.append(oracle(*moved))
+            expected = (ends[0] - ends[1]) / 2e-6
+            np.testing.assert_allclose(slopes[index], expected, rtol=1e-3, atol=1e-3)
+
+
+def test_gradient_of_a_gradient_is_that_of_a_plain_loop():
+    few = PARENTS[:4]
+    root, _, rot6d = pose(10, (2,))
+    root, rot6d, offsets = float32(root), rot6d[:, :4], float32(OFFSETS[:4])
+
+    def bent(energy):
+        def size(offsets, rot6d):
+            slopes = jax.grad(energy, argnums=(0, 2))(offsets, root, rot6d)
+            return sum(jnp.sum(x**2) for x in slopes)
+
+        return jax.jit(jax.grad(size, argnums=(0, 1)))
+
+    written, plain = (bent(energy) for energy in energies((2,), few))
+    pairs = zip(written(offsets, rot6d), plain(offsets, rot6d), strict=True)
+    for found, expected in pairs:
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4 * scale)
+    singular = written(offsets, jnp.zeros_like(rot6d))
+    assert all(np.isfinite(x).all() for x in singular)
+
+
+def test_gradients_of_many_skeletons_by_vmap():
+    """The chain is differentiated under vmap over offsets as well."""
+    root, _, rot6d = pose(11, (3,))
+    sizes = float32([0.5, 1.0, 2.0])
+
+    def energy(size, root, rot6d):
+        bones = skeleton.Skeleton(
+            offsets=size * float32(OFFSETS), parents=PARENTS, names=NAMES
+        )
+        return jnp.sum(skeleton.forward_kinematics(bones, root, rot6d) ** 2)
+
+    given = sizes, float32(root), rot6d
+    slope = jax.grad(energy, argnums=(0, 2))
+    together = jax.jit(jax.vmap(slope))(*given)
+    alone = jax.jit(slope)
+    for i in range(3):
+        for a, b in zip(together, alone(*(x[i] for x in given)), strict=True):
+            np.testing.assert_allclose(a[i], b, rtol=1e-4, atol=1e-3)
 
 
 def test_vmap_and_jit_are_leading_axes(bones):

@@ -14,7 +14,7 @@ from tests.reference import emdm as reference
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
 NET = sequence_discriminator.SequenceDiscriminator(
-    num_steps=4, width=64, time_width=16, groups=8
+    num_steps=4, width=128, time_width=16
 )
 
 
@@ -73,7 +73,7 @@ def test_network_is_the_formula_at_every_step():
             t - 1,
             np.float64(condition),
             width=16,
-            groups=(8, 4),
+            groups=(4, 2),
         )
         np.testing.assert_allclose(found[-1], expected, rtol=1e-4, atol=1e-5)
     assert np.ptp(found) > 1e-3
@@ -131,5 +131,5 @@ def test_a_batch_is_its_samples():
 def test_without_a_condition_its_vector_has_no_channels():
     arguments = pair(3, size=0)
     params = make(NET, *arguments)
-    assert params["layers_0"]["kernel"].shape == (2 * 15 + 16, 64)
+    assert params["layers_0"]["kernel"].shape == (2 * 15 + 16, 128)
     assert NET.apply({"params": params}, *arguments).shape == (3,)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.protocols import emdm_rows
 from jaxmotion.systems import emdm
 from tests import tiny
 from tests.reference import diffusion
@@ -162,17 +163,17 @@ def test_guidance_extrapolates_with_one_latent():
 
 
 def test_steps_of_ddim_are_those_of_guided_diffusion():
-    assert emdm.ddim_steps(1000, 10) == tuple(range(1, 1000, 100))
-    assert emdm.ddim_steps(20, 20) == tuple(range(1, 21))
-    assert emdm.ddim_steps(7, 1) == (1,)
+    assert emdm_rows.ddim_steps(1000, 10) == tuple(range(1, 1000, 100))
+    assert emdm_rows.ddim_steps(20, 20) == tuple(range(1, 21))
+    assert emdm_rows.ddim_steps(7, 1) == (1,)
     for count in (3, 0, -1, 2000):
         with pytest.raises(ValueError, match=f"{count} steps.*the 1000"):
-            emdm.ddim_steps(1000, count)
+            emdm_rows.ddim_steps(1000, count)
 
 
 def test_ddim_follows_x_T_and_tells_the_network_the_old_step():
     """Nothing but x_T comes from the key: the oracle draws no noise."""
-    steps = emdm.ddim_steps(20, 5)
+    steps = emdm_rows.ddim_steps(20, 5)
     condition = one_condition(length=4)
     found = jitted(DDPM, step="ddim", steps=steps)(jax.random.key(1), condition)
     x, _, _ = draws(jax.random.key(1), 5, 0)

@@ -25,12 +25,19 @@ def motions():
     return features.to_first_pose(tiny.skeleton(), stacked)
 
 
+def way(motion):
+    """Of the root: steps on the ground, the first from the origin, and heights."""
+    root = np.float64(motion.root_position)
+    steps = np.diff(root, axis=-2, prepend=np.zeros_like(root[..., :1, :]))
+    return np.stack([steps[..., 0], root[..., 1], steps[..., 2]], axis=-1)
+
+
 @pytest.fixture(scope="module")
 def representation():
     return emdm_motion.fit(tiny.skeleton(), motions())
 
 
-def test_features_are_rows_of_rotations_and_the_root(representation):
+def test_features_are_rows_of_rotations_and_the_way_of_the_root(representation):
     found = emdm_motion.to_features(motions(), representation)
     assert found.shape == (3, 20, 36) and representation.num_features == 36
     mean, std = (
@@ -40,7 +47,7 @@ def test_features_are_rows_of_rotations_and_the_root(representation):
     matrices = rotation.matrix_from_rot6d(motions().joint_rotation)
     rows = np.asarray(matrices)[..., :2, :].reshape(3, 20, 30)
     np.testing.assert_allclose(raw[..., :30], rows, atol=1e-5)
-    np.testing.assert_allclose(raw[..., ROOT], motions().root_position, atol=1e-5)
+    np.testing.assert_allclose(raw[..., ROOT], way(motions()), atol=1e-5)
     np.testing.assert_allclose(raw[..., 33:], 0.0, atol=1e-6)
 
 
@@ -48,10 +55,10 @@ def test_units_are_one_for_all_rotations_and_one_for_each_root_channel(represent
     given = motions()
     matrices = rotation.matrix_from_rot6d(given.joint_rotation)
     rows = np.float64(matrices)[..., :2, :].reshape(-1, 30)
-    root = np.float64(given.root_position).reshape(-1, 3)
+    root = way(given).reshape(-1, 3)
     std = np.asarray(representation.normalizer.std)
     np.testing.assert_allclose(std[:30], np.mean(rows.std(0)), rtol=1e-4)
-    np.testing.assert_allclose(std[ROOT], np.maximum(root.std(0), 0.02), rtol=1e-4)
+    np.testing.assert_allclose(std[ROOT], np.maximum(root.std(0), 0.01), rtol=1e-4)
     np.testing.assert_array_equal(std[33:], 1.0)
     mean = np.asarray(representation.normalizer.mean)
     np.testing.assert_allclose(mean[:30], rows.mean(0), atol=1e-5)
@@ -64,12 +71,12 @@ def test_deviations_have_a_floor():
     given = motions()
     still = dataclasses.replace(
         given,
-        root_position=jnp.ones_like(given.root_position),
+        root_position=jnp.zeros_like(given.root_position).at[..., 1].set(1.0),
         joint_rotation=jnp.broadcast_to(
             given.joint_rotation[:1, :1], given.joint_rotation.shape
         ),
     )
-    for options, floor in (({}, 0.02), ({"floor": 0.5}, 0.5)):
+    for options, floor in (({}, 0.01), ({"floor": 0.5}, 0.5)):
         found = emdm_motion.fit(tiny.skeleton(), still, **options)
         np.testing.assert_allclose(found.normalizer.std[:33], floor, rtol=1e-6)
         x = emdm_motion.to_features(still, found)
