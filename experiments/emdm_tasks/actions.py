@@ -8,9 +8,11 @@ from jaxtyping import Array
 
 from emdm_tasks.judge import Judge
 from emdm_tasks.scores import cells
+from jaxmotion.evaluation.table import Cell
 from jaxmotion.motion import skeleton
 from jaxmotion.protocols import emdm_action
 from jaxmotion.protocols import emdm_action_evaluation as protocol
+from jaxmotion.protocols.emdm_data import ActionArrays
 from jaxmotion.systems import emdm, emdm_motion
 
 
@@ -39,19 +41,18 @@ def make_judge(args: Any) -> Judge:
         )
     recognizer = protocol.load_recognizer(run, num_steps=args.evaluator_steps, seed=0)
     wanted = jnp.repeat(jnp.arange(number), each)
-    key_reference, key_real = jax.random.split(jax.random.key(args.seed))
-    key_motion, key_state = jax.random.split(key_reference)
+    key_motion, key_state, *keys_real = jax.random.split(jax.random.key(args.seed), 4)
     truth = protocol.real_positions(key_motion, wanted, run=run, part=run.train)
     reference = protocol.moments(recognizer, run)(key_state, truth)
     score = protocol.scorer(recognizer, run, reference)
 
-    def score_real(part) -> dict:
+    def score_real(key: Array, part: ActionArrays) -> dict[str, Cell]:
         def once(key: Array) -> dict[str, Array]:
             key_motion, key_score = jax.random.split(key)
             positions = protocol.real_positions(key_motion, wanted, run=run, part=part)
             return score(key_score, positions, wanted)
 
-        keys = jax.random.split(key_real, args.replications)
+        keys = jax.random.split(key, args.replications)
         return cells([once(key) for key in keys])
 
     conditional = run.config["task"] == "action"
@@ -76,8 +77,8 @@ def make_judge(args: Any) -> Judge:
     scale = None if args.scale in (None, 1.0) else jnp.float32(args.scale)
     return Judge(
         real={
-            "real (training clips)": score_real(run.train),
-            "real (held-out clips)": score_real(run.held_out),
+            "real (training clips)": score_real(keys_real[0], run.train),
+            "real (held-out clips)": score_real(keys_real[1], run.held_out),
         },
         score=score_row,
         scale=scale,

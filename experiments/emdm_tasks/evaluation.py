@@ -105,7 +105,7 @@ def evaluate(args: Any, out: Path) -> None:
         results = [score(key) for key in keys[:count]]
         found[row] = cells(results) | {
             "ms a frame": milliseconds_a_frame(sample, judge.one, scale, config.frames),
-            "network calls": Cell(value=number),
+            "network calls": Cell(value=float(number)),
         }
         seconds = time.perf_counter() - begun
         print(f"{row}: {count} x {judge.samples}, {seconds:.0f} s", flush=True)

@@ -125,7 +125,9 @@ def logits(params, calls):
     """The oracle's logits of recorded calls of a discriminator."""
     return [
         [
-            reference.discriminator(params, *map(np.float64, pair), int(t) - 1, vector)
+            reference.discriminator(
+                params, *map(np.float64, pair), int(t) - 1, vector, groups=(4, 2)
+            )
             for *pair, t, vector in zip(*args, strict=True)
         ]
         for args, _ in calls
@@ -156,7 +158,9 @@ def test_discriminator_loss_is_the_formula(watch):
     x_prev, x_t, t, vector = (np.float64(x) for x in calls[0][0])
 
     def judge(x, i):
-        return reference.discriminator(own, x, x_t[i], int(t[i]) - 1, vector[i])
+        return reference.discriminator(
+            own, x, x_t[i], int(t[i]) - 1, vector[i], groups=(4, 2)
+        )
 
     penalty = reference.r1(judge, x_prev, gamma=CONFIG.weight_r1)
     np.testing.assert_allclose(info["adversarial"], expected, rtol=1e-4)
