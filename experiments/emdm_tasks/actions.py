@@ -39,7 +39,8 @@ def make_judge(args: Any) -> Judge:
             f"samples is {args.samples}, expected at least 2 for each of {number} "
             "actions"
         )
-    recognizer = protocol.load_recognizer(run, num_steps=args.evaluator_steps, seed=0)
+    steps = args.evaluator_steps or 1500
+    recognizer = protocol.load_recognizer(run, num_steps=steps, seed=0)
     wanted = jnp.repeat(jnp.arange(number), each)
     key_motion, key_state, *keys_real = jax.random.split(jax.random.key(args.seed), 4)
     truth = protocol.real_positions(key_motion, wanted, run=run, part=run.train)
@@ -86,7 +87,7 @@ def make_judge(args: Any) -> Judge:
         samples=each * number,
         describe={
             "recognizer": "GRU 2 x 128, tanh 30, joint positions; trained on "
-            f"{run.clips.source}, {args.evaluator_steps} updates, seed 0",
+            f"{run.clips.source}, {steps} updates, seed 0",
             "reference": f"{each * number} real motions of training clips, actions "
             "uniform",
             "ground height m": protocol.ground_height(run),

@@ -39,7 +39,7 @@ def make_judge(args: Any) -> Judge:
         protocol.published_evaluator(run, args.matcher)
         if args.matcher
         else protocol.train_evaluator(
-            run, frames=frames, num_steps=args.evaluator_steps, seed=0
+            run, frames=frames, num_steps=args.evaluator_steps or 600, seed=0
         )
     )
     arrays = {

@@ -145,7 +145,7 @@ def train_evaluator(
 
 def _pairs(key: Key, data: Any) -> evaluator.Pairs:
     arrays, coded = data
-    features, frames, caption = sample_text_batch(key, arrays, batch=64)
+    features, frames, caption = sample_text_batch(key, arrays, batch=32)
     row = coded.index[caption]
     return evaluator.Pairs(
         features=features[..., :-_CONTACTS],
