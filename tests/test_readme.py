@@ -69,7 +69,7 @@ def test_commands_parse(words, monkeypatch):
 def test_start_commands():
     assert [words[:3] for words in commands() if words[0] == "pip"] == [
         ["pip", "install", "-e"]
-    ] * 2
+    ] * 3  # plain, with the tests' extra, with text encoders
     # .ci/run looks for this line.
     assert '\npip install -e ".[test]" && pytest\n' in README
     assert [words for words in SCRIPTS if words[1].endswith("quickstart.py")]

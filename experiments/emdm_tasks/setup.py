@@ -13,6 +13,7 @@ from jaxmotion.protocols import (
     emdm_text,
 )
 from jaxmotion.systems import emdm
+from jaxmotion.text import encoder as text_encoder
 
 # Frames of the shortest clip that gets a caption, as in HumanML3D.
 _SHORTEST = 40
@@ -122,6 +123,8 @@ def _prepare_texts(args: Any) -> emdm_runs.Task:
         held_out=args.held_out,
     )
     if not _same(args.out, made):
+        # An encoder that is not there should be said before the features are made.
+        text_encoder.make_encoder(args.encoder)
         motions = _text_motions(args, made["fps"])
         text_motion_io.save_text_motions(args.out / "data.npz", motions)
         emdm_runs.write_config(args.out, made)
