@@ -162,13 +162,14 @@ class Sample:
 def train(args: Train) -> None:
     """Trains row by row."""
     emdm_rows.check_rows(args.rows)
-    loop.check_writable(args.out)
-    task = setup.prepare(args)
     for row in args.rows:
         if row in emdm_rows.SAMPLERS:
             raise ValueError(
                 f"row {row!r} samples {emdm_rows.SAMPLERS[row][0]!r}: train that"
             )
+    loop.check_writable(args.out)
+    task = setup.prepare(args)
+    for row in args.rows:
         begun = time.perf_counter()
         latent = emdm_rows.row_config(task.base, row).latent
         budget = stages.Budget(

@@ -10,7 +10,7 @@ from emdm_tasks.judge import Judge
 from emdm_tasks.scores import cells
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import emdm_action
+from jaxmotion.protocols import emdm_action, emdm_runs
 from jaxmotion.protocols import emdm_action_evaluation as protocol
 from jaxmotion.protocols.emdm_data import ActionArrays
 from jaxmotion.systems import emdm, emdm_motion
@@ -43,39 +43,43 @@ def make_judge(args: Any) -> Judge:
     recognizer = protocol.load_recognizer(run, num_steps=steps, seed=0)
     wanted = jnp.repeat(jnp.arange(number), each)
     key_motion, key_state, *keys_real = jax.random.split(jax.random.key(args.seed), 4)
-    truth = protocol.real_positions(key_motion, wanted, run=run, part=run.train)
+    truth = protocol.real_positions(key_motion, wanted, run.train)
     reference = protocol.moments(recognizer, run)(key_state, truth)
-    score = protocol.scorer(recognizer, run, reference)
+    ground = protocol.ground_height(run)
+    score = protocol.scorer(recognizer, run, reference, ground=ground)
 
     def score_real(key: Array, part: ActionArrays) -> dict[str, Cell]:
         def once(key: Array) -> dict[str, Array]:
             key_motion, key_score = jax.random.split(key)
-            positions = protocol.real_positions(key_motion, wanted, run=run, part=part)
+            positions = protocol.real_positions(key_motion, wanted, part)
             return score(key_score, positions, wanted)
 
         keys = jax.random.split(key, args.replications)
         return cells([once(key) for key in keys])
 
     conditional = run.config["task"] == "action"
-    config = emdm_action.make_task(
-        run, emdm.Config(features=1), conditional=conditional
-    ).base
-    vectors = jax.nn.one_hot(wanted, config.condition_size)
-    conditions = emdm.make_condition(vectors, config=config)
+    conditions = emdm.Condition(
+        vector=jax.nn.one_hot(wanted, number if conditional else 0),
+        keep=jnp.ones(wanted.shape, bool),
+        mask=jnp.ones((*wanted.shape, run.train.frames), bool),
+    )
+
+    @jax.jit
+    def positions_of(x: Array) -> Array:
+        motion = emdm_motion.to_motion(x, run.representation)
+        return skeleton.joint_positions(run.clips.skeleton, motion)
 
     def score_row(key: Array, many) -> dict[str, Array]:
         key_sample, key_score = jax.random.split(key)
         x = many(key_sample, conditions, scale)
-        motion = emdm_motion.to_motion(x, run.representation)
-        positions = skeleton.joint_positions(run.clips.skeleton, motion)
-        found = score(key_score, positions, wanted)
+        found = score(key_score, positions_of(x), wanted)
         if not conditional:
             found = {
                 k: found[k] for k in found if k not in ("accuracy", "multimodality")
             }
         return found
 
-    scale = None if args.scale in (None, 1.0) else jnp.float32(args.scale)
+    scale = emdm_runs.guidance_scale(args.scale, default=1.0)
     return Judge(
         real={
             "real (training clips)": score_real(keys_real[0], run.train),
@@ -90,6 +94,6 @@ def make_judge(args: Any) -> Judge:
             f"{run.clips.source}, {steps} updates, seed 0",
             "reference": f"{each * number} real motions of training clips, actions "
             "uniform",
-            "ground height m": protocol.ground_height(run),
+            "ground height m": ground,
         },
     )

@@ -1,7 +1,6 @@
 """The table of a run: rows beside real motions, with intervals over replications."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -100,9 +99,8 @@ def evaluate(args: Any, out: Path) -> None:
         count = args.long_replications if number >= _LONG else args.replications
         scale = judge.scale
         many = emdm_runs.sample_many(sample, chunk=_CHUNK)
-        score: Callable[[Array], Any] = lambda key: judge.score(key, many)  # noqa: B023, E731
         keys = jax.random.split(jax.random.key(args.seed + 1), args.replications)
-        results = [score(key) for key in keys[:count]]
+        results = [judge.score(key, many) for key in keys[:count]]
         found[row] = cells(results) | {
             "ms a frame": milliseconds_a_frame(sample, judge.one, scale, config.frames),
             "network calls": Cell(value=float(number)),

@@ -46,8 +46,7 @@ def _generate(args: Any, vectors: Any, scale: float) -> np.ndarray:
     run = emdm_runs.sample_many(
         emdm_runs.row_sampler(params, config, args.row), chunk=8
     )
-    scale = scale if args.scale is None else args.scale
-    given = None if scale == 1.0 else jnp.float32(scale)
+    given = emdm_runs.guidance_scale(args.scale, default=scale)
     return run(jax.random.key(args.seed), conditions, given)[:, :length]
 
 

@@ -11,7 +11,7 @@ from emdm_tasks.judge import Judge
 from emdm_tasks.scores import cells
 from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
 from jaxmotion.evaluation import diversity, frechet
-from jaxmotion.protocols import emdm_text
+from jaxmotion.protocols import emdm_runs, emdm_text
 from jaxmotion.protocols import emdm_text_evaluation as protocol
 from jaxmotion.systems import emdm
 
@@ -52,7 +52,7 @@ def make_judge(args: Any) -> Judge:
     score = protocol.make_scorer(run, judge)
 
     def moments(split: str) -> frechet.Moments:
-        key = jax.random.fold_in(jax.random.key(args.seed), len(split))
+        key = jax.random.key(args.seed)
         x, length, _ = draw(key, arrays[split], batch=number)
         return frechet.moments(embed(x, length))
 
@@ -67,8 +67,7 @@ def make_judge(args: Any) -> Judge:
         keys = jax.random.split(jax.random.key(args.seed + 7), args.replications)
         return cells([once(key) for key in keys])
 
-    task = emdm_text.make_task(run, emdm.Config(features=1), frames=frames)
-    vectors, index = task.data[1:]
+    vectors, index = jnp.asarray(run.vectors, jnp.float32), jnp.asarray(run.index)
 
     def conditions(caption: Array, length: Array) -> emdm.Condition:
         return emdm.Condition(
@@ -77,8 +76,7 @@ def make_judge(args: Any) -> Judge:
             mask=jnp.arange(frames)[None] < length[:, None],
         )
 
-    scale = 2.5 if args.scale is None else args.scale
-    scale = None if scale == 1.0 else jnp.float32(scale)
+    scale = emdm_runs.guidance_scale(args.scale, default=2.5)
 
     def score_split(key: Array, many, split: str) -> dict[str, Array]:
         key_draw, key_sample, key_score = jax.random.split(key, 3)

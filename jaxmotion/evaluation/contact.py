@@ -19,8 +19,20 @@ class Slide(NamedTuple):
     seconds: Float[Array, "*batch"]
 
 
-def _foot_steps(foot_positions: Float[Array, "*batch frames feet 3"]) -> Array:
-    """Distance on the ground from each frame to the next, metres."""
+def foot_steps(
+    foot_positions: Float[Array, "*batch frames feet 3"],
+) -> Float[Array, "*batch frames-1 feet"]:
+    """Distance on the ground from each frame to the next.
+
+    Args:
+      foot_positions: World positions, metres.
+
+    Returns:
+      Metres.
+
+    Raises:
+      ValueError: if there are fewer than two frames.
+    """
     if foot_positions.shape[-3] < 2:
         raise ValueError("1 frame or none, expected at least 2 to have a step")
     return jnp.linalg.norm(jnp.diff(foot_positions[..., ::2], axis=-3), axis=-1)
@@ -54,7 +66,7 @@ def slide_distance(
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 2. Differs: a second of low
       foot, so that it depends on neither length nor frame rate.
     """
-    steps = _foot_steps(foot_positions)
+    steps = foot_steps(foot_positions)
     is_low = foot_positions[..., :-1, :, 1] < max_height
     metres = jnp.sum(jnp.where(is_low, steps, 0.0), axis=(-2, -1))
     seconds = jnp.sum(is_low, axis=(-2, -1)) / fps
@@ -90,7 +102,7 @@ def skate_ratio(
     Source: Karunratanakul et al. 2023 (GMD), with a threshold a second. Real data do
       not score zero (about 0.05 there).
     """
-    is_fast = _foot_steps(foot_positions) * fps > min_speed
+    is_fast = foot_steps(foot_positions) * fps > min_speed
     is_low = foot_positions[..., 1] < max_height
     skates = is_fast & is_low[..., 1:, :] & is_low[..., :-1, :]
     return jnp.mean(jnp.any(skates, axis=-1), axis=-1)
@@ -125,7 +137,7 @@ def skating_frame_ratio(
     Source: Zhang et al. 2018 (MANN), section 8; cited for AAMDM's "footskating frame
       ratio" by Li et al. 2024.
     """
-    speed = _foot_steps(foot_positions) * fps
+    speed = foot_steps(foot_positions) * fps
     level = jnp.clip(foot_positions[..., :-1, :, 1] / height, 0.0, 1.0)
     skates = speed * (2.0 - 2.0**level) > min_speed
     return jnp.mean(jnp.any(skates, axis=-1), axis=-1)
@@ -158,7 +170,7 @@ def foot_slide_camdm_release(
 
     Source: released code of CAMDM, cal_metric_foot_sliding.
     """
-    steps = _foot_steps(foot_positions)
+    steps = foot_steps(foot_positions)
     steps = jnp.concatenate([steps, jnp.zeros_like(steps[..., :1, :])], axis=-2)
     is_low = foot_positions[..., 1] < max_height
     count = jnp.sum(is_low, axis=(-2, -1))

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxmotion.evaluation import contact
 from jaxmotion.motion.spring import Scalar
 
 _MILLIMETRES = 1000.0
@@ -102,10 +103,7 @@ def skating(
 
     Source: Yuan et al. 2023 (PhysDiff), with joints instead of vertices.
     """
-    frames = foot_positions.shape[-3]
-    if frames < 2:
-        raise ValueError(f"{frames} frames, expected at least 2 to have a displacement")
-    steps = jnp.linalg.norm(jnp.diff(foot_positions[..., ::2], axis=-3), axis=-1)
+    steps = contact.foot_steps(foot_positions)
     touches = foot_positions[..., 1] - ground <= tolerance
     slides = touches[..., 1:, :] & touches[..., :-1, :]
     total = jnp.sum(jnp.where(slides, steps, 0.0), axis=(-2, -1))

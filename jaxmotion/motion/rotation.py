@@ -121,6 +121,7 @@ def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3
 
     Any input shorter than 1e18 gives a rotation: where the first vector is zero it
     becomes +x, and where the second is parallel to it another axis takes its place.
+    Differentiable in reverse mode only: its gradient is written out.
 
     Args:
       rot6d: Two columns, not necessarily orthonormal.

@@ -154,6 +154,8 @@ def global_transforms(
 ) -> tuple[Float[Array, "*batch joints 3"], Float[Array, "*batch joints 3 3"]]:
     """World positions and world rotations of all joints.
 
+    Differentiable in reverse mode only: its gradient is written out.
+
     Args:
       skeleton: The bones.
       root_position: World position of the root, metres.

@@ -67,7 +67,7 @@ def load_recognizer(run: ActionRun, *, num_steps: int, seed: int) -> Params:
     if checkpoint.latest_step(folder) is None:
         key_data, key_train = jax.random.split(jax.random.key(seed))
         actions = jnp.arange(_RECOGNIZED) % len(run.actions)
-        x = _flat(real_positions(key_data, actions, run=run, part=run.train))
+        x = _flat(real_positions(key_data, actions, run.train))
         params, _ = recognition.train_action_recognizer(
             key_train, x, actions, config=config, num_steps=num_steps
         )
@@ -84,22 +84,22 @@ def _flat(positions: Array) -> Array:
     return positions.reshape(*positions.shape[:-2], -1)
 
 
+@jax.jit
 def real_positions(
-    key: Key, actions: Int[Array, " batch"], *, run: ActionRun, part: ActionArrays
+    key: Key, actions: Int[Array, " batch"], part: ActionArrays
 ) -> Float[Array, "batch frames joints 3"]:
     """Joint positions of recorded motions.
 
     Args:
       key: Consumed.
       actions: Wanted actions.
-      run: The run.
-      part: Its training or held-out clips.
+      part: Training or held-out clips.
 
     Returns:
       Positions, metres.
     """
     motions = emdm_data.sample_motions(key, part, actions)
-    return skeleton.joint_positions(run.clips.skeleton, motions)
+    return skeleton.joint_positions(part.clips.skeleton, motions)
 
 
 def moments(params: Params, run: ActionRun) -> Callable[[Key, Array], frechet.Moments]:
@@ -125,7 +125,7 @@ def moments(params: Params, run: ActionRun) -> Callable[[Key, Array], frechet.Mo
 
 
 def scorer(
-    params: Params, run: ActionRun, reference: frechet.Moments
+    params: Params, run: ActionRun, reference: frechet.Moments, *, ground: float
 ) -> Callable[[Key, Array, Int[Array, " batch"]], dict[str, Array]]:
     """Scores of a set of motions, as one compiled program.
 
@@ -133,13 +133,14 @@ def scorer(
       params: The recogniser's.
       run: The run.
       reference: Moments of the real features.
+      ground: Height of the lowest joint of a person who stands, metres.
 
     Returns:
       `score(key, positions, actions) -> scores`. The actions are in ascending order,
       each as often as the others.
     """
     config, bones = recognizer_config(run), run.clips.skeleton
-    toes_of, ground = jnp.asarray(bones.feet), ground_height(run)
+    feet = jnp.asarray(bones.feet)
 
     @jax.jit
     def score(
@@ -151,7 +152,7 @@ def scorer(
         )
         by_action = features.reshape(config.num_classes, -1, features.shape[-1])
         fps = run.clips.fps
-        toes = positions[..., toes_of, :]
+        toes = positions[..., feet, :]
         return {
             "FID": frechet.frechet_distance(frechet.moments(features), reference),
             "accuracy": jnp.mean(jnp.argmax(logits, -1) == actions),
@@ -163,9 +164,7 @@ def scorer(
                 plausibility.penetration(positions, ground=ground)
             ),
             "float mm": jnp.mean(plausibility.floating(positions, ground=ground)),
-            "skate mm": jnp.mean(
-                plausibility.skating(positions[..., toes_of, :], ground=ground)
-            ),
+            "skate mm": jnp.mean(plausibility.skating(toes, ground=ground)),
             "skate ratio": jnp.mean(
                 contact.skate_ratio(toes, fps, max_height=ground + 0.05)
             ),

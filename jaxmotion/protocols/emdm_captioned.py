@@ -99,8 +99,6 @@ def from_labels(
     Raises:
       ValueError: if a label or the skeleton is unknown, or no clip has an unseen pair.
     """
-    clips = resample.resample_clips(clips, fps)
-    features, error = clip_features(clips)
     words = [
         np.array(clips.names(field))[np.asarray(clips.labels[field])]
         for field in ("content", "style")
@@ -109,6 +107,8 @@ def from_labels(
     for pair in unseen:
         if pair not in pairs:
             raise ValueError(f"no clip is of the unseen pair {pair!r}")
+    clips = resample.resample_clips(clips, fps)
+    features, error = clip_features(clips)
     drawn = np.random.default_rng(seed).random(clips.num_clips) < held_out
     kept = [i for i, x in enumerate(features) if len(x) >= least]
     splits = [

@@ -195,6 +195,20 @@ def row_sampler(params: Params, config: Config, row: str) -> emdm.Sample:
     return emdm.sampler(params, config=config, step="ddim", steps=steps)
 
 
+def guidance_scale(scale: float | None, *, default: float) -> Array | None:
+    """Scale of classifier-free guidance as samplers take it.
+
+    Args:
+      scale: What was asked for; None for the default.
+      default: The paper's of the task.
+
+    Returns:
+      The scale; None for 1, which needs no second call of the network.
+    """
+    scale = default if scale is None else scale
+    return None if scale == 1.0 else jnp.float32(scale)
+
+
 def sample_many(
     sample: emdm.Sample, *, chunk: int
 ) -> Callable[[Key, emdm.Condition, Array | None], Array]:

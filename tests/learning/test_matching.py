@@ -197,3 +197,10 @@ def test_long_sentences_are_cut(given, kept):
 def test_a_token_without_class_is_named():
     with pytest.raises(ValueError, match="token 'walk', expected 'word/CLASS'"):
         matching.encode_tokens(["a/DET", "walk"])
+
+
+def test_tags_are_those_of_the_captions():
+    """Written twice, since neither package may import the other."""
+    from jaxmotion.data import text_tags
+
+    assert tuple(matching.TAGS) == tuple(text_tags.TAG_CLASSES)
