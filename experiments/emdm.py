@@ -82,8 +82,8 @@ class Train:
     frames: int | None = None
     fps: float | None = None
     held_out: float = 0.1
-    steps: int = 2000
-    ddpm_steps: int = 3700
+    steps: int = 5000
+    ddpm_steps: int = 7700
     batch: int = 32
     width: int = 128
     depth: int = 4
