@@ -32,15 +32,14 @@ def _text(values: tuple[str, ...]) -> np.ndarray:
     return np.array(values, dtype=np.str_)
 
 
-def save_clips(path: str | os.PathLike, clips: Clips) -> None:
-    """Writes clips; the file appears under its name only when it is whole.
+def to_fields(clips: Clips) -> dict[str, np.ndarray]:
+    """Clips as named arrays.
 
     Args:
-      path: File to write, conventionally .npz; its folder is made if need be.
       clips: The clips.
 
-    Raises:
-      OSError: if the file cannot be written.
+    Returns:
+      The arrays that a file of clips holds.
     """
     fields = {
         "format": np.array(_FORMAT),
@@ -60,11 +59,36 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
     for field, names in clips.label_names:
         fields[f"label.{field}"] = np.asarray(clips.labels[field], np.int64)
         fields[f"names.{field}"] = _text(names)
-    npz.write_npz(path, fields)
+    return fields
 
 
-def _read_fields(path: str) -> dict[str, np.ndarray]:
-    """All arrays of the file, each of the expected kind and number of axes."""
+def save_clips(path: str | os.PathLike, clips: Clips) -> None:
+    """Writes clips; the file appears under its name only when it is whole.
+
+    Args:
+      path: File to write, conventionally .npz; its folder is made if need be.
+      clips: The clips.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    npz.write_npz(path, to_fields(clips))
+
+
+def read_fields(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All arrays of a file of clips, each of the expected kind and number of axes.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The arrays.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is damaged, foreign, of another version, or lacks a field.
+    """
+    path = os.fspath(path)
     about = dict(what="clips", format_name=_FORMAT, version=_VERSION)
     fields = npz.read_npz(path, _FIELDS, **about)
     labels = {f"label.{field}": ("i", 1) for field in fields["label_fields"]}
@@ -140,8 +164,22 @@ def load_clips(path: str | os.PathLike) -> Clips:
       ValueError: if it is damaged, foreign, of another version, or inconsistent; names
         the file and the field.
     """
-    path = os.fspath(path)
-    fields = _read_fields(path)
+    return from_fields(os.fspath(path), read_fields(path))
+
+
+def from_fields(path: str, fields: dict[str, np.ndarray]) -> Clips:
+    """Clips of what `read_fields` read; checks every field.
+
+    Args:
+      path: The file, for messages.
+      fields: Its arrays.
+
+    Returns:
+      The clips, on the default device.
+
+    Raises:
+      ValueError: if the fields do not agree; names the file and the field.
+    """
     _check_fields(path, fields)
     parents = tuple(int(parent) for parent in fields["skeleton_parents"])
     try:

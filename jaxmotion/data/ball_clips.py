@@ -1,0 +1,192 @@
+"""Clips of a person with a ball: where the ball is, and which joints touch it.
+
+The ball's arrays lie beside those of `Clips`, frame by frame. On disk they are further
+fields of the same npz file, so that whatever reads clips reads the person as well.
+"""
+
+import dataclasses
+import os
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.data import clips_io, npz
+from jaxmotion.data.clips import Clips, take_clips
+from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import Motion
+
+_FIELDS = {
+    "ball_position": ("f", 2),
+    "ball_touch": ("b", 2),
+    "ball_joints": ("i", 1),
+    "ball_radius": ("f", 0),
+}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class BallClips:
+    """Clips with a ball.
+
+    Attributes:
+      clips: The person.
+      position: World position of the ball's centre in every frame, metres, y up.
+      touch: Which of `joints` touch the ball in every frame.
+      joints: Joints that may touch the ball (feet, or hands).
+      radius: Of the ball, metres.
+    """
+
+    clips: Clips
+    position: Float[Array, "frames 3"]
+    touch: Bool[Array, "frames touching"]
+    joints: tuple[int, ...] = jax.tree.static()
+    radius: float = jax.tree.static(default=0.11)
+
+
+def ball_clips(
+    clips: Clips,
+    position: Float[np.ndarray, "frames 3"],
+    touch: Bool[np.ndarray, "frames touching"],
+    *,
+    joints: Sequence[int],
+    radius: float,
+) -> BallClips:
+    """Puts a ball beside clips.
+
+    Args:
+      clips: The person.
+      position: World position of the ball's centre in every frame, metres.
+      touch: Which of the joints touch the ball in every frame.
+      joints: Joints that may touch the ball.
+      radius: Of the ball, metres.
+
+    Returns:
+      The clips with the ball.
+
+    Raises:
+      ValueError: if the frames differ in number, a position is not finite, a joint does
+        not exist, or the radius is not positive.
+    """
+    frames, joints = clips.num_frames, tuple(int(joint) for joint in joints)
+    expected = {"ball_position": (frames, 3), "ball_touch": (frames, len(joints))}
+    for (name, shape), found in zip(expected.items(), (position, touch), strict=True):
+        if found.shape != shape:
+            raise ValueError(
+                f"field {name!r} has shape {found.shape}, expected {shape}"
+            )
+    if not np.isfinite(position).all():
+        frame = int(np.argwhere(~np.isfinite(position))[0, 0])
+        raise ValueError(f"field 'ball_position' of frame {frame} is not finite")
+    if not joints or not all(0 <= j < clips.skeleton.num_joints for j in joints):
+        raise ValueError(
+            f"field 'ball_joints' is {joints}, expected joints in "
+            f"0..{clips.skeleton.num_joints - 1}"
+        )
+    if not 0 < radius < np.inf:
+        raise ValueError(f"field 'ball_radius' is {radius}, expected it positive")
+    return BallClips(
+        clips=clips,
+        position=jnp.asarray(position, jnp.float32),
+        touch=jnp.asarray(touch, bool),
+        joints=joints,
+        radius=float(radius),
+    )
+
+
+def save_ball_clips(path: str | os.PathLike, data: BallClips) -> None:
+    """Writes clips with a ball; the file appears under its name only when it is whole.
+
+    Args:
+      path: File to write, conventionally .npz.
+      data: The clips.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    more = {
+        "ball_position": np.asarray(data.position, np.float32),
+        "ball_touch": np.asarray(data.touch, bool),
+        "ball_joints": np.array(data.joints, np.int64),
+        "ball_radius": np.array(float(data.radius)),
+    }
+    npz.write_npz(path, clips_io.to_fields(data.clips) | more)
+
+
+def load_ball_clips(path: str | os.PathLike) -> BallClips:
+    """Reads what `save_ball_clips` wrote; checks every field.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The clips with the ball, on the default device.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is damaged, foreign, inconsistent, or has no ball; names the
+        file and the field.
+    """
+    path = os.fspath(path)
+    fields = clips_io.read_fields(path)
+    npz.check_fields(path, fields, _FIELDS)
+    clips = clips_io.from_fields(path, fields)
+    try:
+        return ball_clips(
+            clips,
+            fields["ball_position"],
+            fields["ball_touch"],
+            joints=fields["ball_joints"].tolist(),
+            radius=float(fields["ball_radius"]),
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def take_ball_clips(data: BallClips, indices: Sequence[int] | np.ndarray) -> BallClips:
+    """The clips of those numbers, in that order.
+
+    Args:
+      data: The clips.
+      indices: Numbers of clips.
+
+    Returns:
+      Those clips alone.
+
+    Raises:
+      ValueError: if there is no such clip, or none is asked for.
+    """
+    kept = take_clips(data.clips, indices)
+    offsets = np.asarray(data.clips.offsets)
+    frames = np.concatenate([np.arange(offsets[i], offsets[i + 1]) for i in indices])
+    return dataclasses.replace(
+        data,
+        clips=kept,
+        position=jnp.asarray(np.asarray(data.position)[frames]),
+        touch=jnp.asarray(np.asarray(data.touch)[frames]),
+    )
+
+
+def cut_scene(data: BallClips, start: Int[Array, ""], length: int) -> Scene:
+    """The frames from `start`.
+
+    Args:
+      data: The clips.
+      start: First frame, counted over all clips.
+      length: Frames.
+
+    Returns:
+      The window.
+    """
+    take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, length)  # noqa: E731
+    return Scene(
+        motion=Motion(
+            root_position=take(data.clips.root_position),
+            joint_rotation=take(data.clips.joint_rotation),
+            fps=data.clips.fps,
+        ),
+        ball=take(data.position),
+        touch=take(data.touch).astype(jnp.float32),
+    )

@@ -1,0 +1,178 @@
+"""A ball beside a person: its features relative to the root, and how it moves.
+
+Within reach r of the root h the ball's place b is described by
+
+    w = 1 - |b_ground - h_ground| / r,    b' = w (b - h)                        (1)
+
+so that a ball that is far away fades out of the features. The inverse b = b' / w + h
+is singular at distance r and wrong beyond; here w is kept in 0..1, and where it is too
+small to divide by, the ball moves on with its velocity from where it was last known.
+
+Source: SMGDiff, section 3, eq. 1-2.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.motion.skeleton import Motion
+from jaxmotion.motion.spring import Scalar
+
+_TINY = 1e-12
+# Least w that is divided by; at reach 2 m that is a ball 1.9 m away.
+MIN_CONTROL = 0.05
+NUM_FEATURES = 7
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """A person and a ball over some frames.
+
+    Attributes:
+      motion: The person.
+      ball: Position of the ball's centre in the same frame, metres.
+      touch: Which joints touch the ball; 0 or 1, or a model's guess between.
+    """
+
+    motion: Motion
+    ball: Float[Array, "*batch frames 3"]
+    touch: Float[Array, "*batch frames touching"]
+
+
+@jax.jit
+def control_weight(
+    ball: Float[Array, "*batch 3"], root: Float[Array, "*batch 3"], *, reach: Scalar
+) -> Float[Array, "*batch"]:
+    """How much the person controls the ball: w of (1), kept in 0..1.
+
+    Args:
+      ball: World position of the ball, metres.
+      root: World position of the root, metres.
+      reach: Distance on the ground at which control ends, metres.
+
+    Returns:
+      1 above or below the root, 0 from the reach on.
+
+    Source: SMGDiff, eq. 1; the clamp is ours.
+    """
+    square = jnp.sum((ball - root)[..., ::2] ** 2, axis=-1)
+    # A ball right at the root has a distance without gradient.
+    distance = jnp.where(square < _TINY, 0.0, jnp.sqrt(jnp.maximum(square, _TINY)))
+    return jnp.clip(1.0 - distance / reach, 0.0, 1.0)
+
+
+@jax.jit
+def ball_velocities(
+    ball: Float[Array, "*batch frames 3"], fps: Scalar
+) -> Float[Array, "*batch frames 3"]:
+    """Velocity with which the ball arrived in each frame.
+
+    Args:
+      ball: Positions, metres.
+      fps: Frames a second.
+
+    Returns:
+      Metres a second; the first frame's is that of the second.
+
+    Raises:
+      ValueError: if there are fewer than two frames.
+    """
+    _check_frames(ball, 2)
+    step = jnp.diff(ball, axis=-2) * fps
+    return jnp.concatenate([step[..., :1, :], step], axis=-2)
+
+
+@jax.jit
+def ball_accelerations(
+    ball: Float[Array, "*batch frames 3"], fps: Scalar
+) -> Float[Array, "*batch frames 3"]:
+    """Second difference of the ball's position about each frame.
+
+    Args:
+      ball: Positions, metres.
+      fps: Frames a second.
+
+    Returns:
+      Metres a second squared; zero in the first and the last frame, which have no
+      neighbour.
+
+    Raises:
+      ValueError: if there are fewer than three frames.
+
+    Source: SMGDiff, eq. 10.
+    """
+    _check_frames(ball, 3)
+    change = jnp.diff(ball, n=2, axis=-2) * fps**2
+    return jnp.pad(change, [(0, 0)] * (ball.ndim - 2) + [(1, 1), (0, 0)])
+
+
+def _check_frames(ball: Array, least: int) -> None:
+    if ball.shape[-2] < least:
+        raise ValueError(
+            f"{ball.shape[-2]} frames of a ball, expected at least {least}"
+        )
+
+
+@jax.jit
+def encode_ball(
+    ball: Float[Array, "*batch frames 3"],
+    velocity: Float[Array, "*batch frames 3"],
+    root: Float[Array, "*batch frames 3"],
+    *,
+    reach: Scalar,
+) -> Float[Array, "*batch frames 7"]:
+    """Features of a ball: (1).
+
+    Args:
+      ball: Positions, metres.
+      velocity: Of the ball, metres a second.
+      root: Positions of the root, metres.
+      reach: Distance on the ground at which control ends, metres.
+
+    Returns:
+      Weighted place relative to the root 3, velocity 3, weight 1.
+
+    Source: SMGDiff, eq. 1-2.
+    """
+    weight = control_weight(ball, root, reach=reach)[..., None]
+    return jnp.concatenate([weight * (ball - root), velocity, weight], axis=-1)
+
+
+@jax.jit
+def decode_ball(
+    features: Float[Array, "*batch frames 7"],
+    root: Float[Array, "*batch frames 3"],
+    start: Float[Array, "*batch 3"],
+    fps: Scalar,
+) -> Float[Array, "*batch frames 3"]:
+    """Inverse of `encode_ball` for any features, finite everywhere.
+
+    Where the weight is below 0.05 the ball goes on with its velocity channel from where
+    it was in the frame before.
+
+    Args:
+      features: Of the ball, perhaps from a network.
+      root: Positions of the root, metres.
+      start: Where the ball was in the frame before the first, metres.
+      fps: Frames a second.
+
+    Returns:
+      Positions of the ball, metres.
+
+    Source: SMGDiff, eq. 2, made safe.
+    """
+    place, velocity, weight = jnp.split(features, [3, 6], axis=-1)
+    known = weight >= MIN_CONTROL
+    direct = place / jnp.clip(weight, MIN_CONTROL, 1.0) + root
+
+    def move(before: Array, frame: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+        known, direct, velocity = frame
+        now = jnp.where(known, direct, before + velocity / fps)
+        return now, now
+
+    frames = [jnp.moveaxis(x, -2, 0) for x in (known, direct, velocity)]
+    _, found = jax.lax.scan(move, start, tuple(frames))
+    return jnp.moveaxis(found, 0, -2)
