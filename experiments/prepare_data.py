@@ -1,6 +1,7 @@
 """Reads a published motion set, or generates one, into one npz file.
 
-The file holds clips, or for humanml3d and kit_ml feature vectors with captions.
+The file holds clips, for ballplay and soccer_x with a ball, or for humanml3d and kit_ml
+feature vectors with captions.
 
 The sets are third-party recordings: get them from their publishers, mind their
 licences, and keep what this script writes out of the repository. World coordinates
@@ -10,6 +11,7 @@ Example:
   python experiments/prepare_data.py procedural --out data/walker.npz
   python experiments/prepare_data.py lafan1 --manual-dir raw/lafan1 --out data/l.npz
   python experiments/prepare_data.py kit_ml --manual-dir raw/KIT-ML --out data/k.npz
+  python experiments/prepare_data.py ballplay --manual-dir raw/ballplay --out data/b.npz
 """
 
 import dataclasses
@@ -23,6 +25,7 @@ import numpy as np
 import tyro
 
 from jaxmotion.data import clips_io, mirror, resample, selection, text_motion_io
+from jaxmotion.data.ball_clips import BallClips, save_ball_clips
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
 from jaxmotion.data.text_motion import TextMotions
 
@@ -34,9 +37,12 @@ Source = Literal[
     "humanact12",
     "humanml3d",
     "kit_ml",
+    "ballplay",
+    "soccer_x",
     "procedural",
 ]
 TEXT_SOURCES = ("humanml3d", "kit_ml")
+BALL_SOURCES = ("ballplay", "soccer_x")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +94,11 @@ def check_config(config: Config) -> None:
             f"{config.source} is published with mirror images and at its own rate: "
             "--mirror and --fps do not apply"
         )
+    if config.source in BALL_SOURCES and (config.mirror or config.fps is not None):
+        raise ValueError(
+            f"{config.source} is read at 30 frames a second, since touches of the ball "
+            "cannot be resampled: --mirror and --fps do not apply"
+        )
     if config.source != "procedural":
         if config.manual_dir is None:
             raise FileNotFoundError(f"{config.source} needs --manual-dir")
@@ -103,7 +114,7 @@ def check_config(config: Config) -> None:
     probe.unlink()
 
 
-def read_published(config: Config) -> Clips | TextMotions:
+def read_published(config: Config) -> Clips | BallClips | TextMotions:
     """A published set, by way of its tensorflow-datasets builder.
 
     Args:
@@ -113,11 +124,14 @@ def read_published(config: Config) -> Clips | TextMotions:
       The clips at the rate of the set.
     """
     from jaxmotion.data.builders import (
+        ball_base,
+        ballplay,
         bandai_namco,
         base,
         humanact12,
         humanml3d,
         lafan1,
+        soccer_x,
         style100,
     )
 
@@ -133,6 +147,8 @@ def read_published(config: Config) -> Clips | TextMotions:
         "humanact12": humanact12.Humanact12,
         "humanml3d": humanml3d.HumanML3D,
         "kit_ml": humanml3d.HumanML3D,
+        "ballplay": ballplay.Ballplay,
+        "soccer_x": soccer_x.SoccerX,
     }
     folder = config.tfds_dir or config.out.parent / "tfds"
     builder = classes[name](
@@ -143,6 +159,8 @@ def read_published(config: Config) -> Clips | TextMotions:
     base.prepare(builder, config.manual_dir, overwrite=config.overwrite)
     if name in TEXT_SOURCES:
         return humanml3d.text_motions_from_source(builder, cut_fps=config.cut_fps)
+    if name in BALL_SOURCES:
+        return ball_base.ball_clips_from_source(builder)
     return base.clips_from_source(builder)
 
 
@@ -198,6 +216,38 @@ def describe(clips: Clips, path: Path) -> str:
     return "\n".join([*lines, f"written  {path}, {path.stat().st_size / 1e6:.1f} MB"])
 
 
+def describe_ball(data: BallClips, path: Path) -> str:
+    """Counts of clips with a ball.
+
+    Args:
+      data: The clips.
+      path: The file.
+
+    Returns:
+      Lines to print.
+    """
+    clips, touch = data.clips, np.asarray(data.touch)
+    minutes = clips.num_frames / clips.fps / 60
+    touch = np.concatenate([touch.any(1, keepdims=True), touch], axis=1)
+    before = np.roll(touch, 1, axis=0)
+    before[np.asarray(clips.offsets)[:-1]] = False
+    who = ["any joint", *(clips.skeleton.names[joint] for joint in data.joints)]
+    counts = (touch & ~before).sum(0) / minutes
+    words = [f"{name} {n:.1f}" for name, n in zip(who, counts, strict=True)]
+    lines = [
+        f"ball     radius {data.radius:g} m, lowest at "
+        f"{float(np.asarray(data.position)[:, 1].min()):.3f} m",
+        f"touches  in {100 * touch[:, 0].mean():.1f} % of frames; beginnings a minute: "
+        f"{', '.join(words)}",
+    ]
+    lengths = np.diff(np.asarray(clips.offsets)) / clips.fps / 60
+    for field, names in clips.label_names:
+        sums = np.bincount(np.asarray(clips.labels[field]), lengths, len(names))
+        words = [f"{name} {n:.2f}" for name, n in zip(names, sums, strict=True)]
+        lines.append(f"minutes  of each {field}: {', '.join(words)}")
+    return "\n".join([describe(clips, path), *lines])
+
+
 def describe_texts(motions: TextMotions, path: Path) -> str:
     """Counts of clips with captions.
 
@@ -239,6 +289,11 @@ def main(config: Config) -> None:
     if isinstance(clips, TextMotions):
         text_motion_io.save_text_motions(config.out, clips)
         print(describe_texts(clips, config.out))
+        print(f"took     {time.time() - start:.1f} s")
+        return
+    if isinstance(clips, BallClips):
+        save_ball_clips(config.out, clips)
+        print(describe_ball(clips, config.out))
         print(f"took     {time.time() - start:.1f} s")
         return
     default = clips.fps if config.source == "humanact12" else 30.0

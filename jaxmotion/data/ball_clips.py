@@ -48,8 +48,8 @@ class BallClips:
 
 def ball_clips(
     clips: Clips,
-    position: Float[np.ndarray, "frames 3"],
-    touch: Bool[np.ndarray, "frames touching"],
+    position: Float[np.ndarray, "_ _"],
+    touch: Bool[np.ndarray, "_ _"],
     *,
     joints: Sequence[int],
     radius: float,
@@ -58,8 +58,9 @@ def ball_clips(
 
     Args:
       clips: The person.
-      position: World position of the ball's centre in every frame, metres.
-      touch: Which of the joints touch the ball in every frame.
+      position: World position of the ball's centre in every frame, metres; its shape,
+        [frames, 3], is checked here, since it may come from a file.
+      touch: Which of the joints touch the ball in every frame, [frames, touching].
       joints: Joints that may touch the ball.
       radius: Of the ball, metres.
 

@@ -1,5 +1,6 @@
 """Named arrays on disk: one npz file without pickles, written whole or not at all."""
 
+import io
 import os
 import zipfile
 import zlib
@@ -32,19 +33,34 @@ def write_npz(path: str | os.PathLike, fields: Mapping[str, np.ndarray]) -> None
             os.remove(temporary)
 
 
-def _read_arrays(path: str, what: str) -> dict[str, np.ndarray]:
-    """All arrays of the file."""
+def read_arrays(
+    file: str | os.PathLike | io.BytesIO, *, name: str, what: str
+) -> dict[str, np.ndarray]:
+    """All arrays of an npz file without pickles.
+
+    Args:
+      file: Its path, or its content.
+      name: Its path, for messages.
+      what: What it holds, for messages.
+
+    Returns:
+      The arrays.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is damaged or no npz file; names it.
+    """
     try:
-        file = np.load(path, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
+        content = np.load(file, allow_pickle=False)
+        if not isinstance(content, np.lib.npyio.NpzFile):
             raise ValueError("an array, not an npz archive")
-        with file:
-            return {name: file[name] for name in file.files}
+        with content:
+            return {field: content[field] for field in content.files}
     except FileNotFoundError:
-        raise FileNotFoundError(f"no {what} file {path!r}") from None
+        raise FileNotFoundError(f"no {what} file {name!r}") from None
     except (ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
         raise ValueError(
-            f"{path}: not a {what} file, or a damaged one ({error})"
+            f"{name}: not a {what} file, or a damaged one ({error})"
         ) from None
 
 
@@ -75,7 +91,7 @@ def read_npz(
         the file and the field.
     """
     path = os.fspath(path)
-    fields = _read_arrays(path, what)
+    fields = read_arrays(path, name=path, what=what)
     if str(fields.get("format")) != format_name:
         raise ValueError(
             f"{path}: not a {what} file: its field 'format' should be {format_name!r}; "

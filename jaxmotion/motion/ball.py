@@ -12,13 +12,16 @@ Source: SMGDiff, section 3, eq. 1-2.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxmotion.motion import ground
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.motion.spring import Scalar
+from jaxmotion.motion.trajectory import PlanarFrame
 
 _TINY = 1e-12
 # Least w that is divided by; at reach 2 m that is a ball 1.9 m away.
@@ -176,3 +179,26 @@ def decode_ball(
     frames = [jnp.moveaxis(x, -2, 0) for x in (known, direct, velocity)]
     _, found = jax.lax.scan(move, start, tuple(frames))
     return jnp.moveaxis(found, 0, -2)
+
+
+@functools.partial(jax.jit, static_argnames=("out",))
+def move_points(
+    points: Float[Array, "*batch frames 3"], frame: PlanarFrame, *, out: bool
+) -> Float[Array, "*batch frames 3"]:
+    """Points seen from a ground frame, or back in the world; heights stay.
+
+    Args:
+      points: Positions, metres.
+      frame: One for all frames.
+      out: From the frame to the world, instead of into the frame.
+
+    Returns:
+      Positions, metres.
+    """
+    facing = jnp.broadcast_to(frame.facing[..., None, :], points[..., ::2].shape)
+    origin = frame.origin[..., None, :]
+    if out:
+        moved = ground.out_of_frame(points[..., ::2], facing) + origin
+    else:
+        moved = ground.into_frame(points[..., ::2] - origin, facing)
+    return points.at[..., ::2].set(moved)

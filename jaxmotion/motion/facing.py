@@ -15,7 +15,8 @@ from jaxmotion.motion.skeleton import Skeleton
 _HIPS = (
     ("leftupleg", "rightupleg"),  # Mixamo, LaFAN1, CMU
     ("upperlegl", "upperlegr"),  # Bandai Namco Research
-    ("lefthip", "righthip"),  # 100STYLE
+    ("lefthip", "righthip"),  # 100STYLE, SMPL
+    ("lhip", "rhip"),  # BallPlay-M
 )
 
 
@@ -34,8 +35,9 @@ def plain_names(skeleton: Skeleton) -> list[str]:
 def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
     """Finds the hip joints by their names.
 
-    Knows LeftUpLeg/RightUpLeg (Mixamo, LaFAN1), UpperLeg_L/UpperLeg_R (Bandai Namco)
-    and LeftHip/RightHip (100STYLE), in any case and after a prefix like "mixamorig:".
+    Knows LeftUpLeg/RightUpLeg (Mixamo, LaFAN1), UpperLeg_L/UpperLeg_R (Bandai Namco),
+    LeftHip/RightHip (100STYLE, SMPL) and L_Hip/R_Hip (BallPlay-M), in any case and
+    after a prefix like "mixamorig:".
 
     Args:
       skeleton: The bones.
@@ -53,8 +55,9 @@ def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
         if left in plain and right in plain:
             return plain.index(left), plain.index(right)
     raise ValueError(
-        "no hip joints: expected LeftUpLeg/RightUpLeg, UpperLeg_L/UpperLeg_R or "
-        f"LeftHip/RightHip among the joint names {', '.join(skeleton.names)}"
+        "no hip joints: expected LeftUpLeg/RightUpLeg, UpperLeg_L/UpperLeg_R, "
+        "LeftHip/RightHip or L_Hip/R_Hip among the joint names "
+        f"{', '.join(skeleton.names)}"
     )
 
 

@@ -1,5 +1,6 @@
 """What an experiment leaves behind: a rollout to look at, and a table to cite."""
 
+import dataclasses
 import json
 import os
 import platform
@@ -8,12 +9,29 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxmotion.control import presets
 from jaxmotion.data import bvh
 from jaxmotion.evaluation import table
 from jaxmotion.motion import skeleton
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ball:
+    """A ball beside a motion.
+
+    Attributes:
+      position: World position of its centre, metres.
+      touch: Which of the joints touch it.
+      joints: Joints that may touch it.
+      radius: Metres.
+    """
+
+    position: Float[np.ndarray, "frames 3"]
+    touch: Bool[np.ndarray, "frames touching"]
+    joints: tuple[int, ...]
+    radius: float
 
 
 def write_rollout(
@@ -24,8 +42,9 @@ def write_rollout(
     *,
     title: str,
     name: str = "rollout",
+    ball: Ball | None = None,
 ) -> None:
-    """Writes a motion as BVH, GIF and HTML.
+    """Writes a motion as BVH, GIF and HTML, and a ball as CSV.
 
     Args:
       folder: Where to; it must exist.
@@ -35,6 +54,7 @@ def write_rollout(
         the commanded path. None if nothing was.
       title: Of the pictures.
       name: Of the files, without their ends.
+      ball: What the person plays with; None for nothing.
 
     Raises:
       OSError: if a file cannot be written.
@@ -53,9 +73,24 @@ def write_rollout(
     shown = dict(
         fps=fps, names=bones.names, commanded=commanded, walked=walked, title=title
     )
-    animation.save_gif(folder / f"{name}.gif", positions, bones.parents, **shown)
-    html.save_html(folder / f"{name}.html", positions, bones.parents, **shown)
+    gif, page = dict(shown), dict(shown)
+    if ball is not None:
+        _write_ball(folder / f"{name}_ball.csv", ball, fps)
+        place = dict(ball=ball.position, radius=ball.radius)
+        gif |= place | dict(feet=ball.joints, contact=ball.touch)
+        page |= place | dict(touch=np.any(ball.touch, axis=-1))
+    animation.save_gif(folder / f"{name}.gif", positions, bones.parents, **gif)
+    html.save_html(folder / f"{name}.html", positions, bones.parents, **page)
     print(f"wrote {name}.bvh, {name}.gif and {name}.html to {folder}")
+
+
+def _write_ball(path: Path, ball: Ball, fps: float) -> None:
+    """Time, position in metres, and whether something touches it, one frame a line."""
+    lines = ["seconds,x,y,z,touch"]
+    for frame, (place, touch) in enumerate(zip(ball.position, ball.touch, strict=True)):
+        numbers = ",".join(f"{value:.4f}" for value in place)
+        lines.append(f"{frame / fps:.4f},{numbers},{int(np.any(touch))}")
+    path.write_text("\n".join(lines) + "\n")
 
 
 def write_table(

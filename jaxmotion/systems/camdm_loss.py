@@ -66,6 +66,35 @@ def smoothing_matrices(
     return jnp.asarray(np.stack(matrices), jnp.float32)
 
 
+def smooth_course(
+    key: Key, course: trajectory.Trajectory, *, last: int
+) -> trajectory.Trajectory:
+    """A recorded path as a user might have asked for it.
+
+    The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4,
+    1/4); the facings are smoothed with sigma 5 or 10.
+
+    Args:
+      key: Consumed.
+      course: Path of one window.
+      last: Frame in which the smoothed path stays where it was.
+
+    Returns:
+      The path.
+
+    Source: released code of CAMDM. Differs: facings are smoothed within the window,
+    there within the whole clip.
+    """
+    key_path, key_facing = jax.random.split(key)
+    filters = smoothing_matrices(course.position.shape[0], (0.0, 5.0, 10.0))
+    weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
+    path = filters[jax.random.categorical(key_path, weights)] @ course.position
+    path = path + (course.position[last] - path[last])[None]
+    facings = filters[1 + jax.random.bernoulli(key_facing).astype(int)] @ course.facing
+    facings = rotation.safe_normalize(facings, jnp.array([0.0, 1.0]))
+    return trajectory.Trajectory(position=path, facing=facings)
+
+
 def example(
     key: Key,
     bones: skeleton.Skeleton,
@@ -75,9 +104,6 @@ def example(
     config: Config,
 ) -> tuple[Condition, Float[Array, "future features"]]:
     """One training example from one window of motion.
-
-    The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4,
-    1/4); the facings are smoothed with sigma 5 or 10.
 
     Args:
       key: Consumed.
@@ -89,10 +115,9 @@ def example(
     Returns:
       The condition, and the features of the future.
 
-    Source: released code of CAMDM. Differs: facings are smoothed within the window,
-    there within the whole clip.
+    Source: released code of CAMDM.
     """
-    key_turn, key_path, key_facing, key_keep = jax.random.split(key, 4)
+    key_turn, key_course, key_keep = jax.random.split(key, 3)
     last = config.past - 1
     course = trajectory.root_trajectory(bones, window)
     if config.heading == "facing":
@@ -102,15 +127,8 @@ def example(
         facing = jnp.stack([jnp.sin(yaw), jnp.cos(yaw)])
     frame = trajectory.PlanarFrame(origin=course.position[last], facing=facing)
 
-    filters = smoothing_matrices(config.window, (0.0, 5.0, 10.0))
-    weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
-    path = filters[jax.random.categorical(key_path, weights)] @ course.position
-    path = path + (course.position[last] - path[last])[None]
-    facings = filters[1 + jax.random.bernoulli(key_facing).astype(int)] @ course.facing
-    facings = rotation.safe_normalize(facings, jnp.array([0.0, 1.0]))
-    wanted = trajectory.to_local(
-        trajectory.Trajectory(position=path, facing=facings), frame
-    )
+    smoothed = smooth_course(key_course, course, last=last)
+    wanted = trajectory.to_local(smoothed, frame)
     poses = to_features(features.to_frame(window, frame), config=config)
     keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_past)
     condition = Condition(

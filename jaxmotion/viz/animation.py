@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from PIL import Image
 
 from jaxmotion.viz import figure as drawing
@@ -39,6 +40,8 @@ class _Scene:
     colors: list[str]
     paths: list[tuple[np.ndarray, str, str]]
     contacts: tuple[tuple[int, ...], np.ndarray] | None
+    ball: np.ndarray | None
+    radius: float
 
 
 def _draw(axes: Axes, scene: _Scene, frame: int) -> None:
@@ -56,9 +59,16 @@ def _draw(axes: Axes, scene: _Scene, frame: int) -> None:
     axes.add_collection(
         LineCollection(bones, colors=scene.colors, linewidths=2.5, capstyle="round")
     )
+    if scene.ball is not None:
+        place = view(scene.ball[frame])
+        axes.add_patch(
+            Circle(place, scene.radius, fc="#f2f2f2", ec="#222222", zorder=3)
+        )
     if scene.contacts is not None:
         feet, down = scene.contacts
-        axes.scatter(*view(pose[list(feet)][down[frame]]).T, color="#2ca02c", s=25)
+        axes.scatter(
+            *view(pose[list(feet)][down[frame]]).T, color="#2ca02c", s=25, zorder=4
+        )
     middle = view(np.array([centre[0], 0.85, centre[1]]))
     axes.set_xlim(middle[0] - 1.5, middle[0] + 1.5)
     axes.set_ylim(middle[1] - 1.5, middle[1] + 1.5)
@@ -146,6 +156,8 @@ def save_gif(
     walked: np.ndarray | None = None,
     feet: tuple[int, ...] | None = None,
     contact: np.ndarray | None = None,
+    ball: np.ndarray | None = None,
+    radius: float = 0.11,
     title: str = "",
     every: int = 2,
     azimuth: float = 35.0,
@@ -166,6 +178,8 @@ def save_gif(
       walked: [F, 2] walked path, or None.
       feet: Foot joints to mark while they are in contact.
       contact: [F, feet] bool, or None.
+      ball: [F, 3] world position of a ball's centre, or None.
+      radius: Of the ball, metres.
       title: Above the picture.
       every: Draw every so many frames; the speed stays true.
       azimuth: Of the camera, degrees about +y.
@@ -184,6 +198,7 @@ def save_gif(
         raise ValueError(
             f"every {every}, size {size}: expected every >= 1 and size >= 64 pixels"
         )
+    ball = drawing.check_ball(ball, len(positions))
     path = drawing.check_writable(path)
     scene = _Scene(
         view=functools.partial(drawing.project, azimuth=azimuth, elevation=elevation),
@@ -192,6 +207,8 @@ def save_gif(
         colors=drawing.bone_colors(names, len(parents))[1:],
         paths=_lines(ground),
         contacts=marks,
+        ball=ball,
+        radius=radius,
     )
     images = _draw_all(scene, range(0, len(positions), every), title, size)
     times = _durations(len(images), every / fps)

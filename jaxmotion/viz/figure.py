@@ -83,6 +83,30 @@ def check_motion(
     return positions
 
 
+def check_ball(ball: np.ndarray | None, frames: int) -> np.ndarray | None:
+    """Raises unless a ball can be drawn.
+
+    Args:
+      ball: [F, 3] world position of its centre, metres; None for no ball.
+      frames: F.
+
+    Returns:
+      The positions as floats, or None.
+
+    Raises:
+      ValueError: if the shape is wrong or a frame is not finite.
+    """
+    if ball is None:
+        return None
+    ball = np.asarray(ball, float)
+    if ball.shape != (frames, 3):
+        raise ValueError(f"ball is {ball.shape}, expected {(frames, 3)}")
+    finite = np.isfinite(ball).all(axis=1)
+    if not finite.all():
+        raise ValueError(f"ball: frame {int((~finite).argmax())} is not finite")
+    return ball
+
+
 def bone_colors(names: tuple[str, ...] | None, number: int) -> list[str]:
     """Blue for the left side, red for the right, grey for the rest.
 

@@ -73,6 +73,14 @@ function draw() {
   data.parents.forEach((parent, j) => {
     if (parent >= 0) line([pose[parent], pose[j]], c, data.colors[j], 4 * ratio);
   });
+  if (data.ball) {
+    const b = data.ball[now], q = project(b, c);
+    pen.beginPath();
+    pen.arc(q[0], q[1], data.radius * canvas.height / 3.2 * zoom, 0, 2 * Math.PI);
+    pen.fillStyle = "#f2f2f2"; pen.fill();
+    pen.strokeStyle = data.touch[now] ? "#d62728" : "#222";
+    pen.lineWidth = 2 * ratio; pen.stroke();
+  }
   slider.value = now;
   clock.textContent = (now / data.fps).toFixed(2) + " s of " +
     ((frames - 1) / data.fps).toFixed(2) + " s";
@@ -113,6 +121,9 @@ def save_html(
     names: tuple[str, ...] | None = None,
     commanded: np.ndarray | None = None,
     walked: np.ndarray | None = None,
+    ball: np.ndarray | None = None,
+    touch: np.ndarray | None = None,
+    radius: float = 0.11,
     title: str = "",
 ) -> None:
     """Writes the page.
@@ -125,6 +136,9 @@ def save_html(
       names: Joint names, to colour left and right; None for grey.
       commanded: [F, 2] commanded path (x, z), or None.
       walked: [F, 2] walked path, or None.
+      ball: [F, 3] world position of a ball's centre, or None.
+      touch: [F] whether something touches the ball (its rim is red then), or None.
+      radius: Of the ball, metres.
       title: Shown above; escaped.
 
     Raises:
@@ -134,6 +148,10 @@ def save_html(
     positions = drawing.check_motion(
         positions, parents, fps=fps, paths={"commanded": commanded, "walked": walked}
     )
+    ball = drawing.check_ball(ball, len(positions))
+    touch = np.zeros(len(positions), bool) if touch is None else np.asarray(touch, bool)
+    if touch.shape != (len(positions),):
+        raise ValueError(f"touch is {touch.shape}, expected {(len(positions),)}")
     path = drawing.check_writable(path)
 
     def rounded(x: np.ndarray | None) -> list | None:
@@ -146,6 +164,9 @@ def save_html(
         "fps": fps,
         "commanded": rounded(commanded),
         "walked": rounded(walked),
+        "ball": rounded(ball),
+        "touch": touch.tolist(),
+        "radius": radius,
     }
     # "</" would end the script element wherever it stands.
     text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxmotion.data import clips_io, text_motion_io
+from jaxmotion.data import ball_clips, clips_io, text_motion_io
 from tests.data import test_builders, test_text_builders
+from tests.data.builders import test_ballplay, test_soccer_x
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "prepare_data.py"
 
@@ -81,6 +82,37 @@ def test_humanact12_keeps_its_rate(script, tmp_path):
     found = clips_io.load_clips(out)
     assert (found.fps, found.num_frames) == (20.0, 4)
     assert found.clip_names == ("clip0000_run",)
+
+
+def test_clips_with_a_ball_are_written(script, tmp_path, capsys):
+    test_ballplay.write(tmp_path / "raw", test_ballplay.content())
+    out = tmp_path / "data" / "b.npz"
+    options = {"source": "ballplay", "out": out, "manual_dir": tmp_path / "raw"}
+    script.main(script.Config(**options))
+    found = ball_clips.load_ball_clips(out)
+    assert (found.clips.num_clips, found.clips.fps, found.radius) == (3, 30.0, 0.112)
+    printed = capsys.readouterr().out
+    # 9 frames are 0.005 minutes; four touches apart, three of them with the left hand.
+    for word in (
+        "clips    3 (2 to 4 frames)",
+        "catch 1, other 1, run 1",
+        "radius 0.112 m",
+        "in 44.4 % of frames; beginnings a minute: any joint 800.0, L_Wrist 600.0, R_",
+        "minutes  of each skill: catch 0.00",
+    ):
+        assert word in printed
+    for change in ({"mirror": True}, {"fps": 60.0}):
+        with pytest.raises(ValueError, match="--mirror and --fps do not apply"):
+            script.main(script.Config(**options, overwrite=True, **change))
+
+
+def test_soccer_x_is_written(script, tmp_path):
+    files = {"dribble_1.npz": test_soccer_x.sequence(33, 0)}
+    test_soccer_x.write(tmp_path / "raw", files)
+    out = tmp_path / "s.npz"
+    script.main(script.Config(source="soccer_x", out=out, manual_dir=tmp_path / "raw"))
+    found = ball_clips.load_ball_clips(out)
+    assert (found.clips.num_frames, found.joints) == (5, (7, 8, 10, 11))
 
 
 def test_bad_settings_stop_before_any_work(script, raw, tmp_path):

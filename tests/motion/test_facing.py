@@ -23,6 +23,7 @@ def biped(names):
         ("mixamorig:Hips", "a", "mixamorig:LeftUpLeg", "mixamorig:RightUpLeg"),
         ("joint_Root", "Hips", "UpperLeg_L", "UpperLeg_R"),
         ("Hips", "Chest", "LeftHip", "RightHip"),
+        ("Pelvis", "Torso", "L_Hip", "R_Hip"),
     ],
 )
 def test_hips_are_found_by_name(names):

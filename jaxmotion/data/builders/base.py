@@ -14,6 +14,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import tensorflow_datasets as tfds
+from jaxtyping import Float
 
 from jaxmotion.data.clips import Clips, clips_from_motions
 from jaxmotion.motion.skeleton import Motion, Skeleton
@@ -34,6 +35,7 @@ class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
     Attributes:
       LABELS: Label fields of each clip.
       LABEL_NAMES: Published order of a field's labels; other fields are sorted.
+      MORE_TENSORS: Shape and type of what a clip has beside its motion.
       SOURCE: Name of the set and its licence.
       HOMEPAGE: Where it is published.
     """
@@ -42,6 +44,7 @@ class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
     RELEASE_NOTES = {"1.0.0": "First version."}
     LABELS: tuple[str, ...] = ()
     LABEL_NAMES: Mapping[str, Sequence[str]] = {}
+    MORE_TENSORS: Mapping[str, tuple[tuple[int | None, ...], type]] = {}
     SOURCE = ""
     HOMEPAGE = ""
 
@@ -61,9 +64,9 @@ class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
             name: tfds.features.Tensor(
                 shape=shape,
                 dtype=dtype,
-                encoding="bytes" if len(shape) == 3 else "none",
+                encoding="bytes" if shape.count(None) > 1 else "none",
             )
-            for name, (shape, dtype) in _TENSORS.items()
+            for name, (shape, dtype) in (_TENSORS | self.MORE_TENSORS).items()
         }
         # Joint names may contain spaces, but no line ends.
         for name in ("name", "joint_names", *self.LABELS):
@@ -77,6 +80,30 @@ class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
 
     def _split_generators(self, dl_manager):
         return {"train": self._generate_examples(Path(dl_manager.manual_dir))}
+
+
+def motion_from_matrices(
+    root_position: Float[np.ndarray, "frames 3"],
+    local: Float[np.ndarray, "frames joints 3 3"],
+    *,
+    fps: float,
+) -> Motion:
+    """A motion of rotation matrices.
+
+    Args:
+      root_position: World position of the root, metres, y up.
+      local: Parent-local rotations; the root's is global.
+      fps: Frames a second.
+
+    Returns:
+      The motion.
+    """
+    columns = np.concatenate([local[..., 0], local[..., 1]], axis=-1)
+    return Motion(
+        root_position=jnp.asarray(root_position, jnp.float32),
+        joint_rotation=jnp.asarray(columns, jnp.float32),
+        fps=fps,
+    )
 
 
 def example(
@@ -198,6 +225,18 @@ def _word(value) -> str:
     return value.decode() if isinstance(value, bytes) else str(value)
 
 
+def read_records(builder: MotionBuilder) -> list[dict]:
+    """All examples of a prepared builder.
+
+    Args:
+      builder: A prepared builder.
+
+    Returns:
+      Features of each clip, sorted by name.
+    """
+    return sorted(builder.as_data_source(split="train"), key=lambda r: r["name"])
+
+
 def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Clips:
     """All clips of a prepared builder.
 
@@ -211,7 +250,25 @@ def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Cli
     Raises:
       ValueError: if the clips have different skeletons or rates; names two.
     """
-    records = sorted(builder.as_data_source(split="train"), key=lambda r: r["name"])
+    return clips_from_records(builder, read_records(builder), tolerance=tolerance)
+
+
+def clips_from_records(
+    builder: MotionBuilder, records: Sequence[Mapping], *, tolerance: float
+) -> Clips:
+    """Clips of what `read_records` read.
+
+    Args:
+      builder: The builder.
+      records: Features of each clip.
+      tolerance: Largest difference between the offsets of two skeletons, metres.
+
+    Returns:
+      The clips, in the order of the records.
+
+    Raises:
+      ValueError: if the clips have different skeletons or rates; names two.
+    """
     skeletons, motions = [], []
     for record in records:
         skeletons.append(

@@ -20,13 +20,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from jaxmotion.data.builders import base
+from jaxmotion.data.builders import base, smpl
 from jaxmotion.data.plain_pickle import read_plain_pickle
-from jaxmotion.motion.humanml import HUMANML3D
-from jaxmotion.motion.humanml_skeleton import SMPL_JOINTS
-from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.skeleton import Skeleton
 
 ACTIONS = (
     "warm_up",
@@ -43,9 +40,6 @@ ACTIONS = (
     "throw",
 )
 _FPS = 20.0
-# HumanML3D's joints are SMPL's without the hands.
-_JOINTS = (*SMPL_JOINTS, "left_hand", "right_hand")
-_PARENTS = (*HUMANML3D.parents, 20, 21)
 _FILE = "humanact12poses.pkl"
 
 
@@ -64,13 +58,8 @@ class Humanact12(base.MotionBuilder):
         skeleton = fit_skeleton(poses, joints)
         rows = zip(poses, joints, actions, strict=True)
         for number, (pose, position, action) in enumerate(rows):
-            matrix = _matrices(pose)
-            motion = Motion(
-                root_position=jnp.asarray(position[:, 0], jnp.float32),
-                joint_rotation=jnp.asarray(
-                    np.concatenate([matrix[..., 0], matrix[..., 1]], -1), jnp.float32
-                ),
-                fps=_FPS,
+            motion = base.motion_from_matrices(
+                position[:, 0], smpl.matrices(pose), fps=_FPS
             )
             # The order of the file, which is that of its numbers.
             name = f"clip{number:04d}_{action}"
@@ -149,12 +138,6 @@ def read_clips(
     return poses, joints, actions
 
 
-def _matrices(pose: Float[np.ndarray, "frames 72"]) -> np.ndarray:
-    """Rotation matrices of rotation vectors."""
-    vectors = pose.reshape(-1, 3)
-    return Rotation.from_rotvec(vectors).as_matrix().reshape(-1, 24, 3, 3)
-
-
 def fit_skeleton(
     poses: list[Float[np.ndarray, "_ 72"]], joints: list[Float[np.ndarray, "_ 24 3"]]
 ) -> Skeleton:
@@ -168,17 +151,17 @@ def fit_skeleton(
       The skeleton; its feet are SMPL's foot joints.
     """
     position = np.concatenate(joints)
-    local = _matrices(np.concatenate(poses))
+    local = smpl.matrices(np.concatenate(poses))
     world = [local[:, 0]]
     offsets = np.zeros((24, 3))
-    for joint, parent in enumerate(_PARENTS[1:], start=1):
+    for joint, parent in enumerate(smpl.PARENTS[1:], start=1):
         bone = position[:, joint] - position[:, parent]
         # The parent's inverse turns the bone into the parent's frame.
         offsets[joint] = np.einsum("fba,fb->fa", world[parent], bone).mean(0)
         world.append(world[parent] @ local[:, joint])
     return Skeleton(
         offsets=jnp.asarray(offsets, jnp.float32),
-        parents=_PARENTS,
-        names=_JOINTS,
-        feet=(_JOINTS.index("left_foot"), _JOINTS.index("right_foot")),
+        parents=smpl.PARENTS,
+        names=smpl.JOINTS,
+        feet=(smpl.JOINTS.index("left_foot"), smpl.JOINTS.index("right_foot")),
     )

@@ -1,0 +1,122 @@
+"""Serves characters of a run over TCP, for a game engine to steer and to show.
+
+Examples:
+  python experiments/serve.py --run runs/camdm
+  python benchmarks/serve_client.py --port 7777 --seconds 60
+"""
+
+import asyncio
+import contextlib
+import dataclasses
+import gc
+import ipaddress
+import signal
+import sys
+import time
+from pathlib import Path
+
+import tyro
+from serving import protocol, runs, simulation
+from serving.server import Limits, Server
+
+
+@dataclasses.dataclass(frozen=True)
+class Serve:
+    """The command line.
+
+    Attributes:
+      run: Run folder of `camdm.py train`, or a file of `camdm.py export`.
+      data: Clips to start from; None for the mean pose of the model (of the clips
+        that it was trained on where it has none).
+      host: Address to listen on. Anyone who reaches it can connect: there is no
+        authentication.
+      port: Port to listen on; 0 for any that is free.
+      max_clients: Connections at a time. Their characters are computed one after the
+        other: all of them must fit into a tick (1/30 s).
+      seed: Of the noise of the first character; the next ones count on.
+    """
+
+    run: Path = Path("runs/camdm")
+    data: Path | None = None
+    host: str = "127.0.0.1"
+    port: int = 7777
+    max_clients: int = 8
+    seed: int = 0
+
+
+def is_local(host: str) -> bool:
+    """Whether only this machine reaches an address.
+
+    Args:
+      host: Address or name.
+
+    Returns:
+      A truth value; False where it is not known.
+    """
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+async def listen(args: Serve, characters: simulation.Simulation) -> None:
+    """Serves until SIGINT or SIGTERM.
+
+    Args:
+      args: The arguments.
+      characters: What to serve.
+    """
+    stop = asyncio.Event()
+    if sys.platform != "win32":  # where Ctrl-C cancels this coroutine instead
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    server = Server(characters, limits=Limits(clients=args.max_clients), seed=args.seed)
+    ready = lambda port: print(f"listening on {args.host}:{port}", flush=True)  # noqa: E731
+    await server.serve(args.host, args.port, stop=stop, ready=ready)
+    print("closed", flush=True)
+
+
+def serve(args: Serve) -> None:
+    """Loads, compiles, and serves.
+
+    Args:
+      args: The arguments.
+
+    Raises:
+      OSError: if the run cannot be read or the address not be listened on.
+      ValueError: if the run cannot be served.
+    """
+    if args.max_clients < 1:
+        raise ValueError(f"--max-clients is {args.max_clients}, expected 1 or more")
+    if not is_local(args.host):
+        print(
+            f"warning: {args.host} may be reached from other machines, and there is no "
+            "authentication: whoever connects can steer characters",
+            file=sys.stderr,
+            flush=True,
+        )
+    characters = runs.load(args.run, args.data)
+    begin = time.perf_counter()
+    simulation.warm(characters)
+    seconds = time.perf_counter() - begin
+    print(
+        f"{len(characters.joints)} joints, {characters.fps:g} frames a second, labels "
+        f"{', '.join(characters.labels)}; compiled in {seconds:.0f} s"
+    )
+    # What was loaded stays: the collector need not look through it during a tick.
+    gc.collect()
+    gc.freeze()
+    asyncio.run(listen(args, characters))
+
+
+def main() -> None:
+    """Parses the command line and serves."""
+    serve(tyro.cli(Serve, description=f"{__doc__}\n{protocol.__doc__}"))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,1 @@
+"""What `serve.py` is made of: a line protocol, a server, and what it simulates."""

@@ -1,0 +1,236 @@
+"""SMGDiff, a soccer player with a ball: train, evaluate, roll out.
+
+Examples:
+  python experiments/dribble.py --data data/bandai1.npz data/bandai2.npz --out data/dribble.npz
+  python experiments/smgdiff.py train --data data/dribble.npz --out runs/smgdiff
+  python experiments/smgdiff.py train --data data/dribble.npz --out runs/smgdiff --stages motion_2 motion_32
+  python experiments/smgdiff.py evaluate --run runs/smgdiff
+  python experiments/smgdiff.py rollout --run runs/smgdiff --seconds 60
+"""  # noqa: E501
+
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from smgdiff_tasks import playing, tables
+
+from jaxmotion.data.ball_clips import load_ball_clips
+from jaxmotion.learning import loop
+from jaxmotion.protocols import (
+    smgdiff_data,
+    smgdiff_evaluation,
+    smgdiff_runs,
+    stages,
+)
+from jaxmotion.protocols.camdm_runs import arguments_json
+from jaxmotion.systems.smgdiff_guidance import SCHEDULES
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train stages of SMGDiff; what a folder has already is not trained again.
+
+    Example: python experiments/smgdiff.py train --data data/dribble.npz --out runs/smgdiff
+
+    Attributes:
+      data: Clips with a ball, from dribble.py or prepare_data.py.
+      out: Run folder.
+      stages: motion_<T> is the motion model of T steps, paths_<T> the trajectory
+        generator (the paper's: T = 1).
+      preset: "small" for a CPU or a short run, or "paper".
+      held_out: Part of the recordings kept for evaluation.
+      steps: Updates of a motion model.
+      path_steps: Updates of a trajectory generator.
+      batch: Windows an update.
+      learning_rate: Peak of Muon's rate; cosine to a twentieth.
+      seed: Of everything random.
+    """  # noqa: E501
+
+    data: Path = Path("data/dribble.npz")
+    out: Path = Path("runs/smgdiff")
+    stages: tuple[str, ...] = ("paths_1", "motion_8")
+    preset: Literal["small", "paper"] = "small"
+    held_out: float = 0.1
+    steps: int = 4000
+    path_steps: int = 2000
+    batch: int = 48
+    learning_rate: float = 1e-3
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Score plans and players beside real clips; writes a table in a folder of its own.
+
+    Example: python experiments/smgdiff.py evaluate --run runs/smgdiff
+
+    Attributes:
+      run: Run folder of `train`.
+      tables: "schedules" (the paper's table 4), "steps" (table 3: every motion model
+        that was trained), "paths" (table 2).
+      out: Folder; None for <run>/evaluation.
+      steps: Motion model of the tables "schedules" and "paths".
+      schedules: Rows of table 4.
+      windows: Held-out windows, at most.
+      replications: Random halves of them, each with noise of its own.
+      starts: Starts of players of one replication (table "paths").
+      repeats: Players of each start.
+      rate: w_r of DSG.
+      last_sigma: Length of the last step a channel; None for the released code's.
+      min_acceleration: A ball that accelerates more is being touched, m/s^2 (paper 2).
+      max_distance: From here on a joint is too far from the ball's centre, metres
+        (paper 0.1, less than a ball's radius).
+      recognizer_steps: Updates of the recogniser of skills.
+      chunk: Plans or players at a time.
+      seed: Of windows, noise and recogniser.
+    """
+
+    run: Path = Path("runs/smgdiff")
+    tables: tuple[Literal["schedules", "steps", "paths"], ...] = (
+        "schedules",
+        "steps",
+        "paths",
+    )
+    out: Path | None = None
+    steps: int = 8
+    schedules: tuple[str, ...] = tuple(SCHEDULES)
+    windows: int = 600
+    replications: int = 20
+    starts: int = 20
+    repeats: int = 4
+    rate: float = 0.5
+    last_sigma: float | None = 0.02
+    min_acceleration: float = 12.0
+    max_distance: float = 0.15
+    recognizer_steps: int = 800
+    chunk: int = 4
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """Steer one player through all skills; writes BVH, ball CSV, GIF and HTML.
+
+    Example: python experiments/smgdiff.py rollout --run runs/smgdiff --seconds 60
+
+    Attributes:
+      run: Run folder of `train`.
+      seconds: Length; every skill gets an equal part.
+      skills: In this order; none: all of the model's.
+      paths: Trajectory generator; "straight" for none.
+      steps: Motion model.
+      schedule: Of contact guidance.
+      rate: As of `evaluate`.
+      last_sigma: As of `evaluate`.
+      min_acceleration: As of `evaluate`.
+      max_distance: As of `evaluate`.
+      out: Folder; None for <run>/rollout.
+      seed: Of the start and the noise.
+    """
+
+    run: Path = Path("runs/smgdiff")
+    seconds: float = 60.0
+    skills: tuple[str, ...] = ()
+    paths: str = "paths_1"
+    steps: int = 8
+    schedule: str = "end 2"
+    rate: float = 0.5
+    last_sigma: float | None = 0.02
+    min_acceleration: float = 12.0
+    max_distance: float = 0.15
+    out: Path | None = None
+    seed: int = 0
+
+
+def train(args: Train) -> None:
+    """Trains stage by stage."""
+    loop.check_writable(args.out)
+    if (args.out / "config.json").exists():
+        run = smgdiff_runs.load_run(args.out)
+    else:
+        data = load_ball_clips(args.data)
+        kept, held_out = smgdiff_data.split(data, fraction=args.held_out)
+        model = smgdiff_runs.make_model(kept, sizes=smgdiff_runs.PRESETS[args.preset])
+        run = smgdiff_runs.Run(
+            folder=args.out, model=model, train=kept, held_out=held_out
+        )
+        smgdiff_runs.write_run(run)
+        (args.out / "arguments.json").write_text(json.dumps(arguments_json(args)))
+    clips = run.train.clips
+    print(
+        f"{clips.num_clips} clips, {clips.num_frames / clips.fps / 60:.1f} minutes, of "
+        f"{', '.join(run.model.labels)}: {run.model.source}"
+    )
+    for stage in args.stages:
+        smgdiff_runs.with_steps(run.model, stage)
+    for stage in args.stages:
+        begun = time.perf_counter()
+        number = args.steps if stage.startswith("motion") else args.path_steps
+        budget = stages.Budget(
+            steps=number,
+            batch=args.batch,
+            learning_rate=args.learning_rate,
+            seed=args.seed,
+        )
+        smgdiff_runs.train_stage(run, stage, budget=budget)
+        print(f"{stage}: {time.perf_counter() - begun:.0f} s", flush=True)
+
+
+def evaluate(args: Evaluate) -> None:
+    """Writes the tables."""
+    run = smgdiff_runs.load_run(args.run)
+    out = args.out or args.run / "evaluation"
+    loop.check_writable(out)
+    setting = smgdiff_evaluation.make_setting(
+        run.train,
+        run.held_out,
+        run.model,
+        number=args.windows,
+        replications=args.replications,
+        recognizer_steps=args.recognizer_steps,
+        seed=args.seed,
+    )
+    found = {"windows": int(setting.known.label.shape[0])}
+    if "schedules" in args.tables:
+        rows = tables.schedules(args, run, setting)
+        tables.write(out, "schedules", rows, args, run, found)
+    if "steps" in args.tables:
+        rows = tables.steps(args, run, setting)
+        tables.write(out, "steps", rows, args, run, found)
+    if "paths" in args.tables:
+        rows, more = tables.paths(args, run, setting)
+        tables.write(out, "paths", rows, args, run, found | more)
+        print(json.dumps(more, indent=1))
+
+
+def rollout(args: Rollout) -> None:
+    """Writes the rollout."""
+    run = smgdiff_runs.load_run(args.run)
+    out = args.out or args.run / "rollout"
+    loop.check_writable(out)
+    playing.play(args, run, out)
+
+
+Command = (
+    Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Rollout, tyro.conf.subcommand("rollout")]
+)
+
+
+def main() -> None:
+    """Parses the command line and runs the command."""
+    args = tyro.cli(Command, description=__doc__)
+    run = {Train: train, Evaluate: evaluate, Rollout: rollout}
+    run[type(args)](args)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (OSError, ValueError, loop.TrainingDiverged) as error:
+        sys.exit(f"error: {error}")

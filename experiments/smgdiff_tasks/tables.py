@@ -1,0 +1,244 @@
+"""The tables of a run: guidance schedules, step counts, and paths."""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxmotion.evaluation import table
+from jaxmotion.evaluation.table import Cell
+from jaxmotion.protocols import (
+    artifacts,
+    smgdiff_evaluation,
+    smgdiff_players,
+    smgdiff_runs,
+)
+from jaxmotion.protocols.camdm_runs import arguments_json
+from jaxmotion.protocols.smgdiff_evaluation import Setting
+from jaxmotion.protocols.smgdiff_runs import Run
+from jaxmotion.systems import smgdiff_guidance, smgdiff_trajectory
+from jaxmotion.systems.smgdiff_guidance import SCHEDULES, UNGUIDED, Guidance, Plan
+from jaxmotion.systems.smgdiff_model import Model
+
+Rows = dict[str, dict[str, Cell]]
+
+
+def cells(scores: list[dict[str, Array]]) -> dict[str, Cell]:
+    """Means over replications with 95 % intervals, in the order of the scores.
+
+    Args:
+      scores: One dictionary a replication.
+
+    Returns:
+      A row of the table.
+    """
+    return {
+        name: table.cell(jnp.stack([one[name] for one in scores])) for name in scores[0]
+    }
+
+
+def guidance_of(args: Any, schedule: str) -> Guidance:
+    """Contact guidance as the command line asks for it.
+
+    Args:
+      args: With rate, last_sigma, min_acceleration, max_distance.
+      schedule: Of `SCHEDULES`.
+
+    Returns:
+      The guidance.
+
+    Raises:
+      ValueError: if there is no such schedule.
+    """
+    if schedule not in SCHEDULES:
+        raise ValueError(
+            f"unknown schedule {schedule!r}: expected one of {', '.join(SCHEDULES)}"
+        )
+    start, end = SCHEDULES[schedule]
+    names = ("rate", "last_sigma", "min_acceleration", "max_distance")
+    return Guidance(
+        start=start, end=end, **{name: getattr(args, name) for name in names}
+    )
+
+
+def milliseconds(plan: Plan, setting: Setting) -> Cell:
+    """Time of one plan at batch 1.
+
+    Args:
+      plan: The sampler; its parameters are constants of the program.
+      setting: Holds a condition.
+
+    Returns:
+      Median over calls for two seconds, at least 5; ends of the middle half.
+    """
+    condition = jax.tree.map(lambda x: x[0], setting.known.condition)
+    run = jax.jit(lambda key: plan(key, condition))
+    jax.block_until_ready(run(jax.random.key(0)))
+    times: list[float] = []
+    while len(times) < 5 or (sum(times) < 2.0 and len(times) < 200):
+        begun = time.perf_counter()
+        jax.block_until_ready(run(jax.random.key(len(times))))
+        times.append(time.perf_counter() - begun)
+    low, middle, high = np.quantile(times, [0.25, 0.5, 0.75]) * 1000
+    return Cell(
+        value=float(middle), low=float(low), high=float(high), samples=len(times)
+    )
+
+
+def _plan_row(
+    run: Run, setting: Setting, steps: int, guided: Guidance, chunk: int
+) -> dict[str, Cell]:
+    model, params = smgdiff_runs.load_stage(run, f"motion_{steps}")
+    plan = smgdiff_guidance.planner(
+        params, config=model.config, representation=model.representation, guided=guided
+    )
+    many = smgdiff_evaluation.plan_many(plan, model, chunk=chunk)
+    found = cells(smgdiff_evaluation.score_plans(setting, many))
+    return found | {"ms a plan": milliseconds(plan, setting)}
+
+
+def real_rows(run: Run, setting: Setting) -> Rows:
+    """What really happened in the held-out windows, and training clips in their place.
+
+    Args:
+      run: The run.
+      setting: Of the table.
+
+    Returns:
+      Two rows.
+    """
+    number = setting.known.label.shape[0]
+    seen = smgdiff_evaluation.situations(
+        run.train, run.model, number=number, seed=setting.seed + 5
+    )
+    floor = dataclasses.replace(setting, known=seen)
+    return {
+        "real (held-out clips)": cells(smgdiff_evaluation.score_real(setting)),
+        "real (training clips)": cells(smgdiff_evaluation.score_real(floor)),
+    }
+
+
+def schedules(args: Any, run: Run, setting: Setting) -> Rows:
+    """Table 4: where in the chain guidance acts.
+
+    Args:
+      args: Of the command line.
+      run: The run.
+      setting: Of the table.
+
+    Returns:
+      The rows.
+    """
+    rows = real_rows(run, setting)
+    for name in args.schedules:
+        guided = guidance_of(args, name)
+        rows[name] = _plan_row(run, setting, args.steps, guided, args.chunk)
+        print(f"{name}: done", flush=True)
+    return rows
+
+
+def steps(args: Any, run: Run, setting: Setting) -> Rows:
+    """Table 3: models of other step counts, unguided.
+
+    Args:
+      args: Of the command line.
+      run: The run.
+      setting: Of the table.
+
+    Returns:
+      The rows.
+
+    Raises:
+      ValueError: if no such model was trained.
+    """
+    rows = real_rows(run, setting)
+    trained = sorted(
+        int(folder.name.removeprefix("motion_"))
+        for folder in run.folder.glob("motion_*")
+        if folder.name.removeprefix("motion_").isdecimal()
+    )
+    for number in trained:
+        rows[f"{number} steps"] = _plan_row(run, setting, number, UNGUIDED, args.chunk)
+        print(f"{number} steps: done", flush=True)
+    return rows
+
+
+def _generators(run: Run) -> dict[str, tuple[Model, Any]]:
+    """Trained trajectory generators by name."""
+    found = {}
+    for folder in sorted(run.folder.glob("paths_*")):
+        model, params = smgdiff_runs.load_stage(run, folder.name)
+        found[f"generator, T = {model.paths.num_steps}"] = smgdiff_trajectory.generator(
+            params, config=model.paths
+        )
+    return found
+
+
+def paths(args: Any, run: Run, setting: Setting) -> tuple[Rows, dict[str, Any]]:
+    """Table 2: steered players with and without generated paths and guidance.
+
+    Args:
+      args: Of the command line.
+      run: The run.
+      setting: Of the table.
+
+    Returns:
+      The rows, and how much each generator's paths depend on their noise.
+    """
+    model, params = smgdiff_runs.load_stage(run, f"motion_{args.steps}")
+    generators = _generators(run)
+    shares = {
+        name: {
+            k: float(v)
+            for k, v in smgdiff_players.noise_share(
+                jax.random.key(args.seed), generate, setting.known, model, repeats=8
+            ).items()
+        }
+        for name, generate in generators.items()
+    }
+    rows = real_rows(run, setting)
+    every = {"straight paths": smgdiff_players.straight(model)} | generators
+    for name, generate in every.items():
+        for schedule in ("none", "end 2"):
+            plan = smgdiff_guidance.planner(
+                params,
+                config=model.config,
+                representation=model.representation,
+                guided=guidance_of(args, schedule),
+            )
+            play = smgdiff_players.player(
+                generate,
+                plan,
+                model,
+                ticks=2 * model.config.future,
+                repeats=args.repeats,
+                chunk=args.chunk,
+            )
+            scores = smgdiff_players.score_players(
+                setting, model, play, repeats=args.repeats, starts=args.starts
+            )
+            rows[f"{name}, guidance {schedule}"] = cells(scores)
+            print(f"{name}, guidance {schedule}: done", flush=True)
+    return rows, {"noise of the paths": shares}
+
+
+def write(out: Path, name: str, rows: Rows, args: Any, run: Run, more: dict) -> None:
+    """Writes one table into a folder of its own.
+
+    Args:
+      out: Folder of the evaluation.
+      name: Of the table.
+      rows: The table.
+      args: Of the command line.
+      run: The run.
+      more: What belongs beside the table.
+    """
+    folder = out / name
+    folder.mkdir(parents=True, exist_ok=True)
+    report = {"arguments": arguments_json(args), "source": run.model.source} | more
+    artifacts.write_table(folder, rows, report | artifacts.provenance())

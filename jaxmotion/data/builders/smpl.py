@@ -1,0 +1,27 @@
+"""The 24 joints of SMPL, and their rotation vectors as matrices."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from jaxmotion.motion.humanml import HUMANML3D
+from jaxmotion.motion.humanml_skeleton import SMPL_JOINTS
+
+# HumanML3D's joints are SMPL's without the hands.
+JOINTS = (*SMPL_JOINTS, "left_hand", "right_hand")
+PARENTS = (*HUMANML3D.parents, 20, 21)
+
+
+def matrices(
+    poses: Float[np.ndarray, "frames 72"],
+) -> Float[np.ndarray, "frames 24 3 3"]:
+    """Rotation matrices of SMPL's pose parameters.
+
+    Args:
+      poses: Rotation vectors of the joints, radians.
+
+    Returns:
+      Parent-local rotations; the root's is global.
+    """
+    vectors = poses.reshape(-1, 3)
+    return Rotation.from_rotvec(vectors).as_matrix().reshape(-1, 24, 3, 3)

@@ -1,0 +1,234 @@
+"""Soccer-X: people with a football, the set of SMGDiff. The layout read here is OURS.
+
+The set is described in the paper (30 players, 2398 sequences, 240 frames a second, SMPL
+bodies and a ball), but was never published, and nothing says how its files look. A
+holder of the data can write the following files, which this builder reads:
+
+    skeleton.npz                  "offsets" [24, 3]: joint position of SMPL's rest pose
+                                  relative to its parent, metres; row 0 is the pelvis
+                                  relative to the model's origin. One body for all.
+    <skill>_<anything>.npz        one sequence each, in any folder; or <anything>.npz
+                                  in a folder <skill>
+      trans       [frames, 3]     SMPL's translation, metres
+      poses       [frames, 72]    SMPL's rotation vectors, radians
+      ball_trans  [frames, 3]     the ball's centre, metres
+      ball_rot    [frames, 3]     optional; not read, a ball looks the same all round
+      fps                         240 or 30
+      up                          "y" or "z"
+
+with the skills dribble, trick, shoot, stand, celebrate, off_ball. The bones are asked
+for because SMPL's model may not be passed on.
+
+Every eighth frame of 240 is taken. Which foot touches the ball is not measured. A foot
+joint touches it where, at 30 frames a second,
+
+    |joint - ball| < 0.11 m + 0.05 m    and    |ball acceleration| > 12 m/s^2.
+
+The paper's 2 m/s^2 is 2 mm of second difference, which noise and a ball in free fall
+(9.8 m/s^2) exceed in every frame.
+
+Source: SMGDiff, sections 3.2 and 4; the layout and the threshold are ours.
+"""
+
+import io
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxmotion.data import npz
+from jaxmotion.data.builders import ball_base, base, chains, smpl
+from jaxmotion.motion.ball import ball_accelerations
+from jaxmotion.motion.skeleton import Skeleton
+
+SKILLS = ("dribble", "trick", "shoot", "stand", "celebrate", "off_ball")
+RADIUS = 0.11
+# How much farther from the ball's surface a joint may be: it lies inside the foot.
+TOUCH_MARGIN = 0.05
+TOUCH_ACCELERATION = 12.0
+# Ankles and feet.
+_FEET = (7, 8, 10, 11)
+_SKELETON = "skeleton.npz"
+_FRAMES = {"trans": 3, "poses": 72, "ball_trans": 3}
+
+
+class SoccerX(ball_base.BallBuilder):
+    """Football in six skills, in a layout of our own."""
+
+    MANUAL_DOWNLOAD_INSTRUCTIONS = (
+        "Soccer-X is not published. Write one npz a sequence and a skeleton.npz into "
+        "the folder, as the docstring of jaxmotion.data.builders.soccer_x says."
+    )
+    LABELS = ("skill",)
+    LABEL_NAMES = {"skill": SKILLS}
+    SOURCE = "Soccer-X, SMGDiff (not published)"
+    HOMEPAGE = "https://arxiv.org/abs/2411.16216"
+
+    def _generate_examples(self, folder: Path) -> Iterator[tuple[str, dict]]:
+        skeleton = None
+        for path, data in base.read_files(folder, (_SKELETON,)):
+            if skeleton is not None:
+                raise ValueError(f"{path}: a second {_SKELETON}, expected one")
+            skeleton = read_skeleton(path, data)
+        found = False
+        for path, data in base.read_files(folder, (".npz",)):
+            if not path.endswith(_SKELETON):
+                found = True
+                yield read_sequence(path, data, skeleton)
+        if not found:
+            raise FileNotFoundError(f"{folder}: no sequences beside {_SKELETON}")
+
+
+def _arrays(
+    path: str, data: bytes, shapes: dict[str, tuple[int | None, ...]], what: str
+) -> dict[str, np.ndarray]:
+    """Arrays of a file; finite, of those shapes."""
+    fields = npz.read_arrays(io.BytesIO(data), name=path, what=what)
+    kinds = {field: ("f", len(shape)) for field, shape in shapes.items()}
+    npz.check_fields(path, fields, kinds)
+    for field, shape in shapes.items():
+        found = fields[field]
+        if any(n not in (None, m) for n, m in zip(shape, found.shape, strict=True)):
+            expected = ", ".join("frames" if n is None else str(n) for n in shape)
+            raise ValueError(
+                f"{path}: field {field!r} has shape {found.shape}, expected "
+                f"({expected})"
+            )
+        if not np.isfinite(found).all():
+            row = int(np.argwhere(~np.isfinite(found))[0, 0])
+            raise ValueError(f"{path}: field {field!r} is not finite in row {row}")
+    return fields
+
+
+def read_skeleton(path: str, data: bytes) -> Skeleton:
+    """SMPL's joints with the bones of a skeleton.npz.
+
+    Args:
+      path: The file's path, for messages.
+      data: Its content.
+
+    Returns:
+      The skeleton. Its feet are ankles and feet, left before right; row 0 of its
+      offsets is where the pelvis lies from the model's origin.
+
+    Raises:
+      ValueError: if the offsets are missing, malformed or not finite; names the file.
+    """
+    fields = _arrays(path, data, {"offsets": (24, 3)}, "skeleton")
+    return Skeleton(
+        offsets=jnp.asarray(fields["offsets"], jnp.float32),
+        parents=smpl.PARENTS,
+        names=smpl.JOINTS,
+        feet=_FEET,
+    )
+
+
+def read_skill(path: str) -> str:
+    """The skill that a sequence's file name or folder names.
+
+    Args:
+      path: The file's path.
+
+    Returns:
+      One of the six skills.
+
+    Raises:
+      ValueError: if neither names one.
+    """
+    place = PurePosixPath(path.replace("\\", "/"))
+    for skill in SKILLS:
+        if place.stem.startswith(f"{skill}_"):
+            return skill
+    if place.parent.name in SKILLS:
+        return place.parent.name
+    raise ValueError(
+        f"{path}: no skill: expected a file name that begins with, or a folder that is "
+        f"one of {', '.join(SKILLS)} (<skill>_<anything>.npz)"
+    )
+
+
+def read_sequence(path: str, data: bytes, skeleton: Skeleton) -> tuple[str, dict]:
+    """One sequence at 30 frames a second, y up.
+
+    Args:
+      path: The file's path.
+      data: Its content.
+      skeleton: The bones.
+
+    Returns:
+      Key and features, as a builder's generator yields them.
+
+    Raises:
+      ValueError: if a field is missing, malformed or not finite, the name says no
+        skill, or fewer than three frames are left; names the file and the field.
+    """
+    skill = read_skill(path)
+    shapes = {field: (None, width) for field, width in _FRAMES.items()}
+    fields = _arrays(path, data, shapes, "Soccer-X")
+    step = _check_sequence(path, fields)
+    trans, poses, ball = (fields[field][::step].astype(np.float64) for field in _FRAMES)
+    if len(trans) < 3:
+        raise ValueError(
+            f"{path}: {len(trans)} frames at 30 a second, expected at least 3"
+        )
+    offsets = np.asarray(skeleton.offsets, np.float64)
+    # SMPL turns the body about its pelvis, so the way there is not turned.
+    root, local = trans + offsets[0], smpl.matrices(poses)
+    if str(fields["up"]) == "z":
+        turn = ball_base.Y_UP_FROM_Z_UP
+        root, ball = root @ turn.T, ball @ turn.T
+        local[:, 0] = turn @ local[:, 0]
+    world = chains.world_rotations(local, smpl.PARENTS)
+    joints = chains.joint_positions(root, world, offsets, smpl.PARENTS)
+    place = PurePosixPath(path.replace("\\", "/"))
+    return ball_base.ball_example(
+        # Sequences of several folders may bear the same name.
+        f"{place.parent.name}/{place.stem}",
+        skeleton,
+        base.motion_from_matrices(root, local, fps=ball_base.FPS),
+        {"skill": skill},
+        ball=ball,
+        touch=ball_touch(joints[:, list(_FEET)], ball),
+        joints=_FEET,
+        radius=RADIUS,
+    )
+
+
+def _check_sequence(path: str, fields: dict[str, np.ndarray]) -> int:
+    """How many frames make one of the result; raises where fields do not agree."""
+    for field in ("fps", "up"):
+        if field not in fields:
+            raise ValueError(f"{path}: field {field!r} is missing")
+    if fields["fps"].ndim or fields["fps"] not in (30, 240):
+        raise ValueError(f"{path}: field 'fps' is {fields['fps']}, expected 240 or 30")
+    if str(fields["up"]) not in ("y", "z"):
+        raise ValueError(f"{path}: field 'up' is {fields['up']}, expected 'y' or 'z'")
+    for field in _FRAMES:
+        if len(fields[field]) != len(fields["trans"]):
+            raise ValueError(
+                f"{path}: field {field!r} has {len(fields[field])} frames, 'trans' has "
+                f"{len(fields['trans'])}"
+            )
+    return round(float(fields["fps"]) / ball_base.FPS)
+
+
+def ball_touch(
+    joints: Float[np.ndarray, "frames touching 3"], ball: Float[np.ndarray, "frames 3"]
+) -> Bool[np.ndarray, "frames touching"]:
+    """Which joints touch the ball: near it while its velocity changes.
+
+    Args:
+      joints: World positions at 30 frames a second, metres.
+      ball: World position of the ball's centre, metres.
+
+    Returns:
+      True where a joint touches it; never in the first and the last frame.
+
+    Source: SMGDiff, section 3.2; the threshold is ours.
+    """
+    near = np.linalg.norm(joints - ball[:, None], axis=-1) < RADIUS + TOUCH_MARGIN
+    change = ball_accelerations(jnp.asarray(ball, jnp.float32), ball_base.FPS)
+    kicked = np.linalg.norm(np.asarray(change), axis=-1) > TOUCH_ACCELERATION
+    return near & kicked[:, None]

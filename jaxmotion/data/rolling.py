@@ -1,0 +1,233 @@
+"""A ball that rolls on flat ground beside recorded legs.
+
+Between two touches the ball rolls straight on and slows down evenly, as rolling
+friction does:
+
+    x(t) = v t - a t^2 / 2    until it stops at t = v / a                         (1)
+
+It has to be `d` metres away after `t` seconds. It arrives rolling, with v = d / t +
+a t / 2 at the start and v - a t >= 0 at the end, if d >= a t^2 / 2. Otherwise it stops
+there early, with v = sqrt(2 a d), and lies.
+
+All of this is host code in float64.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxmotion.data.clips import Clips
+from jaxmotion.motion.contact import foot_contacts
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+
+# Ball and legs that touch are this far apart at most, bone to ball: SMGDiff's rule is a
+# ball's radius and 5 cm.
+TOUCH_MARGIN = 0.05
+# Frames at a time.
+_BLOCK = 4096
+
+
+def start_speed(
+    distance: Float[np.ndarray, "*batch"],
+    seconds: Float[np.ndarray, "*batch"],
+    deceleration: float,
+) -> Float[np.ndarray, "*batch"]:
+    """Speed with which a ball has to leave to be somewhere in time.
+
+    Args:
+      distance: Metres to roll.
+      seconds: Time to do so, positive; the ball may be early.
+      deceleration: Of a rolling ball, positive, metres a second squared.
+
+    Returns:
+      Metres a second.
+    """
+    rolls = distance / seconds + deceleration * seconds / 2
+    stops = np.sqrt(2 * deceleration * distance)
+    return np.where(distance >= deceleration * seconds**2 / 2, rolls, stops)
+
+
+def roll(
+    displacement: Float[np.ndarray, "*batch 2"],
+    seconds: Float[np.ndarray, "*batch"],
+    deceleration: float,
+    times: Float[np.ndarray, "*batch times"],
+) -> Float[np.ndarray, "*batch times 2"]:
+    """Where a ball is on its way to a place: (1).
+
+    Args:
+      displacement: From where it starts to that place, metres on the ground.
+      seconds: Time of arrival, positive; the ball may stop there before.
+      deceleration: Of a rolling ball, positive, metres a second squared.
+      times: Between 0 and `seconds`.
+
+    Returns:
+      Displacement at those times, metres.
+    """
+    distance = np.linalg.norm(displacement, axis=-1)
+    speed = start_speed(distance, seconds, deceleration)[..., None]
+    moving = np.minimum(times, speed / deceleration)
+    way = speed * moving - deceleration * moving**2 / 2
+    part = way / np.where(distance > 0, distance, 1.0)[..., None]
+    return displacement[..., None, :] * part[..., None]
+
+
+def end_velocities(
+    displacement: Float[np.ndarray, "*batch 2"],
+    seconds: Float[np.ndarray, "*batch"],
+    deceleration: float,
+) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 2"]]:
+    """Velocities of a ball that leaves, and of one that has arrived.
+
+    Args:
+      displacement: From where it starts to where it has to be, metres on the ground.
+      seconds: Time of arrival, positive.
+      deceleration: Of a rolling ball, positive, metres a second squared.
+
+    Returns:
+      Metres a second; the second is zero where the ball stopped on the way.
+    """
+    distance = np.linalg.norm(displacement, axis=-1)
+    speed = start_speed(distance, seconds, deceleration)
+    direction = displacement / np.where(distance > 0, distance, 1.0)[..., None]
+    arrives = np.maximum(speed - deceleration * seconds, 0.0)
+    return speed[..., None] * direction, arrives[..., None] * direction
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Body:
+    """What a ball meets of one clip; metres, metres a second.
+
+    Attributes:
+      ground: Height of the ground.
+      root: On the ground plane (x, z).
+      toes: The skeleton's feet.
+      velocity: Of the toes, on the ground plane.
+      standing: Which of them stand.
+      legs: Both ends of the bones from toe to ankle and from ankle to knee.
+      fps: Frames a second.
+    """
+
+    ground: float
+    root: Float[np.ndarray, "frames 2"]
+    toes: Float[np.ndarray, "frames feet 3"]
+    velocity: Float[np.ndarray, "frames feet 2"]
+    standing: Bool[np.ndarray, "frames feet"]
+    legs: Float[np.ndarray, "frames bones 2 3"]
+    fps: float
+
+
+def bodies(clips: Clips, *, thickness: float) -> list[Body]:
+    """What a ball meets of each clip.
+
+    Args:
+      clips: At least two frames a clip.
+      thickness: How high the joint of a standing toe is above the ground, metres.
+
+    Returns:
+      One body a clip.
+
+    Raises:
+      ValueError: if a clip has one frame, or the skeleton no feet.
+    """
+    skeleton, offsets = clips.skeleton, np.asarray(clips.offsets)
+    if not skeleton.feet:
+        raise ValueError("field 'feet' of the skeleton is empty, expected the toes")
+    if np.diff(offsets).min() < 2:
+        short = int(np.diff(offsets).argmin())
+        name = clips.clip_names[short] if clips.clip_names else f"clip {short}"
+        raise ValueError(f"{name} has one frame, expected at least 2")
+    joints = _all_joints(clips)
+    # All clips at once: one at a time would compile for every length.
+    toes = jnp.asarray(joints[:, list(skeleton.feet)], jnp.float32)
+    standing = np.array(foot_contacts(toes, clips.fps))
+    # The last frame of a clip has no next one.
+    standing[offsets[1:] - 1] = standing[offsets[1:] - 2]
+    return [
+        _body(skeleton, joints[a:b], standing[a:b], clips.fps, thickness)
+        for a, b in zip(offsets[:-1], offsets[1:], strict=True)
+    ]
+
+
+def _all_joints(clips: Clips) -> Float[np.ndarray, "frames joints 3"]:
+    """World positions in all frames, block by block: one shape, compiled once."""
+    extra = -clips.num_frames % _BLOCK
+    root = np.pad(np.asarray(clips.root_position), ((0, extra), (0, 0)), "edge")
+    turns = np.asarray(clips.joint_rotation)
+    turns = np.pad(turns, ((0, extra), (0, 0), (0, 0)), "edge")
+    place = jax.jit(joint_positions)
+    found = [
+        place(
+            clips.skeleton,
+            Motion(
+                root_position=jnp.asarray(root[a : a + _BLOCK]),
+                joint_rotation=jnp.asarray(turns[a : a + _BLOCK]),
+                fps=clips.fps,
+            ),
+        )
+        for a in range(0, len(root), _BLOCK)
+    ]
+    return np.concatenate(found)[: clips.num_frames].astype(np.float64)
+
+
+def _body(
+    skeleton: Skeleton,
+    joints: np.ndarray,
+    standing: np.ndarray,
+    fps: float,
+    thickness: float,
+) -> Body:
+    feet, parents = np.array(skeleton.feet), np.maximum(skeleton.parents, 0)
+    ankles = parents[feet]
+    ends = [(feet, ankles), (ankles, parents[ankles])]
+    toes = joints[:, feet]
+    return Body(
+        ground=ground_height(toes[..., 1], standing) - thickness,
+        root=joints[:, 0, ::2],
+        toes=toes,
+        velocity=np.gradient(toes[..., ::2], axis=0) * fps,
+        standing=standing,
+        legs=np.concatenate(
+            [np.stack([joints[:, a], joints[:, b]], axis=2) for a, b in ends], axis=1
+        ),
+        fps=fps,
+    )
+
+
+def ground_height(
+    heights: Float[np.ndarray, "frames feet"], standing: Bool[np.ndarray, "frames feet"]
+) -> float:
+    """Height at which toes stand: few of those that stand are lower.
+
+    Args:
+      heights: Of the toes, metres.
+      standing: Which of them stand; where none does, all count.
+
+    Returns:
+      The fifth percentile, metres: a lowest foot that no outlier pulls down.
+    """
+    return float(np.percentile(heights[standing] if standing.any() else heights, 5))
+
+
+def leg_distances(
+    ball: Float[np.ndarray, "*batch frames 3"],
+    legs: Float[np.ndarray, "frames bones 2 3"],
+) -> Float[np.ndarray, "*batch frames"]:
+    """Distance from a point to the nearest bone of the legs in the same frame.
+
+    Args:
+      ball: The centre of the ball, metres.
+      legs: Both ends of each bone, metres.
+
+    Returns:
+      Metres.
+    """
+    start, along = legs[:, :, 0], legs[:, :, 1] - legs[:, :, 0]
+    square = np.maximum(np.sum(along**2, axis=-1), 1e-12)
+    away = ball[..., None, :] - start
+    part = np.clip(np.einsum("...i,...i", away, along) / square, 0.0, 1.0)
+    away -= part[..., None] * along
+    return np.sqrt(np.einsum("...i,...i", away, away).min(axis=-1))

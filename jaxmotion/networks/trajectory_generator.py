@@ -1,0 +1,100 @@
+"""SMGDiff's trajectory generator: a small transformer from commands to a ground path.
+
+Tokens: [time 1] [skill 1] [target 1] [past path] [noisy future path]; the last ones go
+through a linear layer and are the predicted path. The paper concatenates its noise with
+the conditions; here the noise is the noisy path of the last diffusion step, which is
+the same thing at T = 1 and makes T >= 2 the same network.
+
+Source: SMGDiff, section 3.1; its sizes are in the missing supplement.
+"""
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.networks import blocks
+
+CHANNELS = 4
+
+
+class TrajectoryGenerator(nn.Module):
+    """The denoiser of paths: (x, z) and facing (x, z) of each frame.
+
+    Attributes:
+      past: Past frames.
+      future: Frames to predict.
+      num_labels: Skills.
+      num_steps: T.
+      width: Channels of a token.
+      depth: Encoder layers.
+      heads: Attention heads.
+      hidden: Channels of the feed-forward layers.
+      frames_per_token: Frames of one token.
+    """
+
+    past: int
+    future: int
+    num_labels: int
+    num_steps: int
+    width: int
+    depth: int
+    heads: int
+    hidden: int
+    frames_per_token: int
+
+    def setup(self):
+        """Makes embeddings and layers."""
+        self.embed_time = blocks.TimeEmbedding(self.width)
+        self.embed_label = nn.Embed(
+            self.num_labels, self.width, embedding_init=nn.initializers.normal(1.0)
+        )
+        self.embed_target = nn.Dense(self.width)
+        self.embed_past = nn.Dense(self.width)
+        self.embed_noisy = nn.Dense(self.width)
+        self.layers = [
+            blocks.EncoderLayer(self.width, self.heads, self.hidden, 0.0, "pre")
+            for _ in range(self.depth)
+        ]
+        self.norm_out = nn.LayerNorm(epsilon=1e-5)
+        self.out = nn.Dense(CHANNELS * self.frames_per_token)
+
+    def __call__(
+        self,
+        x_t: Float[Array, "*batch future 4"],
+        t: Int[Array, "*#batch"],
+        past: Float[Array, "*batch past 4"],
+        target: Float[Array, "*batch 2"],
+        label: Int[Array, "*batch"],
+    ) -> Float[Array, "*batch future 4"]:
+        """Prediction of the clean path.
+
+        Args:
+          x_t: Noisy future path.
+          t: Step in 1..T.
+          past: Displayed path.
+          target: Where the user points to: wanted velocity times one second, metres.
+          label: Skill.
+
+        Returns:
+          Predicted path x_0.
+        """
+        n, batch = self.frames_per_token, x_t.shape[:-2]
+        time = jnp.broadcast_to(
+            self.embed_time(self.num_steps)[t], (*batch, self.width)
+        )
+        tokens = jnp.concatenate(
+            [
+                time[..., None, :],
+                self.embed_label(label)[..., None, :],
+                self.embed_target(target)[..., None, :],
+                self.embed_past(blocks.fold_frames(past, n)),
+                self.embed_noisy(blocks.fold_frames(x_t, n)),
+            ],
+            axis=-2,
+        )
+        positions = blocks.sinusoidal_positions(tokens.shape[-2], self.width)
+        tokens = blocks.add_rows(tokens, positions)
+        for i, layer in enumerate(self.layers, start=1):
+            outputs = self.future // n if i == self.depth else None
+            tokens = layer(tokens, train=False, last=outputs)
+        return self.out(self.norm_out(tokens)).reshape(*batch, self.future, CHANNELS)

@@ -1,0 +1,266 @@
+"""Training of SMGDiff's two stages, and a trained run from its folder.
+
+A run folder holds config.json (the model), train.npz and held_out.npz (clips with a
+ball), and one folder a stage: motion_8 is the motion model of 8 steps, paths_1 the
+trajectory generator of one.
+"""
+
+import dataclasses
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxmotion.data.ball_clips import BallClips, load_ball_clips, save_ball_clips
+from jaxmotion.learning import checkpoint, training
+from jaxmotion.protocols import smgdiff_data, stages
+from jaxmotion.systems import (
+    smgdiff,
+    smgdiff_loss,
+    smgdiff_model,
+    smgdiff_scene,
+    smgdiff_trajectory,
+)
+from jaxmotion.systems.smgdiff_model import SYSTEM, Model
+from jaxmotion.typing import Key, Params
+
+# Sizes and weights of `smgdiff.Config`, by name.
+PRESETS = {
+    # CAMDM's network, which the paper's missing supplement is taken to have.
+    "paper": dict(),
+    # For a CPU or a short run: 31 tokens instead of 147. Feet and bones weigh more than
+    # a long training needs.
+    "small": dict(
+        width=192,
+        hidden=768,
+        frames_per_token=5,
+        norm="pre",
+        dropout=0.0,
+        weight_velocity=3.0,
+        weight_position=5.0,
+        weight_position_velocity=20.0,
+        weight_foot=20.0,
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run:
+    """What a run folder holds besides the parameters.
+
+    Attributes:
+      folder: Where it is.
+      model: The model.
+      train: Clips that it was trained on.
+      held_out: Clips that it never saw.
+    """
+
+    folder: Path
+    model: Model
+    train: BallClips
+    held_out: BallClips
+
+
+def make_model(
+    data: BallClips, *, sizes: dict[str, Any], paths: dict[str, Any] | None = None
+) -> Model:
+    """A model for clips with a ball.
+
+    Args:
+      data: Training clips; their skeleton, rate, skills and source become the model's.
+      sizes: Of `smgdiff.Config`, but for those that the clips decide.
+      paths: Of `smgdiff_trajectory.Config`, likewise.
+
+    Returns:
+      The model, its features standardised on the clips.
+
+    Raises:
+      ValueError: if no clip is as long as a window.
+    """
+    clips, labels = data.clips, data.clips.names(smgdiff_data.FIELD)
+    names = smgdiff_scene.feature_layout(clips.skeleton, data.joints)
+    config = smgdiff.Config(
+        num_features=names.size, num_labels=len(labels), fps=clips.fps, **sizes
+    )
+    arrays = smgdiff_data.scene_arrays(data, config.window)
+    return Model(
+        config=config,
+        paths=smgdiff_trajectory.Config(
+            num_labels=len(labels),
+            past=config.past,
+            future=config.future,
+            **(paths or {}),
+        ),
+        representation=smgdiff_data.fit_representation(arrays, past=config.past),
+        labels=labels,
+        speeds=tuple(round(float(v), 4) for v in smgdiff_data.skill_speeds(data)),
+        source=clips.source,
+    )
+
+
+def with_steps(model: Model, stage: str) -> Model:
+    """The model with the number of steps that a stage's name says.
+
+    Args:
+      model: The model.
+      stage: "motion_8", "paths_1", ...
+
+    Returns:
+      The model, with that T in that stage.
+
+    Raises:
+      ValueError: if there is no such stage.
+    """
+    kind, _, steps = stage.partition("_")
+    if kind not in ("motion", "paths") or not steps.isdecimal() or int(steps) < 1:
+        raise ValueError(
+            f"unknown stage {stage!r}: expected motion_<steps> or paths_<steps>, such "
+            "as motion_8"
+        )
+    field = "config" if kind == "motion" else "paths"
+    changed = dataclasses.replace(getattr(model, field), num_steps=int(steps))
+    return dataclasses.replace(model, **{field: changed})
+
+
+def write_run(run: Run) -> None:
+    """Writes all of a run but its stages; one that is there must be the same.
+
+    Args:
+      run: The run.
+
+    Raises:
+      OSError: if a file cannot be written.
+      ValueError: if the folder holds another model; names what differs.
+    """
+    where = run.folder / "config.json"
+    value = smgdiff_model.to_json(run.model)
+    if where.exists():
+        found = json.loads(where.read_text())
+        differ = [name for name in value if found.get(name) != value[name]]
+        if differ:
+            raise ValueError(
+                f"{where}: another model, its {', '.join(differ)} differ: choose "
+                "another folder, or train with the same data and sizes"
+            )
+        return
+    save_ball_clips(run.folder / "train.npz", run.train)
+    save_ball_clips(run.folder / "held_out.npz", run.held_out)
+    where.write_text(json.dumps(value, indent=1))
+
+
+def load_run(folder: Path) -> Run:
+    """Reads a run folder.
+
+    Args:
+      folder: Of `experiments/smgdiff.py train`.
+
+    Returns:
+      The run.
+
+    Raises:
+      OSError: if a file is missing.
+      ValueError: if one is damaged or foreign; names it and the field.
+    """
+    where = folder / "config.json"
+    if not where.is_file():
+        raise FileNotFoundError(
+            f"no run in {folder}: expected {where}, as `experiments/smgdiff.py train` "
+            "writes it"
+        )
+    try:
+        value = json.loads(where.read_text())
+    except ValueError as error:
+        raise ValueError(f"{where}: not JSON ({error})") from None
+    return Run(
+        folder=folder,
+        model=smgdiff_model.from_json(value, where=str(where)),
+        train=load_ball_clips(folder / "train.npz"),
+        held_out=load_ball_clips(folder / "held_out.npz"),
+    )
+
+
+def _stage_config(model: Model, stage: str) -> tuple[str, dict[str, Any]]:
+    field = "config" if stage.startswith("motion") else "paths"
+    return field, dataclasses.asdict(getattr(with_steps(model, stage), field))
+
+
+def _shapes(model: Model, stage: str) -> Params:
+    model = with_steps(model, stage)
+    if stage.startswith("motion"):
+        return smgdiff.init(jax.random.key(0), model.config)
+    return smgdiff_trajectory.init(jax.random.key(0), model.paths)
+
+
+def train_stage(run: Run, stage: str, *, budget: stages.Budget) -> None:
+    """Trains a stage, from its newest checkpoint if there is one.
+
+    Args:
+      run: The run.
+      stage: "motion_8", "paths_1", ...
+      budget: How long.
+
+    Raises:
+      ValueError: if there is no such stage, or its checkpoint has other settings.
+      TrainingDiverged: if a loss is not finite.
+    """
+    model = with_steps(run.model, stage)
+    is_motion = stage.startswith("motion")
+    if is_motion:
+        loss = functools.partial(
+            smgdiff_loss.loss, representation=model.representation, config=model.config
+        )
+        init = lambda key: smgdiff.init(key, model.config)  # noqa: E731
+    else:
+        loss = functools.partial(
+            smgdiff_trajectory.loss,
+            bones=model.representation.bones,
+            config=model.paths,
+        )
+        init = lambda key: smgdiff_trajectory.init(key, model.paths)  # noqa: E731
+
+    def sample_batch(key: Key, arrays: smgdiff_data.SceneArrays) -> tuple[Any, Any]:
+        scenes, labels = smgdiff_data.sample_scenes(key, arrays, batch=budget.batch)
+        return (scenes if is_motion else scenes.motion), labels
+
+    optimizer = stages.make_optimizer(budget)
+    params = jax.jit(init)(jax.random.key(budget.seed))
+    stages.fit(
+        run.folder / stage,
+        training.init_train_state(params, optimizer),
+        training.make_update(loss, optimizer, ema_decay=budget.ema),
+        sample_batch,
+        smgdiff_data.scene_arrays(run.train, model.config.window),
+        system=SYSTEM,
+        stage=stage,
+        budget=budget,
+        config=dict([_stage_config(run.model, stage)]),
+        show=("loss", "foot") if is_motion else ("loss",),
+    )
+
+
+def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
+    """Averaged parameters of a stage.
+
+    Args:
+      run: The run.
+      stage: "motion_8", "paths_1", ...
+
+    Returns:
+      The model with the stage's number of steps, and the parameters.
+
+    Raises:
+      CheckpointError: if the stage was not trained, or with other sizes.
+      ValueError: if there is no such stage.
+    """
+    model = with_steps(run.model, stage)
+    folder = run.folder / stage
+    value = stages.check_stage(folder, stage, system=SYSTEM)
+    field, expected = _stage_config(run.model, stage)
+    if value.get(field) != expected:
+        raise checkpoint.CheckpointError(
+            f"{folder}: field {field!r} is not that of {run.folder}/config.json"
+        )
+    init = functools.partial(_shapes, run.model, stage)
+    return model, stages.load_params(folder, stage, init, system=SYSTEM)

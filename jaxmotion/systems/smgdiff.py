@@ -1,0 +1,143 @@
+"""SMGDiff: a transformer diffusion model of a person and a ball.
+
+A sample is the next 45 frames of body, ball and contacts (`smgdiff_scene`), seen from
+the last displayed pose; the condition is the last 10 frames, a ground path with
+facings, and a skill. The network is CAMDM's. Eight steps of the cosine schedule; in
+some of them, by default the last two, contact guidance pulls foot and ball together:
+
+    x = reverse_chain(ancestral_step(schedule, net), key, x_8, start=8, stop=2)
+    x = reverse_chain(dsg_step(schedule, net, contact_objective), key, x, start=2)
+
+Source: SMGDiff, section 3; sizes, which its missing supplement has, are CAMDM's.
+"""
+
+import dataclasses
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.motion import rotation
+from jaxmotion.motion.trajectory import Trajectory
+from jaxmotion.networks import transformer
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Architecture and method; the defaults are the paper's where it has them.
+
+    Attributes:
+      num_features: Channels of a frame, from `feature_layout`.
+      num_labels: Skills.
+      past: Past frames of the condition.
+      future: Frames of a sample.
+      fps: Frames a second.
+      num_steps: T of the cosine schedule.
+      width: Channels of a token (CAMDM's).
+      depth: Layers.
+      heads: Attention heads.
+      hidden: Channels of the feed-forward layers.
+      dropout: Rate.
+      frames_per_token: Frames of one token; ours, 1 in CAMDM.
+      norm: Layer norms behind each sum ("post") or before each branch ("pre", ours).
+      weight_data: Weight of the mean squared error of features.
+      weight_velocity: Of the displacements of features.
+      weight_position: Of the joint positions.
+      weight_position_velocity: Of the displacements of joint positions (CAMDM's; not
+        in the paper).
+      weight_foot: Of feet that slide while they stand.
+    """
+
+    num_features: int
+    num_labels: int
+    past: int = 10
+    future: int = 45
+    fps: float = 30.0
+    num_steps: int = 8
+    width: int = 256
+    depth: int = 4
+    heads: int = 4
+    hidden: int = 1024
+    dropout: float = 0.1
+    frames_per_token: int = 1
+    norm: Literal["post", "pre"] = "post"
+    weight_data: float = 1.0
+    weight_velocity: float = 1.0
+    weight_position: float = 1.0
+    weight_position_velocity: float = 0.0
+    weight_foot: float = 1.0
+
+    @property
+    def window(self) -> int:
+        """Frames of a training window."""
+        return self.past + self.future
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Condition:
+    """What a plan is made for, in the frame of the plan.
+
+    Attributes:
+      past: Features of the last displayed frames.
+      trajectory: Ground path and facings wanted for the future.
+      label: Skill.
+      ball: Where the ball was displayed last, metres.
+    """
+
+    past: Float[Array, "*batch past features"]
+    trajectory: Trajectory
+    label: Int[Array, "*batch"]
+    ball: Float[Array, "*batch 3"]
+
+    def arguments(self) -> tuple[Array, ...]:
+        """The network's arguments behind x_t and t.
+
+        Returns:
+          past, path, facing (6D), label, and that the past is kept.
+        """
+        facing = rotation.rot6d_from_matrix(
+            rotation.matrix_from_facing(self.trajectory.facing)
+        )
+        keep = jnp.ones(self.label.shape, bool)
+        return self.past, self.trajectory.position, facing, self.label, keep
+
+
+def network(config: Config) -> transformer.CamdmTransformer:
+    """The denoiser's Flax module: CAMDM's.
+
+    Args:
+      config: Its sizes.
+
+    Returns:
+      A module with methods `encode`, `denoise` and their composition.
+    """
+    names = {field.name for field in dataclasses.fields(transformer.CamdmTransformer)}
+    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
+    return transformer.CamdmTransformer(features=config.num_features, **sizes)
+
+
+def init(key: Key, config: Config) -> Params:
+    """Initial parameters.
+
+    Args:
+      key: Consumed.
+      config: The architecture.
+
+    Returns:
+      Parameters of `network(config)`.
+    """
+    line = Trajectory(
+        position=jnp.zeros((config.future, 2)), facing=jnp.ones((config.future, 2))
+    )
+    condition = Condition(
+        past=jnp.zeros((config.past, config.num_features)),
+        trajectory=line,
+        label=jnp.zeros((), jnp.int32),
+        ball=jnp.zeros(3),
+    )
+    x_t = jnp.zeros((config.future, config.num_features))
+    t = jnp.ones((), jnp.int32)
+    return network(config).init(key, x_t, t, *condition.arguments())["params"]
