@@ -3,6 +3,7 @@
 Examples:
   python benchmarks/step_counts.py --system camdm --steps 2 4 8 16 32 --batch 1 64
   python benchmarks/step_counts.py --system emdm --steps 1 5 10 20 50 --batch 1 32
+  python benchmarks/step_counts.py --system smgdiff --guided
 """
 
 import dataclasses
@@ -18,6 +19,7 @@ import timing
 import tyro
 import workload
 import workload_emdm
+import workload_smgdiff
 from jaxtyping import Array
 
 from jaxmotion.systems import camdm
@@ -27,6 +29,7 @@ from jaxmotion.viz import figure
 COLUMNS = {
     "batch": "batch",
     "steps": "steps",
+    "guided": "guided",
     "network_calls": "network calls",
     "compile_s": "compile s",
     "p50_ms": "p50 ms",
@@ -53,8 +56,10 @@ class Config:
       chunk: Run batches of 16 and more in chunks of so many characters; 0 for all at
         once.
       frames_per_token: Frames of one token; 1 is the paper's network.
-      width: Channels of a token; None for 256 (camdm) or 128 (emdm, the size that
+      width: Channels of a token; None for 256, or 128 (emdm, the size that
         experiments/emdm.py trains).
+      guided: Measure SMGDiff's plans with contact guidance in the last two steps as
+        well.
       paper: Measure EMDM's network of 12 layers and 1024 channels, one frame a token.
       runs: Timed calls of each program.
       limit: Seconds of timed calls of each program, at most.
@@ -62,13 +67,14 @@ class Config:
       gate: Report to compare with; exit status 1 if something is worse.
     """
 
-    system: Literal["camdm", "emdm"] = "camdm"
+    system: Literal["camdm", "emdm", "smgdiff"] = "camdm"
     steps: tuple[int, ...] = (2, 4, 8, 16, 32)
     batch: tuple[int, ...] = (1, 64)
     arguments: bool = False
     chunk: int = 4
     frames_per_token: int = 1
     width: int | None = None
+    guided: bool = False
     paper: bool = False
     runs: int = 50
     limit: float = 25.0
@@ -109,17 +115,30 @@ def sampler(
     return jax.jit(functools.partial(plans, params)), given
 
 
-def program(args: Config, steps: int, batch: int) -> tuple[Callable, tuple, int]:
+def program(
+    args: Config, steps: int, batch: int, guided: bool
+) -> tuple[Callable, tuple, int]:
     """What is timed.
 
     Args:
       args: The settings.
       steps: Diffusion steps.
       batch: Characters or motions.
+      guided: With contact guidance.
 
     Returns:
       The jitted function, its arguments, and frames of a plan or motion.
     """
+    if args.system == "smgdiff":
+        return workload_smgdiff.program(
+            steps=steps,
+            batch=batch,
+            width=args.width or 256,
+            frames_per_token=args.frames_per_token,
+            guided=guided,
+            arguments=args.arguments,
+            chunk=args.chunk,
+        )
     if args.system == "emdm":
         return workload_emdm.program(
             steps=steps,
@@ -137,22 +156,26 @@ def program(args: Config, steps: int, batch: int) -> tuple[Callable, tuple, int]
     return run, given, config.future
 
 
-def case(args: Config, steps: int, batch: int) -> dict[str, Any]:
+def case(
+    args: Config, steps: int, batch: int, *, guided: bool = False
+) -> dict[str, Any]:
     """Measures one step count and batch.
 
     Args:
       args: The settings.
       steps: Diffusion steps.
       batch: Characters or motions.
+      guided: With contact guidance.
 
     Returns:
       One row of the report.
     """
-    run, given, frames = program(args, steps, batch)
+    run, given, frames = program(args, steps, batch, guided)
     found = timing.measure(run, *given, runs=args.runs, limit_s=args.limit)
     return {
         "batch": batch,
         "steps": steps,
+        "guided": guided,
         "network_calls": steps,
         **dataclasses.asdict(found),
         "frames_per_second": 1000 * batch * frames / found.p50_ms,
@@ -171,6 +194,7 @@ def metrics_of(system: str, row: dict[str, Any]) -> list[suite.Metric]:
       Four metrics.
     """
     name = f"{system} steps={row['steps']} batch={row['batch']}"
+    name += " guided" if row["guided"] else ""
     return [
         suite.Metric(f"{name} p50", row["p50_ms"], "ms"),
         suite.Metric(f"{name} p95", row["p95_ms"], "ms", tolerance=0.6),
@@ -182,20 +206,26 @@ def metrics_of(system: str, row: dict[str, Any]) -> list[suite.Metric]:
 def main() -> None:
     """Measures, writes the report and the plot."""
     args = tyro.cli(Config, description=__doc__)
+    if args.guided and args.system != "smgdiff":
+        raise ValueError(f"--guided is of smgdiff, not of {args.system}")
     suite.prepare(args.out, args.gate)
+    kinds = (False, True) if args.guided else (False,)
     rows = []
     for batch in args.batch:
         for steps in args.steps:
-            rows.append(case(args, steps, batch))
-            print(f"batch {batch}, {steps} steps: {rows[-1]['p50_ms']:.4g} ms")
+            for guided in kinds:
+                rows.append(case(args, steps, batch, guided=guided))
+                about = f"batch {batch}, {steps} steps{', guided' if guided else ''}"
+                print(f"{about}: {rows[-1]['p50_ms']:.4g} ms", flush=True)
     suite.print_table(rows, COLUMNS)
     lines = {}
     for batch in args.batch:
-        own = [row for row in rows if row["batch"] == batch]
-        lines[f"batch {batch}"] = tuple(
-            np.array([row[name] for row in own])
-            for name in ("steps", "p50_ms", "p95_ms")
-        )
+        for guided in kinds:
+            own = [r for r in rows if (r["batch"], r["guided"]) == (batch, guided)]
+            lines[f"batch {batch}{', guided' if guided else ''}"] = tuple(
+                np.array([row[name] for row in own])
+                for name in ("steps", "p50_ms", "p95_ms")
+            )
     figure.plot_sweep(
         args.out / "step_counts.png",
         lines,

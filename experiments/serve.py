@@ -25,7 +25,8 @@ class Serve:
     """The command line.
 
     Attributes:
-      run: Run folder of `camdm.py train`, or a file of `camdm.py export`.
+      run: Run folder of `camdm.py train` or `smgdiff.py train`, or a file of
+        `camdm.py export`.
       data: Clips to start from; None for the mean pose of the model (of the clips
         that it was trained on where it has none).
       host: Address to listen on. Anyone who reaches it can connect: there is no

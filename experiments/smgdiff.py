@@ -13,7 +13,7 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from smgdiff_tasks import playing, tables
@@ -42,6 +42,8 @@ class Train:
       stages: motion_<T> is the motion model of T steps, paths_<T> the trajectory
         generator (the paper's: T = 1).
       preset: "small" for a CPU or a short run, or "paper".
+      width: Channels of the motion model's tokens; None for the preset's.
+      depth: Its layers; None for the preset's.
       held_out: Part of the recordings kept for evaluation.
       steps: Updates of a motion model.
       path_steps: Updates of a trajectory generator.
@@ -54,6 +56,8 @@ class Train:
     out: Path = Path("runs/smgdiff")
     stages: tuple[str, ...] = ("paths_1", "motion_8")
     preset: Literal["small", "paper"] = "small"
+    width: int | None = None
+    depth: int | None = None
     held_out: float = 0.1
     steps: int = 4000
     path_steps: int = 2000
@@ -146,15 +150,27 @@ class Rollout:
     seed: int = 0
 
 
+def sizes_of(args: Train) -> dict[str, Any]:
+    """Sizes of the motion model that the arguments describe."""
+    sizes = dict(smgdiff_runs.PRESETS[args.preset])
+    if args.width:
+        sizes |= {"width": args.width, "hidden": 4 * args.width}
+    if args.depth:
+        sizes |= {"depth": args.depth}
+    return sizes
+
+
 def train(args: Train) -> None:
     """Trains stage by stage."""
+    for stage in args.stages:
+        smgdiff_runs.check_stage_name(stage)
     loop.check_writable(args.out)
     if (args.out / "config.json").exists():
         run = smgdiff_runs.load_run(args.out)
     else:
         data = load_ball_clips(args.data)
         kept, held_out = smgdiff_data.split(data, fraction=args.held_out)
-        model = smgdiff_runs.make_model(kept, sizes=smgdiff_runs.PRESETS[args.preset])
+        model = smgdiff_runs.make_model(kept, sizes=sizes_of(args))
         run = smgdiff_runs.Run(
             folder=args.out, model=model, train=kept, held_out=held_out
         )
@@ -165,8 +181,6 @@ def train(args: Train) -> None:
         f"{clips.num_clips} clips, {clips.num_frames / clips.fps / 60:.1f} minutes, of "
         f"{', '.join(run.model.labels)}: {run.model.source}"
     )
-    for stage in args.stages:
-        smgdiff_runs.with_steps(run.model, stage)
     for stage in args.stages:
         begun = time.perf_counter()
         number = args.steps if stage.startswith("motion") else args.path_steps

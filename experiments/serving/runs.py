@@ -4,11 +4,11 @@ import json
 from pathlib import Path
 
 from jaxmotion.learning import checkpoint
-from serving import camdm
+from serving import camdm, smgdiff
 from serving.simulation import Simulation
 
 # By field "system" of a run's config; each is `load(run, data)`.
-SYSTEMS = {"camdm": camdm.load}
+SYSTEMS = {"camdm": camdm.load, "smgdiff": smgdiff.load}
 
 
 def system_of(run: Path) -> str:

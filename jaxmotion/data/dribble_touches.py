@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from jaxmotion.data.rolling import TOUCH_MARGIN, Body, leg_distances
 
 
-def _require(holds: bool, settings: "Dribble", name: str, rule: str) -> None:
+def _require(holds: bool | np.bool_, settings: "Dribble", name: str, rule: str) -> None:
     if not holds:
         raise ValueError(f"{name} is {getattr(settings, name)}, expected it {rule}")
 

@@ -100,6 +100,27 @@ def make_model(
     )
 
 
+def check_stage_name(stage: str) -> tuple[str, int]:
+    """Raises unless a stage has a kind and a number of steps.
+
+    Args:
+      stage: "motion_8", "paths_1", ...
+
+    Returns:
+      "motion" or "paths", and T.
+
+    Raises:
+      ValueError: if there is no such stage.
+    """
+    kind, _, steps = stage.partition("_")
+    if kind not in ("motion", "paths") or not steps.isdecimal() or int(steps) < 1:
+        raise ValueError(
+            f"unknown stage {stage!r}: expected motion_<steps> or paths_<steps>, such "
+            "as motion_8"
+        )
+    return kind, int(steps)
+
+
 def with_steps(model: Model, stage: str) -> Model:
     """The model with the number of steps that a stage's name says.
 
@@ -113,14 +134,9 @@ def with_steps(model: Model, stage: str) -> Model:
     Raises:
       ValueError: if there is no such stage.
     """
-    kind, _, steps = stage.partition("_")
-    if kind not in ("motion", "paths") or not steps.isdecimal() or int(steps) < 1:
-        raise ValueError(
-            f"unknown stage {stage!r}: expected motion_<steps> or paths_<steps>, such "
-            "as motion_8"
-        )
+    kind, steps = check_stage_name(stage)
     field = "config" if kind == "motion" else "paths"
-    changed = dataclasses.replace(getattr(model, field), num_steps=int(steps))
+    changed = dataclasses.replace(getattr(model, field), num_steps=steps)
     return dataclasses.replace(model, **{field: changed})
 
 

@@ -688,7 +688,12 @@ def test_all_that_the_client_calls_malformed_is(protocol):
 def model_and_params():
     still = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(tiny.NAMES)
     config = tiny.config(
-        heading="facing", rotation_scale=4.0, rotation_mean=still, future=16, depth=1
+        heading="facing",
+        rotation_scale=4.0,
+        rotation_mean=still,
+        future=16,
+        depth=1,
+        network="mlp",
     )
     model = camdm_model.Model(
         config=config, bones=tiny.skeleton(), labels=tiny.STYLES, source="tests"

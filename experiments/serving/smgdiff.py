@@ -1,0 +1,60 @@
+"""SMGDiff's players, each with a ball, for the server."""
+
+from pathlib import Path
+
+import jax
+
+from jaxmotion.protocols import smgdiff_evaluation, smgdiff_runs
+from jaxmotion.systems import smgdiff_control, smgdiff_guidance, smgdiff_trajectory
+from jaxmotion.systems.smgdiff_guidance import Guidance
+from serving.controlled import ControlledSimulation
+
+# As `experiments/smgdiff.py rollout` has them.
+_GUIDED = Guidance(end=2, last_sigma=0.02, min_acceleration=12.0, max_distance=0.15)
+
+
+def load(run: Path, data: Path | None) -> ControlledSimulation:
+    """Players of a run of `smgdiff.py train`, steered through generated paths.
+
+    Args:
+      run: Run folder.
+      data: Must be None: a run holds the clips that players start from.
+
+    Returns:
+      The simulation; nothing of it is compiled yet.
+
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if it is no such run, or data are given.
+    """
+    if data is not None:
+        raise ValueError(f"--data {data}: players start from the clips in {run}")
+    loaded = smgdiff_runs.load_run(run)
+    model, params = smgdiff_runs.load_stage(loaded, "motion_8")
+    paths, path_params = smgdiff_runs.load_stage(loaded, "paths_1")
+    known = smgdiff_evaluation.situations(loaded.train, model, number=8, seed=0)
+    past = jax.tree.map(lambda x: x[0], known.past)
+    bones = model.representation.bones
+    driver = smgdiff_control.controller(
+        smgdiff_trajectory.generator(path_params, config=paths.paths),
+        smgdiff_guidance.planner(
+            params,
+            config=model.config,
+            representation=model.representation,
+            guided=_GUIDED,
+        ),
+        representation=model.representation,
+        config=model.config,
+    )
+    return ControlledSimulation(
+        driver,
+        bones,
+        smgdiff_control.init_state(bones, past, config=model.config),
+        lambda frame: {
+            "root": frame.root_position,
+            "rotations": frame.joint_rotation,
+            "ball": frame.ball,
+        },
+        labels=model.labels,
+        fps=model.config.fps,
+    )

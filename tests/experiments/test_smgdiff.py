@@ -1,0 +1,123 @@
+"""experiments/smgdiff.py: train, evaluate and roll out; dribble.py makes its data."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxmotion.data import bvh_text, clips_io
+from jaxmotion.data.ball_clips import load_ball_clips, save_ball_clips
+from tests import ball_walker
+
+ROOT = Path(__file__).parents[2]
+SIZES = "--width 16 --depth 1 --steps 100 --path-steps 100 --batch 4 --held-out 0.3"
+SHORT = "--windows 8 --replications 2 --recognizer-steps 20 --starts 2 --repeats 2"
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+
+@pytest.fixture(scope="module")
+def call():
+    """Runs a script's command line in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "experiments"))
+
+        def run(script, line, *more):
+            path = ROOT / "experiments" / f"{script}.py"
+            spec = importlib.util.spec_from_file_location(f"{script}_script", path)
+            module = importlib.util.module_from_spec(spec)
+            patch.setitem(sys.modules, f"{script}_script", module)
+            spec.loader.exec_module(module)
+            patch.setattr(sys, "argv", [str(path), *line.split(), *more])
+            module.main()
+
+        yield run
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "ball.npz"
+    save_ball_clips(path, ball_walker.clips(80))
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(call, data, tmp_path_factory, quick_compile):
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    call("smgdiff", f"train --data {data} --out {folder} {SIZES}")
+    return folder
+
+
+def test_schedules_stand_beside_real_clips(call, trained):
+    line = f"evaluate --run {trained} --tables schedules steps {SHORT} --schedules"
+    call("smgdiff", line, "none", "end 2")
+    for name, wanted in (("schedules", "none"), ("steps", "8 steps")):
+        report = json.loads(
+            (trained / "evaluation" / name / "metrics.json").read_text()
+        )
+        assert {"real (held-out clips)", "real (training clips)", wanted} <= set(
+            report["rows"]
+        )
+        row = report["rows"][wanted]
+        assert row["FID"]["samples"] == 2 and row["ms a plan"]["value"] > 0
+        assert 0 <= row["skill accuracy"]["value"] <= 1
+        assert report["source"] and report["jax"]
+
+
+def test_a_rollout_is_a_motion_with_a_ball(call, trained, capsys):
+    call("smgdiff", f"rollout --run {trained} --seconds 2 --schedule none")
+    out = trained / "rollout"
+    assert len(bvh_text.read_bvh(out / "rollout.bvh").values) == 60
+    lines = (out / "rollout_ball.csv").read_text().splitlines()
+    assert lines[0] == "seconds,x,y,z,touch" and len(lines) == 61
+    numbers = np.array([line.split(",") for line in lines[1:]], float)
+    assert np.isfinite(numbers).all()
+    with Image.open(out / "rollout.gif") as image:
+        assert image.n_frames == 30
+    assert '"ball":[[' in (out / "rollout.html").read_text()
+    assert "from the root" in capsys.readouterr().out
+
+
+def test_dribble_makes_skills_of_labels(call, tmp_path):
+    from jaxmotion.data import procedural
+
+    source, out = tmp_path / "clips.npz", tmp_path / "ball.npz"
+    clips_io.save_clips(source, procedural.make_clips(minutes=1.0))
+    styles = " ".join(procedural.make_clips(minutes=1.0).names("style")[:3])
+    call(
+        "dribble",
+        f"--data {source} --out {out} --field style --dribble {styles} --sprint none "
+        "--stand none --celebrate none",
+    )
+    data = load_ball_clips(out)
+    assert data.clips.names("skill") == ("dribble", "off_ball")
+    assert bool(data.touch.any()) and "synthetic ball" in data.clips.source
+    with pytest.raises(FileExistsError, match="--overwrite"):
+        call("dribble", f"--data {source} --out {out}")
+
+
+BAD = {
+    "train --data {data} --out {new} --stages motion": "unknown stage 'motion'",
+    "train --data {none} --out {new}": "no clips file",
+    "evaluate --run {none}": "no run in",
+    f"evaluate --run {{run}} {SHORT} --schedules middle": "unknown schedule 'middle'",
+    "rollout --run {run} --skills dive": "unknown skill 'dive'",
+    "rollout --run {run} --seconds 0.01": "too short",
+    "rollout --run {run} --paths paths_7": "no checkpoint",
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_bad_input_is_one_clear_error(call, trained, data, tmp_path, line):
+    places = dict(
+        data=data, run=trained, new=tmp_path / "new", none=tmp_path / "none.npz"
+    )
+    with pytest.raises((OSError, ValueError), match=BAD[line]):
+        call(
+            "smgdiff",
+            line.format(**places) + " " + (SHORT if "evaluate" in line else ""),
+        )

@@ -1,0 +1,151 @@
+"""SMGDiff's run-time: when it plans, and how plans join what is displayed."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.control import rollout
+from jaxmotion.motion.trajectory import Command
+from jaxmotion.systems import (
+    smgdiff,
+    smgdiff_control,
+    smgdiff_guidance,
+    smgdiff_scene,
+    smgdiff_trajectory,
+)
+from tests import ball_walker, tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+CONTROL = smgdiff_control.Control(apply=5, reuse=4)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """Representation, config, and a controller of random networks."""
+    scenes = [ball_walker.scene(16, speed=s, start=s) for s in (0.6, 1.0, 1.4)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *scenes)
+    representation = smgdiff_scene.fit(
+        tiny.skeleton(), stacked, joints=(2, 4), radius=0.11
+    )
+    config = smgdiff.Config(
+        num_features=representation.normalizer.mean.size,
+        num_labels=2,
+        past=4,
+        future=12,
+        num_steps=2,
+        width=16,
+        depth=1,
+        heads=2,
+        hidden=32,
+    )
+    paths = smgdiff_trajectory.Config(
+        num_labels=2,
+        past=4,
+        future=12,
+        width=16,
+        depth=1,
+        hidden=32,
+        frames_per_token=2,
+    )
+    sample = smgdiff_guidance.planner(
+        tiny.random_params(smgdiff.init, config, seed=3),
+        config=config,
+        representation=representation,
+        guided=smgdiff_guidance.Guidance(end=1, last_sigma=0.01),
+    )
+    generate = smgdiff_trajectory.generator(
+        tiny.random_params(smgdiff_trajectory.init, paths, seed=1), config=paths
+    )
+    driver = smgdiff_control.controller(
+        generate,
+        sample,
+        representation=representation,
+        config=config,
+        control=CONTROL,
+    )
+    return representation, config, driver
+
+
+def past(frames=6):
+    return ball_walker.scene(frames, speed=1.0, start=0.4)
+
+
+def commands(ticks, *, change=None):
+    velocity = np.tile([0.2, 1.0], (ticks, 1))
+    if change is not None:
+        velocity[change:] = [1.0, 0.0]
+    return Command(
+        velocity=jnp.asarray(velocity, jnp.float32),
+        facing=jnp.tile(jnp.array([0.0, 1.0]), (ticks, 1)),
+        label=jnp.zeros(ticks, jnp.int32),
+    )
+
+
+def played(parts, steered, number=1):
+    _, config, driver = parts
+    state = smgdiff_control.init_state(tiny.skeleton(), past(), config=config)
+    many = lambda tree: jax.tree.map(lambda x: jnp.stack([x] * number), tree)  # noqa: E731
+    run = jax.jit(lambda *given: rollout.rollout(driver, *given)[1])
+    return run(jax.random.key(1), many(state), many(steered))
+
+
+@pytest.fixture(scope="module")
+def frames(parts):
+    return played(parts, commands(13, change=7), number=2)
+
+
+def test_it_plans_at_first_when_played_out_and_when_told(frames):
+    planned = np.flatnonzero(np.asarray(frames.planned[0]))
+    np.testing.assert_array_equal(planned, [0, 5, 7, 12])
+
+
+def test_a_plan_begins_where_body_and_ball_are_displayed(parts, frames):
+    """The seam keeps the places; nothing jumps by more than the plan itself moves."""
+    scene = past()
+    np.testing.assert_allclose(
+        frames.root_position[0, 0], scene.motion.root_position[-1], atol=0.15
+    )
+    _, config, _ = parts
+    bare = dataclasses.replace(CONTROL, seam=0.0)
+    assert CONTROL.seam > 0 and bare.seam == 0
+    jump = np.linalg.norm(np.diff(np.asarray(frames.ball[0]), axis=0), axis=-1)
+    at_seams = jump[[4, 6, 11]]
+    assert (at_seams < jump.max() + 1e-6).all() and np.isfinite(jump).all()
+    assert (at_seams < 0.5).all()
+
+
+def test_players_draw_their_own_noise_and_one_alone_is_the_same(parts, frames):
+    assert float(jnp.abs(frames.ball[0, 1] - frames.ball[1, 1]).max()) > 1e-4
+    alone = played(parts, commands(13, change=7))
+    np.testing.assert_allclose(alone.ball[0, :5], frames.ball[0, :5], atol=1e-3)
+
+
+def test_urgency_is_a_matter_of_command_and_cursor(parts):
+    _, config, _ = parts
+    state = smgdiff_control.init_state(tiny.skeleton(), past(), config=config)
+    wanted = jax.tree.map(lambda x: x[0], commands(1))
+    need = lambda s, c: int(smgdiff_control.urgency(s, c, control=CONTROL))  # noqa: E731
+    assert need(state, wanted) == 1  # the first command
+    state = dataclasses.replace(state, command=wanted)
+    assert need(state, wanted) == 0
+    other = dataclasses.replace(wanted, label=jnp.int32(1))
+    assert need(state, other) == 1
+    assert need(dataclasses.replace(state, cursor=jnp.int32(5)), wanted) == 1
+
+
+def test_bad_input_is_named(parts):
+    representation, config, _ = parts
+    with pytest.raises(ValueError, match="past has 3 frames, expected 4 or more"):
+        smgdiff_control.init_state(tiny.skeleton(), past(3), config=config)
+    with pytest.raises(ValueError, match="apply is 13, expected 1..12"):
+        smgdiff_control.controller(
+            lambda key, wish: None,
+            lambda key, condition: None,
+            representation=representation,
+            config=config,
+            control=smgdiff_control.Control(apply=13),
+        )
