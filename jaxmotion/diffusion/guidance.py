@@ -127,7 +127,9 @@ def dsg_step(
 
         D = sigma_t noise + rate (D* - sigma_t noise),   x_{t-1} = mean + r D / |D|
 
-    Where g is zero (nothing to guide) it is the ancestral step.
+    Where g is zero (nothing to guide) it is the ancestral step. Any other g, however
+    small, is followed over the whole length: an objective should be flat where it is
+    satisfied.
 
     The last step draws no noise, for its sigma is 0: there the whole step is descent,
     of length sqrt(n) `last_sigma`.

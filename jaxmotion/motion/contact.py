@@ -63,6 +63,9 @@ def ball_contact_gate(
     Returns:
       Whether the ball was pushed; never in the first and the last frame.
 
+    Raises:
+      ValueError: if there are fewer than three frames.
+
     Source: SMGDiff, eq. 10.
     """
     square = jnp.sum(ball_accelerations(ball, fps) ** 2, axis=-1)
@@ -94,7 +97,8 @@ def ball_contact_loss(
       grounded_weight: At least 1.
 
     Returns:
-      Sum over frames of the weighted distances beyond `max_distance`, metres.
+      Sum over frames of the weighted distances (whole) that exceed `max_distance`,
+      metres.
 
     Source: SMGDiff, eq. 11-12, with the missing norm; the quotient there divides a
     frame's term by one.
