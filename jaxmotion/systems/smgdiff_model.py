@@ -89,8 +89,13 @@ def to_json(model: Model) -> dict[str, Any]:
 
 
 def _representation(value: Mapping[str, Any]) -> Representation:
+    bones = model_json.skeleton_from_json(value["skeleton"])
+    size = feature_layout(bones, tuple(value["joints"])).size
+    for name in ("mean", "std"):
+        if len(value[name]) != size:
+            raise ValueError(f"{name} has {len(value[name])} numbers, expected {size}")
     return Representation(
-        bones=model_json.skeleton_from_json(value["skeleton"]),
+        bones=bones,
         normalizer=Normalizer(
             mean=jnp.asarray(value["mean"], jnp.float32),
             std=jnp.asarray(value["std"], jnp.float32),
@@ -130,11 +135,8 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         raise ValueError(f"{where}: field {error} is missing or wrong") from error
     except ValueError as error:
         raise ValueError(f"{where}: field 'representation': {error}") from error
-    features, labels = model.representation, len(model.labels)
-    size = feature_layout(features.bones, features.joints).size
+    labels, size = len(model.labels), model.representation.normalizer.mean.size
     for name, found, expected in (
-        ("representation.mean", features.normalizer.mean.size, size),
-        ("representation.std", features.normalizer.std.size, size),
         ("config.num_features", model.config.num_features, size),
         ("config.num_labels", model.config.num_labels, labels),
         ("paths.num_labels", model.paths.num_labels, labels),

@@ -134,8 +134,9 @@ def test_features_are_standardised_by_kind(scenes, representation):
     x = np.float64(smgdiff_scene.to_features(scenes, representation))
     rotations = x[..., 3:33].reshape(-1, 30)
     np.testing.assert_allclose(np.mean(x.reshape(-1, x.shape[-1]), 0), 0, atol=1e-5)
-    assert rotations.std(0).mean() == pytest.approx(1.0, rel=0.05)
     std = np.asarray(representation.normalizer.std)
+    unit = max((rotations * std[3:33]).std(0).mean(), 0.05)
+    np.testing.assert_allclose(std[3:33], unit, rtol=1e-4)
     assert std[0] == std[2] and np.unique(std[3:33]).size == 1
     assert (std >= 0.05).all()
 
@@ -166,14 +167,14 @@ def plans(params, config, representation, condition, guided):
         params, config=config, representation=representation, guided=guided
     )
     keys = jax.random.split(jax.random.key(5), 6)
-    return plan, keys, jax.jit(jax.vmap(plan, (0, None)))(keys, condition)
+    return plan, jax.jit(jax.vmap(plan, (0, None)))(keys, condition)
 
 
 def test_nothing_to_guide_is_the_plain_chain(params, config, representation, condition):
     """No ball accelerates that much: the objective is zero everywhere."""
     idle = Guidance(end=2, min_acceleration=1e9)
     given = (params, config, representation, condition)
-    found, expected = (plans(*given, guided)[2] for guided in (idle, UNGUIDED))
+    found, expected = (plans(*given, guided)[1] for guided in (idle, UNGUIDED))
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
@@ -188,8 +189,8 @@ def test_guidance_pulls_foot_and_ball_together(
         )
     )
     given = (params, config, representation, condition)
-    guided = np.asarray(objective(plans(*given, on)[2]))
-    plain = np.asarray(objective(plans(*given, UNGUIDED)[2]))
+    guided = np.asarray(objective(plans(*given, on)[1]))
+    plain = np.asarray(objective(plans(*given, UNGUIDED)[1]))
     assert (plain > 0).all()
     assert (guided < plain).sum() >= 5
 
@@ -198,9 +199,10 @@ def test_guided_plans_are_finite_and_the_same_alone(
     params, config, representation, condition
 ):
     given = (params, config, representation, condition)
-    plan, keys, batch = plans(*given, Guidance(start=1, end=2))
+    plan, batch = plans(*given, Guidance(start=1, end=2))
     assert bool(jnp.isfinite(batch).all())
-    np.testing.assert_allclose(jax.jit(plan)(keys[2], condition), batch[2], atol=2e-4)
+    key = jax.random.split(jax.random.key(5), 6)[2]
+    np.testing.assert_allclose(jax.jit(plan)(key, condition), batch[2], atol=2e-4)
 
 
 def test_a_guided_plan_can_be_differentiated(params, config, representation, condition):

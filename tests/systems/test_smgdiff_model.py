@@ -62,7 +62,7 @@ def test_skills_have_numbers(model):
         (("system",), "camdm", "field 'system' is 'camdm', expected 'smgdiff'"),
         (("labels",), ["dribble"], "field 'config.num_labels' is 2, expected 1"),
         (("speeds",), [1.0], "field 'speeds' is 1, expected 2"),
-        (("representation", "mean"), [0.0], "'representation.mean' is 1"),
+        (("representation", "mean"), [0.0], "'representation': mean has 1 numbers"),
         (("config", "wings"), 2, "missing or wrong"),
         (("representation", "skeleton", "parents"), [0, 0, 1, 0, 3], "representation"),
     ],
