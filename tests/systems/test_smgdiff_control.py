@@ -135,17 +135,13 @@ def test_a_plan_begins_where_body_and_ball_are_displayed(parts):
 
     bare, joined = plan(0.0), plan(0.2)
     shown = state.past
-    for get, share in (
-        (lambda x: x.ball, 0.15),
-        (lambda x: x.motion.root_position, 0.15),
-    ):
+    for get in (lambda x: x.ball, lambda x: x.motion.root_position):
         step = get(bare)[1] - get(bare)[0]
-        off = [
-            jnp.linalg.norm(get(x)[0] - get(shown)[-1] - step) for x in (bare, joined)
-        ]
-        assert float(off[1]) < share * float(off[0]) + 0.2 * float(
-            jnp.linalg.norm(step)
-        )
+        expected = get(shown)[-1] + step
+        off, near = (jnp.linalg.norm(get(x)[0] - expected) for x in (bare, joined))
+        # A sixth of the seam later the quintic has given up a fifth of the offset;
+        # the root also brings the velocity along that it had.
+        assert float(near) < 0.5 * float(off)
         # From 0.2 s on the plan is the network's.
         np.testing.assert_allclose(get(joined)[6:], get(bare)[6:], atol=1e-5)
 
