@@ -44,7 +44,7 @@ class Situations:
     condition: Condition
     future: Scene
     past: Scene
-    label: Int[Array, " windows"]
+    label: Int[Array, "*batch"]
 
 
 def situations(data: BallClips, model: Model, *, number: int, seed: int) -> Situations:
