@@ -21,7 +21,7 @@ from serving.server import Limits, Server
 
 
 @dataclasses.dataclass(frozen=True)
-class Serve:
+class Config:
     """The command line.
 
     Attributes:
@@ -59,7 +59,7 @@ def is_local(host: str) -> bool:
     return host == "localhost"
 
 
-async def listen(args: Serve, characters: simulation.Simulation) -> None:
+async def listen(args: Config, characters: simulation.Simulation) -> None:
     """Serves until SIGINT or SIGTERM.
 
     Args:
@@ -76,7 +76,7 @@ async def listen(args: Serve, characters: simulation.Simulation) -> None:
     print("closed", flush=True)
 
 
-def serve(args: Serve) -> None:
+def serve(args: Config) -> None:
     """Loads, compiles, and serves.
 
     Args:
@@ -111,7 +111,7 @@ def serve(args: Serve) -> None:
 
 def main() -> None:
     """Parses the command line and serves."""
-    serve(tyro.cli(Serve, description=f"{__doc__}\n{protocol.__doc__}"))
+    serve(tyro.cli(Config, description=f"{__doc__}\n{protocol.__doc__}"))
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ BEFORE_KEY = {
     "controller",
     "run_chunk",
     "sample",
+    "generate",
     "self",
 }
 

@@ -27,9 +27,29 @@ from jaxmotion.systems.smgdiff_model import Model
 
 Rows = dict[str, dict[str, Cell]]
 
+# Compiled programs return dictionaries in alphabetical order.
+_ORDER = (
+    "FID",
+    "foot slide m/s",
+    "acceleration m/s2",
+    "diversity m2",
+    "trajectory error deg",
+    "orientation error deg",
+    "skill accuracy",
+    "touches /min",
+    "missed /min",
+    "missed part",
+    "touch distance cm",
+    "ball in ground mm",
+    "foot in ball mm",
+    "free acceleration m/s2",
+    "skate ratio",
+    "jerk m/s3",
+)
+
 
 def cells(scores: list[dict[str, Array]]) -> dict[str, Cell]:
-    """Means over replications with 95 % intervals, in the order of the scores.
+    """Means over replications with 95 % intervals.
 
     Args:
       scores: One dictionary a replication.
@@ -37,8 +57,9 @@ def cells(scores: list[dict[str, Array]]) -> dict[str, Cell]:
     Returns:
       A row of the table.
     """
+    names = sorted(scores[0], key=_ORDER.index)
     return {
-        name: table.cell(jnp.stack([one[name] for one in scores])) for name in scores[0]
+        name: table.cell(jnp.stack([one[name] for one in scores])) for name in names
     }
 
 

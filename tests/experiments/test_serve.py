@@ -613,7 +613,7 @@ def test_signals_close_it(script, monkeypatch, capsys, number):
     )
     thread = threading.Thread(target=visitor)
     thread.start()
-    script.serve(script.Serve(port=0))
+    script.serve(script.Config(port=0))
     thread.join()
     assert "hello" in seen[0] and seen[2]["tick"] == 1
     assert printed[-1] == "closed\n"
@@ -639,13 +639,13 @@ def test_other_addresses_are_warned_of(script, monkeypatch, capsys, host, local)
 
     monkeypatch.setattr(script.runs, "load", stop)
     with pytest.raises(ValueError, match="here"):
-        script.serve(script.Serve(host=host))
+        script.serve(script.Config(host=host))
     assert ("no authentication" in capsys.readouterr().err) is not local
 
 
 def test_at_least_one_client(script):
     with pytest.raises(ValueError, match="--max-clients is 0"):
-        script.serve(script.Serve(max_clients=0))
+        script.serve(script.Config(max_clients=0))
 
 
 def test_only_known_systems_are_served(tmp_path):
