@@ -52,6 +52,7 @@ def trained(call, data, tmp_path_factory, quick_compile):
     return folder
 
 
+@pytest.mark.slow
 def test_schedules_stand_beside_real_clips(call, trained):
     line = f"evaluate --run {trained} --tables schedules steps {SHORT} --schedules"
     call("smgdiff", line, "none", "end 2")

@@ -16,7 +16,7 @@ from jaxmotion.protocols import (
     smgdiff_scores,
     stages,
 )
-from jaxmotion.systems import smgdiff_guidance
+from jaxmotion.systems import smgdiff_control, smgdiff_guidance
 from jaxmotion.systems.smgdiff_guidance import UNGUIDED
 from tests import ball_walker, tiny
 
@@ -197,7 +197,13 @@ def test_players_are_scored_with_their_spread(run, setting):
         guided=UNGUIDED,
     )
     play = smgdiff_players.player(
-        smgdiff_players.straight(model), plan, model, ticks=24, repeats=2, chunk=2
+        smgdiff_players.straight(model),
+        plan,
+        model,
+        ticks=24,
+        repeats=2,
+        chunk=2,
+        control=smgdiff_control.Control(apply=5, reuse=4),
     )
     scores = smgdiff_players.score_players(setting, model, play, repeats=2, starts=2)
     assert len(scores) == 3 and float(scores[0]["diversity m2"]) > 0
