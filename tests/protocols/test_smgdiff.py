@@ -169,6 +169,7 @@ def test_planted_errors_are_measured(setting):
     assert total == pytest.approx(1.0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_plans_are_scored_alike_whatever_the_chunk(run, setting):
     model, params = smgdiff_runs.load_stage(run, "motion_2")
     plan = smgdiff_guidance.planner(
@@ -188,6 +189,7 @@ def test_plans_are_scored_alike_whatever_the_chunk(run, setting):
     assert all(np.isfinite(float(v)) for v in found[0][0].values())
 
 
+@pytest.mark.slow
 def test_players_are_scored_with_their_spread(run, setting):
     model, params = smgdiff_runs.load_stage(run, "motion_2")
     plan = smgdiff_guidance.planner(

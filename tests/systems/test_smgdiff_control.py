@@ -146,6 +146,7 @@ def test_a_plan_begins_where_body_and_ball_are_displayed(parts):
         np.testing.assert_allclose(get(joined)[6:], get(bare)[6:], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_players_draw_their_own_noise_and_one_alone_is_the_same(parts, frames):
     assert float(jnp.abs(frames.ball[0, 1] - frames.ball[1, 1]).max()) > 1e-4
     alone = played(parts, commands(13, change=7))
