@@ -196,6 +196,8 @@ def train(args: Train) -> None:
 
 def evaluate(args: Evaluate) -> None:
     """Writes the tables."""
+    for schedule in args.schedules:
+        tables.guidance_of(args, schedule)
     run = smgdiff_runs.load_run(args.run)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
