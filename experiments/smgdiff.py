@@ -27,7 +27,7 @@ from jaxmotion.protocols import (
     stages,
 )
 from jaxmotion.protocols.camdm_runs import arguments_json
-from jaxmotion.systems.smgdiff_guidance import SCHEDULES
+from jaxmotion.systems.smgdiff_guidance import SCHEDULES, TUNED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Train:
       depth: Its layers; None for the preset's.
       held_out: Part of the recordings kept for evaluation.
       steps: Updates of a motion model.
+      draft_steps: Updates before these in which displacements hardly count.
       path_steps: Updates of a trajectory generator.
       batch: Windows an update.
       learning_rate: Peak of Muon's rate; cosine to a twentieth.
@@ -59,10 +60,11 @@ class Train:
     width: int | None = None
     depth: int | None = None
     held_out: float = 0.1
-    steps: int = 4000
+    steps: int = 3000
+    draft_steps: int = 3500
     path_steps: int = 2000
     batch: int = 48
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     seed: int = 0
 
 
@@ -106,10 +108,10 @@ class Evaluate:
     replications: int = 20
     starts: int = 20
     repeats: int = 4
-    rate: float = 0.5
-    last_sigma: float | None = 0.02
-    min_acceleration: float = 12.0
-    max_distance: float = 0.15
+    rate: float = TUNED.rate
+    last_sigma: float | None = TUNED.last_sigma
+    min_acceleration: float = TUNED.min_acceleration
+    max_distance: float = TUNED.max_distance
     recognizer_steps: int = 800
     chunk: int = 4
     seed: int = 0
@@ -142,10 +144,10 @@ class Rollout:
     paths: str = "paths_1"
     steps: int = 8
     schedule: str = "end 2"
-    rate: float = 0.5
-    last_sigma: float | None = 0.02
-    min_acceleration: float = 12.0
-    max_distance: float = 0.15
+    rate: float = TUNED.rate
+    last_sigma: float | None = TUNED.last_sigma
+    min_acceleration: float = TUNED.min_acceleration
+    max_distance: float = TUNED.max_distance
     out: Path | None = None
     seed: int = 0
 
@@ -190,7 +192,9 @@ def train(args: Train) -> None:
             learning_rate=args.learning_rate,
             seed=args.seed,
         )
-        smgdiff_runs.train_stage(run, stage, budget=budget)
+        smgdiff_runs.train_stage(
+            run, stage, budget=budget, draft_steps=args.draft_steps
+        )
         print(f"{stage}: {time.perf_counter() - begun:.0f} s", flush=True)
 
 

@@ -6,11 +6,7 @@ import jax
 
 from jaxmotion.protocols import smgdiff_evaluation, smgdiff_runs
 from jaxmotion.systems import smgdiff_control, smgdiff_guidance, smgdiff_trajectory
-from jaxmotion.systems.smgdiff_guidance import Guidance
 from serving.controlled import ControlledSimulation
-
-# As `experiments/smgdiff.py rollout` has them.
-_GUIDED = Guidance(end=2, last_sigma=0.02, min_acceleration=12.0, max_distance=0.15)
 
 
 def load(run: Path, data: Path | None) -> ControlledSimulation:
@@ -41,7 +37,7 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
             params,
             config=model.config,
             representation=model.representation,
-            guided=_GUIDED,
+            guided=smgdiff_guidance.TUNED,
         ),
         representation=model.representation,
         config=model.config,

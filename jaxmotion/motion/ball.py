@@ -144,6 +144,28 @@ def encode_ball(
     return jnp.concatenate([weight * (ball - root), velocity, weight], axis=-1)
 
 
+def place_ball(
+    features: Float[Array, "*batch frames 7"],
+    root: Float[Array, "*batch frames 3"],
+    *,
+    least_weight: float = MIN_CONTROL,
+) -> Float[Array, "*batch frames 3"]:
+    """Where each frame by itself says that the ball is: b of (1).
+
+    Args:
+      features: Of the ball, perhaps from a network.
+      root: Positions of the root, metres.
+      least_weight: Weights below are taken to be this.
+
+    Returns:
+      Positions of the ball, metres; wrong where the true weight is below the least.
+
+    Source: SMGDiff, eq. 2; the clamp is ours.
+    """
+    place, weight = features[..., :3], features[..., 6:]
+    return place / jnp.clip(weight, least_weight, 1.0) + root
+
+
 @jax.jit
 def decode_ball(
     features: Float[Array, "*batch frames 7"],
@@ -167,9 +189,9 @@ def decode_ball(
 
     Source: SMGDiff, eq. 2, made safe.
     """
-    place, velocity, weight = jnp.split(features, [3, 6], axis=-1)
+    _, velocity, weight = jnp.split(features, [3, 6], axis=-1)
     known = weight >= MIN_CONTROL
-    direct = place / jnp.clip(weight, MIN_CONTROL, 1.0) + root
+    direct = place_ball(features, root)
 
     def move(before: Array, frame: tuple[Array, Array, Array]) -> tuple[Array, Array]:
         known, direct, velocity = frame

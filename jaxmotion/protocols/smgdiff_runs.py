@@ -31,7 +31,8 @@ PRESETS = {
     # CAMDM's network, which the paper's missing supplement is taken to have.
     "paper": dict(),
     # For a CPU or a short run: 31 tokens instead of 147. Feet and bones weigh more than
-    # a long training needs.
+    # a long training needs, and the ball has losses of its own: without them it jitters
+    # so much that guidance takes every frame for a touch.
     "small": dict(
         width=192,
         hidden=768,
@@ -40,10 +41,17 @@ PRESETS = {
         dropout=0.0,
         weight_velocity=3.0,
         weight_position=5.0,
-        weight_position_velocity=20.0,
-        weight_foot=20.0,
+        weight_position_velocity=100.0,
+        weight_foot=200.0,
+        weight_ball=5.0,
+        weight_ball_acceleration=300.0,
     ),
 }
+# Of a training's first part. Displacements are least for a body that does not move, and
+# a network that meets them first stays on the mean pose for thousands of updates.
+DRAFT = dict(
+    weight_position_velocity=5.0, weight_foot=5.0, weight_ball_acceleration=0.0
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -199,61 +207,86 @@ def load_run(folder: Path) -> Run:
 
 def _stage_config(model: Model, stage: str) -> tuple[str, dict[str, Any]]:
     field = "config" if stage.startswith("motion") else "paths"
-    return field, dataclasses.asdict(getattr(with_steps(model, stage), field))
+    return field, dataclasses.asdict(getattr(model, field))
 
 
-def _shapes(model: Model, stage: str) -> Params:
-    model = with_steps(model, stage)
+def _init(key: Key, model: Model, stage: str) -> Params:
     if stage.startswith("motion"):
-        return smgdiff.init(jax.random.key(0), model.config)
-    return smgdiff_trajectory.init(jax.random.key(0), model.paths)
+        return smgdiff.init(key, model.config)
+    return smgdiff_trajectory.init(key, model.paths)
 
 
-def train_stage(run: Run, stage: str, *, budget: stages.Budget) -> None:
+def train_stage(
+    run: Run, stage: str, *, budget: stages.Budget, draft_steps: int = 0
+) -> None:
     """Trains a stage, from its newest checkpoint if there is one.
 
     Args:
       run: The run.
       stage: "motion_8", "paths_1", ...
       budget: How long.
+      draft_steps: Updates of a motion model before these, with the weights `DRAFT`.
 
     Raises:
       ValueError: if there is no such stage, or its checkpoint has other settings.
       TrainingDiverged: if a loss is not finite.
     """
     model = with_steps(run.model, stage)
-    is_motion = stage.startswith("motion")
+    arrays = smgdiff_data.scene_arrays(run.train, model.config.window)
+    folder, key = run.folder / stage, jax.random.key(budget.seed)
+    params = jax.jit(lambda key: _init(key, model, stage))(key)
+    if draft_steps and stage.startswith("motion"):
+        params = _fit(
+            folder / "draft",
+            dataclasses.replace(
+                model, config=dataclasses.replace(model.config, **DRAFT)
+            ),
+            stage,
+            params,
+            arrays,
+            budget=dataclasses.replace(budget, steps=draft_steps),
+        )
+    _fit(folder, model, stage, params, arrays, budget=budget)
+
+
+def _fit(
+    folder: Path,
+    model: Model,
+    stage: str,
+    params: Params,
+    arrays: smgdiff_data.SceneArrays,
+    *,
+    budget: stages.Budget,
+) -> Params:
+    """Trains a stage's parameters; returns their average."""
+    is_motion, representation = stage.startswith("motion"), model.representation
     if is_motion:
         loss = functools.partial(
-            smgdiff_loss.loss, representation=model.representation, config=model.config
+            smgdiff_loss.loss, representation=representation, config=model.config
         )
-        init = lambda key: smgdiff.init(key, model.config)  # noqa: E731
     else:
         loss = functools.partial(
-            smgdiff_trajectory.loss,
-            bones=model.representation.bones,
-            config=model.paths,
+            smgdiff_trajectory.loss, bones=representation.bones, config=model.paths
         )
-        init = lambda key: smgdiff_trajectory.init(key, model.paths)  # noqa: E731
 
     def sample_batch(key: Key, arrays: smgdiff_data.SceneArrays) -> tuple[Any, Any]:
         scenes, labels = smgdiff_data.sample_scenes(key, arrays, batch=budget.batch)
         return (scenes if is_motion else scenes.motion), labels
 
     optimizer = stages.make_optimizer(budget)
-    params = jax.jit(init)(jax.random.key(budget.seed))
-    stages.fit(
-        run.folder / stage,
+    state = stages.fit(
+        folder,
         training.init_train_state(params, optimizer),
         training.make_update(loss, optimizer, ema_decay=budget.ema),
         sample_batch,
-        smgdiff_data.scene_arrays(run.train, model.config.window),
+        arrays,
         system=SYSTEM,
         stage=stage,
         budget=budget,
-        config=dict([_stage_config(run.model, stage)]),
+        config=dict([_stage_config(model, stage)]),
         show=("loss", "foot") if is_motion else ("loss",),
     )
+    return state.ema_params
 
 
 def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
@@ -273,10 +306,10 @@ def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
     model = with_steps(run.model, stage)
     folder = run.folder / stage
     value = stages.check_stage(folder, stage, system=SYSTEM)
-    field, expected = _stage_config(run.model, stage)
+    field, expected = _stage_config(model, stage)
     if value.get(field) != expected:
         raise checkpoint.CheckpointError(
             f"{folder}: field {field!r} is not that of {run.folder}/config.json"
         )
-    init = functools.partial(_shapes, run.model, stage)
+    init = lambda: _init(jax.random.key(0), model, stage)  # noqa: E731
     return model, stages.load_params(folder, stage, init, system=SYSTEM)

@@ -48,6 +48,9 @@ class Config:
       weight_position_velocity: Of the displacements of joint positions (CAMDM's; not
         in the paper).
       weight_foot: Of feet that slide while they stand.
+      weight_ball: Of the ball's place while it is near (not in the paper).
+      weight_ball_acceleration: Of the second differences of its place, by which contact
+        guidance tells touches (not in the paper).
     """
 
     num_features: int
@@ -68,6 +71,8 @@ class Config:
     weight_position: float = 1.0
     weight_position_velocity: float = 0.0
     weight_foot: float = 1.0
+    weight_ball: float = 0.0
+    weight_ball_acceleration: float = 0.0
 
     @property
     def window(self) -> int:

@@ -9,13 +9,16 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
-from jaxmotion.motion import features, layout, skeleton, trajectory
+from jaxmotion.motion import ball, features, layout, skeleton, trajectory
 from jaxmotion.motion.ball import Scene
 from jaxmotion.systems import smgdiff_scene
 from jaxmotion.systems.camdm_loss import smooth_course
 from jaxmotion.systems.smgdiff import Condition, Config, network
 from jaxmotion.systems.smgdiff_scene import Representation
 from jaxmotion.typing import Key, Params
+
+# Control weight from which on the ball is near: 1.6 m away at a reach of 2 m.
+NEAR = 0.2
 
 
 def situation(
@@ -128,6 +131,8 @@ def loss(
         "position": config.weight_position,
         "position_velocity": config.weight_position_velocity,
         "foot": config.weight_foot,
+        "ball": config.weight_ball,
+        "ball_acceleration": config.weight_ball_acceleration,
     }
     return sum(weights[name] * value for name, value in terms.items()), terms
 
@@ -138,10 +143,10 @@ def loss_terms(
     *,
     representation: Representation,
 ) -> dict[str, Float[Array, ""]]:
-    """The losses: data, velocity, position, position_velocity, foot.
+    """The losses: data, velocity, position, position_velocity, foot, and of the ball.
 
-    A foot stands where the data say so. The ball has no term of its own beside its
-    features: its place is a quotient whose error grows without bound at the reach.
+    A foot stands where the data say so. The ball's place is a quotient whose error
+    grows without bound at the reach: it counts while the ball is nearer than that.
 
     Args:
       prediction: Predicted features.
@@ -151,7 +156,7 @@ def loss_terms(
     Returns:
       Each unweighted mean.
 
-    Source: SMGDiff, eq. 6-9; position_velocity from CAMDM.
+    Source: SMGDiff, eq. 6-9; position_velocity from CAMDM; those of the ball are ours.
     """
     every = jnp.ones(target.shape[:-1], bool)
     bones = representation.bones
@@ -161,8 +166,14 @@ def loss_terms(
         for x in (prediction, target)
     )
     names = smgdiff_scene.feature_layout(bones, representation.joints)
-    raw = features.denormalize(representation.normalizer, target)
-    stands = layout.unpack(names, raw)["ground"] > 0.5
+    guess, truth = (
+        layout.unpack(names, features.denormalize(representation.normalizer, x))
+        for x in (prediction, target)
+    )
+    stands = truth["ground"] > 0.5
+    is_near = truth["ball"][..., -1] >= NEAR
+    ball_error = _ball_place(guess) - _ball_place(truth)
+    none = jnp.zeros_like(ball_error)
     flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
     feet = jnp.array(bones.feet)
     return {
@@ -171,4 +182,14 @@ def loss_terms(
         "position": losses.masked_mse(flat(predicted), flat(wanted), every),
         "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
         "foot": losses.foot_slide_loss(predicted[..., feet, :], stands),
+        "ball": losses.masked_mse(ball_error, none, is_near),
+        "ball_acceleration": losses.velocity_loss(
+            losses.displacement(ball_error),
+            none[..., 1:, :],
+            is_near[..., 1:] & is_near[..., :-1],
+        ),
     }
+
+
+def _ball_place(parts: dict[str, Array]) -> Float[Array, "*batch frames 3"]:
+    return ball.place_ball(parts["ball"], parts["root"], least_weight=NEAR)

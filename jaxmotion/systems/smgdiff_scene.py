@@ -125,16 +125,8 @@ def fit(
     )
     found = features.fit_normalizer(_raw(scenes, plain), floor=0.0)
     std = layout.unpack(feature_layout(bones, joints), found.std)
-    # x and z of a place, of any direction, vary alike; heights vary less.
-    groups = {name: [slice(0, part.size)] for name, part in std.items()}
-    groups["root"] = [slice(0, 3, 2), slice(1, 2)]
-    groups["ball"] = [
-        slice(0, 3, 2),
-        slice(1, 2),
-        slice(3, 6, 2),
-        slice(4, 5),
-        slice(6, 7),
-    ]
+    groups = {name: (slice(0, part.size),) for name, part in std.items()}
+    groups |= {"root": _ROOT, "ball": _BALL}
     for name, slices in groups.items():
         for where in slices:
             value = jnp.maximum(jnp.mean(std[name][where]), floor)

@@ -14,7 +14,10 @@ from jaxmotion.data.ball_clips import load_ball_clips, save_ball_clips
 from tests import ball_walker
 
 ROOT = Path(__file__).parents[2]
-SIZES = "--width 16 --depth 1 --steps 100 --path-steps 100 --batch 4 --held-out 0.3"
+SIZES = (
+    "--width 16 --depth 1 --steps 100 --draft-steps 100 --path-steps 100 --batch 4 "
+    "--held-out 0.3"
+)
 SHORT = "--windows 8 --replications 2 --recognizer-steps 20 --starts 2 --repeats 2"
 
 pytestmark = pytest.mark.usefixtures("quick_compile")

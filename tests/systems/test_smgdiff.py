@@ -221,8 +221,36 @@ def test_a_guided_plan_can_be_differentiated(params, config, representation, con
 def test_the_truth_costs_nothing_but_its_own_slide(scenes, representation):
     x = smgdiff_scene.to_features(scenes, representation)
     terms = smgdiff_loss.loss_terms(x, x, representation=representation)
-    for name in ("data", "velocity", "position", "position_velocity"):
+    assert set(terms) == {
+        *("data", "velocity", "position", "position_velocity", "foot"),
+        *("ball", "ball_acceleration"),
+    }
+    for name in set(terms) - {"foot"}:
         assert float(terms[name]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_ball_that_trembles_costs_its_second_differences(scenes, representation):
+    """Every other frame a centimetre higher: differences of 2 cm in each triple."""
+    near = dataclasses.replace(
+        scenes, ball=scenes.motion.root_position + jnp.array([[[0.3, -0.7, 0.4]]])
+    )
+    up = jnp.zeros_like(near.ball).at[:, 1::2, 1].set(0.01)
+    trembling = dataclasses.replace(near, ball=near.ball + up)
+    x, y = (smgdiff_scene.to_features(s, representation) for s in (near, trembling))
+    terms = smgdiff_loss.loss_terms(y, x, representation=representation)
+    frames = near.ball.shape[-2]
+    part_up = (frames // 2) / frames
+    assert float(terms["ball"]) == pytest.approx(part_up * 1e-4 / 3, rel=1e-2)
+    assert float(terms["ball_acceleration"]) == pytest.approx(4e-4 / 3, rel=1e-2)
+
+
+def test_a_ball_that_is_far_away_costs_nothing_of_its_own(scenes, representation):
+    far = dataclasses.replace(
+        scenes, ball=scenes.motion.root_position + jnp.array([[[1.7, 0.0, 0.0]]])
+    )
+    x = smgdiff_scene.to_features(far, representation)
+    terms = smgdiff_loss.loss_terms(1.1 * x, x, representation=representation)
+    assert float(terms["ball"]) == float(terms["ball_acceleration"]) == 0.0
 
 
 def test_a_shifted_person_costs_its_shift(scenes, representation):
