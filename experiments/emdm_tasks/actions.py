@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from emdm_tasks.judge import Judge
-from emdm_tasks.scores import cells
+from emdm_tasks.scores import ORDER
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import emdm_action, emdm_runs
+from jaxmotion.protocols import cells, emdm_action, emdm_runs
 from jaxmotion.protocols import emdm_action_evaluation as protocol
 from jaxmotion.protocols.emdm_data import ActionArrays
 from jaxmotion.systems import emdm, emdm_motion
@@ -55,7 +55,7 @@ def make_judge(args: Any) -> Judge:
             return score(key_score, positions, wanted)
 
         keys = jax.random.split(key, args.replications)
-        return cells([once(key) for key in keys])
+        return cells.row([once(key) for key in keys], order=ORDER)
 
     conditional = run.config["task"] == "action"
     conditions = emdm.Condition(

@@ -5,13 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from jaxtyping import Array
 
 from emdm_tasks import actions, texts
-from emdm_tasks.scores import cells
+from emdm_tasks.scores import ORDER
 from jaxmotion.evaluation.table import Cell
-from jaxmotion.protocols import artifacts, emdm_rows, emdm_runs
+from jaxmotion.protocols import artifacts, cells, emdm_rows, emdm_runs
 from jaxmotion.protocols.camdm_runs import arguments_json
 from jaxmotion.systems import emdm
 
@@ -47,31 +46,12 @@ def trained_rows(folder: Path) -> tuple[str, ...]:
     return (*rows, *more)
 
 
-def milliseconds_a_frame(
+def _milliseconds(
     sample: emdm.Sample, condition: emdm.Condition, scale: Array | None, frames: int
 ) -> Cell:
-    """Time of one motion at batch 1, per frame, as the paper gives it.
-
-    Args:
-      sample: The sampler; its parameters are constants of the program.
-      condition: Of one motion.
-      scale: Of the guidance.
-      frames: Of a motion.
-
-    Returns:
-      Median over calls for two seconds, at least 3; ends of the middle half.
-    """
+    """Time of one motion at batch 1, per frame, as the paper gives it."""
     run = jax.jit(lambda key: sample(key, condition, scale=scale))
-    jax.block_until_ready(run(jax.random.key(0)))
-    times: list[float] = []
-    while len(times) < 3 or (sum(times) < 2.0 and len(times) < 200):
-        begun = time.perf_counter()
-        jax.block_until_ready(run(jax.random.key(len(times))))
-        times.append(time.perf_counter() - begun)
-    low, middle, high = np.quantile(times, [0.25, 0.5, 0.75]) * 1000 / frames
-    return Cell(
-        value=float(middle), low=float(low), high=float(high), samples=len(times)
-    )
+    return cells.milliseconds(run, parts=frames, least=3)
 
 
 def evaluate(args: Any, out: Path) -> None:
@@ -101,8 +81,8 @@ def evaluate(args: Any, out: Path) -> None:
         many = emdm_runs.sample_many(sample, chunk=_CHUNK)
         keys = jax.random.split(jax.random.key(args.seed + 1), args.replications)
         results = [judge.score(key, many) for key in keys[:count]]
-        found[row] = cells(results) | {
-            "ms a frame": milliseconds_a_frame(sample, judge.one, scale, config.frames),
+        found[row] = cells.row(results, order=ORDER) | {
+            "ms a frame": _milliseconds(sample, judge.one, scale, config.frames),
             "network calls": Cell(value=float(number)),
         }
         seconds = time.perf_counter() - begun

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from emdm_tasks.judge import Judge
-from emdm_tasks.scores import cells
+from emdm_tasks.scores import ORDER
 from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
 from jaxmotion.evaluation import diversity, frechet
-from jaxmotion.protocols import emdm_runs, emdm_text
+from jaxmotion.protocols import cells, emdm_runs, emdm_text
 from jaxmotion.protocols import emdm_text_evaluation as protocol
 from jaxmotion.systems import emdm
 
@@ -65,7 +65,7 @@ def make_judge(args: Any) -> Judge:
             return score(key_score, x, length, caption, references[split])
 
         keys = jax.random.split(jax.random.key(args.seed + 7), args.replications)
-        return cells([once(key) for key in keys])
+        return cells.row([once(key) for key in keys], order=ORDER)
 
     vectors, index = jnp.asarray(run.vectors, jnp.float32), jnp.asarray(run.index)
 

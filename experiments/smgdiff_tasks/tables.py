@@ -1,19 +1,16 @@
 """The tables of a run: guidance schedules, step counts, and paths."""
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
-from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.protocols import (
     artifacts,
+    cells,
     smgdiff_evaluation,
     smgdiff_players,
     smgdiff_runs,
@@ -27,7 +24,6 @@ from jaxmotion.systems.smgdiff_model import Model
 
 Rows = dict[str, dict[str, Cell]]
 
-# Compiled programs return dictionaries in alphabetical order.
 _ORDER = (
     "FID",
     "foot slide m/s",
@@ -48,19 +44,8 @@ _ORDER = (
 )
 
 
-def cells(scores: list[dict[str, Array]]) -> dict[str, Cell]:
-    """Means over replications with 95 % intervals.
-
-    Args:
-      scores: One dictionary a replication.
-
-    Returns:
-      A row of the table.
-    """
-    names = sorted(scores[0], key=_ORDER.index)
-    return {
-        name: table.cell(jnp.stack([one[name] for one in scores])) for name in names
-    }
+def _row(scores: list[dict[str, Array]]) -> dict[str, Cell]:
+    return cells.row(scores, order=_ORDER)
 
 
 def guidance_of(args: Any, schedule: str) -> Guidance:
@@ -87,28 +72,10 @@ def guidance_of(args: Any, schedule: str) -> Guidance:
     )
 
 
-def milliseconds(plan: Plan, setting: Setting) -> Cell:
-    """Time of one plan at batch 1.
-
-    Args:
-      plan: The sampler; its parameters are constants of the program.
-      setting: Holds a condition.
-
-    Returns:
-      Median over calls for two seconds, at least 5; ends of the middle half.
-    """
+def _milliseconds(plan: Plan, setting: Setting) -> Cell:
+    """Time of one plan at batch 1; its parameters are constants of the program."""
     condition = jax.tree.map(lambda x: x[0], setting.known.condition)
-    run = jax.jit(lambda key: plan(key, condition))
-    jax.block_until_ready(run(jax.random.key(0)))
-    times: list[float] = []
-    while len(times) < 5 or (sum(times) < 2.0 and len(times) < 200):
-        begun = time.perf_counter()
-        jax.block_until_ready(run(jax.random.key(len(times))))
-        times.append(time.perf_counter() - begun)
-    low, middle, high = np.quantile(times, [0.25, 0.5, 0.75]) * 1000
-    return Cell(
-        value=float(middle), low=float(low), high=float(high), samples=len(times)
-    )
+    return cells.milliseconds(jax.jit(lambda key: plan(key, condition)))
 
 
 def _plan_row(
@@ -119,8 +86,8 @@ def _plan_row(
         params, config=model.config, representation=model.representation, guided=guided
     )
     many = smgdiff_evaluation.plan_many(plan, model, chunk=chunk)
-    found = cells(smgdiff_evaluation.score_plans(setting, many))
-    return found | {"ms a plan": milliseconds(plan, setting)}
+    found = _row(smgdiff_evaluation.score_plans(setting, many))
+    return found | {"ms a plan": _milliseconds(plan, setting)}
 
 
 def real_rows(run: Run, setting: Setting) -> Rows:
@@ -139,8 +106,8 @@ def real_rows(run: Run, setting: Setting) -> Rows:
     )
     floor = dataclasses.replace(setting, known=seen)
     return {
-        "real (held-out clips)": cells(smgdiff_evaluation.score_real(setting)),
-        "real (training clips)": cells(smgdiff_evaluation.score_real(floor)),
+        "real (held-out clips)": _row(smgdiff_evaluation.score_real(setting)),
+        "real (training clips)": _row(smgdiff_evaluation.score_real(floor)),
     }
 
 
@@ -243,7 +210,7 @@ def paths(args: Any, run: Run, setting: Setting) -> tuple[Rows, dict[str, Any]]:
             scores = smgdiff_players.score_players(
                 setting, model, play, repeats=args.repeats, starts=args.starts
             )
-            rows[f"{name}, guidance {schedule}"] = cells(scores)
+            rows[f"{name}, guidance {schedule}"] = _row(scores)
             print(f"{name}, guidance {schedule}: done", flush=True)
     return rows, {"noise of the paths": shares}
 
