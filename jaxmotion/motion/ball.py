@@ -5,8 +5,8 @@ Within reach r of the root h the ball's place b is described by
     w = 1 - |b_ground - h_ground| / r,    b' = w (b - h)                        (1)
 
 so that a ball that is far away fades out of the features. The inverse b = b' / w + h
-is singular at distance r and wrong beyond; here w is kept in 0..1, and where it is too
-small to divide by, the ball moves on with its velocity from where it was last known.
+is singular at distance r and wrong beyond; here w is kept in 0..1, and the smaller it
+is, the more the ball moves on with its velocity from where it was in the frame before.
 
 Source: SMGDiff, section 3, eq. 1-2.
 """
@@ -24,8 +24,13 @@ from jaxmotion.motion.spring import Scalar
 from jaxmotion.motion.trajectory import PlanarFrame
 
 _TINY = 1e-12
-# Least w that is divided by; at reach 2 m that is a ball 1.9 m away.
-MIN_CONTROL = 0.05
+# Least w whose quotient counts, and the least that is trusted wholly: a ball 1.8 m and
+# 1.4 m away at reach 2 m. A network's w of a ball that is far away is some hundredths,
+# and its quotient anywhere about the root.
+MIN_CONTROL, FULL_CONTROL = 0.1, 0.3
+# A quotient so far from where the velocity leads (metres) is trusted wholly, twice as
+# far not at all: a ball does not jump, and a network's does where w is wrong.
+_JUMP = 0.5
 NUM_FEATURES = 7
 
 
@@ -175,8 +180,10 @@ def decode_ball(
 ) -> Float[Array, "*batch frames 3"]:
     """Inverse of `encode_ball` for any features, finite everywhere.
 
-    Where the weight is below 0.05 the ball goes on with its velocity channel from where
-    it was in the frame before.
+    A weight of 0.3 and more is trusted wholly, one of 0.1 not at all: there the ball
+    goes on with its velocity channel from where it was in the frame before, and between
+    it is in between. Likewise a place within 0.5 m of where the velocity leads, and one
+    1 m away. Features of a ball that moves as they say come back exactly.
 
     Args:
       features: Of the ball, perhaps from a network.
@@ -190,16 +197,23 @@ def decode_ball(
     Source: SMGDiff, eq. 2, made safe.
     """
     _, velocity, weight = jnp.split(features, [3, 6], axis=-1)
-    known = weight >= MIN_CONTROL
-    direct = place_ball(features, root)
+    trust = (weight - MIN_CONTROL) / (FULL_CONTROL - MIN_CONTROL)
+    trust = jnp.clip(trust, 0.0, 1.0)
 
     def move(before: Array, frame: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        known, direct, velocity = frame
-        now = jnp.where(known, direct, before + velocity / fps)
+        trust, direct, velocity = frame
+        moved = before + velocity / fps
+        gap = direct - moved
+        square = jnp.sum(gap * gap, axis=-1, keepdims=True)
+        # Only beyond the jump is the distance looked at: at 0 it has no gradient.
+        distance = jnp.sqrt(jnp.maximum(square, _JUMP**2))
+        now = moved + trust * jnp.clip(2.0 - distance / _JUMP, 0.0, 1.0) * gap
         return now, now
 
-    frames = [jnp.moveaxis(x, -2, 0) for x in (known, direct, velocity)]
-    _, found = jax.lax.scan(move, start, tuple(frames))
+    frames = (trust, place_ball(features, root), velocity)
+    _, found = jax.lax.scan(
+        move, start, jax.tree.map(lambda x: jnp.moveaxis(x, -2, 0), frames)
+    )
     return jnp.moveaxis(found, 0, -2)
 
 

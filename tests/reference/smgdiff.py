@@ -6,7 +6,7 @@ Written from the paper (eq. 1-2, 10-15). One clip or one sample at a time, metre
 
 import numpy as np
 
-REACH, MIN_WEIGHT = 2.0, 0.05
+REACH, WEIGHTS, JUMPS = 2.0, (0.1, 0.3), (0.5, 1.0)
 ACCELERATION, MAX_DISTANCE, GROUNDED_WEIGHT, RATE = 2.0, 0.1, 2.0, 0.5
 
 
@@ -34,14 +34,14 @@ def encode_ball(ball, velocity, root, reach=REACH):
 
 
 def decode_ball(features, root, start, fps):
-    """Eq. 2 inverted; below MIN_WEIGHT the ball goes on with its velocity (ours)."""
+    """Eq. 2 inverted; of small weights and of jumps the velocity makes motion (ours)."""
     before, rows = np.asarray(start, np.float64), []
     for row, h in zip(np.asarray(features, np.float64), root, strict=True):
-        weight = min(row[6], 1.0)
-        if weight >= MIN_WEIGHT:
-            before = row[:3] / weight + h
-        else:
-            before = before + row[3:6] / fps
+        before = before + row[3:6] / fps
+        if row[6] > WEIGHTS[0]:
+            gap = row[:3] / min(row[6], 1.0) + h - before
+            near = np.interp(np.linalg.norm(gap), JUMPS, (1.0, 0.0))
+            before = before + near * np.interp(row[6], WEIGHTS, (0.0, 1.0)) * gap
         rows.append(before)
     return np.array(rows)
 
