@@ -50,10 +50,10 @@ class Guidance:
 
 
 UNGUIDED = Guidance(end=0)
-# For models of a short training, chosen on windows of training clips: their ball still
-# trembles, and the paper's threshold takes every frame for a touch. Joints, unlike skin,
-# keep more than 11 cm from its centre. The last step changes the result itself, with no
-# network behind it to smooth that, and is kept short.
+# For models of a short training, chosen on windows of training clips. Their ball still
+# trembles: the paper's threshold takes every frame for a touch. Joints, unlike skin,
+# keep more than 11 cm from its centre. The last step changes the result itself, without
+# a network behind it to smooth that, and is kept short.
 TUNED = Guidance(rate=0.9, last_sigma=0.0005, min_acceleration=12.0, max_distance=0.18)
 # Table 4 of the paper, beside no guidance at all.
 SCHEDULES = {
