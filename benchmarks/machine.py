@@ -11,13 +11,7 @@ from typing import Any
 
 import jax
 
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(x.split(":")[1].strip() for x in lines if "model name" in x)
-    except (OSError, StopIteration):
-        return platform.processor()
+from jaxmotion.protocols import provenance
 
 
 def busy() -> tuple[float, float, float] | None:
@@ -100,7 +94,7 @@ def environment() -> dict[str, Any]:
     return {
         "device": str(jax.devices()[0]),
         "devices": len(jax.devices()),
-        "cpu": _cpu(),
+        "cpu": provenance.processor(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         **versions("jax", "jaxlib", "flax", "numpy", "jaxmotion"),

@@ -208,7 +208,8 @@ def evaluate(args: Evaluate) -> None:
     loop.check_writable(out)
     run = aamdm_runs.load_run(args.run)
     table, report = tables.evaluate(run, args, out)
-    artifacts.write_table(out, table, report)
+    note = "div and fid are of joint positions in the character's axes: no recogniser."
+    artifacts.write_table(out, table, report, (note,))
     for line in report["orderings"]:
         print(line)
 

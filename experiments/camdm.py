@@ -20,7 +20,13 @@ import tyro
 from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import Clips
 from jaxmotion.learning import checkpoint, loop
-from jaxmotion.protocols import artifacts, camdm_evaluation, camdm_runs, camdm_training
+from jaxmotion.protocols import (
+    artifacts,
+    camdm_evaluation,
+    camdm_runs,
+    camdm_training,
+    evaluators,
+)
 from jaxmotion.systems import camdm_model
 
 Steering = Literal["forward", "strafe", "stop_and_go"]
@@ -64,7 +70,7 @@ class Train:
     out: Path = Path("runs/camdm")
     preset: Literal["small", "planted", "paper"] = "small"
     init: Path | None = None
-    contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right", "run")
+    contents: tuple[str, ...] = camdm_runs.CONTENTS
     label: str = "style"
     held_out: float = 0.1
     mirror: bool = True
@@ -164,7 +170,9 @@ class Evaluate:
       speed: Metres a second; None for each style's own median walking speed.
       contents: Contents of the clips to compare with; none: all of the run's.
       chunk: Characters to run at a time, at most.
-      recognizer_steps: Updates of the style recogniser.
+      recognizer_steps: Updates of the style recogniser, if it is trained here.
+      evaluator: File of a frozen style recogniser, from evaluator.py; None trains one
+        here.
       seed: Of poses, noise, recogniser and subsets.
     """
 
@@ -178,6 +186,7 @@ class Evaluate:
     contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right")
     chunk: int = 5
     recognizer_steps: int = 1500
+    evaluator: Path | None = None
     seed: int = 0
 
 
@@ -212,6 +221,7 @@ class Rollout:
 
 def evaluate(args: Evaluate) -> None:
     """Writes the table."""
+    evaluator = None if args.evaluator is None else evaluators.load(args.evaluator)
     run = camdm_runs.load_run(args.run, args.data, args.contents)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
@@ -224,9 +234,11 @@ def evaluate(args: Evaluate) -> None:
         chunk=args.chunk,
         recognizer_steps=args.recognizer_steps,
         seed=args.seed,
+        evaluator=evaluator,
     )
     report = {"arguments": camdm_runs.arguments_json(args)} | report
-    artifacts.write_table(out, rows, report)
+    notes = (evaluators.note(report["evaluator"]),)
+    artifacts.write_table(out, rows, report, notes)
     print(report)
 
 

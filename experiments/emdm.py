@@ -66,11 +66,7 @@ class Train:
     out: Path = Path("runs/emdm_action")
     rows: tuple[str, ...] = ("emdm",)
     field: str = "content"
-    merge: tuple[str, ...] = (
-        "bye=wave-right-hand",
-        "byebye=wave-both-hands",
-        "dash=run",
-    )
+    merge: tuple[str, ...] = setup.MERGE
     least: int = 10
     encoder: str = "wordllama"
     unseen: tuple[str, ...] = (
@@ -116,6 +112,8 @@ class Evaluate:
         paper's.
       evaluator_steps: Updates of the evaluator; None for 1500 of the recogniser of
         actions, 600 of the text-motion evaluator, whose updates are ten times as dear.
+      evaluator: File of a frozen recogniser of actions, from evaluator.py; None trains
+        one here.
       matcher: Published weights of the text-motion evaluator; None trains one here.
       seed: Of noise and pairs.
     """
@@ -128,6 +126,7 @@ class Evaluate:
     long_replications: int = 2
     scale: float | None = None
     evaluator_steps: int | None = None
+    evaluator: Path | None = None
     matcher: Path | None = None
     seed: int = 0
 

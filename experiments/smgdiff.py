@@ -21,9 +21,11 @@ from smgdiff_tasks import playing, tables
 from jaxmotion.data.ball_clips import load_ball_clips
 from jaxmotion.learning import loop
 from jaxmotion.protocols import (
+    evaluators,
     smgdiff_data,
     smgdiff_evaluation,
     smgdiff_runs,
+    smgdiff_training,
     stages,
 )
 from jaxmotion.protocols.camdm_runs import arguments_json
@@ -90,7 +92,9 @@ class Evaluate:
       min_acceleration: A ball that accelerates more is being touched, m/s^2 (paper 2).
       max_distance: From here on a joint is too far from the ball's centre, metres
         (paper 0.1, less than a ball's radius).
-      recognizer_steps: Updates of the recogniser of skills.
+      recognizer_steps: Updates of the recogniser of skills, if it is trained here.
+      evaluator: File of a frozen recogniser with ball, from evaluator.py; None trains
+        one here.
       chunk: Plans or players at a time.
       seed: Of windows, noise and recogniser.
     """
@@ -113,6 +117,7 @@ class Evaluate:
     min_acceleration: float = TUNED.min_acceleration
     max_distance: float = TUNED.max_distance
     recognizer_steps: int = 800
+    evaluator: Path | None = None
     chunk: int = 4
     seed: int = 0
 
@@ -154,7 +159,7 @@ class Rollout:
 
 def sizes_of(args: Train) -> dict[str, Any]:
     """Sizes of the motion model that the arguments describe."""
-    sizes = dict(smgdiff_runs.PRESETS[args.preset])
+    sizes = dict(smgdiff_training.PRESETS[args.preset])
     if args.width:
         sizes |= {"width": args.width, "hidden": 4 * args.width}
     if args.depth:
@@ -192,7 +197,7 @@ def train(args: Train) -> None:
             learning_rate=args.learning_rate,
             seed=args.seed,
         )
-        smgdiff_runs.train_stage(
+        smgdiff_training.train_stage(
             run, stage, budget=budget, draft_steps=args.draft_steps
         )
         print(f"{stage}: {time.perf_counter() - begun:.0f} s", flush=True)
@@ -202,6 +207,7 @@ def evaluate(args: Evaluate) -> None:
     """Writes the tables."""
     for schedule in args.schedules:
         tables.guidance_of(args, schedule)
+    evaluator = None if args.evaluator is None else evaluators.load(args.evaluator)
     run = smgdiff_runs.load_run(args.run)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
@@ -213,8 +219,16 @@ def evaluate(args: Evaluate) -> None:
         replications=args.replications,
         recognizer_steps=args.recognizer_steps,
         seed=args.seed,
+        evaluator=evaluator,
     )
-    found = {"windows": int(setting.known.label.shape[0])}
+    found = {
+        "windows": int(setting.known.label.shape[0]),
+        "evaluator": evaluators.describe(
+            setting.judge.params,
+            evaluator,
+            reference=evaluators.clips_fingerprint(run.train, smgdiff_data.FIELD),
+        ),
+    }
     if "schedules" in args.tables:
         rows = tables.schedules(args, run, setting)
         tables.write(out, "schedules", rows, args, run, found)

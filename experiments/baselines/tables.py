@@ -1,7 +1,6 @@
 """AAMDM's tables 1 and 2, measured, and which orderings of the paper hold here."""
 
 import json
-import platform
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from jaxmotion.protocols import (
     aamdm_rows,
     aamdm_runs,
     camdm_runs,
+    provenance,
 )
 from jaxmotion.systems.aamdm_control import Frame
 
@@ -202,8 +202,7 @@ def evaluate(
         "arguments": camdm_runs.arguments_json(args),
         "source": run.source,
         "orderings": orderings(found),
-        "jax": jax.__version__,
-        "machine": f"{platform.machine()}, {jax.devices()[0]}",
+        **provenance.provenance(),
     }
     if args.long_minutes and "aamdm" in steppers:
         step, space = steppers["aamdm"]

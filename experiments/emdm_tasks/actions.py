@@ -10,7 +10,7 @@ from emdm_tasks.judge import Judge
 from emdm_tasks.scores import ORDER
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import cells, emdm_action, emdm_runs
+from jaxmotion.protocols import cells, emdm_action, emdm_runs, evaluators
 from jaxmotion.protocols import emdm_action_evaluation as protocol
 from jaxmotion.protocols.emdm_data import ActionArrays
 from jaxmotion.systems import emdm, emdm_motion
@@ -29,7 +29,8 @@ def make_judge(args: Any) -> Judge:
       The judge.
 
     Raises:
-      ValueError: if the run has other data, or there are too few samples.
+      ValueError: if the run has other data, there are too few samples, or a frozen
+        evaluator does not fit.
     """
     run = emdm_action.load_run(args.run)
     number = len(run.actions)
@@ -39,8 +40,14 @@ def make_judge(args: Any) -> Judge:
             f"samples is {args.samples}, expected at least 2 for each of {number} "
             "actions"
         )
+    frozen = None if args.evaluator is None else evaluators.load(args.evaluator)
     steps = args.evaluator_steps or 1500
-    recognizer = protocol.load_recognizer(run, num_steps=steps, seed=0)
+    recognizer = protocol.load_recognizer(
+        run, num_steps=steps, seed=0, evaluator=frozen
+    )
+    trained = (run.clips.source, steps, 0)
+    if frozen is not None:
+        trained = (frozen.source, frozen.updates, frozen.seed)
     wanted = jnp.repeat(jnp.arange(number), each)
     key_motion, key_state, *keys_real = jax.random.split(jax.random.key(args.seed), 4)
     truth = protocol.real_positions(key_motion, wanted, run.train)
@@ -91,9 +98,14 @@ def make_judge(args: Any) -> Judge:
         samples=each * number,
         describe={
             "recognizer": "GRU 2 x 128, tanh 30, joint positions; trained on "
-            f"{run.clips.source}, {steps} updates, seed 0",
+            "{}, {} updates, seed {}".format(*trained),
             "reference": f"{each * number} real motions of training clips, actions "
             "uniform",
             "ground height m": ground,
-        },
+        }
+        | evaluators.describe(
+            recognizer,
+            frozen,
+            reference=evaluators.clips_fingerprint(run.train.clips, run.field),
+        ),
     )

@@ -10,7 +10,14 @@ from jaxtyping import Array
 from emdm_tasks import actions, texts
 from emdm_tasks.scores import ORDER
 from jaxmotion.evaluation.table import Cell
-from jaxmotion.protocols import artifacts, cells, emdm_rows, emdm_runs
+from jaxmotion.protocols import (
+    artifacts,
+    cells,
+    emdm_rows,
+    emdm_runs,
+    evaluators,
+    provenance,
+)
 from jaxmotion.protocols.camdm_runs import arguments_json
 from jaxmotion.systems import emdm
 
@@ -91,5 +98,5 @@ def evaluate(args: Any, out: Path) -> None:
         "arguments": arguments_json(args),
         "run": value,
         "evaluator": judge.describe,
-    } | artifacts.provenance()
-    artifacts.write_table(out, found, report)
+    } | provenance.provenance()
+    artifacts.write_table(out, found, report, (evaluators.note(judge.describe),))

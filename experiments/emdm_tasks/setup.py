@@ -15,6 +15,8 @@ from jaxmotion.protocols import (
 from jaxmotion.systems import emdm
 from jaxmotion.text import encoder as text_encoder
 
+# Labels of Bandai-Namco that name the same action as others.
+MERGE = ("bye=wave-right-hand", "byebye=wave-both-hands", "dash=run")
 # Frames of the shortest clip that gets a caption, as in HumanML3D.
 _SHORTEST = 40
 
@@ -74,7 +76,18 @@ def prepare(args: Any) -> emdm_runs.Task:
     return (_prepare_texts if args.task == "text" else _prepare_actions)(args)
 
 
-def _merges(pairs: tuple[str, ...]) -> dict[str, str]:
+def merges(pairs: tuple[str, ...]) -> dict[str, str]:
+    """Labels that name the same action as others.
+
+    Args:
+      pairs: "old=new".
+
+    Returns:
+      The new label of each old one.
+
+    Raises:
+      ValueError: if a pair is not of that form.
+    """
     merge = {}
     for pair in pairs:
         old, equals, new = pair.partition("=")
@@ -85,7 +98,7 @@ def _merges(pairs: tuple[str, ...]) -> dict[str, str]:
 
 
 def _prepare_actions(args: Any) -> emdm_runs.Task:
-    merge = _merges(args.merge)
+    merge = merges(args.merge)
     made = dict(
         task=args.task,
         data=[str(path) for path in args.data],

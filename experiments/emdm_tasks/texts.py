@@ -11,6 +11,7 @@ from emdm_tasks.judge import Judge
 from emdm_tasks.scores import ORDER
 from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
 from jaxmotion.evaluation import diversity, frechet
+from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.protocols import cells, emdm_runs, emdm_text
 from jaxmotion.protocols import emdm_text_evaluation as protocol
 from jaxmotion.systems import emdm
@@ -29,8 +30,14 @@ def make_judge(args: Any) -> Judge:
       The judge.
 
     Raises:
-      ValueError: if the run has other data, or there are too few samples.
+      ValueError: if the run has other data, there are too few samples, or a
+        recogniser of actions is given.
     """
+    if args.evaluator is not None:
+        raise ValueError(
+            f"evaluator is {args.evaluator}, but {args.run} makes motions from texts: "
+            "expected none, or --matcher"
+        )
     run = emdm_text.load_run(args.run)
     frames, number = run.config["frames"], args.samples // 32 * 32
     if number < 64:
@@ -112,6 +119,8 @@ def make_judge(args: Any) -> Judge:
         one=jax.tree.map(lambda x: x[0], one),
         samples=number,
         describe={
+            "fingerprint": fingerprint(judge.params),
+            "origin": judge.name,
             "matcher": dataclasses.asdict(judge.config) | {"name": judge.name},
             "texts": run.encoder.name,
             "reference": f"{number} real motions of the same split",

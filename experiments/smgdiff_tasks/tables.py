@@ -11,6 +11,8 @@ from jaxmotion.evaluation.table import Cell
 from jaxmotion.protocols import (
     artifacts,
     cells,
+    evaluators,
+    provenance,
     smgdiff_evaluation,
     smgdiff_players,
     smgdiff_runs,
@@ -224,9 +226,10 @@ def write(out: Path, name: str, rows: Rows, args: Any, run: Run, more: dict) -> 
       rows: The table.
       args: Of the command line.
       run: The run.
-      more: What belongs beside the table.
+      more: What belongs beside the table; "evaluator" says who judged.
     """
     folder = out / name
     folder.mkdir(parents=True, exist_ok=True)
     report = {"arguments": arguments_json(args), "source": run.model.source} | more
-    artifacts.write_table(folder, rows, report | artifacts.provenance())
+    notes = (evaluators.note(more["evaluator"]),)
+    artifacts.write_table(folder, rows, report | provenance.provenance(), notes)

@@ -1,16 +1,68 @@
 """Whether a long rollout is still a living character.
 
 Two ways to fail: it *diverges* (numbers that no body shows) or it *freezes* (the limbs
-stop although it is told to move). Both are yes or no, with stated bounds.
+stop although it is told to move). Both are yes or no, with stated bounds, for frames
+and for whole rollouts; `time_to_failure` makes a rate of them.
 """
 
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxmotion.motion.spring import Scalar
+
+_SECONDS = 60.0
+
+
+class Exposure(NamedTuple):
+    """Whether a rollout failed, and for how long it was watched until then."""
+
+    failed: Bool[Array, "*batch"]
+    minutes: Float[Array, "*batch"]
+
+
+class FailureRate(NamedTuple):
+    """Failures for each minute watched, and the part that fails within a minute."""
+
+    per_minute: Float[Array, ""]
+    fraction: Float[Array, ""]
+    failures: Float[Array, ""]
+    minutes: Float[Array, ""]
+
+
+@functools.partial(jax.jit, static_argnames=("fps",))
+def diverged_frames(
+    positions: Float[Array, "*batch frames joints 3"],
+    *,
+    fps: float,
+    min_root: Scalar,
+    max_root: Scalar,
+    max_speed: Scalar = 20.0,
+) -> Bool[Array, "*batch frames"]:
+    """Which frames are outside what a body can show.
+
+    Args:
+      positions: World positions of the joints, metres; joint 0 is the root.
+      fps: Frames a second.
+      min_root: Lowest root height, metres.
+      max_root: Highest root height, metres.
+      max_speed: Of any joint, metres a second.
+
+    Returns:
+      True where a number is not finite, the root is outside its heights, or a joint
+      came there from the frame before faster than the bound.
+    """
+    finite = jnp.all(jnp.isfinite(positions), axis=(-2, -1))
+    height = positions[..., 0, 1]
+    inside = (height >= min_root) & (height <= max_root)
+    step = jnp.diff(positions, axis=-3) * fps
+    slow = jnp.all(jnp.sum(step**2, axis=-1) <= max_speed**2, axis=-1)
+    # Nothing comes before the first frame.
+    slow = jnp.concatenate([jnp.ones((*slow.shape[:-1], 1), bool), slow], axis=-1)
+    return ~(finite & inside & slow)
 
 
 @functools.partial(jax.jit, static_argnames=("fps",))
@@ -35,16 +87,14 @@ def has_diverged(
       True where a number is not finite, the root is outside its heights, or a joint is
       faster than the bound.
     """
-    finite = jnp.all(jnp.isfinite(positions), axis=(-3, -2, -1))
-    height = positions[..., 0, 1]
-    inside = jnp.all((height >= min_root) & (height <= max_root), axis=-1)
-    step = jnp.diff(positions, axis=-3) * fps
-    slow = jnp.all(jnp.sum(step**2, axis=-1) <= max_speed**2, axis=(-2, -1))
-    return ~(finite & inside & slow)
+    found = diverged_frames(
+        positions, fps=fps, min_root=min_root, max_root=max_root, max_speed=max_speed
+    )
+    return jnp.any(found, axis=-1)
 
 
 @functools.partial(jax.jit, static_argnames=("fps", "seconds"))
-def is_frozen(
+def frozen_frames(
     positions: Float[Array, "*batch frames joints 3"],
     wanted_velocity: Float[Array, "*batch frames 2"],
     *,
@@ -52,8 +102,8 @@ def is_frozen(
     seconds: float = 2.0,
     min_speed: Scalar = 0.05,
     commanded: Scalar = 0.3,
-) -> Bool[Array, "*batch"]:
-    """Whether a character stops moving its limbs for some seconds while told to travel.
+) -> Bool[Array, "*batch frames"]:
+    """Which frames lie in a window of time in which the limbs stand though told to go.
 
     Time is cut into windows of `seconds`. A window is frozen if the joints' mean speed
     relative to the root is below `min_speed` while the slowest velocity wanted in it is
@@ -68,7 +118,7 @@ def is_frozen(
       commanded: Metres a second.
 
     Returns:
-      True where any window is frozen; never for motions shorter than a window.
+      True for all frames of frozen windows; never behind the last whole window.
 
     Raises:
       ValueError: if a window is shorter than a frame.
@@ -85,4 +135,91 @@ def is_frozen(
 
     wanted = jnp.linalg.norm(wanted_velocity[..., :-1, :], axis=-1)
     still = cut(speed).mean(-1) < min_speed
-    return jnp.any(still & (cut(wanted).min(-1) > commanded), axis=-1)
+    frozen = still & (cut(wanted).min(-1) > commanded)
+    rest = positions.shape[-3] - windows * length
+    frames = jnp.repeat(frozen, length, axis=-1)
+    return jnp.pad(frames, [(0, 0)] * (frames.ndim - 1) + [(0, rest)])
+
+
+@functools.partial(jax.jit, static_argnames=("fps", "seconds"))
+def is_frozen(
+    positions: Float[Array, "*batch frames joints 3"],
+    wanted_velocity: Float[Array, "*batch frames 2"],
+    *,
+    fps: float,
+    seconds: float = 2.0,
+    min_speed: Scalar = 0.05,
+    commanded: Scalar = 0.3,
+) -> Bool[Array, "*batch"]:
+    """Whether a character stops moving its limbs for some seconds while told to travel.
+
+    Args:
+      positions: World positions of the joints, metres; joint 0 is the root.
+      wanted_velocity: Velocity (x, z) asked for in each frame, metres a second.
+      fps: Frames a second.
+      seconds: Length of a window of `frozen_frames`.
+      min_speed: Metres a second.
+      commanded: Metres a second.
+
+    Returns:
+      True where any window is frozen; never for motions shorter than a window.
+
+    Raises:
+      ValueError: if a window is shorter than a frame.
+    """
+    found = frozen_frames(
+        positions,
+        wanted_velocity,
+        fps=fps,
+        seconds=seconds,
+        min_speed=min_speed,
+        commanded=commanded,
+    )
+    return jnp.any(found, axis=-1)
+
+
+@functools.partial(jax.jit, static_argnames=("fps",))
+def time_to_failure(failed: Bool[Array, "*batch frames"], *, fps: float) -> Exposure:
+    """When rollouts fail first; what comes behind counts neither way.
+
+    Args:
+      failed: Frames that diverged or are frozen: `diverged_frames | frozen_frames`, or
+        one of both.
+      fps: Frames a second.
+
+    Returns:
+      Whether any frame failed, and the minutes up to the first that did, it included,
+      or of the whole rollout.
+    """
+    any_failed = jnp.any(failed, axis=-1)
+    frames = jnp.where(any_failed, jnp.argmax(failed, axis=-1) + 1, failed.shape[-1])
+    return Exposure(failed=any_failed, minutes=frames / fps / _SECONDS)
+
+
+@jax.jit
+def failure_rate(exposure: Exposure) -> FailureRate:
+    """Part of the characters that freeze or diverge within a minute.
+
+    With failures that come at a constant rate the maximum-likelihood rate is failures
+    over all minutes watched, however long each rollout was, and the part that fails
+    within a minute is 1 - exp(-rate). Intervals: `statistics.bootstrap_interval` over
+    the rollouts; where none failed, rates up to 3 / minutes are within 95 %.
+
+    Args:
+      exposure: Of rollouts, from `time_to_failure`.
+
+    Returns:
+      Rate a minute, part in 0..1 that fails within one, number of failures, and
+      minutes watched; a rate of NaN for no time.
+
+    Source: maximum likelihood of an exponential time to failure with censoring.
+    """
+    failures = jnp.sum(exposure.failed, dtype=exposure.minutes.dtype)
+    minutes = jnp.sum(exposure.minutes)
+    rate = failures / minutes
+    return FailureRate(
+        per_minute=rate,
+        fraction=-jnp.expm1(-rate),
+        failures=failures,
+        minutes=minutes,
+    )

@@ -2,12 +2,9 @@
 
 import dataclasses
 import json
-import os
-import platform
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -94,7 +91,10 @@ def _write_ball(path: Path, ball: Ball, fps: float) -> None:
 
 
 def write_table(
-    folder: Path, rows: dict[str, dict[str, table.Cell]], report: dict[str, Any]
+    folder: Path,
+    rows: dict[str, dict[str, table.Cell]],
+    report: dict[str, Any],
+    notes: tuple[str, ...] = (),
 ) -> None:
     """Writes metrics.json and table.md, and prints the table.
 
@@ -102,25 +102,10 @@ def write_table(
       folder: Where to; it must exist.
       rows: The table.
       report: What belongs beside it: arguments, versions, hardware, bounds.
+      notes: Lines below the table.
     """
     whole = report | {"rows": table.to_json(rows)}
     (folder / "metrics.json").write_text(json.dumps(whole, indent=1))
-    text = table.to_markdown(rows)
+    text = "\n\n".join([table.to_markdown(rows), *notes])
     (folder / "table.md").write_text(text + "\n")
     print(text)
-
-
-def provenance() -> dict[str, Any]:
-    """What a table was made with.
-
-    Returns:
-      Versions, processor, its number of cores, and devices, as a JSON object.
-    """
-    return {
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "numpy": np.__version__,
-        "machine": platform.machine(),
-        "cores": os.cpu_count(),
-        "devices": [str(device) for device in jax.devices()],
-    }

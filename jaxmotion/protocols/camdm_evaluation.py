@@ -1,7 +1,6 @@
 """Characters of a run, steered along a preset; and how they measure up."""
 
 import dataclasses
-import platform
 import time
 from typing import Any
 
@@ -13,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxmotion.evaluation import table
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.protocols import camdm as protocol
-from jaxmotion.protocols import camdm_rows, camdm_styles
+from jaxmotion.protocols import camdm_rows, camdm_styles, evaluators, provenance
 from jaxmotion.protocols.camdm_runs import Run
 from jaxmotion.typing import Key
 
@@ -102,6 +101,7 @@ def evaluate_run(
     chunk: int | None = None,
     recognizer_steps: int = 1500,
     seed: int = 0,
+    evaluator: evaluators.Evaluator | None = None,
 ) -> tuple[dict[str, dict[str, table.Cell]], dict[str, Any]]:
     """Steers characters in every style, and measures them beside held-out clips.
 
@@ -112,15 +112,16 @@ def evaluate_run(
       seconds: Length of each rollout.
       speed: Metres a second; None for each style's own median speed.
       chunk: Characters to run at a time, at most.
-      recognizer_steps: Updates of the style recogniser.
+      recognizer_steps: Updates of the style recogniser, if it is trained here.
       seed: Of poses, noise, recogniser and subsets.
+      evaluator: A frozen style recogniser; None to train one.
 
     Returns:
       The table, and what belongs beside it: speeds, health, counts, versions.
 
     Raises:
       ValueError: before any training, if there is no such preset, rollouts are too
-        short, or a style has no held-out clip.
+        short, a style has no held-out clip, or the evaluator does not fit the run.
     """
     model, field, fps = run.model, run.field, run.model.config.fps
     repeats = max(rollouts // len(model.labels), 1)
@@ -129,10 +130,7 @@ def evaluate_run(
     protocol.check_ticks(commands.label.shape[1], fps=fps, skip=SKIP)
     states = protocol.start_states(run.held_out, model, labels, field=field, seed=seed)
     key_fit, key_roll = jax.random.split(jax.random.key(seed))
-    print(f"training the style recogniser for {recognizer_steps} steps", flush=True)
-    recognizer = camdm_styles.fit_recognizer(
-        key_fit, run.train, field=field, num_steps=recognizer_steps
-    )
+    recognizer = _recognizer(key_fit, run, evaluator, recognizer_steps)
     frames = _timed_rollouts(run, key_roll, states, commands, chunk)
     real = protocol.data_windows(run.held_out, stride=protocol.WINDOW, field=field)
     dense = protocol.data_windows(run.train, stride=10, field=field)
@@ -142,10 +140,34 @@ def evaluate_run(
     )
     return rows, report | {
         "source": model.source,
+        "evaluator": evaluators.describe(
+            recognizer.params,
+            evaluator,
+            reference=evaluators.clips_fingerprint(run.train, field),
+        ),
         "speeds": dict(zip(model.labels, speeds[::repeats].tolist(), strict=True)),
-        "jax": jax.__version__,
-        "machine": f"{platform.machine()}, {jax.devices()[0]}",
+        **provenance.provenance(),
     }
+
+
+def _recognizer(
+    key: Key, run: Run, evaluator: evaluators.Evaluator | None, num_steps: int
+) -> camdm_styles.Recognized:
+    """The frozen recogniser if there is one, else one trained on the run's clips."""
+    frozen = evaluators.params_for(
+        evaluator,
+        kind="style",
+        labels=run.model.labels,
+        joints=run.model.bones.names,
+        fps=run.model.config.fps,
+        frames=protocol.WINDOW,
+    )
+    if frozen is not None:
+        return camdm_styles.Recognized(params=frozen, config=evaluator.config)
+    print(f"training the style recogniser for {num_steps} steps", flush=True)
+    return camdm_styles.fit_recognizer(
+        key, run.train, field=run.field, num_steps=num_steps
+    )
 
 
 def _timed_rollouts(

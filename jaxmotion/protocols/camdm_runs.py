@@ -9,6 +9,9 @@ from jaxmotion.data.clips import Clips
 from jaxmotion.systems import camdm_model
 from jaxmotion.typing import Params
 
+# Locomotion of Bandai-Namco: what a model and its evaluator are trained on.
+CONTENTS = ("walk", "walk-turn-left", "walk-turn-right", "run")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:

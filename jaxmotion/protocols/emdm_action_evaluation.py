@@ -17,7 +17,7 @@ from jaxmotion.evaluation import contact, diversity, frechet, plausibility, smoo
 from jaxmotion.learning import action_recognition as recognition
 from jaxmotion.learning import checkpoint
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import emdm_data, stages
+from jaxmotion.protocols import emdm_data, evaluators, stages
 from jaxmotion.protocols.emdm_action import ActionRun
 from jaxmotion.protocols.emdm_data import ActionArrays
 from jaxmotion.typing import Key, Params
@@ -40,20 +40,63 @@ def recognizer_config(run: ActionRun) -> recognition.ActionRecognizerConfig:
     )
 
 
-def load_recognizer(run: ActionRun, *, num_steps: int, seed: int) -> Params:
+def fit_recognizer(
+    train: ActionArrays, *, num_steps: int, seed: int
+) -> tuple[recognition.ActionRecognizerConfig, Params]:
+    """Trains a recogniser on motions with actions drawn uniformly.
+
+    Args:
+      train: Training clips.
+      num_steps: Updates.
+      seed: Of parameters, batches and motions.
+
+    Returns:
+      Its size, and its parameters.
+    """
+    config = recognition.ActionRecognizerConfig(
+        num_classes=train.counts.shape[0], num_joints=train.clips.skeleton.num_joints
+    )
+    key_data, key_train = jax.random.split(jax.random.key(seed))
+    actions = jnp.arange(_RECOGNIZED) % config.num_classes
+    x = _flat(real_positions(key_data, actions, train))
+    params, _ = recognition.train_action_recognizer(
+        key_train, x, actions, config=config, num_steps=num_steps
+    )
+    return config, params
+
+
+def load_recognizer(
+    run: ActionRun,
+    *,
+    num_steps: int,
+    seed: int,
+    evaluator: evaluators.Evaluator | None = None,
+) -> Params:
     """The run's recogniser, trained on its training clips if it is not there yet.
 
     Args:
       run: The run.
       num_steps: Updates.
       seed: Of parameters and batches.
+      evaluator: A frozen recogniser to use in its place; None for none.
 
     Returns:
       Its parameters.
 
     Raises:
-      ValueError: if the folder's was trained otherwise; names the field.
+      ValueError: if the folder's was trained otherwise, or the evaluator does not fit
+        the run; names the field.
     """
+    frozen = evaluators.params_for(
+        evaluator,
+        kind="action",
+        labels=run.actions,
+        joints=run.clips.skeleton.names,
+        fps=run.clips.fps,
+        frames=run.train.frames,
+    )
+    if frozen is not None:
+        return frozen
     folder = run.folder / "recognizer"
     config = recognizer_config(run)
     value = {
@@ -65,12 +108,7 @@ def load_recognizer(run: ActionRun, *, num_steps: int, seed: int) -> Params:
         "source": run.clips.source,
     }
     if checkpoint.latest_step(folder) is None:
-        key_data, key_train = jax.random.split(jax.random.key(seed))
-        actions = jnp.arange(_RECOGNIZED) % len(run.actions)
-        x = _flat(real_positions(key_data, actions, run.train))
-        params, _ = recognition.train_action_recognizer(
-            key_train, x, actions, config=config, num_steps=num_steps
-        )
+        _, params = fit_recognizer(run.train, num_steps=num_steps, seed=seed)
         checkpoint.save(folder, num_steps, {"params": params}, value)
     return stages.restore_evaluator(
         folder,

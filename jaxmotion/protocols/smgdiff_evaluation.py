@@ -21,7 +21,7 @@ from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.evaluation import locomotion
 from jaxmotion.motion import rotation, skeleton, trajectory
 from jaxmotion.motion.ball import Scene
-from jaxmotion.protocols import smgdiff_data, smgdiff_scores
+from jaxmotion.protocols import evaluators, smgdiff_data, smgdiff_scores
 from jaxmotion.systems import camdm_loss, smgdiff_loss, smgdiff_scene
 from jaxmotion.systems.smgdiff import Condition
 from jaxmotion.systems.smgdiff_guidance import Plan
@@ -196,6 +196,7 @@ def make_setting(
     replications: int,
     recognizer_steps: int,
     seed: int,
+    evaluator: evaluators.Evaluator | None = None,
 ) -> Setting:
     """Trains the judge and draws the windows.
 
@@ -207,13 +208,22 @@ def make_setting(
       replications: Sets of half of the held-out windows.
       recognizer_steps: Updates of the recogniser.
       seed: Of everything random.
+      evaluator: A frozen recogniser; None to train one.
 
     Returns:
       The setting.
 
     Raises:
-      ValueError: if clips are too short or too few.
+      ValueError: if clips are too short or few, or the evaluator does not fit.
     """
+    frozen = evaluators.params_for(
+        evaluator,
+        kind="ball",
+        labels=model.labels,
+        joints=model.representation.bones.names,
+        fps=model.config.fps,
+        frames=model.config.future,
+    )
     reference = situations(train, model, number=2 * number, seed=seed)
     judge = smgdiff_scores.make_judge(
         jax.random.key(seed),
@@ -222,6 +232,7 @@ def make_setting(
         representation=model.representation,
         num_labels=len(model.labels),
         num_steps=recognizer_steps,
+        frozen=frozen,
     )
     return Setting(
         judge=judge,
@@ -248,9 +259,8 @@ def score_scenes(
     for number, half in enumerate(setting.halves):
         chosen = jnp.asarray(half)
         known = jax.tree.map(lambda x: x[chosen], setting.known)  # noqa: B023
-        scenes = scenes_of(number, chosen)
         wanted = known.condition.trajectory
-        found.append(setting.score(scenes, wanted, known.label))
+        found.append(setting.score(scenes_of(number, chosen), wanted, known.label))
     return found
 
 

@@ -1,4 +1,4 @@
-"""Training of SMGDiff's two stages, and a trained run from its folder.
+"""Run folders of SMGDiff, and what was trained in them.
 
 A run folder holds config.json (the model), train.npz and held_out.npz (clips with a
 ball), and one folder a stage: motion_8 is the motion model of 8 steps, paths_1 the
@@ -6,7 +6,6 @@ trajectory generator of one.
 """
 
 import dataclasses
-import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -14,44 +13,16 @@ from typing import Any
 import jax
 
 from jaxmotion.data.ball_clips import BallClips, load_ball_clips, save_ball_clips
-from jaxmotion.learning import checkpoint, training
+from jaxmotion.learning import checkpoint
 from jaxmotion.protocols import smgdiff_data, stages
 from jaxmotion.systems import (
     smgdiff,
-    smgdiff_loss,
     smgdiff_model,
     smgdiff_scene,
     smgdiff_trajectory,
 )
 from jaxmotion.systems.smgdiff_model import SYSTEM, Model
 from jaxmotion.typing import Key, Params
-
-# Sizes and weights of `smgdiff.Config`, by name.
-PRESETS = {
-    # CAMDM's network, which the paper's missing supplement is taken to have.
-    "paper": dict(),
-    # For a CPU or a short run: 31 tokens instead of 147. Feet and bones weigh more than
-    # a long training needs, and the ball has losses of its own: without them it jitters
-    # so much that guidance takes every frame for a touch.
-    "small": dict(
-        width=192,
-        hidden=768,
-        frames_per_token=5,
-        norm="pre",
-        dropout=0.0,
-        weight_velocity=3.0,
-        weight_position=5.0,
-        weight_position_velocity=100.0,
-        weight_foot=200.0,
-        weight_ball=5.0,
-        weight_ball_acceleration=300.0,
-    ),
-}
-# Of a training's first part. Displacements are least for a body that does not move, and
-# a network that meets them first stays on the mean pose for thousands of updates.
-DRAFT = dict(
-    weight_position_velocity=5.0, weight_foot=5.0, weight_ball_acceleration=0.0
-)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -205,88 +176,34 @@ def load_run(folder: Path) -> Run:
     )
 
 
-def _stage_config(model: Model, stage: str) -> tuple[str, dict[str, Any]]:
+def stage_config(model: Model, stage: str) -> tuple[str, dict[str, Any]]:
+    """What a stage's checkpoint says of it.
+
+    Args:
+      model: The model, with the stage's number of steps.
+      stage: "motion_8", "paths_1", ...
+
+    Returns:
+      Name of the model's field, and that configuration as JSON.
+    """
     field = "config" if stage.startswith("motion") else "paths"
     return field, dataclasses.asdict(getattr(model, field))
 
 
-def _init(key: Key, model: Model, stage: str) -> Params:
+def init_stage(key: Key, model: Model, stage: str) -> Params:
+    """Initial parameters of a stage.
+
+    Args:
+      key: Consumed.
+      model: The model, with the stage's number of steps.
+      stage: "motion_8", "paths_1", ...
+
+    Returns:
+      The parameters.
+    """
     if stage.startswith("motion"):
         return smgdiff.init(key, model.config)
     return smgdiff_trajectory.init(key, model.paths)
-
-
-def train_stage(
-    run: Run, stage: str, *, budget: stages.Budget, draft_steps: int = 0
-) -> None:
-    """Trains a stage, from its newest checkpoint if there is one.
-
-    Args:
-      run: The run.
-      stage: "motion_8", "paths_1", ...
-      budget: How long.
-      draft_steps: Updates of a motion model before these, with the weights `DRAFT`.
-
-    Raises:
-      ValueError: if there is no such stage, or its checkpoint has other settings.
-      TrainingDiverged: if a loss is not finite.
-    """
-    model = with_steps(run.model, stage)
-    arrays = smgdiff_data.scene_arrays(run.train, model.config.window)
-    folder, key = run.folder / stage, jax.random.key(budget.seed)
-    params = jax.jit(lambda key: _init(key, model, stage))(key)
-    if draft_steps and stage.startswith("motion"):
-        params = _fit(
-            folder / "draft",
-            dataclasses.replace(
-                model, config=dataclasses.replace(model.config, **DRAFT)
-            ),
-            stage,
-            params,
-            arrays,
-            budget=dataclasses.replace(budget, steps=draft_steps),
-        )
-    _fit(folder, model, stage, params, arrays, budget=budget)
-
-
-def _fit(
-    folder: Path,
-    model: Model,
-    stage: str,
-    params: Params,
-    arrays: smgdiff_data.SceneArrays,
-    *,
-    budget: stages.Budget,
-) -> Params:
-    """Trains a stage's parameters; returns their average."""
-    is_motion, representation = stage.startswith("motion"), model.representation
-    if is_motion:
-        loss = functools.partial(
-            smgdiff_loss.loss, representation=representation, config=model.config
-        )
-    else:
-        loss = functools.partial(
-            smgdiff_trajectory.loss, bones=representation.bones, config=model.paths
-        )
-
-    def sample_batch(key: Key, arrays: smgdiff_data.SceneArrays) -> tuple[Any, Any]:
-        scenes, labels = smgdiff_data.sample_scenes(key, arrays, batch=budget.batch)
-        return (scenes if is_motion else scenes.motion), labels
-
-    optimizer = stages.make_optimizer(budget)
-    state = stages.fit(
-        folder,
-        training.init_train_state(params, optimizer),
-        training.make_update(loss, optimizer, ema_decay=budget.ema),
-        sample_batch,
-        arrays,
-        system=SYSTEM,
-        stage=stage,
-        budget=budget,
-        config=dict([_stage_config(model, stage)]),
-        show=("loss", "foot") if is_motion else ("loss",),
-    )
-    return state.ema_params
 
 
 def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
@@ -306,10 +223,10 @@ def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
     model = with_steps(run.model, stage)
     folder = run.folder / stage
     value = stages.check_stage(folder, stage, system=SYSTEM)
-    field, expected = _stage_config(model, stage)
+    field, expected = stage_config(model, stage)
     if value.get(field) != expected:
         raise checkpoint.CheckpointError(
             f"{folder}: field {field!r} is not that of {run.folder}/config.json"
         )
-    init = lambda: _init(jax.random.key(0), model, stage)  # noqa: E731
+    init = lambda: init_stage(jax.random.key(0), model, stage)  # noqa: E731
     return model, stages.load_params(folder, stage, init, system=SYSTEM)

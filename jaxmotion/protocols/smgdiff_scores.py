@@ -91,6 +91,7 @@ def make_judge(
     representation: Representation,
     num_labels: int,
     num_steps: int,
+    frozen: Params | None = None,
 ) -> Judge:
     """Trains the recogniser of skills on real windows.
 
@@ -101,6 +102,7 @@ def make_judge(
       representation: Of their skeleton.
       num_labels: Skills.
       num_steps: Updates.
+      frozen: Parameters of a recogniser that was trained before; None to train one.
 
     Returns:
       The judge; the same windows are its reference.
@@ -111,9 +113,11 @@ def make_judge(
         frames=scenes.ball.shape[-2],
     )
     x = jax.jit(recognizer_input)(scenes, representation)
-    params, _ = recognition.train_recognizer(
-        key, x, labels, config=config, num_steps=num_steps
-    )
+    params = frozen
+    if params is None:
+        params, _ = recognition.train_recognizer(
+            key, x, labels, config=config, num_steps=num_steps
+        )
     features, _ = jax.jit(functools.partial(recognition.recognize, config=config))(
         params, x
     )

@@ -39,6 +39,45 @@ def test_intra_style_variance_is_numpys():
     np.testing.assert_allclose(diversity.intra_style_variance(same), 0.0, atol=1e-12)
 
 
+def repeated(metric, x, *, pairs, number=3000):
+    """Mean over many draws, and the error of that mean."""
+    keys = jax.random.split(jax.random.key(4), number)
+    found = jax.vmap(lambda k: metric(k, jnp.asarray(x), num_pairs=pairs))(keys)
+    return float(found.mean()), float(found.std(ddof=1)) / np.sqrt(number)
+
+
+def test_published_diversity_pairs_samples_with_themselves():
+    x = np.random.default_rng(2).normal(size=(5, 3)).astype(np.float32)
+    own = oracle.mean_pair_distance(x.astype(np.float64))
+    got, error = repeated(diversity.diversity_emdm_release, x, pairs=3)
+    assert error < 0.03 * own
+    assert abs(got - own * 4 / 5) < 4 * error
+    with pytest.raises(ValueError, match="6 pairs of 5 samples"):
+        diversity.diversity_emdm_release(jax.random.key(0), jnp.asarray(x), num_pairs=6)
+
+
+def test_published_multimodality_is_smaller_likewise():
+    x = np.random.default_rng(3).normal(size=(3, 4, 2)).astype(np.float32)
+    own = np.mean([oracle.mean_pair_distance(rows.astype(float)) for rows in x])
+    got, error = repeated(diversity.multimodality_emdm_release, x, pairs=2)
+    assert error < 0.03 * own
+    assert abs(got - own * 3 / 4) < 4 * error
+    unbiased, error = repeated(diversity.multimodality, x, pairs=2)
+    assert abs(unbiased - own) < 4 * error
+
+
+def test_distance_of_joints_is_the_mean_over_pairs_frames_and_joints():
+    x = np.random.default_rng(5).normal(size=(4, 3, 2, 3)).astype(np.float32)
+    gaps = np.linalg.norm(x[:, None].astype(float) - x[None], axis=-1)
+    gaps = gaps[~np.eye(4, dtype=bool)].mean((-1, -2))
+    pairs = 20_000
+    got = diversity.joint_distance(jax.random.key(0), jnp.asarray(x), num_pairs=pairs)
+    assert abs(float(got) - gaps.mean()) < 4 * gaps.std() / np.sqrt(pairs)
+    apart = jnp.zeros((2, 5, 7, 3)).at[1].add(jnp.array([0.0, 0.3, 0.4])[None, None])
+    got = diversity.joint_distance(jax.random.key(1), apart, num_pairs=33)
+    np.testing.assert_allclose(got, 0.5, rtol=1e-6)
+
+
 def test_single_samples_are_refused():
     with pytest.raises(ValueError, match="1 samples, expected at least 2"):
         diversity.diversity(jax.random.key(0), jnp.zeros((1, 3)), num_pairs=2)

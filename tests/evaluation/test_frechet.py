@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 
 from jaxmotion.evaluation import frechet
 from tests.reference import metrics as oracle
@@ -88,3 +89,58 @@ def test_distance_maps_over_a_batch_of_styles():
     got = jax.vmap(frechet.frechet_distance)(*made)
     want = [oracle.frechet(np.float64(a[i]), np.float64(b[i])) for i in range(3)]
     np.testing.assert_allclose(got, want, rtol=1e-3)
+
+
+@pytest.mark.parametrize("features", [4, 24])
+def test_distance_is_scipys_to_1e_5(features):
+    """Of given moments, so that only the distance itself is on trial."""
+    rng = np.random.default_rng(features)
+    made = []
+    for _ in range(2):
+        mix = rng.normal(size=(features, 3 * features)) / np.sqrt(features)
+        covariance = np.float32(mix @ mix.T)
+        mean = np.float32(rng.normal(size=features))
+        made.append((mean, (covariance + covariance.T) / 2))
+    got = frechet.frechet_distance(
+        *(
+            frechet.Moments(
+                mean=jnp.asarray(m), covariance=jnp.asarray(c), count=jnp.array(9.0)
+            )
+            for m, c in made
+        )
+    )
+    (m_a, c_a), (m_b, c_b) = [(m.astype(float), c.astype(float)) for m, c in made]
+    root = scipy.linalg.sqrtm(c_a @ c_b).real
+    want = np.sum((m_a - m_b) ** 2) + np.trace(c_a + c_b - 2 * root)
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_masked_moments_are_those_of_the_rows():
+    x = samples(9, 40, 3, shift=5.0)
+    mask = np.random.default_rng(0).uniform(size=40) < 0.4
+    got = frechet.masked_moments(jnp.asarray(x), jnp.asarray(mask))
+    kept = x[mask].astype(np.float64)
+    np.testing.assert_allclose(got.mean, kept.mean(0), rtol=1e-5)
+    want = np.cov(kept, rowvar=False)
+    np.testing.assert_allclose(got.covariance, want, rtol=1e-4, atol=1e-4)
+    assert got.count == mask.sum()
+    one = frechet.masked_moments(jnp.asarray(x), jnp.arange(40) == 7)
+    np.testing.assert_allclose(one.mean, x[7], rtol=1e-6)
+    assert np.isnan(one.covariance).all()
+
+
+def test_distances_by_group_are_each_groups_own():
+    a, b = samples(10, 90, 4), samples(11, 60, 4, shift=0.5)
+    rng = np.random.default_rng(1)
+    groups, styles = rng.integers(0, 3, 90), np.arange(60) % 2
+    groups[5] = 3  # a group of one row
+    # Groups 0 and 2 are of style 0, groups 1 and 3 of style 1.
+    of_style = [fit(b[styles == style]) for style in (0, 1, 0, 1)]
+    references = jax.tree.map(lambda *x: jnp.stack(x), *of_style)
+    got = frechet.frechet_by_group(jnp.asarray(a), jnp.asarray(groups), references)
+    want = [
+        oracle.frechet(a[groups == g].astype(float), b[styles == g % 2].astype(float))
+        for g in range(3)
+    ]
+    np.testing.assert_allclose(got[:3], want, rtol=1e-4)
+    assert np.isnan(got[3])

@@ -112,3 +112,56 @@ def test_a_batch_is_judged_one_by_one(alive):
     np.testing.assert_array_equal(found, [False, True, False])
     found = health.is_frozen(batch, jnp.broadcast_to(told(), (3, FRAMES, 2)), fps=FPS)
     np.testing.assert_array_equal(found, [False, False, True])
+
+
+def test_frames_say_where_a_rollout_fails(alive):
+    broken = alive.copy()
+    broken[50, 1, 0] += 0.8  # there and back faster than the bound
+    broken[200:, :, 1] -= 0.6
+    broken[120, 4, 2] = np.nan
+    found = health.diverged_frames(jnp.asarray(broken), **BOUNDS)
+    expected = np.zeros(FRAMES, bool)
+    expected[[50, 51, 120, 121]] = True
+    expected[200:] = True
+    np.testing.assert_array_equal(found, expected)
+    still = held(alive, 100, 200)
+    found = health.frozen_frames(jnp.asarray(still), told(), fps=FPS)
+    # Windows of 60 frames: the statue fills the third alone.
+    np.testing.assert_array_equal(np.flatnonzero(found), np.arange(120, 180))
+
+
+def test_exposure_ends_with_the_first_failure():
+    failed = np.zeros((3, 1800), bool)
+    failed[1, 449:600] = True
+    failed[1, 1000] = True
+    failed[2, 0] = True
+    found = health.time_to_failure(jnp.asarray(failed), fps=30.0)
+    np.testing.assert_array_equal(found.failed, [False, True, True])
+    np.testing.assert_allclose(found.minutes, [1.0, 0.25, 1 / 1800], rtol=1e-6)
+
+
+def test_failures_of_a_known_rate_are_found_at_that_rate():
+    """Times to failure at 0.5 a minute, in rollouts of 20 s and of 3 minutes."""
+    rng = np.random.default_rng(0)
+    rate, fps = 0.5, 10.0
+    failures, minutes = 0, 0.0
+    for frames, number in ((200, 1500), (1800, 300)):
+        first = rng.geometric(rate / 60 / fps, number) - 1
+        failed = np.arange(frames)[None] >= first[:, None]
+        found = health.time_to_failure(jnp.asarray(failed), fps=fps)
+        one = health.failure_rate(found)
+        error = rate / np.sqrt(float(one.failures))
+        assert abs(float(one.per_minute) - rate) < 4 * error
+        np.testing.assert_allclose(one.fraction, 1 - np.exp(-one.per_minute), rtol=1e-5)
+        np.testing.assert_array_equal(one.failures, (first < frames).sum())
+        watched = np.minimum(first + 1, frames).sum() / fps / 60
+        np.testing.assert_allclose(one.minutes, watched, rtol=1e-4)
+        failures, minutes = failures + one.failures, minutes + one.minutes
+    np.testing.assert_allclose(failures / minutes, rate, rtol=0.2)
+
+
+def test_nothing_fails_at_the_rate_zero():
+    found = health.failure_rate(
+        health.time_to_failure(jnp.zeros((4, 900), bool), fps=30.0)
+    )
+    np.testing.assert_allclose(found, (0.0, 0.0, 0.0, 2.0), rtol=1e-6)

@@ -7,13 +7,14 @@ import jax
 import numpy as np
 import pytest
 
-from jaxmotion.learning.checkpoint import CheckpointError
+from jaxmotion.learning.checkpoint import CheckpointError, latest_step, load_config
 from jaxmotion.protocols import (
     smgdiff_data,
     smgdiff_evaluation,
     smgdiff_players,
     smgdiff_runs,
     smgdiff_scores,
+    smgdiff_training,
     stages,
 )
 from jaxmotion.systems import smgdiff_control, smgdiff_guidance
@@ -38,7 +39,7 @@ def run(tmp_path_factory):
     made = smgdiff_runs.Run(folder=folder, model=model, train=train, held_out=held_out)
     smgdiff_runs.write_run(made)
     for stage in ("motion_2", "paths_1"):
-        smgdiff_runs.train_stage(made, stage, budget=BUDGET)
+        smgdiff_training.train_stage(made, stage, budget=BUDGET, draft_steps=2)
     return smgdiff_runs.load_run(folder)
 
 
@@ -53,6 +54,17 @@ def setting(run):
         recognizer_steps=40,
         seed=0,
     )
+
+
+def test_a_motion_model_starts_from_a_draft_with_weights_of_its_own(run):
+    draft, last = (
+        load_config(run.folder / "motion_2" / where / "checkpoints")
+        for where in ("draft", "")
+    )
+    assert draft["config"] | smgdiff_training.DRAFT == draft["config"]
+    assert draft["config"] != last["config"] == dataclasses.asdict(run.model.config)
+    assert latest_step(run.folder / "motion_2" / "draft" / "checkpoints") == 2
+    assert not (run.folder / "paths_1" / "draft").exists()
 
 
 def test_pieces_of_one_recording_stay_together():

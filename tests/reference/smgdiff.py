@@ -34,7 +34,7 @@ def encode_ball(ball, velocity, root, reach=REACH):
 
 
 def decode_ball(features, root, start, fps):
-    """Eq. 2 inverted; of small weights and of jumps the velocity makes motion (ours)."""
+    """Eq. 2 inverted; small weights and jumps give way to the velocity (ours)."""
     before, rows = np.asarray(start, np.float64), []
     for row, h in zip(np.asarray(features, np.float64), root, strict=True):
         before = before + row[3:6] / fps

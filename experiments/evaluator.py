@@ -1,0 +1,214 @@
+"""Frozen evaluators: train a recogniser once, and judge everybody's motions by it.
+
+Examples:
+  python experiments/evaluator.py train --kind style --data data/bandai2.npz --out evaluators/bandai2_style.npz
+  python experiments/evaluator.py train --kind action --data data/bandai1.npz data/bandai2.npz --out evaluators/bandai_action.npz
+  python experiments/evaluator.py train --kind ball --data data/dribble.npz --out evaluators/dribble_ball.npz
+  python experiments/evaluator.py show evaluators/bandai2_style.npz
+  python experiments/camdm.py evaluate --run runs/camdm --evaluator evaluators/bandai2_style.npz
+"""  # noqa: E501
+
+import dataclasses
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from emdm_tasks import setup
+
+from jaxmotion.data import selection
+from jaxmotion.data.ball_clips import load_ball_clips
+from jaxmotion.learning import loop
+from jaxmotion.protocols import (
+    camdm_runs,
+    emdm_data,
+    evaluator_training,
+    evaluators,
+    smgdiff_data,
+)
+from jaxmotion.protocols.evaluators import Evaluator, Kind
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train a recogniser on the training part of clips, and write it to a file.
+
+    The defaults split clips as the systems' own `train` do, so that what a run held out
+    its evaluator never saw; give the options that the run was trained with.
+
+    Example: python experiments/evaluator.py train --kind style --data data/bandai2.npz --out evaluators/bandai2_style.npz
+
+    Attributes:
+      kind: "style" for camdm.py, "action" for emdm.py, "ball" for smgdiff.py.
+      data: Clips from prepare_data.py or dribble.py; one file, but for actions.
+      label: Field of the clips that is recognised; None for style, content or skill.
+      out: File to write.
+      contents: Contents of the clips to use (style); None for those of camdm.py, none:
+        all clips.
+      merge: Labels that name the same action as others, "old=new" (action); None for
+        those of emdm.py.
+      least: Fewest clips of an action (action); None for 10.
+      fps: Frames a second that clips are resampled to (action); None for 15.
+      frames: Frames that are judged at a time (action, ball); None for 60 or 45.
+      held_out: Part of the clips or recordings that accuracy is measured on, in (0, 1).
+      updates: Of the training; None for 1500, or 800 (ball).
+      overwrite: Replace the file if it exists.
+      seed: Of parameters, batches and windows.
+    """  # noqa: E501
+
+    kind: Kind = "style"
+    data: tuple[Path, ...] = (Path("data/bandai2.npz"),)
+    label: str | None = None
+    out: Path = Path("evaluators/bandai2_style.npz")
+    contents: tuple[str, ...] | None = None
+    merge: tuple[str, ...] | None = None
+    least: int | None = None
+    fps: float | None = None
+    frames: int | None = None
+    held_out: float = 0.1
+    updates: int | None = None
+    overwrite: bool = False
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Show:
+    """Print what an evaluator is.
+
+    Example: python experiments/evaluator.py show evaluators/bandai2_style.npz
+
+    Attributes:
+      file: Of `train`.
+    """
+
+    file: tyro.conf.Positional[Path]
+
+
+def one_file(args: Train) -> Path:
+    """The only file of clips."""
+    if len(args.data) != 1:
+        raise ValueError(
+            f"data has {len(args.data)} files, expected one for kind {args.kind!r}"
+        )
+    return args.data[0]
+
+
+def train_style(args: Train) -> Evaluator:
+    """Of windows of a label, for CAMDM."""
+    field = args.label or "style"
+    contents = camdm_runs.CONTENTS if args.contents is None else args.contents
+    train, held_out = camdm_runs.split_data(
+        one_file(args), contents, field, args.held_out
+    )
+    steps = args.updates or 1500
+    return evaluator_training.train_style(
+        train, held_out, field=field, num_steps=steps, seed=args.seed
+    )
+
+
+def train_action(args: Train) -> Evaluator:
+    """Of whole motions of an action, for EMDM."""
+    field = args.label or "content"
+    clips, left_out = emdm_data.prepare_clips(
+        args.data,
+        field=field,
+        merge=setup.merges(setup.MERGE if args.merge is None else args.merge),
+        least=10 if args.least is None else args.least,
+        fps=15.0 if args.fps is None else args.fps,
+    )
+    if left_out:
+        print(f"left out, too few clips: {', '.join(left_out)}")
+    parts = selection.split_clips(clips, fraction=args.held_out, seed=0, field=field)
+    frames = 60 if args.frames is None else args.frames
+    train, held_out = (
+        emdm_data.action_arrays(part, field=field, frames=frames) for part in parts
+    )
+    steps = args.updates or 1500
+    return evaluator_training.train_action(
+        train, held_out, field=field, num_steps=steps, seed=args.seed
+    )
+
+
+def train_ball(args: Train) -> Evaluator:
+    """Of skills with a ball, for SMGDiff."""
+    if args.label not in (None, smgdiff_data.FIELD):
+        raise ValueError(
+            f"label is {args.label!r}, expected {smgdiff_data.FIELD!r} for kind 'ball'"
+        )
+    data = load_ball_clips(one_file(args))
+    train, held_out = smgdiff_data.split(data, fraction=args.held_out)
+    return evaluator_training.train_ball(
+        train,
+        held_out,
+        frames=45 if args.frames is None else args.frames,
+        num_steps=args.updates or 800,
+        seed=args.seed,
+    )
+
+
+# What trains a kind, and the options that only some kinds have.
+KINDS: dict[str, tuple[Callable[[Train], Evaluator], tuple[str, ...]]] = {
+    "style": (train_style, ("contents",)),
+    "action": (train_action, ("merge", "least", "fps", "frames")),
+    "ball": (train_ball, ("frames",)),
+}
+
+
+def check(args: Train) -> None:
+    """Raises for what is wrong before any clip is read."""
+    _, own = KINDS[args.kind]
+    for _, options in KINDS.values():
+        for name in options:
+            if name not in own and getattr(args, name) is not None:
+                raise ValueError(f"option --{name} is not for kind {args.kind!r}")
+    for name, least in (("updates", 1), ("frames", 2), ("least", 1), ("fps", 1)):
+        value = getattr(args, name)
+        if value is not None and value < least:
+            raise ValueError(f"{name} is {value}, expected at least {least}")
+    if args.out.exists() and not args.overwrite:
+        raise FileExistsError(f"{args.out} exists; --overwrite replaces it")
+
+
+def train(args: Train) -> None:
+    """Writes the file, and says how well it recognises."""
+    check(args)
+    loop.check_writable(args.out.parent)
+    begun = time.perf_counter()
+    run, _ = KINDS[args.kind]
+    evaluator = run(args)
+    evaluators.save(args.out, evaluator)
+    megabytes = args.out.stat().st_size / 1e6
+    seconds = time.perf_counter() - begun
+    print(f"wrote {args.out}, {megabytes:.1f} MB, after {seconds:.0f} s")
+    show(Show(file=args.out))
+
+
+def show(args: Show) -> None:
+    """Prints the fields, the fingerprint first."""
+    value = evaluators.to_json(evaluators.load(args.file))
+    lines = {"fingerprint": value.pop("fingerprint"), "file": args.file} | value
+    lines["accuracy"] = f"{100 * value['accuracy']:.1f} % of held-out clips' windows"
+    for name, found in lines.items():
+        shown = ", ".join(found) if isinstance(found, list) else found
+        print(f"{name}: {shown}")
+
+
+Command = (
+    Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Show, tyro.conf.subcommand("show")]
+)
+
+
+def main() -> None:
+    """Parses the command line and runs the command."""
+    args = tyro.cli(Command, description=__doc__)
+    {Train: train, Show: show}[type(args)](args)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,1 @@
+"""The papers' tables and claims, and what this checkout measured of them."""

@@ -1,0 +1,244 @@
+"""The report as Markdown."""
+
+import math
+from collections.abc import Iterable
+
+from jaxmotion.evaluation.table import Cell
+from reports import verdicts
+from reports.claims import Absent, Claim, Column, Row, Source, Stated, Table
+from reports.results import Found, provenance
+
+ARROWS = {"lower": "↓", "higher": "↑", "real": "→"}
+# Command lines that leave a source behind.
+Commands = dict[Source, tuple[str, ...]]
+Decided = list[tuple[Table, Claim, verdicts.Decision]]
+
+
+def number(value: float) -> str:
+    """Three digits, or whole thousands.
+
+    Args:
+      value: Finite.
+
+    Returns:
+      The text.
+    """
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def stated(value: Stated) -> str:
+    """What the paper prints.
+
+    Args:
+      value: With or without the half width of its interval.
+
+    Returns:
+      The text.
+    """
+    if value is None:
+        return "–"
+    return f"{value[0]:g} ± {value[1]:g}" if isinstance(value, tuple) else f"{value:g}"
+
+
+def measured(cell: Cell, column: Column) -> str:
+    """A value with its interval and number of samples.
+
+    Args:
+      cell: The value.
+      column: Its column.
+
+    Returns:
+      The text.
+    """
+    if not math.isfinite(cell.value):
+        return f"not finite (n={cell.samples})"
+    if column.kind == "count":
+        return f"{number(cell.value)} of {cell.samples}"
+    text = number(cell.value)
+    if cell.low is not None and cell.high is not None:
+        text += f" [{number(cell.low)}, {number(cell.high)}]"
+    return f"{text} (n={cell.samples})"
+
+
+def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Lines of a Markdown table.
+
+    Args:
+      header: Of the columns.
+      rows: Of texts.
+
+    Returns:
+      The lines.
+    """
+
+    def line(cells: Iterable[str]) -> str:
+        safe = (cell.replace("|", "\\|").replace("\n", " ") for cell in cells)
+        return f"| {' | '.join(safe)} |"
+
+    header = list(header)
+    return [line(header), "|---" * len(header) + "|", *map(line, rows)]
+
+
+def why_not(table: Table, row: Row, found: Found) -> str:
+    """Why a row has no values.
+
+    Args:
+      table: The table.
+      row: Of it.
+      found: All that was measured.
+
+    Returns:
+      The reason; "" if the row was measured.
+    """
+    if row.here is None:
+        return f"not run: {row.reason}"
+    there = found.get(table.source_of(row))
+    if there is None or row.here not in there.rows:
+        return "not run"
+    return ""
+
+
+def _row(table: Table, row: Row, found: Found) -> list[str]:
+    missing, cells = why_not(table, row, found), []
+    for column, paper in zip(table.columns, row.paper, strict=True):
+        cell = verdicts.cell_of(table, row, column, found)
+        here = ("" if missing else "–") if cell is None else measured(cell, column)
+        cells.append("<br>".join(filter(None, [f"*{stated(paper)}*", here])))
+    name = f"**{row.name}**" + (f"<br>`{row.here}`" if row.here else "")
+    return [name + (f"<br>{missing}" if missing else ""), *cells]
+
+
+def _block(commands: tuple[str, ...]) -> list[str]:
+    return ["```bash", *commands, "```", ""]
+
+
+def _sources(table: Table, found: Found, commands: Commands) -> list[str]:
+    lines = []
+    sources = dict.fromkeys(
+        table.source_of(row) for row in table.rows if row.here is not None
+    )
+    for source in sources:
+        there = found.get(source)
+        rows = [r for r in table.rows if r.here and table.source_of(r) == source]
+        names = ", ".join(row.name for row in rows)
+        lacks = [r.name for r in rows if there is None or r.here not in there.rows]
+        if there is None:
+            lines += [
+                f"{names}: **not run**. To be made by",
+                "",
+                *_block(commands[source]),
+            ]
+            continue
+        lacking = f" **Not run** in it: {', '.join(lacks)}." if lacks else ""
+        lines += [f"{names}: `{there.path}`.{lacking} To be made by", ""]
+        lines += _block(commands[source])
+    return lines
+
+
+def _values(table: Table, claim: Claim, found: Found) -> tuple[str, str]:
+    """What the paper prints of a claim's rows, and what was measured."""
+    column, paper, here = table.column(claim.column), [], []
+    for name in claim.rows:
+        paper.append(f"{name} {stated(table.stated(name, claim.column))}")
+        cell = verdicts.cell_of(table, table.row(name), column, found)
+        if cell is not None:
+            here.append(f"{name} {measured(cell, column)}")
+    return "<br>".join(paper), "<br>".join(here) or "–"
+
+
+def _claims(table: Table, decided: Decided, found: Found) -> list[str]:
+    rows = []
+    for where, claim, decision in decided:
+        if where is table:
+            reason = f"<br>{decision.reason}" if decision.reason else ""
+            values = _values(table, claim, found)
+            rows.append(
+                [f"{claim.words} ({claim.where})", *values]
+                + [f"**{decision.verdict}**{reason}"]
+            )
+    return table_lines(("claim", "paper", "here", "verdict"), rows) if rows else []
+
+
+def section(
+    table: Table,
+    decided: Decided,
+    found: Found,
+    commands: Commands,
+    picture: str | None,
+) -> list[str]:
+    """Lines of one table: values, picture, sources and claims.
+
+    Args:
+      table: The table.
+      decided: All claims.
+      found: All that was measured.
+      commands: What makes each source.
+      picture: File name; None where nothing was measured.
+
+    Returns:
+      The lines.
+    """
+    header = [f"{x.name} {ARROWS[x.better]}" for x in table.columns]
+    notes = [f"{x.name}: {x.note}" for x in table.columns if x.note]
+    lines = [f"### {table.name}: {table.title}", "", table.note, ""]
+    lines += table_lines(
+        ("paper's row", *header), [_row(table, row, found) for row in table.rows]
+    )
+    lines += ["", "Here: " + "; ".join(notes) + ".", ""]
+    lines += _sources(table, found, commands)
+    if picture is not None:
+        lines += [f"![{table.name}]({picture})", ""]
+    return lines + [*_claims(table, decided, found), ""]
+
+
+def summary(decided: Decided) -> list[str]:
+    """Lines of all claims with their verdicts, counted.
+
+    Args:
+      decided: All claims.
+
+    Returns:
+      The lines.
+    """
+    found = [decision.verdict for _, _, decision in decided]
+    counts = [f"{found.count(name)} {name}" for name in verdicts.Verdict.__args__]
+    rows = [
+        [table.name, claim.words, f"**{decision.verdict}**"]
+        for table, claim, decision in decided
+    ]
+    head = f"{len(found)} claims: {', '.join(counts)}."
+    return [head, "", *table_lines(("table", "claim", "verdict"), rows), ""]
+
+
+def absent_lines(absent: Iterable[Absent]) -> list[str]:
+    """Lines of what cannot be run.
+
+    Args:
+      absent: All of it.
+
+    Returns:
+      The lines.
+    """
+    rows = [(x.paper, x.what, x.reason) for x in absent]
+    return [*table_lines(("paper", "what", "why not"), rows), ""]
+
+
+def source_lines(found: Found, judged: set[Source]) -> list[str]:
+    """Lines of where every file came from.
+
+    Args:
+      found: All that was measured.
+      judged: Sources with values of a recogniser.
+
+    Returns:
+      The lines.
+    """
+    lines = []
+    for source, there in found.items():
+        if there is None:
+            lines += [f"- {source.run}, {source.file}: not run"]
+            continue
+        lines += [f"- `{there.path}`"]
+        told = provenance(there, judged=source in judged)
+        lines += [f"  - {name}: {text}" for name, text in told.items()]
+    return [*lines, ""]

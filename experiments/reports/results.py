@@ -1,0 +1,169 @@
+"""Reads what evaluations left behind, and says what is damaged."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from jaxmotion.evaluation.table import Cell
+from reports.claims import Source
+
+NOT_RECORDED = "not recorded"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Measured:
+    """The rows of a file, and what the file says about them.
+
+    Attributes:
+      path: The file.
+      rows: Row names to column names to cells.
+      about: Everything else in the file.
+    """
+
+    path: Path
+    rows: dict[str, dict[str, Cell]]
+    about: dict[str, Any]
+
+    @property
+    def judge(self) -> tuple[str, str] | None:
+        """Fingerprints of the recogniser and of the clips that distances refer to."""
+        found = self.about.get("evaluator")
+        names = ("fingerprint", "reference_clips")
+        if not isinstance(found, dict) or not all(name in found for name in names):
+            return None
+        return tuple(str(found[name]) for name in names)
+
+
+# What each source's file holds; None where there is no file.
+Found = dict[Source, Measured | None]
+
+
+def _fail(path: Path, field: str, found: Any, expected: str) -> None:
+    shown = repr(found)
+    shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
+    raise ValueError(f"{path}: field {field!r} is {shown}, expected {expected}")
+
+
+def _object(path: Path, field: str, value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        _fail(path, field, value, "an object")
+    return value
+
+
+def _number(path: Path, field: str, value: Any) -> float | None:
+    """A number; None for null, as which tables write what is not finite."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        _fail(path, field, value, "a number or null")
+    return float(value)
+
+
+def _cell(path: Path, field: str, value: Any) -> Cell:
+    value = _object(path, field, value)
+    for name in ("value", "samples"):
+        if name not in value:
+            raise ValueError(f"{path}: field '{field}.{name}' is missing")
+    numbers = {
+        name: _number(path, f"{field}.{name}", value.get(name))
+        for name in ("value", "low", "high")
+    }
+    samples = value["samples"]
+    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 0:
+        _fail(path, f"{field}.samples", samples, "a number of samples")
+    if numbers["value"] is None:
+        return Cell(value=math.nan, samples=samples)
+    return Cell(**numbers, samples=samples)
+
+
+def read(path: Path) -> Measured | None:
+    """Reads the metrics.json of an evaluation, or the table.json of a sweep.
+
+    Args:
+      path: The file.
+
+    Returns:
+      What was measured; None if there is no such file.
+
+    Raises:
+      OSError: if the file cannot be read.
+      ValueError: if it is damaged; names the file and the field.
+    """
+    try:
+        text = path.read_text()
+    except FileNotFoundError:
+        return None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a text file: {error.reason}") from error
+    try:
+        whole = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(
+            f"{path}: not JSON, line {error.lineno} column {error.colno}: {error.msg}"
+        ) from error
+    about = dict(_object(path, "(whole file)", whole))
+    if "rows" not in about:
+        raise ValueError(f"{path}: field 'rows' is missing")
+    rows = {
+        row: {
+            column: _cell(path, f"rows.{row}.{column}", cell)
+            for column, cell in _object(path, f"rows.{row}", cells).items()
+        }
+        for row, cells in _object(path, "rows", about.pop("rows")).items()
+    }
+    return Measured(path=path, rows=rows, about=about)
+
+
+def _joined(about: dict[str, Any], names: tuple[str, ...]) -> str:
+    found = []
+    for name in names:
+        value = about.get(name)
+        if value is not None:
+            shown = ", ".join(value) if isinstance(value, list) else str(value)
+            found.append(f"{name} {shown}")
+    return "; ".join(found) or NOT_RECORDED
+
+
+def _data(about: dict[str, Any], evaluator: Any) -> str:
+    if "source" in about:
+        return str(about["source"])
+    run = about.get("run")
+    files = run.get("data", []) if isinstance(run, dict) else []
+    # Data and licence of whom the recogniser was trained on, where nothing else says.
+    told = evaluator.get("recognizer") if isinstance(evaluator, dict) else None
+    parts = [", ".join(str(x) for x in files), f"recogniser: {told}" if told else ""]
+    return "; ".join(filter(None, parts)) or NOT_RECORDED
+
+
+def _evaluator(evaluator: Any) -> str:
+    if not isinstance(evaluator, dict) or "fingerprint" not in evaluator:
+        return NOT_RECORDED
+    names = ("fingerprint", "origin", "reference_clips")
+    return _joined(evaluator, names).removeprefix("fingerprint ")
+
+
+def provenance(measured: Measured, *, judged: bool) -> dict[str, str]:
+    """What a file says about how its rows came about.
+
+    Args:
+      measured: Of the file.
+      judged: Whether a recogniser had a part in it.
+
+    Returns:
+      Texts by heading; "not recorded" for what it does not say.
+    """
+    about, evaluator = measured.about, measured.about.get("evaluator")
+    arguments = about.get("arguments")
+    seed = arguments.get("seed") if isinstance(arguments, dict) else None
+    seeds = about.get("seeds", seed)
+    return {
+        "data": _data(about, evaluator),
+        "seed": NOT_RECORDED if seeds is None else str(seeds),
+        "versions": _joined(about, ("python", "jax", "jaxlib", "flax", "numpy")),
+        "hardware": _joined(about, ("cpu", "machine", "cores", "devices")),
+        "git commit": str(about.get("git_commit") or NOT_RECORDED),
+        "evaluator": _evaluator(evaluator) if judged else "none needed",
+        "arguments": json.dumps(arguments) if arguments else NOT_RECORDED,
+    }

@@ -1,0 +1,226 @@
+"""Whether an ordering that a paper claims is seen in what was measured here."""
+
+import dataclasses
+import math
+from typing import Literal
+
+from jaxmotion.evaluation.table import Cell
+from reports.claims import Claim, Column, Row, Stated, Table
+from reports.results import Found
+
+Ends = tuple[float, float]
+Verdict = Literal["reproduced", "not reproduced", "not decided", "not run"]
+
+# In place of the interval of a time that has none.
+TIME_FACTOR = 1.25
+_QUANTILE = 1.96  # of the normal distribution, two-sided 95 %
+
+RULE = (
+    "A claim is a set of comparisons, each of two rows of one column. A comparison "
+    "holds if the intervals are apart in the claimed order, fails if they are apart in "
+    "the opposite one, and is undecided if they overlap. (That two intervals of 95 % "
+    "are apart asks for more than Welch's test at 5 % does.)",
+    "The claim is **reproduced** if all hold, **not reproduced** if one fails, **not "
+    "run** if a row was not measured and none fails, and else **not decided**.",
+    "Where the larger is claimed to be so many times the smaller, its interval must "
+    "begin above so many times the upper end of the smaller. The bar is ours, below "
+    "the paper's own ratio, since machines differ.",
+    "Nearness to recorded motion must come out alike for every value in the latter's "
+    "interval.",
+    "Intervals are those of the file, of 95 %. Counts have Wilson's. Times have what "
+    "their column says, and those without spread a factor of "
+    f"{TIME_FACTOR:g} either way; others without an interval decide nothing.",
+    "Rows of several files that a recogniser judged are compared only if the files "
+    "name the same recogniser and reference clips.",
+    "Intervals run over replications, clips or rollouts with one training of each "
+    "row: what another seed of training would change is not in them.",
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Decision:
+    """A verdict, and what it rests on.
+
+    Attributes:
+      verdict: The verdict.
+      reason: Comparisons that failed, were undecided or could not be made; or "".
+    """
+
+    verdict: Verdict
+    reason: str = ""
+
+
+def cell_of(table: Table, row: Row, column: Column, found: Found) -> Cell | None:
+    """What was measured, in the paper's unit.
+
+    Args:
+      table: The table.
+      row: Of it.
+      column: Of it.
+      found: All that was measured.
+
+    Returns:
+      The cell; None if it was not measured.
+    """
+    measured = found.get(table.source_of(row))
+    if measured is None or row.here is None:
+        return None
+    cell = measured.rows.get(row.here, {}).get(column.here)
+    if cell is None or column.scale == 1.0:
+        return cell
+    scaled = {
+        name: None if end is None else end * column.scale
+        for name, end in (("value", cell.value), ("low", cell.low), ("high", cell.high))
+    }
+    return dataclasses.replace(cell, **scaled)
+
+
+def _wilson(count: float, samples: int) -> Ends:
+    part, z2 = count / samples, _QUANTILE**2
+    middle = (part + z2 / (2 * samples)) / (1 + z2 / samples)
+    spread = part * (1 - part) / samples + z2 / (4 * samples**2)
+    half = _QUANTILE / (1 + z2 / samples) * math.sqrt(spread)
+    return samples * (middle - half), samples * (middle + half)
+
+
+def ends(cell: Cell, column: Column) -> Ends:
+    """Interval of a cell, for decisions.
+
+    Args:
+      cell: With a finite value.
+      column: Its column.
+
+    Returns:
+      Lower and upper end.
+    """
+    if column.kind == "count" and cell.samples:
+        return _wilson(cell.value, cell.samples)
+    if cell.low is not None and cell.high is not None:
+        return cell.low, cell.high
+    if column.kind == "time":
+        return cell.value / TIME_FACTOR, cell.value * TIME_FACTOR
+    # A single sample says nothing about its spread.
+    return -math.inf, math.inf
+
+
+def ordered(smaller: Ends, larger: Ends, factor: float = 1.0) -> bool | None:
+    """Whether one quantity is below another.
+
+    Args:
+      smaller: Interval of what is claimed to be the smaller.
+      larger: Of the larger.
+      factor: By which the larger is larger, at least.
+
+    Returns:
+      True or False if the intervals are apart; None if they overlap.
+    """
+    if factor * smaller[1] < larger[0]:
+        return True
+    return False if larger[1] < factor * smaller[0] else None
+
+
+def _distance(interval: Ends, point: float) -> Ends:
+    far = max(abs(end - point) for end in interval)
+    near = min(abs(end - point) for end in interval)
+    return (0.0 if interval[0] <= point <= interval[1] else near), far
+
+
+def nearer(near: Ends, far: Ends, target: Ends) -> bool | None:
+    """Whether one quantity is nearer to a third than another.
+
+    Args:
+      near: Interval of what is claimed to be the nearer.
+      far: Of the farther.
+      target: Of the third.
+
+    Returns:
+      True or False if it is so for every target; None otherwise.
+    """
+    # Distances are straight lines between these points.
+    low, high = target
+    points = {low, high} | {min(max(x, low), high) for x in (*near, *far)}
+    answers = {ordered(_distance(near, x), _distance(far, x)) for x in points}
+    return answers.pop() if len(answers) == 1 else None
+
+
+def compare(claim: Claim, intervals: dict[str, Ends]) -> dict[tuple[str, str], bool]:
+    """Makes the comparisons of a claim that can be made.
+
+    Args:
+      claim: The claim.
+      intervals: Of rows; those that are not known are missing.
+
+    Returns:
+      True, False or None for each pair of known rows.
+    """
+    answers = {}
+    for pair in claim.pairs:
+        names = (*pair, claim.towards) if claim.towards else pair
+        if not all(name in intervals for name in names):
+            continue
+        known = [intervals[name] for name in names]
+        answers[pair] = (
+            nearer(*known) if claim.towards else ordered(*known, claim.factor)
+        )
+    return answers
+
+
+def printed(value: Stated) -> float | None:
+    """The value alone of what a paper prints.
+
+    Args:
+      value: With or without the half width of its interval.
+
+    Returns:
+      The value; None if the paper prints none.
+    """
+    return value[0] if isinstance(value, tuple) else value
+
+
+def _judges_differ(table: Table, column: Column, rows: list[Row], found: Found) -> bool:
+    sources = {table.source_of(row) for row in rows}
+    if not column.judged or len(sources) <= 1:
+        return False
+    judges = {measured.judge for source in sources if (measured := found.get(source))}
+    return len(judges) > 1 or None in judges
+
+
+def decide(table: Table, claim: Claim, found: Found) -> Decision:
+    """Decides a claim.
+
+    Args:
+      table: The claim's table.
+      claim: The claim.
+      found: All that was measured.
+
+    Returns:
+      The decision.
+    """
+    column = table.column(claim.column)
+    rows = [table.row(name) for name in claim.rows]
+    cells = {row.name: cell_of(table, row, column, found) for row in rows}
+    absent = [name for name, cell in cells.items() if cell is None]
+    present = {name: cell for name, cell in cells.items() if cell is not None}
+    if _judges_differ(table, column, [table.row(name) for name in present], found):
+        reason = "rows were judged by different or unrecorded evaluators"
+        return Decision(verdict="not decided", reason=reason)
+    finite = {
+        name: ends(cell, column)
+        for name, cell in present.items()
+        if math.isfinite(cell.value)
+    }
+    answers = compare(claim, finite)
+    failed = [pair for pair, answer in answers.items() if answer is False]
+    if failed:
+        return Decision(verdict="not reproduced", reason=f"fails: {_pairs(failed)}")
+    if absent:
+        return Decision(verdict="not run", reason=f"not measured: {', '.join(absent)}")
+    open_pairs = [pair for pair in claim.pairs if answers.get(pair) is None]
+    if open_pairs:
+        reason = f"intervals overlap or are missing: {_pairs(open_pairs)}"
+        return Decision(verdict="not decided", reason=reason)
+    return Decision(verdict="reproduced")
+
+
+def _pairs(pairs: list[tuple[str, str]]) -> str:
+    return "; ".join(f"{first} and {second}" for first, second in pairs)

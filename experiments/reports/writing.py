@@ -1,0 +1,225 @@
+"""Writes report.md, report.json and a picture of each table."""
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxmotion.evaluation.table import Cell
+from jaxmotion.viz import dots
+from reports import aamdm, camdm, emdm_appendix, markdown, smgdiff, verdicts
+from reports.claims import Column, Stated, Table
+from reports.results import Found, provenance
+
+PAPERS = {
+    "CAMDM": (camdm, "Chen et al., SIGGRAPH 2024"),
+    "AAMDM": (aamdm, "Li et al., CVPR 2024, arXiv:2401.06146"),
+    "EMDM": (emdm_appendix, "Zhou et al., ECCV 2024, arXiv:2312.02256"),
+    "SMGDiff": (smgdiff, "Yang et al., 2024, arXiv:2411.16216"),
+}
+TABLES = tuple(table for module, _ in PAPERS.values() for table in module.TABLES)
+ABSENT = tuple(what for module, _ in PAPERS.values() for what in module.ABSENT)
+# Every file that a table needs, in the tables' order.
+SOURCES = tuple(
+    dict.fromkeys(table.source_of(row) for table in TABLES for row in table.rows)
+)
+# Those with values of a recogniser.
+JUDGED = {
+    table.source_of(row)
+    for table in TABLES
+    for row in table.rows
+    if any(column.judged for column in table.columns)
+}
+
+
+def _ends(cell: Cell | None, column: Column) -> tuple[float, float, float]:
+    if cell is None:
+        return (math.nan,) * 3
+    if column.kind == "count":
+        return cell.value, *verdicts.ends(cell, column)
+    return cell.value, *(math.nan if x is None else x for x in (cell.low, cell.high))
+
+
+def _printed(value: Stated) -> tuple[float, float, float]:
+    if isinstance(value, tuple):
+        return value[0], value[0] - value[1], value[0] + value[1]
+    return (math.nan if value is None else value), math.nan, math.nan
+
+
+def draw(path: Path, table: Table, found: Found) -> None:
+    """Draws a table's values beside the paper's.
+
+    Args:
+      path: The picture.
+      table: The table.
+      found: All that was measured.
+    """
+    panels = []
+    for place, column in enumerate(table.columns):
+        cells = (verdicts.cell_of(table, row, column, found) for row in table.rows)
+        target = 0 if column.better == "real" else None
+        panels.append(
+            dots.Panel(
+                title=f"{column.name} {markdown.ARROWS[column.better]}",
+                left=np.array([_printed(row.paper[place]) for row in table.rows]),
+                right=np.array([_ends(cell, column) for cell in cells]),
+                target=target,
+            )
+        )
+    names = tuple(row.name.removesuffix(" (not in the paper)") for row in table.rows)
+    title = f"{table.name}: {table.title}"
+    dots.write_dots(
+        path,
+        names,
+        tuple(panels),
+        sources=("paper", "here"),
+        absent=("not given", "not measured"),
+        title=title,
+    )
+
+
+def picture_of(table: Table) -> str:
+    """File name of a table's picture.
+
+    Args:
+      table: The table.
+
+    Returns:
+      The name.
+    """
+    return re.sub(r"[^a-z0-9]+", "_", table.name.lower()).strip("_") + ".png"
+
+
+def _table_json(table: Table, found: Found) -> dict[str, Any]:
+    def cell(row: Any, column: Column) -> dict[str, Any]:
+        stated = table.stated(row.name, column.name)
+        here = verdicts.cell_of(table, row, column, found)
+        finite = here is not None and math.isfinite(here.value)
+        return {
+            "paper": verdicts.printed(stated),
+            "paper half width": stated[1] if isinstance(stated, tuple) else None,
+            "here": None
+            if here is None
+            else {
+                "value": here.value if finite else None,
+                "low": here.low,
+                "high": here.high,
+                "samples": here.samples,
+            },
+        }
+
+    return {
+        "paper": table.paper,
+        "table": table.number,
+        "title": table.title,
+        "note": table.note,
+        "rows": {
+            row.name: {
+                "here": row.here,
+                "file": (source := table.source_of(row)).file,
+                "run": source.run,
+                "why not": markdown.why_not(table, row, found) or None,
+                "cells": {x.name: cell(row, x) for x in table.columns},
+            }
+            for row in table.rows
+        },
+    }
+
+
+def _json(
+    decided: markdown.Decided, found: Found, commands: markdown.Commands, made: Any
+) -> dict[str, Any]:
+    return {
+        "written with": made,
+        "rule": verdicts.RULE,
+        "claims": [
+            {
+                "table": table.name,
+                "claim": claim.words,
+                "where": claim.where,
+                "column": claim.column,
+                "pairs": claim.pairs,
+                "factor": claim.factor,
+                "towards": claim.towards,
+                "verdict": decision.verdict,
+                "reason": decision.reason,
+            }
+            for table, claim, decision in decided
+        ],
+        "tables": [_table_json(table, found) for table in TABLES],
+        "cannot be run": [vars(what) for what in ABSENT],
+        "sources": [
+            {"run": source.run, "file": source.file, "command": commands[source]}
+            | {"found": None if there is None else str(there.path)}
+            | ({} if there is None else provenance(there, judged=source in JUDGED))
+            for source, there in found.items()
+        ],
+    }
+
+
+def _lines(
+    decided: markdown.Decided,
+    found: Found,
+    commands: markdown.Commands,
+    pictures: dict[str, str],
+    made: Any,
+) -> list[str]:
+    lines = ["# The papers' tables, and what is measured here", ""]
+    lines += [
+        "In tables the paper's value stands above in italics, and below it what was "
+        "measured here, with its interval and number of samples. Columns are to be "
+        "lower ↓, higher ↑, or near recorded motion →.",
+        "",
+        "How claims are decided:",
+        "",
+        *(f"- {sentence}" for sentence in verdicts.RULE),
+        "",
+        "## Claims",
+        "",
+        *markdown.summary(decided),
+    ]
+    for name, (module, reference) in PAPERS.items():
+        lines += [f"## {name}", "", f"{reference}.", ""]
+        for table in module.TABLES:
+            picture = pictures.get(table.name)
+            lines += markdown.section(table, decided, found, commands, picture)
+    lines += ["## What cannot be run here", "", *markdown.absent_lines(ABSENT)]
+    lines += ["## Where the values come from", ""]
+    lines += markdown.source_lines(found, JUDGED)
+    shown = "; ".join(f"{name} {text}" for name, text in made.items())
+    return [*lines, f"This report was written with: {shown}."]
+
+
+def write(
+    out: Path, found: Found, commands: markdown.Commands, made: dict[str, Any]
+) -> markdown.Decided:
+    """Decides all claims and writes the report.
+
+    Args:
+      out: Folder; it must exist.
+      found: All that was measured.
+      commands: What makes each source.
+      made: Versions, commit and date of this report.
+
+    Returns:
+      Tables, claims and decisions.
+    """
+    decided = [
+        (table, claim, verdicts.decide(table, claim, found))
+        for table in TABLES
+        for claim in table.claims
+    ]
+    pictures = {}
+    for table in TABLES:
+        measured = any(not markdown.why_not(table, row, found) for row in table.rows)
+        if measured:
+            pictures[table.name] = picture_of(table)
+            draw(out / pictures[table.name], table, found)
+    whole = _json(decided, found, commands, made)
+    (out / "report.json").write_text(json.dumps(whole, indent=1))
+    lines = _lines(decided, found, commands, pictures, made)
+    (out / "report.md").write_text("\n".join(lines) + "\n")
+    return decided

@@ -1,0 +1,116 @@
+"""Quality against time for several numbers of steps, for any of the four systems.
+
+Trains a model for each number of steps with the same budget, seed and data (or loads
+those that the folder has), evaluates all with the same noise, commands and samples, and
+writes table.md, table.csv, table.json, pareto.png and a rollout of each.
+
+Examples:
+  python experiments/step_sweep.py --system camdm --steps 2 4 8 16 32 --budget quick
+  python experiments/step_sweep.py --system smgdiff --steps 2 4 8 16 32
+  python experiments/step_sweep.py --system emdm --steps 1 2 5 10 20
+  python experiments/step_sweep.py --system aamdm --steps 0+3 1+3 2+3 10+3 2+10
+  python experiments/step_sweep.py --system camdm --change updates=3000 width=192
+"""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import tyro
+from sweeps import aamdm, budgets, camdm, emdm, run, smgdiff
+from sweeps.system import Job
+
+from jaxmotion.learning import loop
+from jaxmotion.protocols.camdm_runs import arguments_json
+
+SYSTEMS = {
+    "camdm": camdm.SYSTEM,
+    "aamdm": aamdm.SYSTEM,
+    "emdm": emdm.SYSTEM,
+    "smgdiff": smgdiff.SYSTEM,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """Sweep over numbers of steps.
+
+    Attributes:
+      system: camdm, aamdm, emdm or smgdiff.
+      steps: Numbers of steps T: of the motion model (camdm, smgdiff), of the GAN
+        (emdm), polish steps (aamdm; or polish and draft steps as in 2+3).
+      drafts: Draft steps of aamdm, where polish steps alone are given.
+      budget: quick (half an hour of two cores for five numbers of steps, training
+        included) or full; the numbers are listed above.
+      change: Numbers of the budget to change, as in updates=3000.
+      data: Clips from prepare_data.py or dribble.py; none: data/bandai2.npz (camdm),
+        data/lafan1.npz (aamdm), data/bandai1.npz and bandai2.npz (emdm),
+        data/dribble.npz (smgdiff).
+      out: Folder of the results; None for runs/sweep_<system>.
+      models: Folder of the models; None for <out>/models. A model that is there is
+        not trained again; one of another budget, seed or data is refused.
+      replications: Sets of samples of each model, each with noise of its own;
+        intervals run over these.
+      seed: Of parameters, batches, poses, noise and evaluators.
+    """
+
+    system: str
+    steps: tuple[str, ...] = ("2", "4", "8", "16", "32")
+    drafts: int = 3
+    budget: str = "quick"
+    change: tuple[str, ...] = ()
+    data: tuple[Path, ...] = ()
+    out: Path | None = None
+    models: Path | None = None
+    replications: int = 20
+    seed: int = 0
+
+
+def make_job(args: Sweep) -> tuple[Job, Path]:
+    """The sweep that the arguments describe, and the folder of its results.
+
+    Args:
+      args: Of the command line.
+
+    Returns:
+      Both.
+
+    Raises:
+      ValueError: names the field that is wrong.
+    """
+    if args.system not in SYSTEMS:
+        raise ValueError(
+            f"system: unknown system {args.system!r}, expected one of "
+            f"{', '.join(SYSTEMS)}"
+        )
+    system = SYSTEMS[args.system]
+    out = args.out or Path(f"runs/sweep_{args.system}")
+    job = Job(
+        points=system.points(args.steps, drafts=args.drafts),
+        data=args.data or system.data,
+        models=args.models or out / "models",
+        budget=budgets.resolve(system.amounts, args.budget, args.change),
+        replications=args.replications,
+        seed=args.seed,
+    )
+    return job, out
+
+
+def main() -> None:
+    """Parses the command line and runs the sweep."""
+    numbers = [budgets.describe(name, x.amounts) for name, x in SYSTEMS.items()]
+    args = tyro.cli(Sweep, description="\n\n".join([__doc__, *numbers]))
+    job, out = make_job(args)
+    shown = arguments_json(args) | {
+        "data": [str(file) for file in job.data],
+        "out": str(out),
+        "models": str(job.models),
+    }
+    run.sweep(args.system, SYSTEMS[args.system], job, out, shown)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (OSError, ValueError, loop.TrainingDiverged) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,1 @@
+"""Parts of experiments/step_sweep.py: what all systems share, and a module a system."""

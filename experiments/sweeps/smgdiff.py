@@ -1,0 +1,164 @@
+"""Step counts T of SMGDiff's motion model, without contact guidance."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import smgdiff as script
+from jaxtyping import Array
+
+from jaxmotion.protocols import (
+    cells,
+    evaluators,
+    smgdiff_data,
+    smgdiff_evaluation,
+    smgdiff_runs,
+)
+from jaxmotion.systems import smgdiff_guidance
+from jaxmotion.systems.smgdiff_guidance import UNGUIDED, Plan
+from sweeps import points
+from sweeps.budgets import Amount
+from sweeps.points import Point
+from sweeps.system import GROUND_TRUTH, NOISE_FLOOR, Bench, Job, Row, System
+
+AMOUNTS = {
+    "updates": Amount(
+        quick=500, full=3000, meaning="updates of each motion model, a multiple of 100"
+    ),
+    "draft_updates": Amount(
+        quick=400,
+        full=3500,
+        meaning="updates before these in which displacements hardly count, a multiple "
+        "of 100",
+    ),
+    "batch": Amount(quick=48, full=48, meaning="windows an update"),
+    "width": Amount(quick=128, full=192, meaning="channels of a token"),
+    "depth": Amount(quick=4, full=4, meaning="layers"),
+    "held_out": Amount(
+        quick=0.1, full=0.1, meaning="part of the recordings kept for evaluation"
+    ),
+    "windows": Amount(
+        quick=160,
+        full=600,
+        meaning="held-out windows, at most; a replication plans for half of them",
+        training=False,
+    ),
+    "recognizer_updates": Amount(
+        quick=300, full=800, meaning="updates of the skill recogniser", training=False
+    ),
+    "chunk": Amount(quick=4, full=4, meaning="plans to make at a time", training=False),
+    "rollout_seconds": Amount(
+        quick=8.0,
+        full=20.0,
+        meaning="length of the rollout that is written to look at",
+        training=False,
+    ),
+}
+
+
+def _stage(point: Point) -> str:
+    return f"motion_{point.steps}"
+
+
+def trainer(job: Job) -> Callable[[Point], None]:
+    """Trains with `experiments/smgdiff.py`, all in one run folder."""
+    budget = job.budget
+
+    def train(point: Point) -> None:
+        script.train(
+            script.Train(
+                data=job.data[0],
+                out=job.models,
+                stages=(_stage(point),),
+                width=budget["width"],
+                depth=budget["depth"],
+                held_out=budget["held_out"],
+                steps=budget["updates"],
+                draft_steps=budget["draft_updates"],
+                batch=budget["batch"],
+                seed=job.seed,
+            )
+        )
+
+    return train
+
+
+def bench(job: Job) -> Bench:
+    """The evaluation of the paper's table 3."""
+    run, budget = smgdiff_runs.load_run(job.models), job.budget
+    setting = smgdiff_evaluation.make_setting(
+        run.train,
+        run.held_out,
+        run.model,
+        number=budget["windows"],
+        replications=job.replications,
+        recognizer_steps=budget["recognizer_updates"],
+        seed=job.seed,
+    )
+    ground_truth, noise_floor = script.tables.real_rows(run, setting).values()
+    condition = jax.tree.map(lambda x: x[0], setting.known.condition)
+
+    def planner(point: Point) -> Plan:
+        model, params = smgdiff_runs.load_stage(run, _stage(point))
+        return smgdiff_guidance.planner(
+            params,
+            config=model.config,
+            representation=model.representation,
+            guided=UNGUIDED,
+        )
+
+    def score(point: Point) -> Row:
+        many = smgdiff_evaluation.plan_many(
+            planner(point), run.model, chunk=budget["chunk"]
+        )
+        found = cells.row(smgdiff_evaluation.score_plans(setting, many))
+        return {column: found[column] for column in ground_truth}
+
+    def sampler(point: Point) -> Callable[[Array], Array]:
+        plan = planner(point)
+        return jax.jit(lambda key: plan(key, condition))
+
+    def rollout(point: Point, folder: Path) -> None:
+        script.rollout(
+            script.Rollout(
+                run=job.models,
+                seconds=budget["rollout_seconds"],
+                paths="straight",
+                steps=point.steps,
+                schedule="none",
+                out=folder,
+                seed=job.seed,
+            )
+        )
+
+    windows = int(setting.known.label.shape[0])
+    return Bench(
+        real={GROUND_TRUTH: ground_truth, NOISE_FLOOR: noise_floor},
+        score=score,
+        sampler=sampler,
+        rollout=rollout,
+        describe={
+            "source": run.model.source,
+            "samples": f"plans for {windows // 2} of {windows} held-out windows along "
+            f"the path that was walked; Fréchet distances to {2 * windows} training "
+            "windows",
+            "windows": windows,
+            "recognizer": f"skills, {budget['recognizer_updates']} updates, seed "
+            f"{job.seed}",
+            "evaluator": evaluators.describe(
+                setting.judge.params,
+                reference=evaluators.clips_fingerprint(run.train, smgdiff_data.FIELD),
+            ),
+        },
+    )
+
+
+SYSTEM = System(
+    data=(Path("data/dribble.npz"),),
+    amounts=AMOUNTS,
+    points=lambda texts, drafts: points.plain(texts),
+    trainer=trainer,
+    bench=bench,
+    quality="FID",
+    sample="one plan of 45 frames",
+)

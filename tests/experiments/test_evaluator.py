@@ -1,0 +1,250 @@
+"""experiments/evaluator.py: frozen evaluators, and their use by the three systems."""
+
+import dataclasses
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxmotion.data import clips_io
+from jaxmotion.data.ball_clips import save_ball_clips
+from jaxmotion.learning import action_recognition, recognition
+from jaxmotion.learning.fingerprint import fingerprint
+from jaxmotion.protocols import evaluators
+from tests import ball_walker, tiny
+
+ROOT = Path(__file__).parents[2]
+FIELDS = ("fingerprint", "kind", "labels", "joints", "fps", "frames", "accuracy")
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+
+@pytest.fixture(scope="module")
+def call():
+    """Runs a script's command line in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "experiments"))
+
+        def run(script, line):
+            path = ROOT / "experiments" / f"{script}.py"
+            spec = importlib.util.spec_from_file_location(f"{script}_script", path)
+            module = importlib.util.module_from_spec(spec)
+            patch.setitem(sys.modules, f"{script}_script", module)
+            spec.loader.exec_module(module)
+            patch.setattr(sys, "argv", [str(path), *line.split()])
+            module.main()
+
+        yield run
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Files of clips: of two styles, and of a ball at hand or far away."""
+    folder = tmp_path_factory.mktemp("data")
+    clips_io.save_clips(folder / "clips.npz", tiny.clips(130))
+    save_ball_clips(folder / "ball.npz", ball_walker.clips(60))
+    return folder
+
+
+# What `train` needs for the tiny clips of each kind.
+TRAIN = {
+    "style": "--data {data}/clips.npz --held-out 0.5",
+    "action": "--data {data}/clips.npz --held-out 0.5 --label style --merge --least 1 "
+    "--frames 8 --fps 30",
+    "ball": "--data {data}/ball.npz --held-out 0.3 --frames 12",
+}
+
+
+@pytest.fixture
+def frozen(call, data, tmp_path):
+    """Trains an evaluator of a kind by two updates; returns its file."""
+
+    def train(kind):
+        path = tmp_path / "new" / f"{kind}.npz"
+        options = TRAIN[kind].format(data=data)
+        call("evaluator", f"train --kind {kind} {options} --updates 2 --out {path}")
+        return path
+
+    return train
+
+
+def shown(text):
+    """Fields that `show` printed."""
+    return dict(re.findall(r"^([\w ]+): (.*)$", text, re.MULTILINE))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "action",
+        pytest.param("style", marks=pytest.mark.slow),
+        pytest.param("ball", marks=pytest.mark.slow),
+    ],
+)
+def test_training_writes_a_file_and_prints_its_fingerprint(call, frozen, capsys, kind):
+    path = frozen(kind)
+    trained = shown(capsys.readouterr().out)
+    assert set(FIELDS) <= set(trained)
+    assert trained["fingerprint"] == fingerprint(evaluators.load(path).params)
+    assert re.fullmatch(r"[\d.]+ % of held-out .*", trained["accuracy"])
+    labels = {"ball": "dribble, off_ball"}.get(kind, "calm, brisk")
+    assert trained["labels"] == labels and trained["joints"].startswith("Hips, ")
+    assert (trained["kind"], trained["updates"]) == (kind, "2")
+    call("evaluator", f"show {path}")
+    assert shown(capsys.readouterr().out) == trained
+
+
+BAD = {
+    "train --data {gone} --out {new}": "gone.npz",
+    "train --data {clips} --out {new} --label mood": "field 'mood'",
+    "train --data {clips} {clips} --out {new}": "data has 2 files, expected one",
+    "train --data {clips} --out {new} --frames 30": "--frames is not for kind 'style'",
+    "train --data {clips} --out {new} --held-out 1.5": "between 0 and 1",
+    "train --data {clips} --out {new} --updates 0": "updates is 0, expected at least 1",
+    "train --data {clips} --out {clips}": "clips.npz exists; --overwrite",
+    "train --data {clips} --out {clips}/below/e.npz": "below",
+    "train --kind action --data {clips} --out {new}": "content",
+    "train --kind action --data {clips} --out {new} --label style --merge calm": (
+        "expected old=new"
+    ),
+    "train --kind action --data {clips} --out {new} --contents walk": "--contents",
+    "train --kind ball --data {clips} --out {new}": "ball",
+    "train --kind ball --data {ball} --out {new} --label style": "expected 'skill'",
+    "show {gone}": "gone.npz",
+    "show {clips}": "clips.npz: not an export",
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_bad_input_is_one_clear_error(call, data, tmp_path, line):
+    places = dict(
+        clips=data / "clips.npz",
+        ball=data / "ball.npz",
+        gone=tmp_path / "gone.npz",
+        new=tmp_path / "new.npz",
+    )
+    with pytest.raises((OSError, ValueError), match=BAD[line]):
+        call("evaluator", line.format(**places))
+    assert not (tmp_path / "new.npz").exists()
+
+
+def test_from_a_shell_there_is_help_and_an_error_is_one_line(tmp_path):
+    def run(line):
+        command = [sys.executable, str(ROOT / "experiments" / "evaluator.py")]
+        return subprocess.run([*command, *line.split()], capture_output=True, text=True)
+
+    done = run("train --help")
+    text = re.sub(r"[│\s]+", " ", done.stdout)
+    assert done.returncode == 0
+    for word in ("Example:", "(default: 0.1)", "--kind", "--overwrite", "or 800"):
+        assert word in text
+    done = run(f"show {tmp_path}/gone.npz")
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
+# --- use ---------------------------------------------------------------------------
+
+
+def judge(path, kind, clips, field, frames):
+    """An evaluator that was not trained, for a run of these clips."""
+    made = evaluators.Evaluator(
+        kind=kind,
+        params={},
+        field=field,
+        labels=clips.names(field),
+        joints=clips.skeleton.names,
+        fps=clips.fps,
+        frames=frames,
+        source="tests",
+        clips="0" * 12,
+        seed=0,
+        updates=0,
+        accuracy=0.5,
+    )
+    init = recognition.init_recognizer
+    if kind == "action":
+        init = action_recognition.init_action_recognizer
+    made = dataclasses.replace(made, params=tiny.random_params(init, made.config))
+    evaluators.save(path, made)
+    return made
+
+
+def check_same(folders, made, path):
+    """Both evaluations used it, say so, and have the same numbers but for times."""
+    reports = [json.loads((x / "metrics.json").read_text()) for x in folders]
+    name = fingerprint(made.params)
+    for folder, report in zip(folders, reports, strict=True):
+        assert report["evaluator"]["fingerprint"] == name
+        assert report["evaluator"]["origin"] == path.name
+        assert report["arguments"]["evaluator"] == str(path)
+        notes = (folder / "table.md").read_text().splitlines()[-1]
+        assert notes.startswith(f"Recogniser {name} ({path.name})")
+    first, second = (report["rows"] for report in reports)
+    for row in first:
+        for column, cell in first[row].items():
+            if not column.startswith("ms "):
+                assert second[row][column] == cell, (row, column)
+
+
+@pytest.mark.slow
+def test_camdm_is_judged_alike_twice(call, tmp_path):
+    clips = tiny.clips(130)
+    clips_io.save_clips(tmp_path / "clips.npz", clips)
+    run, path = tmp_path / "run", tmp_path / "style.npz"
+    call(
+        "camdm",
+        f"train --data {tmp_path}/clips.npz --out {run} --width 16 --depth 1 "
+        "--batch 4 --diffusion-steps 2 --held-out 0.5 --warmup 1 --chunk 1 --steps 2",
+    )
+    made = judge(path, "style", clips, "style", 60)
+    line = f"evaluate --run {run} --rollouts 2 --seconds 4 --chunk 2"
+    for name in ("a", "b"):
+        call("camdm", f"{line} --evaluator {path} --out {tmp_path / name}")
+    check_same([tmp_path / "a", tmp_path / "b"], made, path)
+    call("camdm", f"{line} --recognizer-steps 2 --out {tmp_path / 'here'}")
+    assert "(trained here)" in (tmp_path / "here" / "table.md").read_text()
+
+
+@pytest.mark.slow
+def test_smgdiff_is_judged_alike_twice(call, data, tmp_path):
+    run, path = tmp_path / "run", tmp_path / "ball.npz"
+    call(
+        "smgdiff",
+        f"train --data {data}/ball.npz --out {run} --width 16 --depth 1 --steps 100 "
+        "--draft-steps 100 --batch 4 --held-out 0.3 --stages motion_2",
+    )
+    made = judge(path, "ball", ball_walker.clips(60).clips, "skill", 45)
+    line = f"evaluate --run {run} --tables steps --steps 2 --windows 8 --replications 2"
+    for name in ("a", "b"):
+        call("smgdiff", f"{line} --evaluator {path} --out {tmp_path / name}")
+    check_same([tmp_path / name / "steps" for name in "ab"], made, path)
+    wrong = tmp_path / "wrong.npz"
+    judge(wrong, "ball", ball_walker.clips(60).clips, "skill", 12)
+    with pytest.raises(ValueError, match="wrong.npz.*field 'frames' is 12, expected"):
+        call("smgdiff", f"{line} --evaluator {wrong}")
+
+
+@pytest.mark.slow
+def test_emdm_is_judged_alike_twice(call, data, tmp_path):
+    run, path = tmp_path / "run", tmp_path / "action.npz"
+    call(
+        "emdm",
+        f"train --data {data}/clips.npz --out {run} --field style --least 1 --fps 30 "
+        "--frames 20 --held-out 0.5 --steps 100 --batch 8 --width 16 --hidden 16 "
+        "--depth 1 --discriminator-width 64 --merge",
+    )
+    made = judge(path, "action", tiny.clips(130), "style", 20)
+    line = f"evaluate --run {run} --samples 20 --replications 2"
+    for name in ("a", "b"):
+        call("emdm", f"{line} --evaluator {path} --out {tmp_path / name}")
+    check_same([tmp_path / "a", tmp_path / "b"], made, path)
+    assert not (run / "recognizer").exists()
+    report = json.loads((tmp_path / "a" / "metrics.json").read_text())
+    assert "trained on tests, 0 updates" in report["evaluator"]["recognizer"]
+    assert np.isfinite(report["rows"]["emdm"]["FID"]["value"])

@@ -1,0 +1,330 @@
+"""experiments/report.py: claims decided each way, what is missing, what is damaged."""
+
+import dataclasses
+import importlib
+import json
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxmotion.evaluation.table import Cell
+
+SCRIPT = Path(__file__).parents[2] / "experiments" / "report.py"
+
+
+@pytest.fixture(scope="module")
+def load():
+    """Imports modules as the script finds them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(SCRIPT.parent))
+        yield importlib.import_module
+
+
+@pytest.fixture
+def call(load, monkeypatch):
+    """Runs a command line in this process."""
+    module = load("report")
+
+    def run(line):
+        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *line.split()])
+        module.main()
+
+    return run
+
+
+def cell(value, low=None, high=None, samples=20):
+    return dict(value=value, low=low, high=high, samples=samples)
+
+
+def near(value, spread=0.1):
+    return cell(value, value - spread, value + spread)
+
+
+def put(path, rows, **about):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(about | {"rows": rows}))
+    return path
+
+
+# --- the papers' data ---------------------------------------------------------------
+
+
+def all_claims(load):
+    tables = load("reports.writing").TABLES
+    return [(table, claim) for table in tables for claim in table.claims]
+
+
+def test_tables_are_complete(load):
+    writing = load("reports.writing")
+    names = [table.name for table in writing.TABLES]
+    assert len(set(names)) == len(names)
+    for table in writing.TABLES:
+        for part in (table.rows, table.columns):
+            assert len({x.name for x in part}) == len(part), table.name
+        for row in table.rows:
+            assert len(row.paper) == len(table.columns), (table.name, row.name)
+            assert (row.here is not None) or row.reason, (table.name, row.name)
+
+
+def test_claims_speak_of_what_can_be_run(load):
+    for table, claim in all_claims(load):
+        assert claim.pairs and claim.where
+        table.column(claim.column)
+        for name in claim.rows:
+            assert table.row(name).here, (table.name, claim.words)
+
+
+def test_every_claim_holds_for_what_the_paper_prints(load):
+    verdicts, made = load("reports.verdicts"), 0
+    for table, claim in all_claims(load):
+        printed = {
+            name: verdicts.printed(table.stated(name, claim.column))
+            for name in claim.rows
+        }
+        points = {k: (v, v) for k, v in printed.items() if v is not None}
+        answers = verdicts.compare(claim, points)
+        assert all(answers.values()), (table.name, claim.words)
+        made += len(answers)
+    assert made > 100
+
+
+def test_every_source_has_an_option_and_its_command_its_folder(load):
+    options = {x.name for x in dataclasses.fields(load("report").Report)}
+    for source in load("reports.writing").SOURCES:
+        assert source.run in options
+        assert any("{run}" in command for command in source.commands)
+
+
+# --- decisions ----------------------------------------------------------------------
+
+
+def test_intervals_decide_only_when_apart(load):
+    ordered = load("reports.verdicts").ordered
+    assert ordered((1.0, 2.0), (2.1, 3.0)) is True
+    assert ordered((2.1, 3.0), (1.0, 2.0)) is False
+    assert ordered((1.0, 2.0), (1.9, 3.0)) is None
+    assert ordered((1.0, 2.0), (9.0, 11.0), 4.0) is True
+    assert ordered((1.0, 2.0), (9.0, 11.0), 5.0) is None
+    assert ordered((1.0, 2.0), (9.0, 11.0), 12.0) is False
+
+
+def test_nearness_agrees_with_all_values_of_the_intervals(load):
+    nearer, generator = load("reports.verdicts").nearer, np.random.default_rng(0)
+    seen = []
+    for _ in range(400):
+        near, far, target = np.sort(generator.uniform(0, 10, (3, 2)), axis=1)
+        near[1], far[1] = near[0] + 0.3, far[0] + 0.3
+        target[1] = target[0] + generator.uniform(0.1, 3.0)
+        grid = [np.linspace(*x, 41) for x in (near, far, target)]
+        a, b = (np.abs(x[:, None] - grid[2]) for x in grid[:2])
+        expected = None
+        if (a.max(axis=0) < b.min(axis=0)).all():
+            expected = True
+        elif (b.max(axis=0) < a.min(axis=0)).all():
+            expected = False
+        found = nearer(tuple(near), tuple(far), tuple(target))
+        # On the grid's edge the two may differ by a grid step.
+        margin = np.abs([*(a.max(0) - b.min(0)), *(b.max(0) - a.min(0))]).min()
+        assert found is expected or margin < 0.1
+        seen.append(found)
+    assert all(seen.count(x) > 20 for x in (True, False, None))
+
+
+@pytest.mark.parametrize(("count", "samples"), [(9, 16), (0, 16), (20, 20)])
+def test_counts_have_wilsons_interval(load, count, samples):
+    claims, verdicts = load("reports.claims"), load("reports.verdicts")
+    column = claims.Column(name="c", here="c", better="lower", kind="count")
+    found = verdicts.ends(Cell(value=float(count), samples=samples), column)
+    # The ends are where the observed part is 1.96 deviations away.
+    for end in np.asarray(found) / samples:
+        deviation = math.sqrt(max(end * (1 - end), 0.0) / samples)
+        np.testing.assert_allclose(
+            abs(count / samples - end), 1.96 * deviation, atol=1e-9
+        )
+
+
+def test_what_has_no_interval(load):
+    claims, verdicts = load("reports.claims"), load("reports.verdicts")
+    time = claims.Column(name="t", here="t", better="lower", kind="time")
+    assert verdicts.ends(Cell(value=10.0), time) == (8.0, 12.5)
+    mean = claims.Column(name="m", here="m", better="lower")
+    assert verdicts.ends(Cell(value=10.0), mean) == (-math.inf, math.inf)
+
+
+@pytest.fixture
+def decide(load, tmp_path):
+    """Decides FID of A < B < C from cells of a file."""
+    claims, results = load("reports.claims"), load("reports.results")
+    source = claims.Source(run="a", file="a.json", commands=("make {run}",))
+    other = claims.Source(run="b", file="b.json", commands=("make {run}",))
+    table = claims.Table(
+        paper="P",
+        number="1",
+        title="t",
+        source=source,
+        columns=(claims.Column(name="FID", here="fid", better="lower", judged=True),),
+        rows=tuple(
+            claims.Row(name=name, here=name.lower(), paper=(1.0,), source=where)
+            for name, where in (("A", None), ("B", None), ("C", None), ("D", other))
+        ),
+    )
+
+    def run(rows, *, pairs=None, judges=(None, None)):
+        pairs = pairs or claims.chain("A", "B", "C")
+        claim = claims.Claim(words="w", column="FID", pairs=pairs, where="here")
+        found = {}
+        for key, names, judge in ((source, "abc", judges[0]), (other, "d", judges[1])):
+            own = {k: {"fid": v} for k, v in rows.items() if k in names}
+            about = {"evaluator": judge} if judge else {}
+            found[key] = results.read(put(tmp_path / key.file, own, **about))
+        return load("reports.verdicts").decide(table, claim, found)
+
+    return run
+
+
+def test_a_claim_comes_out_each_way(decide):
+    made = decide(dict(a=near(1.0), b=near(2.0), c=near(3.0)))
+    assert (made.verdict, made.reason) == ("reproduced", "")
+    made = decide(dict(a=near(1.0), b=near(3.0), c=near(2.0)))
+    assert made.verdict == "not reproduced" and "B and C" in made.reason
+    made = decide(dict(a=near(1.0), b=near(2.0), c=near(2.15)))
+    assert made.verdict == "not decided" and "B and C" in made.reason
+    made = decide(dict(a=near(1.0), b=near(2.0)))
+    assert made.verdict == "not run" and made.reason == "not measured: C"
+    # One comparison that fails is enough, whatever the missing row would show.
+    assert decide(dict(a=near(2.0), b=near(1.0))).verdict == "not reproduced"
+
+
+def test_what_is_not_finite_or_has_no_interval_decides_nothing(decide):
+    rows = dict(a=near(1.0), b=near(2.0))
+    assert decide(rows | dict(c=cell(None))).verdict == "not decided"
+    assert decide(rows | dict(c=cell(9.0, samples=1))).verdict == "not decided"
+
+
+def test_rows_of_two_judges_are_not_compared(decide):
+    rows, pairs = dict(a=near(1.0), d=near(2.0)), (("A", "D"),)
+    one = {"fingerprint": "aa", "reference_clips": "cc"}
+    for judges in ((None, None), (one, one | {"fingerprint": "bb"}), (one, None)):
+        made = decide(rows, pairs=pairs, judges=judges)
+        assert made.verdict == "not decided" and "evaluators" in made.reason
+    assert decide(rows, pairs=pairs, judges=(one, one)).verdict == "reproduced"
+
+
+# --- a report -----------------------------------------------------------------------
+
+SWEEP = {
+    f"T = {steps}": {
+        "p50 ms": near(float(steps)),
+        "fid": near(fid),
+        "slide_camdm_release": near(0.5),
+    }
+    for steps, fid in ((2, 5.0), (4, 4.0), (8, 3.0), (16, 2.0), (32, None))
+    if fid
+}
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Run folders of which one has results."""
+    about = dict(
+        source="some clips (CC0)",
+        jax="0.10",
+        seeds={"training": 3},
+        git_commit="abc",
+        evaluator={"fingerprint": "f00d", "reference_clips": "c11"},
+        arguments={"steps": [2, 4, 8, 16]},
+    )
+    put(tmp_path / "runs" / "sweep_camdm" / "table.json", SWEEP, **about)
+    return tmp_path / "runs"
+
+
+def test_a_report_has_values_verdicts_and_what_is_missing(call, runs, tmp_path, capsys):
+    out = tmp_path / "out"
+    call(f"--runs {runs} --out {out}")
+    shown, text = capsys.readouterr().out, (out / "report.md").read_text()
+    whole = json.loads((out / "report.json").read_text())
+    assert "not run: " in shown and str(out) in shown
+    verdicts = {(x["table"], x["claim"]): x["verdict"] for x in whole["claims"]}
+    five = {k[1]: v for k, v in verdicts.items() if k[0] == "CAMDM, table 5"}
+    assert five == {
+        "more steps take longer": "not run",
+        "up to 8 steps FID falls": "reproduced",
+        "8 steps have a lower FID than 16 and 32": "not reproduced",
+        "up to 8 steps feet slide less": "not decided",
+    }
+    others = [v for k, v in verdicts.items() if k[0] != "CAMDM, table 5"]
+    assert len(others) > 50 and set(others) == {"not run"}
+    # The paper's value above the one here; sources; a command for what is missing.
+    assert "*0.938*<br>5 [4.9, 5.1] (n=20)" in text
+    for told in ("some clips (CC0)", "jax 0.10", "abc", "f00d", "c11", "'training': 3"):
+        assert told in text
+    assert f"python experiments/aamdm.py evaluate --run {runs}/aamdm" in text
+    rows = next(
+        x for x in whole["tables"] if x["paper"] == "CAMDM" and x["table"] == "5"
+    )
+    assert rows["rows"]["2 steps"]["cells"]["FID"]["paper"] == 0.938
+    assert rows["rows"]["2 steps"]["cells"]["FID"]["here"]["value"] == 5.0
+    assert rows["rows"]["32 steps"]["cells"]["FID"]["here"] is None
+    assert "100STYLE" in text and len(whole["cannot be run"]) > 5
+    # Pictures only of what was measured, and all of them shown.
+    pictures = [path.name for path in out.glob("*.png")]
+    assert pictures == re.findall(r"!\[.*\]\((.*)\)", text) == ["camdm_table_5.png"]
+    with Image.open(out / pictures[0]) as image:
+        assert min(image.size) > 200
+
+
+def test_a_run_folder_can_be_elsewhere(load, runs, tmp_path):
+    report = load("report")
+    (tmp_path / "mine").mkdir()
+    args = report.Report(runs=runs, aamdm=tmp_path / "mine")
+    folders = {source.run: path for source, path in report.folders_of(args).items()}
+    assert folders["aamdm"] == tmp_path / "mine" and folders["camdm"] == runs / "camdm"
+
+
+def test_a_missing_folder_is_named(call, runs, tmp_path):
+    with pytest.raises(OSError, match="runs: no folder .*gone"):
+        call(f"--runs {tmp_path}/gone --out {tmp_path}/out")
+    with pytest.raises(OSError, match="emdm_text: no folder .*gone"):
+        call(f"--runs {runs} --emdm-text {tmp_path}/gone --out {tmp_path}/out")
+    (tmp_path / "plain").write_text("")
+    with pytest.raises(OSError, match="plain"):
+        call(f"--runs {runs} --out {tmp_path}/plain/below")
+
+
+DAMAGED = {
+    '{"rows": {': "not JSON, line 1 column 11",
+    "[]": "field '.whole file.' is \\[\\], expected an object",
+    "{}": "field 'rows' is missing",
+    '{"rows": 3}': "field 'rows' is 3, expected an object",
+    '{"rows": {"a": 3}}': "field 'rows.a' is 3",
+    '{"rows": {"a": {"b": 3}}}': "field 'rows.a.b' is 3",
+    '{"rows": {"a": {"b": {"samples": 1}}}}': "field 'rows.a.b.value' is missing",
+    '{"rows": {"a": {"b": {"value": 1}}}}': "field 'rows.a.b.samples' is missing",
+    '{"rows": {"a": {"b": {"value": "1", "samples": 1}}}}': "a.b.value' is '1'",
+    '{"rows": {"a": {"b": {"value": 1, "low": [], "samples": 1}}}}': "b.low' is",
+    '{"rows": {"a": {"b": {"value": 1, "samples": 1.5}}}}': "b.samples' is 1.5",
+}
+
+
+@pytest.mark.parametrize("text", DAMAGED)
+def test_a_damaged_file_is_named_with_its_field(call, runs, tmp_path, text):
+    path = runs / "sweep_camdm" / "table.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=DAMAGED[text]) as error:
+        call(f"--runs {runs} --out {tmp_path}/out")
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_help_names_every_option(call, capsys):
+    with pytest.raises(SystemExit) as stop:
+        call("--help")
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    for option in ("--runs", "--out", "--sweep-emdm", "--smgdiff"):
+        assert option in text

@@ -1,0 +1,403 @@
+"""experiments/step_sweep.py: points, budgets, what is refused, and tiny sweeps."""
+
+import csv
+import dataclasses
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+from PIL import Image
+
+from jaxmotion.data import bvh_text, clips_io, procedural
+from jaxmotion.data.ball_clips import save_ball_clips
+from jaxmotion.evaluation import table
+from tests import ball_walker
+from tests.protocols import samples
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "experiments" / "step_sweep.py"
+TINY = (
+    "--replications 2 --change updates=2 batch=4 width=16 depth=1 warmup=1 "
+    "held_out=0.4 seconds=4 recognizer_updates=2 chunk=2 rollout_seconds=0.5"
+)
+TIMES = ("p50 ms", "p95 ms")
+
+
+@pytest.fixture(scope="module")
+def load():
+    """Imports modules as the script finds them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(SCRIPT.parent))
+        yield importlib.import_module
+
+
+def made_up(load, trained):
+    """A system whose models are files with a number, and whose scores are noise."""
+    budgets, points, system = (
+        load(f"sweeps.{name}") for name in ("budgets", "points", "system")
+    )
+
+    def trainer(job):
+        def train(point):
+            path = job.models / point.folder
+            if not path.exists():
+                path.write_text(str(job.budget["updates"] / point.steps))
+                trained.append(point.steps)
+
+        return train
+
+    def bench(job):
+        def row(value):
+            noise = jax.random.normal(jax.random.key(job.seed), (job.replications,))
+            one = table.Cell(value=1.0)
+            return {"fid": table.cell(value + 0.1 * noise), "one": one}
+
+        def score(point):
+            if point.steps == 7:
+                return {"one": table.Cell(value=float("nan"))}
+            return row(float((job.models / point.folder).read_text()))
+
+        return system.Bench(
+            real={system.GROUND_TRUTH: row(1.0), system.NOISE_FLOOR: row(0.5)},
+            score=score,
+            sampler=lambda point: jax.jit(jax.random.normal),
+            rollout=lambda point, folder: (folder / "seen.txt").write_text(point.name),
+            describe={"source": "noise", "samples": "one number"},
+        )
+
+    return system.System(
+        data=(),
+        amounts={
+            "updates": budgets.Amount(quick=8, full=80, meaning="of nothing"),
+            "length": budgets.Amount(
+                quick=1.5, full=2.0, meaning="of nothing", training=False
+            ),
+        },
+        points=lambda texts, drafts: points.plain(texts),
+        trainer=trainer,
+        bench=bench,
+        quality="fid",
+        sample="a number",
+    )
+
+
+@pytest.fixture(scope="module")
+def trained():
+    """Step counts that were trained so far."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def call(load, trained):
+    """Runs a command line in this process; there is a fifth system, "noise"."""
+    module = load("step_sweep")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(module.SYSTEMS, "noise", made_up(load, trained))
+
+        def run(line):
+            patch.setattr(sys, "argv", [str(SCRIPT), *line.split()])
+            module.main()
+
+        yield run
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "clips.npz"
+    clips_io.save_clips(path, samples.clips())
+    return path
+
+
+@pytest.fixture(scope="module")
+def swept(call, tmp_path_factory):
+    """A sweep of noise."""
+    out = tmp_path_factory.mktemp("sweeps") / "a"
+    call(f"--system noise --steps 4 2 --out {out}")
+    return out
+
+
+def report_of(folder):
+    return json.loads((folder / "table.json").read_text())
+
+
+def check_same(first, second):
+    """The same rows but for times."""
+    assert first.keys() == second.keys()
+    for name, row in first.items():
+        assert row.keys() == second[name].keys()
+        for column in set(row) - set(TIMES):
+            assert row[column] == second[name][column], (name, column)
+
+
+# --- step counts and budgets --------------------------------------------------------
+
+
+def test_step_counts_keep_their_order(load):
+    points = load("sweeps.points").plain(("8", "2", "32"))
+    assert [p.steps for p in points] == [8, 2, 32]
+    assert [p.name for p in points] == ["8", "2", "32"]
+    assert len({p.folder for p in points} | {p.row for p in points}) == 6
+
+
+def test_polish_steps_have_draft_steps(load):
+    points = load("sweeps.points").pairs(("2", "0+3", "2+10"), drafts=3)
+    assert [p.parts for p in points] == [(2, 3), (0, 3), (2, 10)]
+    assert [p.steps for p in points] == [5, 3, 12]
+    # The rows that experiments/aamdm.py knows.
+    load("aamdm").rows.check(tuple(p.folder for p in points))
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (("2", "0"), "steps: '0' is no number of steps"),
+        (("-1",), "steps: '-1'"),
+        (("2.5",), "steps: '2.5'"),
+        (("2+3",), r"steps: '2\+3'"),
+        (("2", "4", "02"), "steps: T = 2 is given twice"),
+        ((), "steps: there are none"),
+    ],
+)
+def test_what_is_no_step_count_is_named(load, texts, message):
+    with pytest.raises(ValueError, match=message):
+        load("sweeps.points").plain(texts)
+
+
+@pytest.mark.parametrize(
+    ("texts", "drafts", "message"),
+    [
+        (("0",), 3, "steps: '0'"),
+        (("0+0",), 3, r"steps: '0\+0' has no step"),
+        (("2+",), 3, "steps: ''"),
+        (("2", "2+3"), 3, r"steps: 2 polish \+ 3 draft is given twice"),
+        (("2",), -1, "drafts: -1"),
+    ],
+)
+def test_what_is_no_pair_is_named(load, texts, drafts, message):
+    with pytest.raises(ValueError, match=message):
+        load("sweeps.points").pairs(texts, drafts=drafts)
+
+
+def test_a_budget_is_changed_by_name(load):
+    budgets, amounts = load("sweeps.budgets"), load("sweeps.camdm").AMOUNTS
+    quick = budgets.resolve(amounts, "quick")
+    changed = budgets.resolve(amounts, "quick", ("updates=7", "seconds=5"))
+    assert changed == quick | {"updates": 7, "seconds": 5.0}
+    assert isinstance(changed["updates"], int)
+    trained = budgets.training_part(amounts, changed)
+    assert "updates" in trained and "seconds" not in trained
+
+
+def test_the_help_has_every_number_of_every_budget(load, call, capsys):
+    with pytest.raises(SystemExit) as stop:
+        call("--help")
+    assert stop.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for system in load("step_sweep").SYSTEMS.values():
+        for name, amount in system.amounts.items():
+            wanted = f"{name} {amount.quick:g} / {amount.full:g}: {amount.meaning}"
+            assert wanted in text
+
+
+# --- what a sweep leaves behind ------------------------------------------------------
+
+
+def test_a_sweep_has_real_motion_and_every_model(swept):
+    report = report_of(swept)
+    truth, floor, *models = report["rows"]
+    assert "ground truth" in truth and "noise floor" in floor
+    assert models == ["T = 4", "T = 2"]
+    for name, value in zip(models, (2.0, 4.0), strict=True):
+        row = report["rows"][name]
+        assert row["fid"]["samples"] == 20
+        assert row["fid"]["low"] < value < row["fid"]["high"]
+        assert 0 < row["p50 ms"]["low"] <= row["p50 ms"]["value"]
+        assert row["p50 ms"]["value"] <= row["p50 ms"]["high"]
+        assert row["p50 ms"]["value"] <= row["p95 ms"]["value"]
+    assert not set(TIMES) & set(report["rows"][truth])
+    for name in ("jax", "jaxlib", "flax", "numpy", "cpu", "cores", "git_commit"):
+        assert report[name], name
+    assert report["seeds"] == {"training": 0, "evaluation": 0}
+    assert report["budget"] == {"updates": 8, "length": 1.5}
+    assert report["source"] == "noise" and report["replications"] == 20
+    assert "--system noise --steps 4 2" in report["command"]
+
+
+def test_the_tables_agree(swept):
+    rows = report_of(swept)["rows"]
+    with open(swept / "table.csv", newline="") as file:
+        cells = list(csv.DictReader(file))
+    assert len(cells) == sum(len(row) for row in rows.values())
+    for cell in cells:
+        own = rows[cell["row"]][cell["column"]]
+        assert float(cell["value"]) == own["value"]
+        assert (cell["low"] == "") == (own["low"] is None)
+        assert int(cell["samples"]) == own["samples"]
+    assert {cell["steps"] for cell in cells} == {"", "2", "4"}
+    text = (swept / "table.md").read_text()
+    for name in rows:
+        assert f"| {name} |" in text
+    for note in report_of(swept)["notes"]:
+        assert f"- {note}" in text
+    assert "one number" in text and "commit" in text
+
+
+def test_a_plot_and_rollouts_are_written(swept):
+    with Image.open(swept / "pareto.png") as image:
+        assert min(image.size) > 400
+    for name in ("2", "4"):
+        assert (swept / "rollouts" / f"T{name}" / "seen.txt").read_text() == name
+
+
+def test_what_is_trained_is_loaded(call, swept, trained, tmp_path):
+    assert trained[:2] == [4, 2]
+    before = len(trained)
+    call(
+        f"--system noise --steps 2 16 --models {swept}/models --out {tmp_path} "
+        "--change length=9"
+    )
+    assert trained[before:] == [16]
+    rows, first = report_of(tmp_path)["rows"], report_of(swept)["rows"]
+    assert rows["T = 2"]["fid"] == first["T = 2"]["fid"]
+
+
+@pytest.mark.parametrize(
+    ("more", "what"),
+    [
+        ("--change updates=9", "updates"),
+        ("--seed 1", "seed"),
+        ("--data {file}", "data"),
+    ],
+)
+def test_models_of_another_sweep_are_refused(call, swept, tmp_path, more, what):
+    (tmp_path / "file").write_text("")
+    more = more.format(file=tmp_path / "file")
+    with pytest.raises(ValueError, match=f"models: .* trained with other {what}:"):
+        call(f"--system noise --models {swept}/models --out {tmp_path} {more}")
+
+
+def test_a_model_without_a_number_is_in_the_table_alone(call, tmp_path):
+    call(f"--system noise --steps 2 7 --out {tmp_path}")
+    report = report_of(tmp_path)
+    assert report["rows"]["T = 7"]["one"]["value"] is None
+    assert "not in the plot" in report["notes"][-1] and "T = 7" in report["notes"][-1]
+    assert (tmp_path / "pareto.png").exists()
+
+
+def test_the_same_seed_gives_the_same_table(call, swept, tmp_path):
+    call(f"--system noise --steps 4 2 --out {tmp_path / 'same'}")
+    call(f"--system noise --steps 4 2 --out {tmp_path / 'other'} --seed 1")
+    first, same, other = (
+        report_of(x)["rows"] for x in (swept, tmp_path / "same", tmp_path / "other")
+    )
+    check_same(first, same)
+    assert first["T = 2"]["fid"] != other["T = 2"]["fid"]
+
+
+# --- systems ------------------------------------------------------------------------
+
+# Step counts, data and numbers of a sweep that takes a minute or two.
+SYSTEMS = {
+    "camdm": ("1 2", "clips", TINY),
+    "smgdiff": (
+        "1 2",
+        "ball",
+        "--replications 2 --change updates=100 draft_updates=100 batch=4 width=16 "
+        "depth=1 held_out=0.3 windows=8 recognizer_updates=20 rollout_seconds=0.5",
+    ),
+    "emdm": (
+        "1 2",
+        "actions",
+        "--replications 2 --change updates=100 batch=4 width=16 depth=1 hidden=16 "
+        "discriminator_width=64 frames=20 least=2 held_out=0.3 samples=8 "
+        "recognizer_updates=20",
+    ),
+    "aamdm": (
+        "1+1 0+2",
+        "walker",
+        "--replications 2 --change autoencoder_updates=100 polisher_updates=100 "
+        "generator_updates=100 batch=8 width=32 characters=2 seconds=0.5 "
+        "rollout_seconds=0.5",
+    ),
+}
+
+
+def clips_for(kind, path):
+    """Writes clips of the walker that a system can use."""
+    if kind == "ball":
+        save_ball_clips(path, ball_walker.clips(80))
+        return
+    clips = samples.clips() if kind == "clips" else procedural.make_clips(minutes=2.0)
+    if kind == "actions":
+        labels = {"content": clips.labels["style"] % 2}
+        names = (("content", ("run", "walk")),)
+        clips = dataclasses.replace(clips, labels=labels, label_names=names)
+    clips_io.save_clips(path, clips)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_compile")
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_tiny_sweep_twice_gives_the_same_table(load, call, tmp_path, system):
+    steps, kind, more = SYSTEMS[system]
+    clips_for(kind, tmp_path / "clips.npz")
+    line = f"--system {system} --steps {steps} --data {tmp_path}/clips.npz {more}"
+    for name in "ab":
+        call(f"{line} --out {tmp_path / name}")
+    first, second = (report_of(tmp_path / name)["rows"] for name in "ab")
+    check_same(first, second)
+    truth, floor, *models = first
+    assert len(models) == 2
+    quality = load("step_sweep").SYSTEMS[system].quality
+    for name in (truth, floor, *models):
+        assert first[name][quality]["samples"] == 2
+    assert "rocedural" in report_of(tmp_path / "a")["source"]
+    for folder in (tmp_path / "a" / "rollouts").iterdir():
+        assert len(bvh_text.read_bvh(folder / "rollout.bvh").values) > 1
+        assert (folder / "rollout.gif").exists()
+
+
+# --- errors -------------------------------------------------------------------------
+
+BAD = {
+    "--system camd --steps 2": "system: unknown system 'camd', expected one of camdm",
+    "--system camdm --steps 0": "steps: '0'",
+    "--system camdm --steps 4 4": "steps: T = 4 is given twice",
+    "--system camdm --budget huge": "budget: unknown budget 'huge'",
+    "--system camdm --change speed=3": "change: 'speed=3'",
+    "--system camdm --change updates=many": "change: 'updates=many'",
+    "--system camdm --change updates=0": "change: 'updates=0'",
+    "--system emdm --data {gone} --out {new}": "data: no clips file .*gone.npz",
+    "--system camdm --data {data} --out {file}/below": "out: .*plain/below",
+    "--system camdm --data {data} --out {new} --models {file}/below": "models: .*plain",
+    "--system camdm --data {data} --out {new} --replications 1": "replications: 1",
+}
+
+
+@pytest.mark.parametrize("line", BAD)
+def test_what_is_wrong_is_named_before_any_work(call, data, tmp_path, line):
+    (tmp_path / "plain").write_text("")
+    places = dict(
+        data=data,
+        gone=tmp_path / "gone.npz",
+        file=tmp_path / "plain",
+        new=tmp_path / "new",
+    )
+    with pytest.raises((OSError, ValueError), match=BAD[line]):
+        call(line.format(**places))
+    assert not list(tmp_path.glob("new/models/T*"))
+
+
+def test_from_a_shell_an_error_is_one_line(tmp_path):
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), "--system", "mdm", "--out", str(tmp_path)],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1
+    assert done.stderr.strip().splitlines()[-1].startswith("error: system: unknown")
+    assert "Traceback" not in done.stderr
