@@ -32,6 +32,7 @@ def load():
         yield importlib.import_module
 
 
+@pytest.mark.slow
 def test_the_script_measures_and_says_what_it_has_no_parameters_for(tmp_path):
     arguments = ["--rollouts", 4, 2, "--sets", 2, "--seconds", 0.4, "--every", 4]
     arguments += ["--steps", 4, 8, "--guidance", 0, 1, "--pairs", 50, "--chunk", 2]
@@ -202,6 +203,7 @@ def test_planners_stay_conditions_in_many_rollouts(small):
         assert " cond[" not in str(jax.make_jaxpr(jax.vmap(one))(keys, states))
 
 
+@pytest.mark.slow
 def test_chunks_do_not_change_a_rollout(small):
     one, state = small
     keys = jax.random.split(jax.random.key(0), 5)

@@ -102,6 +102,7 @@ def test_actions_are_scored_beside_real_motions(call, actions):
     assert "procedural" in report["evaluator"]["recognizer"].lower()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_scores(call, actions, tmp_path):
     for name in ("a", "b"):
         call(
@@ -124,6 +125,7 @@ def test_samples_of_actions_are_motions(call, actions, tmp_path):
             assert image.n_frames > 1
 
 
+@pytest.mark.slow
 def test_motions_from_nothing(call, data, tmp_path):
     folder = tmp_path / "none"
     call(
@@ -137,6 +139,7 @@ def test_motions_from_nothing(call, data, tmp_path):
     assert (tmp_path / "out" / "motion.bvh").exists()
 
 
+@pytest.mark.slow
 def test_texts_are_scored_and_sampled(call, texts, tmp_path):
     call(f"evaluate --run {texts} --samples 64 --replications 2 --evaluator-steps 20")
     rows = rows_of(texts / "evaluation")["rows"]

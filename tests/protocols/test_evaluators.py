@@ -246,6 +246,7 @@ def actions(tmp_path_factory):
     return emdm_action.load_run(folder)
 
 
+@pytest.mark.slow
 def test_an_evaluator_of_actions_is_the_recogniser_a_run_trains(actions, tmp_path):
     made = evaluator_training.train_action(
         actions.train, actions.held_out, field="style", num_steps=3, seed=0
