@@ -23,7 +23,7 @@ from jaxmotion.protocols import provenance
 
 
 @dataclasses.dataclass(frozen=True)
-class Report:
+class Config:
     """Report on the papers' tables.
 
     Attributes:
@@ -58,7 +58,7 @@ class Report:
     smgdiff: Path | None = None
 
 
-def folders_of(args: Report) -> dict[Source, Path]:
+def folders_of(args: Config) -> dict[Source, Path]:
     """Run folder of each source.
 
     Args:
@@ -81,7 +81,7 @@ def folders_of(args: Report) -> dict[Source, Path]:
     return found
 
 
-def report(args: Report) -> None:
+def report(args: Config) -> None:
     """Writes the report, and prints how the claims came out.
 
     Args:
@@ -107,7 +107,7 @@ def report(args: Report) -> None:
 
 def main() -> None:
     """Parses the command line and writes the report."""
-    report(tyro.cli(Report, description=__doc__))
+    report(tyro.cli(Config, description=__doc__))
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ SYSTEMS = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Sweep:
+class Config:
     """Sweep over numbers of steps.
 
     Attributes:
@@ -66,7 +66,7 @@ class Sweep:
     seed: int = 0
 
 
-def make_job(args: Sweep) -> tuple[Job, Path]:
+def make_job(args: Config) -> tuple[Job, Path]:
     """The sweep that the arguments describe, and the folder of its results.
 
     Args:
@@ -99,7 +99,7 @@ def make_job(args: Sweep) -> tuple[Job, Path]:
 def main() -> None:
     """Parses the command line and runs the sweep."""
     numbers = [budgets.describe(name, x.amounts) for name, x in SYSTEMS.items()]
-    args = tyro.cli(Sweep, description="\n\n".join([__doc__, *numbers]))
+    args = tyro.cli(Config, description="\n\n".join([__doc__, *numbers]))
     job, out = make_job(args)
     shown = arguments_json(args) | {
         "data": [str(file) for file in job.data],

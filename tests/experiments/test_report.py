@@ -94,7 +94,7 @@ def test_every_claim_holds_for_what_the_paper_prints(load):
 
 
 def test_every_source_has_an_option_and_its_command_its_folder(load):
-    options = {x.name for x in dataclasses.fields(load("report").Report)}
+    options = {x.name for x in dataclasses.fields(load("report").Config)}
     for source in load("reports.writing").SOURCES:
         assert source.run in options
         assert any("{run}" in command for command in source.commands)
@@ -281,7 +281,7 @@ def test_a_report_has_values_verdicts_and_what_is_missing(call, runs, tmp_path, 
 def test_a_run_folder_can_be_elsewhere(load, runs, tmp_path):
     report = load("report")
     (tmp_path / "mine").mkdir()
-    args = report.Report(runs=runs, aamdm=tmp_path / "mine")
+    args = report.Config(runs=runs, aamdm=tmp_path / "mine")
     folders = {source.run: path for source, path in report.folders_of(args).items()}
     assert folders["aamdm"] == tmp_path / "mine" and folders["camdm"] == runs / "camdm"
 
