@@ -7,7 +7,7 @@ command that would run it.
 Examples:
   python experiments/report.py
   python experiments/report.py --runs runs --out runs/report
-  python experiments/report.py --smgdiff runs/smgdiff_quick --out runs/report_quick
+  python experiments/report.py --smgdiff runs/other --out runs/report
 """
 
 import dataclasses
