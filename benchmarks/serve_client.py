@@ -151,7 +151,7 @@ async def abuse(port: int) -> dict[str, float]:
 
     Returns:
       How many lines were sent and answered, frames meanwhile, and how far the character
-      then walked in 6 s of the 6 m that it was told to; it may have to turn first.
+      then walked in 3 s of the 3 m that it was told to.
     """
     async with connected(port) as client:
         for line in malformed(MALFORMED):
@@ -162,7 +162,7 @@ async def abuse(port: int) -> dict[str, float]:
             await asyncio.sleep(0.05)
         meanwhile, begin = len(client.frames), np.array(client.frames[-1]["root"])
         client.send(velocity=[0.0, 1.0], facing=[0.0, 1.0])
-        await asyncio.sleep(6)
+        await asyncio.sleep(3)
         moved = np.array(client.frames[-1]["root"]) - begin
         return {
             "malformed lines": MALFORMED,

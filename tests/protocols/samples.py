@@ -17,6 +17,8 @@ STYLES = ("neutral", "zombie")
 SEED = 3
 
 
+# Made once: modules that compile otherwise would round otherwise.
+@functools.cache
 def clips(minutes=0.4):
     """Half of them in each style, four seconds each."""
     some = {name: gaits.GAITS[name] for name in STYLES}
