@@ -10,6 +10,7 @@ Examples:
   python experiments/step_sweep.py --system emdm --steps 1 2 5 10 20
   python experiments/step_sweep.py --system aamdm --steps 0+3 1+3 2+3 10+3 2+10
   python experiments/step_sweep.py --system camdm --change updates=3000 width=192
+  python experiments/step_sweep.py --system camdm --evaluator evaluators/styles.npz
 """
 
 import dataclasses
@@ -21,6 +22,7 @@ from sweeps import aamdm, budgets, camdm, emdm, run, smgdiff
 from sweeps.system import Job
 
 from jaxmotion.learning import loop
+from jaxmotion.protocols import evaluators
 from jaxmotion.protocols.camdm_runs import arguments_json
 
 SYSTEMS = {
@@ -51,6 +53,8 @@ class Config:
         not trained again; one of another budget, seed or data is refused.
       replications: Sets of samples of each model, each with noise of its own;
         intervals run over these.
+      evaluator: File of a frozen recogniser, from evaluator.py; None trains one, with
+        the budget's updates. aamdm has none.
       seed: Of parameters, batches, poses, noise and evaluators.
     """
 
@@ -63,7 +67,36 @@ class Config:
     out: Path | None = None
     models: Path | None = None
     replications: int = 20
+    evaluator: Path | None = None
     seed: int = 0
+
+
+def load_evaluator(
+    args: Config, kind: evaluators.Kind | None
+) -> evaluators.Evaluator | None:
+    """The frozen recogniser that the arguments name.
+
+    Args:
+      args: Of the command line.
+      kind: That the system needs; None for none.
+
+    Returns:
+      The recogniser; None if it is to be trained.
+
+    Raises:
+      ValueError: if there is no such file, or it is of another kind.
+    """
+    if args.evaluator is None:
+        return None
+    if kind is None:
+        raise ValueError(f"evaluator: {args.system} is judged without a recogniser")
+    found = evaluators.load(args.evaluator)
+    if found.kind != kind:
+        raise ValueError(
+            f"evaluator: {args.evaluator} is of kind {found.kind!r}, {args.system} "
+            f"needs {kind!r}"
+        )
+    return found
 
 
 def make_job(args: Config) -> tuple[Job, Path]:
@@ -92,6 +125,7 @@ def make_job(args: Config) -> tuple[Job, Path]:
         budget=budgets.resolve(system.amounts, args.budget, args.change),
         replications=args.replications,
         seed=args.seed,
+        evaluator=load_evaluator(args, system.judge),
     )
     return job, out
 

@@ -137,8 +137,8 @@ def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
     ticks = round(budget["seconds"] * run.model.config.fps)
     protocol.check_ticks(ticks, fps=run.model.config.fps, skip=camdm_evaluation.SKIP)
     key_fit, _ = jax.random.split(jax.random.key(job.seed))
-    recognizer = camdm_styles.fit_recognizer(
-        key_fit, run.train, field=field, num_steps=budget["recognizer_updates"]
+    recognizer = camdm_evaluation.recognizer(
+        key_fit, run, job.evaluator, num_steps=budget["recognizer_updates"]
     )
     real = protocol.data_windows(run.held_out, stride=protocol.WINDOW, field=field)
     dense = protocol.data_windows(run.train, stride=10, field=field)
@@ -252,10 +252,9 @@ def bench(job: Job) -> Bench:
             "fid_windows": judge.count,
             "fid_reference_windows": len(judge.reference),
             "rollouts": int(judge.labels.size),
-            "recognizer": f"styles, {job.budget['recognizer_updates']} updates, "
-            f"seed {job.seed}",
             "evaluator": evaluators.describe(
                 judge.recognizer.params,
+                job.evaluator,
                 reference=evaluators.clips_fingerprint(run.train, run.field),
             ),
         },
@@ -270,4 +269,5 @@ SYSTEM = System(
     bench=bench,
     quality="fid",
     sample="one plan of 45 frames",
+    judge="style",
 )

@@ -133,6 +133,7 @@ def bench(job: Job) -> Bench:
             samples=budget["samples"],
             replications=job.replications,
             evaluator_steps=budget["recognizer_updates"],
+            evaluator=None if job.evaluator is None else job.evaluator.path,
             seed=job.seed,
         )
     )
@@ -171,4 +172,5 @@ SYSTEM = System(
     bench=bench,
     quality="FID",
     sample="one motion",
+    judge="action",
 )

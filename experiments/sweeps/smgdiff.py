@@ -93,6 +93,7 @@ def bench(job: Job) -> Bench:
         number=budget["windows"],
         replications=job.replications,
         recognizer_steps=budget["recognizer_updates"],
+        evaluator=job.evaluator,
         seed=job.seed,
     )
     ground_truth, noise_floor = script.tables.real_rows(run, setting).values()
@@ -143,10 +144,9 @@ def bench(job: Job) -> Bench:
             f"the path that was walked; Fréchet distances to {2 * windows} training "
             "windows",
             "windows": windows,
-            "recognizer": f"skills, {budget['recognizer_updates']} updates, seed "
-            f"{job.seed}",
             "evaluator": evaluators.describe(
                 setting.judge.params,
+                job.evaluator,
                 reference=evaluators.clips_fingerprint(run.train, smgdiff_data.FIELD),
             ),
         },
@@ -161,4 +161,5 @@ SYSTEM = System(
     bench=bench,
     quality="FID",
     sample="one plan of 45 frames",
+    judge="ball",
 )

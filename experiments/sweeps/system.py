@@ -8,6 +8,7 @@ from typing import Any
 from jaxtyping import Array
 
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.protocols.evaluators import Evaluator, Kind
 from sweeps.budgets import Amounts
 from sweeps.points import Point
 
@@ -30,6 +31,7 @@ class Job:
       budget: Numbers, from `budgets.resolve`.
       replications: Of the evaluation.
       seed: Of everything random.
+      evaluator: A frozen recogniser; None to train one.
     """
 
     points: tuple[Point, ...]
@@ -38,6 +40,7 @@ class Job:
     budget: dict[str, Any]
     replications: int
     seed: int
+    evaluator: Evaluator | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -73,6 +76,7 @@ class System:
       bench: Prepares the evaluation of trained models.
       quality: Column of the plot, lower is better.
       sample: What one sample is, for the time at batch 1.
+      judge: Kind of its recogniser; None if it is judged without one.
     """
 
     data: tuple[Path, ...]
@@ -82,3 +86,4 @@ class System:
     bench: Callable[[Job], Bench]
     quality: str
     sample: str
+    judge: Kind | None = None

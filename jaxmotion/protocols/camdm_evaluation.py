@@ -130,18 +130,18 @@ def evaluate_run(
     protocol.check_ticks(commands.label.shape[1], fps=fps, skip=SKIP)
     states = protocol.start_states(run.held_out, model, labels, field=field, seed=seed)
     key_fit, key_roll = jax.random.split(jax.random.key(seed))
-    recognizer = _recognizer(key_fit, run, evaluator, recognizer_steps)
+    judge = recognizer(key_fit, run, evaluator, num_steps=recognizer_steps)
     frames = _timed_rollouts(run, key_roll, states, commands, chunk)
     real = protocol.data_windows(run.held_out, stride=protocol.WINDOW, field=field)
     dense = protocol.data_windows(run.train, stride=10, field=field)
     made = protocol.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=SKIP)
     rows, report = camdm_rows.evaluation_table(
-        model.bones, real, dense, made, frames, recognizer, repeats=repeats
+        model.bones, real, dense, made, frames, judge, repeats=repeats
     )
     return rows, report | {
         "source": model.source,
         "evaluator": evaluators.describe(
-            recognizer.params,
+            judge.params,
             evaluator,
             reference=evaluators.clips_fingerprint(run.train, field),
         ),
@@ -150,10 +150,23 @@ def evaluate_run(
     }
 
 
-def _recognizer(
-    key: Key, run: Run, evaluator: evaluators.Evaluator | None, num_steps: int
+def recognizer(
+    key: Key, run: Run, evaluator: evaluators.Evaluator | None, *, num_steps: int
 ) -> camdm_styles.Recognized:
-    """The frozen recogniser if there is one, else one trained on the run's clips."""
+    """The frozen recogniser if there is one, else one trained on the run's clips.
+
+    Args:
+      key: Consumed.
+      run: The run.
+      evaluator: A frozen style recogniser; None to train one.
+      num_steps: Updates of a training.
+
+    Returns:
+      The recogniser.
+
+    Raises:
+      ValueError: if the evaluator does not fit the run; names the field.
+    """
     frozen = evaluators.params_for(
         evaluator,
         kind="style",

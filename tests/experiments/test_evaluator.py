@@ -1,6 +1,5 @@
 """experiments/evaluator.py: frozen evaluators, and their use by the three systems."""
 
-import dataclasses
 import importlib.util
 import json
 import re
@@ -13,10 +12,10 @@ import pytest
 
 from jaxmotion.data import clips_io
 from jaxmotion.data.ball_clips import save_ball_clips
-from jaxmotion.learning import action_recognition, recognition
 from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.protocols import evaluators
 from tests import ball_walker, tiny
+from tests.protocols import samples
 
 ROOT = Path(__file__).parents[2]
 FIELDS = ("fingerprint", "kind", "labels", "joints", "fps", "frames", "accuracy")
@@ -153,24 +152,15 @@ def test_from_a_shell_there_is_help_and_an_error_is_one_line(tmp_path):
 
 def judge(path, kind, clips, field, frames):
     """An evaluator that was not trained, for a run of these clips."""
-    made = evaluators.Evaluator(
-        kind=kind,
-        params={},
+    made = samples.evaluator(
+        kind,
         field=field,
         labels=clips.names(field),
         joints=clips.skeleton.names,
         fps=clips.fps,
         frames=frames,
-        source="tests",
-        clips="0" * 12,
-        seed=0,
         updates=0,
-        accuracy=0.5,
     )
-    init = recognition.init_recognizer
-    if kind == "action":
-        init = action_recognition.init_action_recognizer
-    made = dataclasses.replace(made, params=tiny.random_params(init, made.config))
     evaluators.save(path, made)
     return made
 

@@ -15,6 +15,7 @@ from PIL import Image
 from jaxmotion.data import bvh_text, clips_io, procedural
 from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.evaluation import table
+from jaxmotion.protocols import evaluators
 from tests import ball_walker
 from tests.protocols import samples
 
@@ -376,16 +377,21 @@ BAD = {
     "--system camdm --data {data} --out {file}/below": "out: .*plain/below",
     "--system camdm --data {data} --out {new} --models {file}/below": "models: .*plain",
     "--system camdm --data {data} --out {new} --replications 1": "replications: 1",
+    "--system aamdm --evaluator {judge}": "evaluator: aamdm is judged without",
+    "--system camdm --evaluator {judge}": "judge.npz is of kind 'ball', camdm needs",
+    "--system camdm --evaluator {gone}": "gone.npz",
 }
 
 
 @pytest.mark.parametrize("line", BAD)
 def test_what_is_wrong_is_named_before_any_work(call, data, tmp_path, line):
     (tmp_path / "plain").write_text("")
+    evaluators.save(tmp_path / "judge.npz", samples.evaluator("ball"))
     places = dict(
         data=data,
         gone=tmp_path / "gone.npz",
         file=tmp_path / "plain",
+        judge=tmp_path / "judge.npz",
         new=tmp_path / "new",
     )
     with pytest.raises((OSError, ValueError), match=BAD[line]):

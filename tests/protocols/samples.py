@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.data import gaits, procedural, selection
+from jaxmotion.learning import action_recognition, recognition
 from jaxmotion.protocols import camdm as protocol
-from jaxmotion.protocols import camdm_runs, camdm_training
+from jaxmotion.protocols import camdm_runs, camdm_training, evaluators
 from jaxmotion.systems import camdm, camdm_control
 from tests import tiny
 
@@ -87,3 +88,26 @@ def standing(frames):
             six.reshape(1, 1, 1, 6), frames.joint_rotation.shape
         ),
     )
+
+
+def evaluator(kind="action", **changes):
+    """A frozen evaluator that was not trained, of windows of 8 frames."""
+    value = dict(
+        kind=kind,
+        field="style",
+        labels=("calm", "brisk"),
+        joints=tiny.NAMES,
+        fps=30.0,
+        frames=8,
+        source="tests",
+        clips="0" * 12,
+        seed=3,
+        updates=5,
+        accuracy=0.75,
+    )
+    made = evaluators.Evaluator(params={}, **value | changes)
+    init = recognition.init_recognizer
+    if kind == "action":
+        init = action_recognition.init_action_recognizer
+    params = tiny.random_params(init, made.config)
+    return dataclasses.replace(made, params=params)

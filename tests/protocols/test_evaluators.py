@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.data import clips_io
-from jaxmotion.learning import action_recognition, checkpoint, recognition
+from jaxmotion.learning import checkpoint
 from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.protocols import (
     camdm_evaluation,
@@ -32,29 +32,6 @@ KINDS = ("style", "action", "ball")
 FRAMES = 12
 
 
-def evaluator(kind="action", **changes):
-    """One that was not trained, of windows of 8 frames."""
-    value = dict(
-        kind=kind,
-        field="style",
-        labels=("calm", "brisk"),
-        joints=tiny.NAMES,
-        fps=30.0,
-        frames=8,
-        source="tests",
-        clips="0" * 12,
-        seed=3,
-        updates=5,
-        accuracy=0.75,
-    )
-    made = evaluators.Evaluator(params={}, **value | changes)
-    init = recognition.init_recognizer
-    if kind == "action":
-        init = action_recognition.init_action_recognizer
-    params = tiny.random_params(init, made.config)
-    return dataclasses.replace(made, params=params)
-
-
 def same(a, b):
     assert jax.tree.structure(a) == jax.tree.structure(b)
     for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
@@ -66,7 +43,7 @@ def same(a, b):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_loaded_is_what_was_saved(tmp_path, kind):
-    saved, path = evaluator(kind), tmp_path / "below" / "e.npz"
+    saved, path = samples.evaluator(kind), tmp_path / "below" / "e.npz"
     evaluators.save(path, saved)
     found = evaluators.load(path)
     assert [file.name for file in path.parent.iterdir()] == ["e.npz"]
@@ -100,7 +77,7 @@ BAD_FIELDS = {
 
 @pytest.mark.parametrize("field", BAD_FIELDS)
 def test_a_field_that_is_wrong_is_named_with_the_file(tmp_path, field):
-    made, path = evaluator(), tmp_path / "e.npz"
+    made, path = samples.evaluator(), tmp_path / "e.npz"
     value = evaluators.to_json(made) | {field: BAD_FIELDS[field]}
     checkpoint.export_params(path, made.params, value, dtype=np.float32)
     with pytest.raises(ValueError, match=f"{path}: field '{field}'"):
@@ -108,13 +85,13 @@ def test_a_field_that_is_wrong_is_named_with_the_file(tmp_path, field):
 
 
 def test_other_parameters_than_were_frozen_are_refused(tmp_path):
-    made, path = evaluator(), tmp_path / "e.npz"
+    made, path = samples.evaluator(), tmp_path / "e.npz"
     value = evaluators.to_json(made)
     # Rounded to three digits they would judge otherwise.
     checkpoint.export_params(path, made.params, value, dtype=np.float16)
     with pytest.raises(ValueError, match=f"{path}: field 'fingerprint'"):
         evaluators.load(path)
-    wide = evaluator(labels=("calm", "brisk", "limp")).params
+    wide = samples.evaluator(labels=("calm", "brisk", "limp")).params
     checkpoint.export_params(path, wide, value, dtype=np.float32)
     with pytest.raises(ValueError, match=f"{path}: parameters of another network"):
         evaluators.load(path)
@@ -127,7 +104,7 @@ def test_files_that_are_no_evaluators_are_named(tmp_path):
     clips_io.save_clips(path, tiny.clips())
     with pytest.raises(ValueError, match=f"{path}: not an export"):
         evaluators.load(path)
-    evaluators.save(path, evaluator())
+    evaluators.save(path, samples.evaluator())
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(ValueError, match=f"{path}: not an export"):
@@ -154,7 +131,7 @@ RUN = dict(
 )
 def test_what_does_not_fit_a_run_is_named(tmp_path, field, other):
     path = tmp_path / "e.npz"
-    evaluators.save(path, evaluator())
+    evaluators.save(path, samples.evaluator())
     loaded = evaluators.load(path)
     assert evaluators.params_for(loaded, **RUN) is loaded.params
     with pytest.raises(ValueError) as error:
@@ -169,7 +146,7 @@ def test_without_an_evaluator_there_are_no_parameters():
 
 def test_camdm_refuses_one_that_does_not_fit_before_any_training(capsys):
     call = dict(preset="forward", rollouts=2, seconds=4.0)
-    wrong = evaluator("style", labels=samples.STYLES, frames=60)
+    wrong = samples.evaluator("style", labels=samples.STYLES, frames=60)
     with pytest.raises(ValueError, match="does not fit the run: field 'joints'"):
         camdm_evaluation.evaluate_run(samples.run(), evaluator=wrong, **call)
     assert capsys.readouterr().out == ""
@@ -179,7 +156,7 @@ def test_camdm_refuses_one_that_does_not_fit_before_any_training(capsys):
 
 
 def test_tables_say_who_judged(tmp_path):
-    made, path = evaluator(), tmp_path / "e.npz"
+    made, path = samples.evaluator(), tmp_path / "e.npz"
     evaluators.save(path, made)
     name = fingerprint(made.params)
     here = evaluators.describe(made.params, reference="abc")
