@@ -150,7 +150,8 @@ def _notes(system: System, job: Job, whole: dict[str, Any]) -> list[str]:
     return [
         f"Data: {whole['source']}.",
         f"Trained with the same budget, data and seed {job.seed}: {budget} (--help "
-        "says what each is).",
+        "says what each is). One training a row: what another training seed would "
+        "change is in no interval.",
         f"Evaluated with the same noise, commands and samples, {job.replications} "
         f"replications: {whole['samples']}. Intervals are of 95 %.",
         *judge,
