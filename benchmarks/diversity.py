@@ -39,7 +39,9 @@ class Config:
     many run at a time as the memory allows.
 
     Attributes:
-      rollouts: Numbers of rollouts; the other sweeps use the largest.
+      rollouts: Numbers of rollouts.
+      sweep_rollouts: Rollouts of each row of the sweeps over steps and guidance; None
+        for the largest number.
       run: Model of CAMDM: an exported file of the procedural walker, or a run folder
         of experiments/camdm.py (with the data it was trained on). None for the shipped
         walker.
@@ -63,6 +65,7 @@ class Config:
     """
 
     rollouts: tuple[int, ...] = (64, 256, 1024)
+    sweep_rollouts: int | None = None
     run: Path | None = None
     step_runs: tuple[Path, ...] = ()
     steps: tuple[int, ...] = (2, 4, 8, 16, 32)
@@ -72,7 +75,7 @@ class Config:
     speed: float | None = None
     seconds: float = 4.0
     every: int = 6
-    sets: int = 5
+    sets: int = 20
     seed: int = 0
     pairs: int = 2000
     memory_gib: float = 4.0
@@ -91,6 +94,7 @@ def check(args: Config) -> None:
     """
     least = {
         "--rollouts": (min(args.rollouts, default=0), 2),
+        "--sweep-rollouts": (args.sweep_rollouts or 2, 2),
         "--steps": (min(args.steps, default=1), 1),
         "--every": (args.every, 1),
         "--sets": (args.sets, 2),
@@ -147,9 +151,10 @@ def sweep(
     Returns:
       The table, and what each program needs of the memory.
     """
-    number, needs = max(args.rollouts), []
+    largest, needs = max(args.rollouts), []
+    number = args.sweep_rollouts or largest
 
-    def program(load: workload.Load) -> workload.Program:
+    def program(load: workload.Load, number: int) -> workload.Program:
         made = workload.fit_program(
             load,
             number,
@@ -161,11 +166,14 @@ def sweep(
         print(memory.describe(needs[-1]), flush=True)
         return made
 
-    main = program(load)
+    main = program(load, largest)
     by_number = _cells(args, main, tuple(sorted(set(args.rollouts))))
-    by_steps = [(main.steps, load.name, by_number[number])]
+    if number != largest:
+        main = program(load, number)
+    own = by_number.get(number) or _cells(args, main, (number,))[number]
+    by_steps = [(main.steps, load.name, own)]
     for other in others:
-        made = program(other)
+        made = program(other, number)
         cells = _cells(args, made, (number,))[number]
         by_steps.append((made.steps, other.name, cells))
     known = {steps for steps, *_ in by_steps}

@@ -39,7 +39,7 @@ AMOUNTS = {
         quick=0.1, full=0.1, meaning="part of each clip, at its end, for evaluation"
     ),
     "characters": Amount(
-        quick=2, full=8, meaning="rollouts of a replication", training=False
+        quick=16, full=16, meaning="rollouts of a replication", training=False
     ),
     "seconds": Amount(
         quick=4.0,

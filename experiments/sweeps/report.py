@@ -12,7 +12,7 @@ from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.viz import pareto
 from sweeps.points import Point
-from sweeps.system import GROUND_TRUTH, NOISE_FLOOR, Rows
+from sweeps.system import GROUND_TRUTH, NOISE_FLOOR, Row, Rows
 
 
 def write(
@@ -69,6 +69,12 @@ def _ends(cell: Cell) -> tuple[float, float, float]:
     return cell.value, low, high
 
 
+def _fails(cells: Row) -> bool:
+    """Whether most rollouts diverge or freeze; then no distance speaks for them."""
+    counts = [cells[name] for name in ("diverged", "frozen") if name in cells]
+    return any(2 * cell.value > cell.samples for cell in counts)
+
+
 def _draw(
     path: Path,
     rows: Rows,
@@ -99,5 +105,6 @@ def _draw(
             xlabel=f"{sample}, batch 1: p50, ms",
             ylabel=f"{quality} (lower is better)",
             title=title,
+            broken=tuple(point.name for point in shown if _fails(rows[point.row])),
         )
     return ", ".join(point.row for point in points if point not in shown)

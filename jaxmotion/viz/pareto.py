@@ -61,6 +61,7 @@ def write_pareto(
     xlabel: str,
     ylabel: str,
     title: str = "",
+    broken: tuple[str, ...] = (),
 ) -> None:
     """Draws named points with error bars in both directions, lower left is best.
 
@@ -73,21 +74,34 @@ def write_pareto(
       xlabel: Quantity and unit.
       ylabel: Quantity and unit.
       title: Above the picture.
+      broken: Names of points that fail in other ways: hollow, and beaten by all.
 
     Raises:
       OSError: if the file cannot be written.
+      ValueError: if a broken name is of no point.
     """
+    unknown = set(broken) - set(names)
+    if unknown:
+        raise ValueError(f"broken: no point is named {', '.join(sorted(unknown))}")
     path = figure.check_writable(path)
     canvas = Figure(figsize=(7.5, 5), dpi=120, layout="constrained")
     axes = canvas.add_subplot()
-    front = np.flatnonzero(pareto_front(x[:, 0], y[:, 0]))
+    sound = np.array([name not in broken for name in names])
+    whole = np.flatnonzero(sound)
+    front = whole[pareto_front(x[whole, 0], y[whole, 0])]
     front = front[np.argsort(x[front, 0])]
     axes.plot(x[front, 0], y[front, 0], color=figure.LEFT, lw=1, alpha=0.5)
     bars = [np.abs(z[:, 1:] - z[:, :1]).T for z in (x, y)]
-    axes.errorbar(
-        x[:, 0], y[:, 0], xerr=bars[0], yerr=bars[1], fmt="o", color=figure.LEFT,
-        capsize=3, label="95 % intervals; line: none is better in both",
-    )  # fmt: skip
+    labels = "95 % intervals; line: none is better in both", "fails in other ways"
+    for which, label, fill in zip(
+        (sound, ~sound), labels, ("full", "none"), strict=True
+    ):
+        if which.any():
+            axes.errorbar(
+                x[which, 0], y[which, 0], xerr=bars[0][:, which],
+                yerr=bars[1][:, which], fmt="o", color=figure.LEFT, capsize=3,
+                fillstyle=fill, label=label,
+            )  # fmt: skip
     for name, place in zip(names, zip(x[:, 0], y[:, 0], strict=True), strict=True):
         axes.annotate(
             name, place, xytext=(7, 7), textcoords="offset points", fontsize=11,

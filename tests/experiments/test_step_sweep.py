@@ -289,6 +289,14 @@ def test_a_model_without_a_number_is_in_the_table_alone(call, tmp_path):
     assert (tmp_path / "pareto.png").exists()
 
 
+def test_distances_of_rollouts_that_diverge_stand_for_nothing(load):
+    fails = load("sweeps.report")._fails
+    count = lambda n: table.Cell(value=float(n), samples=40)  # noqa: E731
+    assert fails({"diverged": count(21)}) and fails({"frozen": count(40)})
+    assert not fails({"diverged": count(20), "frozen": count(0)})
+    assert not fails({"fid": table.Cell(value=3.0, samples=2)})
+
+
 def test_the_same_seed_gives_the_same_table(call, swept, tmp_path):
     call(f"--system noise --steps 4 2 --out {tmp_path / 'same'}")
     call(f"--system noise --steps 4 2 --out {tmp_path / 'other'} --seed 1")

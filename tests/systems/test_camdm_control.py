@@ -379,6 +379,22 @@ def test_chunks_and_batches_change_nothing(params, bones, whole):
     assert np.abs(whole[1].root_position[2] - whole[1].root_position[3]).max() > 1e-2
 
 
+def test_256_characters_at_a_time_are_256_alone(params, bones):
+    """Over the first plan; later ones repeat what rounding there was."""
+    number, ticks = 256, CONTROL.apply
+    commands = commands_of(*turning(number, ticks))
+    states = states_of(bones, number)
+    alone, together = (
+        program(number, chunk)(params, bones, jax.random.key(0), states, commands)[1]
+        for chunk in (1, number)
+    )
+    assert np.asarray(alone.planned)[:, 0].all()
+    for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)
+    # And they are different characters.
+    assert np.asarray(alone.root_position).std(axis=0).max() > 1e-2
+
+
 def test_live_ticks_are_the_rollout(params, bones, whole):
     commands = commands_of(*turning(4, 9))
 

@@ -50,6 +50,16 @@ def test_a_picture_shows_points_and_lines(tmp_path):
     assert blue(with_line) > 100 and blue(without) > 100
 
 
+def test_what_is_broken_is_hollow_and_off_the_line(tmp_path):
+    pictures = [draw(tmp_path / "a.png"), draw(tmp_path / "b.png", broken=("2",))]
+    filled = [(p[..., 2] > p[..., 0] + 60).sum() for p in pictures]
+    assert 100 < filled[1] < filled[0]
+    # All may be broken.
+    draw(tmp_path / "c.png", broken=("2", "8", "32"))
+    with pytest.raises(ValueError, match="broken: no point is named 4"):
+        draw(tmp_path / "d.png", broken=("4",))
+
+
 def test_an_unwritable_file_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=r"a\.png"):
