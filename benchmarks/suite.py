@@ -83,10 +83,13 @@ def settings(args: Any) -> dict[str, Any]:
     Returns:
       Its fields; paths as text.
     """
-    return {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in dataclasses.asdict(args).items()
-    }
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return [plain(x) for x in value]
+        return str(value) if isinstance(value, Path) else value
+
+    return {name: plain(value) for name, value in dataclasses.asdict(args).items()}
 
 
 def start(main: Callable[[], None]) -> None:

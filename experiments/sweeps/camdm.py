@@ -165,9 +165,16 @@ def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
     )
     return judge, {
         GROUND_TRUTH: {"fid": distance(feature, reference)}
+        | _unbiased(job, feature, reference)
         | camdm_rows.metric_row(bones, real, hits, height=height),
-        NOISE_FLOOR: {"fid": distance(reference[own], reference[~own])},
+        NOISE_FLOOR: {"fid": distance(reference[own], reference[~own])}
+        | _unbiased(job, reference[own], reference[~own]),
     }
+
+
+def _unbiased(job: Job, features: np.ndarray, reference: np.ndarray) -> Row:
+    found = camdm_rows.unbiased_cell(features, reference, seed=job.seed)
+    return {} if found is None else {"fid_unbiased": found}
 
 
 def _fid(job: Job, judge: Judge, features: np.ndarray, owner: np.ndarray) -> Cell:
@@ -207,6 +214,7 @@ def score(job: Job, judge: Judge, run: camdm_runs.Run) -> Row:
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
     health = camdm_rows.rollout_health(bones, frames, fps=fps, height=judge.root)
     row = {"fid": _fid(job, judge, features, owner)}
+    row |= _unbiased(job, features, judge.reference)
     row |= camdm_rows.metric_row(bones, grouped, hits, height=judge.height)
     row["diversity_m2"] = camdm_rows.repeat_diversity(
         bones, made, repeats=job.replications
@@ -248,7 +256,9 @@ def bench(job: Job) -> Bench:
             "samples": f"one rollout of {job.budget['seconds']:g} s for each of "
             f"{len(run.model.labels)} styles, preset {PRESET!r}; Fréchet distances of "
             f"{judge.count} windows to {len(judge.reference)}; the clips' distances "
-            "are of as many random subsets, their other intervals over clips",
+            "are of as many random subsets, their other intervals over clips; "
+            "fid_unbiased is extrapolated to infinitely many windows from a row's "
+            "subsets of at least as many windows as features",
             "fid_windows": judge.count,
             "fid_reference_windows": len(judge.reference),
             "rollouts": int(judge.labels.size),

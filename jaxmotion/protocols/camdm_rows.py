@@ -11,7 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxmotion.evaluation import diversity, frechet, health, locomotion, table
+from jaxmotion.evaluation import (
+    diversity,
+    frechet,
+    frechet_bias,
+    health,
+    locomotion,
+    table,
+)
 from jaxmotion.learning import recognition
 from jaxmotion.motion import skeleton
 from jaxmotion.protocols.camdm import Windows
@@ -100,6 +107,38 @@ def frechet_cell(
         own = frechet.moments(jnp.asarray(feature[chosen]))
         found.append(frechet.frechet_distance(own, target))
     return table.cell(jnp.stack(found))
+
+
+def unbiased_cell(
+    feature: np.ndarray, reference: np.ndarray, *, seed: int, sizes: int = 5
+) -> table.Cell | None:
+    """Fréchet distance to the reference, extrapolated to infinitely many windows.
+
+    Distances of few windows are too large, and not by the same amount for all models.
+
+    Args:
+      feature: Features of all windows of a row.
+      reference: Features of the reference windows.
+      seed: Of the subsets.
+      sizes: Of the subsets, from as many windows as there are features to all.
+
+    Returns:
+      The distance, without an interval; None if there are too few windows for the
+      extrapolation to hold.
+
+    Source: `frechet_bias`.
+    """
+    count, least = feature.shape
+    if count < least + sizes - 1:
+        return None
+    found = frechet_bias.frechet_bias(
+        jax.random.key(seed),
+        jnp.asarray(feature),
+        frechet.moments(jnp.asarray(reference)),
+        sizes=frechet_bias.subset_sizes(count, number=sizes, least=least),
+        repeats=3,
+    )
+    return table.Cell(value=float(found.extrapolated), samples=count)
 
 
 def rollout_health(

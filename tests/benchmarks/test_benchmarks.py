@@ -88,6 +88,18 @@ def test_phases_add_up(load):
     assert row["total"] == pytest.approx(sum(parts))
 
 
+def test_settings_are_json(load):
+    @dataclasses.dataclass(frozen=True)
+    class Config:
+        out: Path = Path("a")
+        runs: tuple[Path, ...] = (Path("b"), Path("c"))
+        steps: tuple[int, ...] = (2, 4)
+        gate: Path | None = None
+
+    found = json.loads(json.dumps(load("suite").settings(Config())))
+    assert found == {"out": "a", "runs": ["b", "c"], "steps": [2, 4], "gate": None}
+
+
 @pytest.mark.slow
 def test_compile_times(tmp_path):
     small = ["--width", 16, "--steps", 2, "--updates", 2, "--batch", 2]

@@ -177,3 +177,22 @@ def test_the_table_is_written_as_strict_json_and_markdown(tmp_path, capsys):
     markdown = (tmp_path / "table.md").read_text()
     assert markdown.count("\n") == 5 and TRUTH in markdown
     assert markdown.strip() in capsys.readouterr().out
+
+
+def test_an_unbiased_distance_is_nearer_to_the_true_one():
+    """Of Gaussians a unit apart, from few windows."""
+    draw = np.random.default_rng(0).normal
+    reference = draw(size=(20_000, 16)).astype(np.float32)
+    apart = np.eye(16)[0].astype(np.float32)
+    biased, unbiased = [], []
+    for seed in range(8):
+        features = draw(size=(120, 16)).astype(np.float32) + apart
+        cell = camdm_rows.unbiased_cell(features, reference, seed=seed)
+        assert cell.samples == 120 and cell.low is None
+        unbiased.append(cell.value)
+        whole = dict(count=120, seed=seed, repeats=1)
+        biased.append(camdm_rows.frechet_cell(features, reference, **whole).value)
+    assert np.mean(biased) > 1.4
+    error = np.std(unbiased, ddof=1) / np.sqrt(8)
+    assert abs(np.mean(unbiased) - 1.0) < max(4 * error, 0.1) < 0.4
+    assert camdm_rows.unbiased_cell(features[:19], reference, seed=0) is None

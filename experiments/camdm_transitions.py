@@ -1,0 +1,132 @@
+"""CAMDM's changes of style: how many succeed, how soon, with and without guidance.
+
+Characters walk in one style, are told another, and a recogniser looks for it in what
+follows: the paper's tables 2 and 4, where people judged. Rows are the run-time's
+constants of the paper, of its release, without guidance on the past, and characters who
+were told nothing, in whom what is found is a mistake of the recogniser's.
+
+Examples:
+  python experiments/camdm_transitions.py --run runs/camdm
+  python experiments/camdm_transitions.py --run runs/camdm --evaluator evaluators/styles.npz
+"""  # noqa: E501
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import jax
+import tyro
+
+from jaxmotion.learning import loop
+from jaxmotion.protocols import (
+    artifacts,
+    camdm_evaluation,
+    camdm_runs,
+    camdm_transitions,
+    evaluators,
+    provenance,
+)
+from jaxmotion.systems.camdm_control import RELEASED, Control
+
+CONTROLS = {
+    "guided once, scale 0.7 (paper)": Control(),
+    "guided twice, scale 0.5 (release)": Control(
+        guidance_scale=RELEASED.guidance_scale, guided_plans=RELEASED.guided_plans
+    ),
+    "not guided": Control(guided_plans=0),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Change the style of characters, and measure how it goes.
+
+    Attributes:
+      run: Run folder of camdm.py train.
+      data: Clips; None for those that the run was trained on.
+      out: Folder for metrics.json and table.md; None for <run>/transitions.
+      replications: Sets of one rollout for each ordered pair of styles, with start
+        poses and noise of their own; intervals run over these.
+      before: Seconds in the first style.
+      limit: Seconds behind the command in which the change must have come.
+      preset: Commands: forward, strafe or stop_and_go; each style goes at its own
+        median speed.
+      contents: Contents of the clips to start from; none: all of the run's.
+      chunk: Characters to run at a time, at most.
+      recognizer_steps: Updates of the style recogniser, if it is trained here.
+      evaluator: File of a frozen style recogniser, from evaluator.py; None trains one
+        here.
+      seed: Of poses, noise and recogniser.
+    """
+
+    run: Path = Path("runs/camdm")
+    data: Path | None = None
+    out: Path | None = None
+    replications: int = 20
+    before: float = 2.0
+    limit: float = 4.0
+    preset: str = "forward"
+    contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right")
+    chunk: int = 14
+    recognizer_steps: int = 1500
+    evaluator: Path | None = None
+    seed: int = 0
+
+
+def measure(args: Config) -> None:
+    """Writes the table.
+
+    Args:
+      args: Of the command line.
+    """
+    evaluator = None if args.evaluator is None else evaluators.load(args.evaluator)
+    run = camdm_runs.load_run(args.run, args.data, args.contents)
+    out = args.out or args.run / "transitions"
+    loop.check_writable(out)
+    changes = camdm_transitions.make_changes(
+        run,
+        preset=args.preset,
+        before=args.before,
+        limit=args.limit,
+        replications=args.replications,
+        seed=args.seed,
+    )
+    key_fit, _ = jax.random.split(jax.random.key(args.seed))
+    judge = camdm_evaluation.recognizer(
+        key_fit, run, evaluator, num_steps=args.recognizer_steps
+    )
+    rows = camdm_transitions.evaluate_transitions(
+        run, changes, CONTROLS, judge, chunk=args.chunk, seed=args.seed
+    )
+    report = {
+        "arguments": camdm_runs.arguments_json(args),
+        "source": run.model.source,
+        "rollouts": int(changes.old.size),
+        "recognised_in_clips_%": camdm_transitions.clip_accuracy(run, judge).value,
+        "evaluator": evaluators.describe(
+            judge.params,
+            evaluator,
+            reference=evaluators.clips_fingerprint(run.train, run.field),
+        ),
+        **provenance.provenance(),
+    }
+    notes = (
+        f"{changes.old.size} rollouts a row: every ordered pair of "
+        f"{len(run.model.labels)} styles, {args.replications} times.",
+        evaluators.note(report["evaluator"]),
+        f"It is right in {report['recognised_in_clips_%']:.1f} % of the windows of "
+        "held-out clips.",
+    )
+    artifacts.write_table(out, rows, report, notes)
+
+
+def main() -> None:
+    """Parses the command line and runs the command."""
+    measure(tyro.cli(Config, description=__doc__))
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except (OSError, ValueError) as error:
+        sys.exit(f"error: {error}")

@@ -1,0 +1,277 @@
+"""Changes of style: how often they come, how soon, and what the motion is meanwhile.
+
+Every ordered pair of styles is one change. A replication has one rollout of each, with
+noise and start poses of its own; all rows have the same. A recogniser decides, in
+windows behind the command, whether the new style is there (`evaluation.transitions`).
+
+Source: Chen et al. 2024 (CAMDM), section 4.1, tables 2 and 4, where people judged.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxmotion.evaluation import table
+from jaxmotion.evaluation.transitions import transition
+from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.protocols import camdm as protocol
+from jaxmotion.protocols import camdm_evaluation, camdm_rows, camdm_styles
+from jaxmotion.protocols.camdm_runs import Run
+from jaxmotion.protocols.camdm_styles import Recognized
+from jaxmotion.systems import camdm_control
+
+# Frames between the windows in which the new style is looked for.
+STRIDE = 6
+# Seconds behind the command whose motion is measured; the paper's 120 frames.
+MEASURED = 4.0
+MOTION = (
+    "foot_slide_m/s",
+    "jerk_m/s3",
+    "slide_camdm_release",
+    "coherence_camdm_release",
+)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Changes:
+    """Rollouts to be made, and when and into what their style changes.
+
+    Attributes:
+      states: Where characters start, in poses of their first style.
+      commands: [characters, ticks]; each style goes at its own speed.
+      old: First style of each character.
+      new: Style commanded from `tick` on.
+      replication: That each character belongs to.
+      tick: Of the change.
+      limit: Seconds behind it in which it must have come.
+    """
+
+    states: camdm_control.CharacterState
+    commands: trajectory.Command
+    old: np.ndarray
+    new: np.ndarray
+    replication: np.ndarray
+    tick: int
+    limit: float
+
+
+def make_changes(
+    run: Run,
+    *,
+    preset: str,
+    before: float,
+    limit: float = 4.0,
+    replications: int,
+    seed: int,
+) -> Changes:
+    """Every ordered pair of styles, in each replication.
+
+    Args:
+      run: The run.
+      preset: Of `presets.PRESETS`.
+      before: Seconds in the first style.
+      limit: Seconds behind the command in which the change must have come.
+      replications: Of all pairs, with start poses of their own.
+      seed: Of the start poses.
+
+    Returns:
+      The changes; their rollouts last so long that the last window is whole.
+
+    Raises:
+      ValueError: if there are fewer than two styles or replications, no such preset,
+        or no time.
+    """
+    number, fps = len(run.model.labels), run.model.config.fps
+    least = {"styles": (number, 2), "replications": (replications, 2)}
+    for name, (found, expected) in least.items():
+        if found < expected:
+            raise ValueError(f"{name}: {found}, expected at least {expected}")
+    for name, seconds in (("before", before), ("limit", limit)):
+        if not seconds > 0:
+            raise ValueError(f"{name}: {seconds} s, expected more than 0")
+    pairs = np.array([(a, b) for a in range(number) for b in range(number) if a != b])
+    old, new = np.tile(pairs, (replications, 1)).T
+    tick = round(before * fps)
+    after = max(round(limit * fps), round(MEASURED * fps) - protocol.WINDOW)
+    ticks = tick + after + protocol.WINDOW
+    of_style = functools.partial(
+        camdm_evaluation.preset_of_run, run, preset, seconds=ticks / fps, speed=None
+    )
+    commands = jax.tree.map(
+        lambda a, b: jnp.concatenate([a[:, :tick], b[:, tick:]], axis=1),
+        of_style(old)[1],
+        of_style(new)[1],
+    )
+    return Changes(
+        states=protocol.start_states(
+            run.held_out, run.model, old, field=run.field, seed=seed
+        ),
+        commands=commands,
+        old=old,
+        new=new,
+        replication=np.repeat(np.arange(replications), len(pairs)),
+        tick=tick,
+        limit=limit,
+    )
+
+
+def without(changes: Changes) -> Changes:
+    """The same characters, who keep their first style: what finds a change is wrong.
+
+    Args:
+      changes: The changes.
+
+    Returns:
+      Changes whose commands keep label and speed, judged by the same new styles.
+    """
+    first = changes.commands.label[:, :1]
+    label = jnp.broadcast_to(first, changes.commands.label.shape)
+    commands = dataclasses.replace(changes.commands, label=label)
+    return dataclasses.replace(changes, commands=commands)
+
+
+def find_changes(
+    bones: skeleton.Skeleton,
+    frames: camdm_control.Frame,
+    changes: Changes,
+    recognizer: Recognized,
+    *,
+    fps: float,
+) -> tuple[Bool[np.ndarray, "characters windows"], np.ndarray]:
+    """Whether each window behind the command shows the new style.
+
+    Args:
+      bones: The skeleton.
+      frames: Displayed frames [characters, ticks, ...].
+      changes: That they were made for.
+      recognizer: Of styles.
+      fps: Ticks a second.
+
+    Returns:
+      Decisions, and the windows' starts in seconds behind the command.
+    """
+    starts = np.arange(0, round(changes.limit * fps) + 1, STRIDE)
+    found = []
+    for start in starts:
+        first = changes.tick + int(start)
+        cut = jax.tree.map(lambda x: x[:, first : first + protocol.WINDOW], frames)  # noqa: B023
+        label = jnp.asarray(changes.new)
+        made = protocol.rollout_windows(cut, label, fps=fps, skip=0)
+        found.append(camdm_styles.recognized(bones, made, recognizer)[1] > 0.5)
+    return np.stack(found, axis=1), starts / fps
+
+
+def transition_row(
+    run: Run,
+    frames: camdm_control.Frame,
+    changes: Changes,
+    recognizer: Recognized,
+    *,
+    height: float,
+) -> dict[str, table.Cell]:
+    """Success, duration and quality of motion, over replications.
+
+    Args:
+      run: The run.
+      frames: Of all characters.
+      changes: That they were made for.
+      recognizer: Of styles.
+      height: Below it a foot joint should not move, metres.
+
+    Returns:
+      Success in per cent; duration in seconds and frames, failures counted as the
+      limit; and of the four seconds behind the command what `metric_row` measures.
+    """
+    bones, fps = run.model.bones, run.model.config.fps
+    found, starts = find_changes(bones, frames, changes, recognizer, fps=fps)
+    done = transition(
+        jnp.asarray(found), jnp.asarray(starts, jnp.float32), limit=changes.limit
+    )
+    groups = int(changes.replication.max()) + 1
+
+    def cell(values: Array) -> table.Cell:
+        own = np.asarray(values).reshape(groups, -1).mean(axis=1)
+        return table.cell(jnp.asarray(own, jnp.float32))
+
+    row = {
+        "success_%": cell(100.0 * done.succeeded),
+        "transition_s": cell(done.seconds),
+        "transition_frames": cell(fps * done.seconds),
+    }
+    behind = slice(changes.tick, changes.tick + round(MEASURED * fps))
+    cut = jax.tree.map(lambda x: x[:, behind], frames)
+    made = protocol.rollout_windows(cut, jnp.asarray(changes.new), fps=fps, skip=0)
+    owner = changes.replication[np.asarray(made.group)]
+    grouped = dataclasses.replace(made, group=jnp.asarray(owner))
+    motion = camdm_rows.metric_row(bones, grouped, None, height=height)
+    return row | {name: motion[name] for name in MOTION}
+
+
+def evaluate_transitions(
+    run: Run,
+    changes: Changes,
+    controls: dict[str, camdm_control.Control],
+    recognizer: Recognized,
+    *,
+    chunk: int | None = None,
+    seed: int = 0,
+    report: Callable[[str], None] = print,
+) -> dict[str, dict[str, table.Cell]]:
+    """One row for each run-time, and one of characters who keep their style.
+
+    Args:
+      run: The run.
+      changes: What characters are told.
+      controls: Constants of the run-time, by row; the last row's serve for those who
+        keep their style.
+      recognizer: Of styles.
+      chunk: Characters to run at a time, at most.
+      seed: Of the noise, the same for all rows.
+      report: Called with each row's name when it is measured.
+
+    Returns:
+      The table.
+    """
+    real = protocol.data_windows(run.held_out, stride=protocol.WINDOW, field=run.field)
+    height = camdm_rows.contact_height(run.model.bones, real)
+
+    def row(own: Changes, control: camdm_control.Control) -> dict[str, table.Cell]:
+        frames = protocol.steered_rollouts(
+            run.params,
+            jax.random.key(seed),
+            own.states,
+            own.commands,
+            model=run.model,
+            control=control,
+            chunk=chunk,
+        )
+        return transition_row(run, frames, own, recognizer, height=height)
+
+    rows = {}
+    for name, control in controls.items():
+        rows[name] = row(changes, control)
+        report(name)
+    rows["style kept (changes found by mistake)"] = row(without(changes), control)
+    return rows
+
+
+def clip_accuracy(run: Run, recognizer: Recognized) -> table.Cell:
+    """How often the recogniser is right on held-out clips: a bound on success.
+
+    Args:
+      run: The run.
+      recognizer: Of styles.
+
+    Returns:
+      Per cent, over clips.
+    """
+    real = protocol.data_windows(run.held_out, stride=STRIDE, field=run.field)
+    _, hits = camdm_styles.recognized(run.model.bones, real, recognizer)
+    owner = np.asarray(real.group)
+    clips = [100.0 * hits[owner == i].mean() for i in np.unique(owner)]
+    return table.cell(jnp.asarray(clips, jnp.float32))

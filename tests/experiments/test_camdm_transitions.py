@@ -1,0 +1,89 @@
+"""experiments/camdm_transitions.py: help, errors, and a tiny run."""
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from jaxmotion.data import clips_io
+from jaxmotion.protocols import evaluators
+from tests.protocols import samples
+
+FOLDER = Path(__file__).parents[2] / "experiments"
+
+
+@pytest.fixture
+def call(monkeypatch):
+    """Runs a script's command line in this process."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+
+    def run(script, line):
+        module = importlib.import_module(script)
+        monkeypatch.setattr(sys, "argv", [f"{script}.py", *line.split()])
+        module.main()
+
+    return run
+
+
+def test_the_help_has_units_defaults_and_an_example(call, capsys):
+    with pytest.raises(SystemExit) as stop:
+        call("camdm_transitions", "--help")
+    assert stop.value.code == 0
+    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+    for words in (
+        "python experiments/camdm_transitions.py --run runs/camdm",
+        "Seconds behind the command",
+        "(default: 20)",
+        "(default: 4.0)",
+    ):
+        assert words in text
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--run {folder}/none", "none"),
+        ("--evaluator {folder}/none.npz", r"none\.npz"),
+    ],
+)
+def test_what_is_missing_is_named(call, tmp_path, line, message):
+    with pytest.raises((OSError, ValueError), match=message):
+        call("camdm_transitions", line.format(folder=tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick_compile")
+def test_a_tiny_run_twice_gives_the_same_table(call, tmp_path):
+    clips = samples.clips()
+    clips_io.save_clips(tmp_path / "clips.npz", clips)
+    evaluators.save(
+        tmp_path / "judge.npz",
+        samples.evaluator(
+            "style", labels=samples.STYLES, joints=clips.skeleton.names, frames=60
+        ),
+    )
+    run = tmp_path / "run"
+    call(
+        "camdm",
+        f"train --data {tmp_path}/clips.npz --out {run} --no-mirror --contents "
+        "--held-out 0.3 --steps 2 --batch 4 --chunk 2 --save-every 2 --width 16 "
+        "--depth 1 --diffusion-steps 1 --warmup 1",
+    )
+    found = []
+    for name in "ab":
+        call(
+            "camdm_transitions",
+            f"--run {run} --replications 2 --before 0.5 --limit 1 --contents --chunk 2 "
+            f"--evaluator {tmp_path}/judge.npz --out {tmp_path / name}",
+        )
+        found.append(json.loads((tmp_path / name / "metrics.json").read_text()))
+    assert found[0]["rows"] == found[1]["rows"]
+    assert len(found[0]["rows"]) == 4
+    for row in found[0]["rows"].values():
+        assert 0 <= row["success_%"]["value"] <= 100
+        assert row["transition_s"]["samples"] == 2
+    assert found[0]["rollouts"] == 4 and found[0]["jax"] and found[0]["git_commit"]
+    assert "4 rollouts a row" in (tmp_path / "a" / "table.md").read_text()
