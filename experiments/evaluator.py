@@ -177,6 +177,7 @@ def train(args: Train) -> None:
     loop.check_writable(args.out.parent)
     begun = time.perf_counter()
     run, _ = KINDS[args.kind]
+    print(f"training on {', '.join(map(str, args.data))}: minutes", flush=True)
     evaluator = run(args)
     evaluators.save(args.out, evaluator)
     megabytes = args.out.stat().st_size / 1e6
