@@ -47,7 +47,7 @@ class Config:
       out: Folder for metrics.json and table.md; None for <run>/transitions.
       replications: Sets of one rollout for each ordered pair of styles, with start
         poses and noise of their own; intervals run over these.
-      before: Seconds in the first style.
+      before: Seconds in the first style, 1 at least.
       limit: Seconds behind the command in which the change must have come.
       preset: Commands: forward, strafe or stop_and_go; each style goes at its own
         median speed.

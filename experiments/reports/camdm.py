@@ -83,7 +83,7 @@ DURATION = Column(
     better="lower",
     judged=True,
     note="frames at 30 a second, failures counted as 120; by a recogniser of windows "
-    "behind the command, where people judged",
+    "of 2 s, dated to their centre, where people judged",
 )
 SUCCESS = Column(
     name="Succ. Rate",

@@ -1,8 +1,9 @@
 """Changes of style: how often they come, how soon, and what the motion is meanwhile.
 
 Every ordered pair of styles is one change. A replication has one rollout of each, with
-noise and start poses of its own; all rows have the same. A recogniser decides, in
-windows behind the command, whether the new style is there (`evaluation.transitions`).
+noise and start poses of its own; all rows have the same. A recogniser decides in
+windows of two seconds whether the new style is there, and the change is dated to the
+centre of the first window that shows it: up to half of that window may be from before.
 
 Source: Chen et al. 2024 (CAMDM), section 4.1, tables 2 and 4, where people judged.
 """
@@ -26,7 +27,8 @@ from jaxmotion.protocols.camdm_styles import Recognized
 from jaxmotion.systems import camdm_control
 
 # Frames between the windows in which the new style is looked for.
-STRIDE = 6
+STRIDE = 3
+HALF = protocol.WINDOW // 2
 # Seconds behind the command whose motion is measured; the paper's 120 frames.
 MEASURED = 4.0
 MOTION = (
@@ -74,7 +76,7 @@ def make_changes(
     Args:
       run: The run.
       preset: Of `presets.PRESETS`.
-      before: Seconds in the first style.
+      before: Seconds in the first style, at least half a window.
       limit: Seconds behind the command in which the change must have come.
       replications: Of all pairs, with start poses of their own.
       seed: Of the start poses.
@@ -91,14 +93,17 @@ def make_changes(
     for name, (found, expected) in least.items():
         if found < expected:
             raise ValueError(f"{name}: {found}, expected at least {expected}")
-    for name, seconds in (("before", before), ("limit", limit)):
-        if not seconds > 0:
-            raise ValueError(f"{name}: {seconds} s, expected more than 0")
+    for name, seconds, shortest in (
+        ("before", before, HALF / fps),
+        ("limit", limit, 0),
+    ):
+        if not (seconds >= shortest and seconds > 0):
+            what = f"at least {shortest:g}" if shortest else "more than 0"
+            raise ValueError(f"{name}: {seconds} s, expected {what}")
     pairs = np.array([(a, b) for a in range(number) for b in range(number) if a != b])
     old, new = np.tile(pairs, (replications, 1)).T
     tick = round(before * fps)
-    after = max(round(limit * fps), round(MEASURED * fps) - protocol.WINDOW)
-    ticks = tick + after + protocol.WINDOW
+    ticks = tick + max(round(limit * fps) + HALF, round(MEASURED * fps))
     of_style = functools.partial(
         camdm_evaluation.preset_of_run, run, preset, seconds=ticks / fps, speed=None
     )
@@ -143,7 +148,7 @@ def find_changes(
     *,
     fps: float,
 ) -> tuple[Bool[np.ndarray, "characters windows"], np.ndarray]:
-    """Whether each window behind the command shows the new style.
+    """Whether each window about or behind the command shows the new style.
 
     Args:
       bones: The skeleton.
@@ -153,17 +158,17 @@ def find_changes(
       fps: Ticks a second.
 
     Returns:
-      Decisions, and the windows' starts in seconds behind the command.
+      Decisions, and the windows' centres in seconds behind the command, from 0 on.
     """
-    starts = np.arange(0, round(changes.limit * fps) + 1, STRIDE)
+    centres = np.arange(0, round(changes.limit * fps) + 1, STRIDE)
     found = []
-    for start in starts:
-        first = changes.tick + int(start)
+    for centre in centres:
+        first = changes.tick + int(centre) - HALF
         cut = jax.tree.map(lambda x: x[:, first : first + protocol.WINDOW], frames)  # noqa: B023
         label = jnp.asarray(changes.new)
         made = protocol.rollout_windows(cut, label, fps=fps, skip=0)
         found.append(camdm_styles.recognized(bones, made, recognizer)[1] > 0.5)
-    return np.stack(found, axis=1), starts / fps
+    return np.stack(found, axis=1), centres / fps
 
 
 def transition_row(
@@ -188,9 +193,9 @@ def transition_row(
       limit; and of the four seconds behind the command what `metric_row` measures.
     """
     bones, fps = run.model.bones, run.model.config.fps
-    found, starts = find_changes(bones, frames, changes, recognizer, fps=fps)
+    found, centres = find_changes(bones, frames, changes, recognizer, fps=fps)
     done = transition(
-        jnp.asarray(found), jnp.asarray(starts, jnp.float32), limit=changes.limit
+        jnp.asarray(found), jnp.asarray(centres, jnp.float32), limit=changes.limit
     )
     groups = int(changes.replication.max()) + 1
 

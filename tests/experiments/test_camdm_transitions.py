@@ -76,7 +76,7 @@ def test_a_tiny_run_twice_gives_the_same_table(call, tmp_path):
     for name in "ab":
         call(
             "camdm_transitions",
-            f"--run {run} --replications 2 --before 0.5 --limit 1 --contents --chunk 2 "
+            f"--run {run} --replications 2 --before 1 --limit 1 --contents --chunk 2 "
             f"--evaluator {tmp_path}/judge.npz --out {tmp_path / name}",
         )
         found.append(json.loads((tmp_path / name / "metrics.json").read_text()))

@@ -38,8 +38,8 @@ def test_every_pair_is_commanded_in_every_replication(changes):
     np.testing.assert_array_equal(label[:, :30], changes.old[:, None].repeat(30, 1))
     after = label.shape[1] - 30
     np.testing.assert_array_equal(label[:, 30:], changes.new[:, None].repeat(after, 1))
-    # The last window in which the style may appear is whole: 60 frames from 2 s on.
-    assert after == 60 + 60
+    # The last window is whole, centred 2 s behind; 4 s are measured.
+    assert after == max(60 + 30, 120)
     speed = np.linalg.norm(np.asarray(changes.commands.velocity), axis=-1)
     assert abs(speed[0, 5] - speed[1, 5]) > 0.01
     assert speed[0, -1] == pytest.approx(speed[1, 5], rel=1e-3)
@@ -79,12 +79,13 @@ def sees_height(monkeypatch):
 
 @pytest.mark.usefixtures("sees_height")
 def test_planted_changes_are_found_at_their_time(changes):
-    frames = planted(changes, [0, 18, 20, np.inf])
+    # All of a window must be high: its centre is a second behind the change.
+    frames = planted(changes, [-30, 0, 2, np.inf])
     row = transitions.transition_row(samples.run(), frames, changes, JUDGE, height=0.05)
-    # 20 frames are found at the next window, 24; the last one counts as the limit.
+    # 2 frames are found at the next window, 3; the last one counts as the limit.
     assert row["success_%"].value == pytest.approx(75.0)
     assert row["success_%"].samples == 2
-    seconds = [0.0, 0.6, 0.8, 2.0]
+    seconds = [0.0, 1.0, 1.1, 2.0]
     assert row["transition_s"].value == pytest.approx(np.mean(seconds), abs=1e-5)
     frames_there = row["transition_frames"]
     assert frames_there.value == pytest.approx(30 * np.mean(seconds), abs=1e-3)
@@ -96,18 +97,18 @@ def test_planted_changes_are_found_at_their_time(changes):
 def test_windows_are_where_they_say(changes):
     run = samples.run()
     frames = planted(changes, [12, 12, 12, 12])
-    found, starts = transitions.find_changes(
+    found, centres = transitions.find_changes(
         run.model.bones, frames, changes, JUDGE, fps=FPS
     )
-    np.testing.assert_allclose(starts, np.arange(0, 61, 6) / 30)
-    np.testing.assert_array_equal(found, (starts >= 0.4)[None].repeat(4, 0))
+    np.testing.assert_allclose(centres, np.arange(0, 61, 3) / 30)
+    np.testing.assert_array_equal(found, (centres >= 1.4)[None].repeat(4, 0))
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"replications": 1}, "replications: 1, expected at least 2"),
-        ({"before": 0.0}, "before: 0.0 s"),
+        ({"before": 0.5}, "before: 0.5 s, expected at least 1"),
         ({"limit": -1.0}, "limit: -1.0 s"),
         ({"preset": "zigzag"}, "zigzag"),
     ],
