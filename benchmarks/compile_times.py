@@ -24,6 +24,7 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import training
+from jaxmotion.protocols import camdm_training, script
 from jaxmotion.systems import camdm, camdm_control, camdm_loss, camdm_model
 from jaxmotion.typing import Key, Params
 
@@ -140,11 +141,7 @@ def training_program(
     optimizer = training.adamw_cosine(num_steps=1000)
     loss = functools.partial(camdm_loss.loss, bones=model.bones, config=model.config)
 
-    def sample_batch(key: Key, data: tuple) -> tuple:
-        clips, index = data
-        motion, clip = windows.sample_windows(key, clips, index, batch=args.batch)
-        return motion, clips.labels["style"][clip]
-
+    sample_batch = camdm_training.window_sampler(field="style", batch=args.batch)
     update = training.make_update(loss, optimizer)
     run = training.train_chunk(update, sample_batch, num_steps=args.updates)
     state = training.init_train_state(params, optimizer)
@@ -195,7 +192,7 @@ def programs(args: Config) -> Iterator[tuple[str, Callable, tuple]]:
 def main() -> None:
     """Measures and writes the report."""
     args = tyro.cli(Config, description=__doc__)
-    suite.prepare(args.out, args.gate)
+    suite.prepare(args)
     rows = [phases(*program) for program in programs(args)]
     suite.print_table(rows, COLUMNS)
     metrics = [
@@ -203,15 +200,8 @@ def main() -> None:
         for row in rows
         for phase in ("trace", "lower", "compile")
     ]
-    suite.report(
-        "compile_times",
-        metrics,
-        args.out,
-        gate=args.gate,
-        rows=rows,
-        settings=suite.settings(args),
-    )
+    suite.report("compile_times", metrics, args, rows=rows)
 
 
 if __name__ == "__main__":
-    suite.start(main)
+    script.start(main)

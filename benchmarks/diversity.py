@@ -24,7 +24,7 @@ import workload_diversity as workload
 
 from jaxmotion.control import presets
 from jaxmotion.evaluation import table
-from jaxmotion.protocols import provenance
+from jaxmotion.protocols import provenance, script
 
 WALKER = Path(__file__).parents[1] / "jaxmotion" / "assets" / "walker.npz"
 
@@ -62,6 +62,7 @@ class Config:
       chunk: Rollouts at a time; None for as many as fit, but 16 on a CPU, whose cache
         more would not fit.
       out: Folder for diversity.json and diversity.md.
+      gate: Report to compare with; exit status 1 if a program needs more memory.
     """
 
     rollouts: tuple[int, ...] = (64, 256, 1024)
@@ -81,6 +82,7 @@ class Config:
     memory_gib: float = 4.0
     chunk: int | None = None
     out: Path = Path("runs/benchmarks")
+    gate: Path | None = None
 
 
 def check(args: Config) -> None:
@@ -94,13 +96,14 @@ def check(args: Config) -> None:
     """
     least = {
         "--rollouts": (min(args.rollouts, default=0), 2),
-        "--sweep-rollouts": (args.sweep_rollouts or 2, 2),
         "--steps": (min(args.steps, default=1), 1),
         "--every": (args.every, 1),
         "--sets": (args.sets, 2),
         "--pairs": (args.pairs, 1),
         "--chunk": (1 if args.chunk is None else args.chunk, 1),
     }
+    if args.sweep_rollouts is not None:
+        least["--sweep-rollouts"] = (args.sweep_rollouts, 2)
     for name, (found, expected) in least.items():
         if found < expected:
             raise ValueError(f"{name} {found}: expected {expected} or more")
@@ -152,7 +155,7 @@ def sweep(
       The table, and what each program needs of the memory.
     """
     largest, needs = max(args.rollouts), []
-    number = args.sweep_rollouts or largest
+    number = largest if args.sweep_rollouts is None else args.sweep_rollouts
 
     def program(load: workload.Load, number: int) -> workload.Program:
         made = workload.fit_program(
@@ -194,7 +197,7 @@ def main() -> None:
     """Measures, prints the table and writes the report."""
     args = tyro.cli(Config, description=__doc__)
     check(args)
-    suite.prepare(args.out, None)
+    suite.prepare(args)
     options = dict(
         style=args.style,
         preset=args.preset,
@@ -218,15 +221,14 @@ def main() -> None:
     suite.report(
         "diversity",
         metrics,
-        args.out,
+        args,
         rows=table.to_json(rows),
         memory=needs,
         peak_memory=peak,
         seeds=list(range(args.seed, args.seed + args.sets)),
         commit=provenance.git_commit(),
-        settings=suite.settings(args),
     )
 
 
 if __name__ == "__main__":
-    suite.start(main)
+    script.start(main)

@@ -27,6 +27,7 @@ import torch_camdm
 import tyro
 import workload
 
+from jaxmotion.protocols import script
 from jaxmotion.systems import camdm
 
 EAGER = "torch eager"
@@ -224,7 +225,7 @@ def judge(
 def main() -> None:
     """Measures, writes the report, and checks the target."""
     args = tyro.cli(Config, description=__doc__)
-    suite.prepare(args.out, args.gate)
+    suite.prepare(args)
     threads = machine.use_cores(args.threads)
     torch.set_num_threads(threads)
     config = workload.paper_config(steps=args.steps)
@@ -266,10 +267,8 @@ def main() -> None:
     suite.report(
         "peers",
         metrics,
-        args.out,
-        gate=args.gate,
+        args,
         rows=rows,
-        settings=suite.settings(args),
         threads=threads,
         torch=torch.__version__,
         torch_compile=note,
@@ -282,4 +281,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    suite.start(main)
+    script.start(main)

@@ -19,6 +19,7 @@ import workload
 import workload_aamdm
 
 from jaxmotion.control import rollout
+from jaxmotion.protocols import script
 
 # Characters at a time unless told: what was fastest on two cores.
 CHUNKS = {"camdm": (4,), "aamdm": (0,)}
@@ -207,7 +208,7 @@ def compare_loops(
 def main() -> None:
     """Measures and writes the report."""
     args = tyro.cli(Config, description=__doc__)
-    suite.prepare(args.out, args.gate)
+    suite.prepare(args)
     chunks = CHUNKS[args.system] if args.chunks is None else args.chunks
     cases = [(n, chunk) for n in args.characters for chunk in chunks_of(n, chunks)]
     rows, more = [], {}
@@ -234,13 +235,11 @@ def main() -> None:
     suite.report(
         "rollout_batch",
         metrics,
-        args.out,
-        gate=args.gate,
+        args,
         rows=rows,
-        settings=suite.settings(args),
         **more,
     )
 
 
 if __name__ == "__main__":
-    suite.start(main)
+    script.start(main)

@@ -22,6 +22,7 @@ import workload_emdm
 import workload_smgdiff
 from jaxtyping import Array
 
+from jaxmotion.protocols import script
 from jaxmotion.systems import camdm
 from jaxmotion.typing import Params
 from jaxmotion.viz import figure
@@ -208,7 +209,7 @@ def main() -> None:
     args = tyro.cli(Config, description=__doc__)
     if args.guided and args.system != "smgdiff":
         raise ValueError(f"--guided is of smgdiff, not of {args.system}")
-    suite.prepare(args.out, args.gate)
+    suite.prepare(args)
     kinds = (False, True) if args.guided else (False,)
     rows = []
     for batch in args.batch:
@@ -233,15 +234,8 @@ def main() -> None:
         ylabel="a batch of plans, ms (p50, whisker to p95)",
     )
     metrics = [metric for row in rows for metric in metrics_of(args.system, row)]
-    suite.report(
-        "step_counts",
-        metrics,
-        args.out,
-        gate=args.gate,
-        rows=rows,
-        settings=suite.settings(args),
-    )
+    suite.report("step_counts", metrics, args, rows=rows)
 
 
 if __name__ == "__main__":
-    suite.start(main)
+    script.start(main)

@@ -6,10 +6,8 @@ the machine meanwhile: figures from a shared machine are no figures of the progr
 
 import dataclasses
 import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import machine
 
@@ -35,20 +33,33 @@ class Metric:
     tolerance: float = 0.3
 
 
-def prepare(out: Path, gate: Path | None) -> None:
+class Settings(Protocol):
+    """Command-line settings of a benchmark: a dataclass with these fields."""
+
+    @property
+    def out(self) -> Path:
+        """Folder of the report."""
+        ...
+
+    @property
+    def gate(self) -> Path | None:
+        """Baseline report, or None."""
+        ...
+
+
+def prepare(args: Settings) -> None:
     """Raises if the report could not be written or compared; before any work.
 
     Args:
-      out: Folder of the report.
-      gate: Baseline report, or None.
+      args: The settings.
 
     Raises:
       OSError: if the folder cannot be written, or the baseline not be read.
       ValueError: if the baseline is no report.
     """
-    check_writable(out)
-    if gate is not None:
-        read_baseline(gate)
+    check_writable(args.out)
+    if args.gate is not None:
+        read_baseline(args.gate)
 
 
 def read_baseline(path: Path) -> dict[str, float]:
@@ -90,18 +101,6 @@ def settings(args: Any) -> dict[str, Any]:
         return str(value) if isinstance(value, Path) else value
 
     return {name: plain(value) for name, value in dataclasses.asdict(args).items()}
-
-
-def start(main: Callable[[], None]) -> None:
-    """Runs a script; bad input ends it with one line and exit status 1.
-
-    Args:
-      main: The script.
-    """
-    try:
-        main()
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
 
 
 def compare(metrics: list[Metric], baseline: Path) -> list[str]:
@@ -154,9 +153,9 @@ def print_table(rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
 def report(
     name: str,
     metrics: list[Metric],
-    out: Path,
+    args: Settings,
     *,
-    gate: Path | None = None,
+    rows: Any,
     **more: Any,
 ) -> None:
     """Writes metrics as JSON, and applies the gate.
@@ -164,31 +163,35 @@ def report(
     Args:
       name: Of the benchmark; the file is <out>/<name>.json.
       metrics: What was measured.
-      out: Folder.
-      gate: Baseline report, or None.
+      args: The settings.
+      rows: The table.
       **more: Further entries of the file.
 
     Raises:
       SystemExit: with status 1, if the gate finds something worse.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    args.out.mkdir(parents=True, exist_ok=True)
     here = machine.environment()
     value = {
         "benchmark": name,
         "environment": here,
         "metrics": [dataclasses.asdict(metric) for metric in metrics],
+        "rows": rows,
+        "settings": settings(args),
         **more,
     }
-    path = out / f"{name}.json"
+    path = args.out / f"{name}.json"
     path.write_text(json.dumps(value, indent=1))
     print(f"{here['cpu']}, {here['cores']} cores, jax {here['jax']}")
-    if (here["other_load"] or 0.0) > 0.1:
+    # Memory is what it is on a busy machine, too.
+    timed = any(metric.unit != "GiB" for metric in metrics)
+    if timed and (here["other_load"] or 0.0) > 0.1:
         print(
             f"Not idle: other processes used {here['other_load']} cores meanwhile, "
             "so these times are too long."
         )
     print(f"wrote {path}")
-    worse = [] if gate is None else compare(metrics, gate)
+    worse = [] if args.gate is None else compare(metrics, args.gate)
     if worse:
         print("worse than the baseline:", *worse, sep="\n  ")
         raise SystemExit(1)

@@ -26,7 +26,7 @@ import workload
 
 from jaxmotion.data import windows
 from jaxmotion.learning import training
-from jaxmotion.protocols import camdm_training
+from jaxmotion.protocols import camdm_training, script
 from jaxmotion.systems import aamdm, aamdm_loss, camdm, camdm_loss
 from jaxmotion.typing import Key
 
@@ -98,15 +98,9 @@ def camdm_program(width: int, batch: int) -> Program:
     model = camdm_training.make_model(clips, field="style", **sizes)
     optimizer = training.muon_cosine(num_steps=1000)
     loss = functools.partial(camdm_loss.loss, bones=model.bones, config=model.config)
-
-    def sample(key: Key, data: tuple) -> tuple:
-        clips, index = data
-        motion, clip = windows.sample_windows(key, clips, index, batch=batch)
-        return motion, clips.labels["style"][clip]
-
     return Program(
         update=training.make_update(loss, optimizer),
-        sample=sample,
+        sample=camdm_training.window_sampler(field="style", batch=batch),
         init=lambda key: training.init_train_state(
             camdm.init(key, model.config), optimizer
         ),
@@ -146,30 +140,8 @@ def aamdm_program(width: int, batch: int) -> Program:
 
 
 SYSTEMS = {"camdm": camdm_program, "aamdm": aamdm_program}
-
-
-def together(program: Program, *, updates: int) -> Callable:
-    """A chunk of training of all models, which share batches and noise.
-
-    Args:
-      program: Of one model.
-      updates: A call.
-
-    Returns:
-      `run(states, key, data) -> (states, info)`, jitted; states have the axis of
-      models first and are donated, as in `training.train_chunk`.
-    """
-    update = jax.vmap(program.update, (0, None, None))
-
-    def run(states: Any, key: Key, data: Any) -> tuple[Any, training.Info]:
-        def one(states: Any, _) -> tuple[Any, training.Info]:
-            step_key = jax.random.fold_in(key, states.step[0])
-            key_batch, key_loss = jax.random.split(step_key)
-            return update(states, key_loss, program.sample(key_batch, data))
-
-        return jax.lax.scan(one, states, None, length=updates)
-
-    return jax.jit(run, donate_argnums=0)
+# Axis of the models in each field; they share the number of updates made.
+MODELS = training.TrainState(step=None, params=0, ema_params=0, opt_state=0)
 
 
 def measure(args: Config, width: int) -> dict[str, Any]:
@@ -187,11 +159,14 @@ def measure(args: Config, width: int) -> dict[str, Any]:
     key, data = jax.random.key(1), jax.tree.map(jnp.asarray, program.data)
     # The programs donate their state: what they return replaces it.
     singles = [jax.jit(program.init)(k) for k in keys]
-    stacked = [jax.jit(jax.vmap(program.init))(keys)]
-    run_one = training.train_chunk(
-        program.update, program.sample, num_steps=args.updates
+    stacked = [jax.jit(jax.vmap(program.init, out_axes=MODELS))(keys)]
+    run_one, run_all = (
+        training.train_chunk(update, program.sample, num_steps=args.updates)
+        for update in (
+            program.update,
+            jax.vmap(program.update, (MODELS, None, None), (MODELS, 0)),
+        )
     )
-    run_all = together(program, updates=args.updates)
 
     def alone() -> list:
         singles[:] = [run_one(state, key, data)[0] for state in singles]
@@ -227,7 +202,7 @@ def main() -> None:
     for name in ("models", "updates", "batch", "rounds"):
         if getattr(args, name) < 1:
             raise ValueError(f"--{name} {getattr(args, name)}: expected 1 or more")
-    suite.prepare(args.out, args.gate)
+    suite.prepare(args)
     rows = [measure(args, width) for width in args.width]
     suite.print_table(rows, COLUMNS)
     metrics = [
@@ -239,15 +214,8 @@ def main() -> None:
         )
         for row in rows
     ]
-    suite.report(
-        "train_together",
-        metrics,
-        args.out,
-        gate=args.gate,
-        rows=rows,
-        settings=suite.settings(args),
-    )
+    suite.report("train_together", metrics, args, rows=rows)
 
 
 if __name__ == "__main__":
-    suite.start(main)
+    script.start(main)

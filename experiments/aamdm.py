@@ -8,7 +8,6 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Literal
@@ -24,6 +23,7 @@ from jaxmotion.protocols import (
     aamdm_runs,
     aamdm_stages,
     artifacts,
+    script,
 )
 
 Steering = Literal["forward", "strafe", "stop_and_go"]
@@ -255,7 +255,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError, loop.TrainingDiverged) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

@@ -9,7 +9,6 @@ Examples:
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,6 +25,7 @@ from jaxmotion.protocols import (
     camdm_runs,
     camdm_training,
     evaluators,
+    script,
 )
 from jaxmotion.systems import camdm_model
 
@@ -300,7 +300,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError, loop.TrainingDiverged) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

@@ -11,7 +11,6 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import jax
@@ -25,6 +24,7 @@ from jaxmotion.protocols import (
     camdm_transitions,
     evaluators,
     provenance,
+    script,
 )
 from jaxmotion.systems.camdm_control import RELEASED, Control
 
@@ -127,7 +127,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

@@ -9,7 +9,6 @@ Example:
 """  # noqa: E501
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from jaxmotion.data.dribble import (
 )
 from jaxmotion.data.dribble_touches import Dribble
 from jaxmotion.learning import loop
+from jaxmotion.protocols import script
 
 _FAR, _NEAR = (2.5, 5.0), (0.4, 0.8)
 
@@ -142,7 +142,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

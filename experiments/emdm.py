@@ -11,7 +11,6 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,7 +19,7 @@ import tyro
 from emdm_tasks import evaluation, sampling, setup
 
 from jaxmotion.learning import loop
-from jaxmotion.protocols import emdm_rows, emdm_runs, stages
+from jaxmotion.protocols import emdm_rows, emdm_runs, script, stages
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,7 +213,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError, loop.TrainingDiverged) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

@@ -9,7 +9,6 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +25,7 @@ from jaxmotion.protocols import (
     emdm_data,
     evaluator_training,
     evaluators,
+    script,
     smgdiff_data,
 )
 from jaxmotion.protocols.evaluators import Evaluator, Kind
@@ -209,7 +209,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

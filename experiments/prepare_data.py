@@ -16,7 +16,6 @@ Example:
 
 import dataclasses
 import os
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Literal
@@ -28,6 +27,7 @@ from jaxmotion.data import clips_io, mirror, resample, selection, text_motion_io
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
 from jaxmotion.data.text_motion import TextMotions
+from jaxmotion.protocols import script
 
 Source = Literal[
     "bandai_namco/1",
@@ -272,7 +272,7 @@ def describe_texts(motions: TextMotions, path: Path) -> str:
     return "\n".join(lines)
 
 
-def main(config: Config) -> None:
+def prepare(config: Config) -> None:
     """Prepares the data and prints what it is.
 
     Args:
@@ -305,8 +305,10 @@ def main(config: Config) -> None:
     print(f"took     {time.time() - start:.1f} s")
 
 
+def main() -> None:
+    """Parses the command line and prepares the data."""
+    prepare(tyro.cli(Config, description=__doc__))
+
+
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

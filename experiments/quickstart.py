@@ -26,7 +26,7 @@ from jaxmotion.data import procedural, selection, windows
 from jaxmotion.data.gaits import GAITS, Gait
 from jaxmotion.learning import loop, training
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import artifacts, camdm_rows, camdm_training
+from jaxmotion.protocols import artifacts, camdm_rows, camdm_training, script
 from jaxmotion.protocols import camdm as protocol
 from jaxmotion.systems import camdm, camdm_control, camdm_loss, camdm_model
 
@@ -203,4 +203,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    script.start(main)

@@ -11,7 +11,6 @@ Examples:
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import tyro
@@ -19,7 +18,7 @@ from reports import results, verdicts, writing
 from reports.claims import Source
 
 from jaxmotion.learning import loop
-from jaxmotion.protocols import provenance
+from jaxmotion.protocols import provenance, script
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +110,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

@@ -19,6 +19,8 @@ import tyro
 from serving import protocol, runs, simulation
 from serving.server import Limits, Server
 
+from jaxmotion.protocols import script
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -115,9 +117,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except (OSError, ValueError) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

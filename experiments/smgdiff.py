@@ -10,7 +10,6 @@ Examples:
 
 import dataclasses
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,6 +21,7 @@ from jaxmotion.data.ball_clips import load_ball_clips
 from jaxmotion.learning import loop
 from jaxmotion.protocols import (
     evaluators,
+    script,
     smgdiff_data,
     smgdiff_evaluation,
     smgdiff_runs,
@@ -264,7 +264,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError, loop.TrainingDiverged) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

@@ -24,6 +24,7 @@ from baselines import amdm, lmm, mvae
 
 from jaxmotion.evaluation import modes
 from jaxmotion.learning import adversarial, loop, training
+from jaxmotion.protocols import script
 from jaxmotion.systems import aamdm, aamdm_loss
 from jaxmotion.viz import scatter
 
@@ -194,4 +195,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    script.start(main)

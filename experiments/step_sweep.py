@@ -14,15 +14,13 @@ Examples:
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import tyro
 from sweeps import aamdm, budgets, camdm, emdm, run, smgdiff
 from sweeps.system import Job
 
-from jaxmotion.learning import loop
-from jaxmotion.protocols import evaluators
+from jaxmotion.protocols import evaluators, script
 from jaxmotion.protocols.camdm_runs import arguments_json
 
 SYSTEMS = {
@@ -144,7 +142,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except (OSError, ValueError, loop.TrainingDiverged) as error:
-        sys.exit(f"error: {error}")
+    script.start(main)

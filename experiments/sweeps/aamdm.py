@@ -24,8 +24,7 @@ AMOUNTS = {
     "autoencoder_updates": Amount(
         quick=4000,
         full=20000,
-        meaning="updates of the pose autoencoder, which all models share; a multiple "
-        "of 100, as the next two",
+        meaning="updates of the pose autoencoder, which all models share",
     ),
     "polisher_updates": Amount(
         quick=2000, full=5000, meaning="updates of each diffusion model"

@@ -17,9 +17,7 @@ from sweeps.points import Point
 from sweeps.system import GROUND_TRUTH, NOISE_FLOOR, Bench, Job, Row, System
 
 AMOUNTS = {
-    "updates": Amount(
-        quick=1000, full=5000, meaning="updates of each GAN, a multiple of 100"
-    ),
+    "updates": Amount(quick=1000, full=5000, meaning="updates of each GAN"),
     "batch": Amount(quick=32, full=32, meaning="motions an update"),
     "width": Amount(quick=128, full=128, meaning="channels of a token"),
     "depth": Amount(quick=4, full=4, meaning="layers"),

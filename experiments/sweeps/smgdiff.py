@@ -22,14 +22,11 @@ from sweeps.points import Point
 from sweeps.system import GROUND_TRUTH, NOISE_FLOOR, Bench, Job, Row, System
 
 AMOUNTS = {
-    "updates": Amount(
-        quick=500, full=3000, meaning="updates of each motion model, a multiple of 100"
-    ),
+    "updates": Amount(quick=500, full=3000, meaning="updates of each motion model"),
     "draft_updates": Amount(
         quick=400,
         full=3500,
-        meaning="updates before these in which displacements hardly count, a multiple "
-        "of 100",
+        meaning="updates before these in which displacements hardly count",
     ),
     "batch": Amount(quick=48, full=48, meaning="windows an update"),
     "width": Amount(quick=128, full=192, meaning="channels of a token"),

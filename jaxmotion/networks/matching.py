@@ -18,6 +18,8 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxmotion.networks.convolution import convolve
+
 UNIT = 4  # frames of a movement: two convolutions of stride 2
 
 _XAVIER = nn.initializers.xavier_normal()
@@ -37,7 +39,12 @@ class MovementEncoder(nn.Module):
 
     def setup(self):
         """Makes the layers."""
-        halve = dict(strides=(2,), padding=((1, 1),), kernel_init=_XAVIER)
+        halve = dict(
+            strides=(2,),
+            padding=((1, 1),),
+            kernel_init=_XAVIER,
+            conv_general_dilated=convolve,
+        )
         self.convolution_1 = nn.Conv(self.width, (4,), **halve)
         self.convolution_2 = nn.Conv(self.width, (4,), **halve)
         self.out = nn.Dense(self.width, kernel_init=_XAVIER)

@@ -11,6 +11,8 @@ Source: released feature extractor of CAMDM (Chen et al. 2024).
 import flax.linen as nn
 from jaxtyping import Array, Float
 
+from jaxmotion.networks.convolution import convolve
+
 
 class ResidualConvolution(nn.Module):
     """Convolution of width 3, norm and leaky ReLU, added to a 1 x 1 convolution.
@@ -23,9 +25,9 @@ class ResidualConvolution(nn.Module):
 
     def setup(self):
         """Makes the two convolutions and the norm."""
-        self.main = nn.Conv(self.channels, (3,))
+        self.main = nn.Conv(self.channels, (3,), conv_general_dilated=convolve)
         self.norm = nn.GroupNorm(8)
-        self.side = nn.Conv(self.channels, (1,))
+        self.side = nn.Conv(self.channels, (1,), conv_general_dilated=convolve)
 
     def __call__(
         self, x: Float[Array, "batch frames channels_in"]

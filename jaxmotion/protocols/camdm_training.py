@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
@@ -124,6 +125,29 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
     return dataclasses.replace(found, source=model.source), params
 
 
+def window_sampler(
+    *, field: str, batch: int
+) -> Callable[[Key, tuple[Clips, windows.WindowIndex]], tuple[skeleton.Motion, Array]]:
+    """Random windows and their styles, as `camdm_loss.loss` takes them.
+
+    Args:
+      field: Label field that is the style.
+      batch: Windows a draw.
+
+    Returns:
+      `(key, (clips, index)) -> (motion, label)`.
+    """
+
+    def sample_batch(
+        key: Key, data: tuple[Clips, windows.WindowIndex]
+    ) -> tuple[skeleton.Motion, Array]:
+        clips, index = data
+        motion, clip = windows.sample_windows(key, clips, index, batch=batch)
+        return motion, clips.labels[field][clip]
+
+    return sample_batch
+
+
 def start(
     clips: Clips,
     model: Model,
@@ -179,11 +203,7 @@ def start(
     update = training.make_update(objective, transformation, ema_decay=ema)
     mesh = jax.make_mesh((devices,), ("data",)) if devices > 1 else None
 
-    def sample_batch(key: Key, data: tuple[Clips, windows.WindowIndex]) -> tuple:
-        clips, index = data
-        motion, clip = windows.sample_windows(key, clips, index, batch=batch)
-        return motion, clips.labels[field][clip]
-
+    sample_batch = window_sampler(field=field, batch=batch)
     key_init, key_train = jax.random.split(jax.random.key(seed))
     if params is None:
         params = camdm.init(key_init, model.config)

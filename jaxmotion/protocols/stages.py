@@ -5,6 +5,7 @@ system and stage it is, so that one cannot be taken for another.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -25,7 +26,7 @@ class Budget:
       optimizer: "muon" or "adamw" with cosine decay, AAMDM's "radam" or EMDM's "adam".
       learning_rate: Of the optimiser.
       ema: Decay of the parameters' moving average.
-      chunk: Updates of one compiled call.
+      chunk: Updates of one compiled call; fewer, if these do not divide the steps.
       save_every: Updates between checkpoints.
       seed: Of parameters and batches.
     """
@@ -158,10 +159,11 @@ def fit(
                 f"{[value[k] for k in differ]}, found {[found.get(k) for k in differ]}"
             )
         state = checkpoint.restore(folder / "checkpoints", state)
-    run = training.train_chunk(update, sample_batch, num_steps=budget.chunk)
+    chunk = math.gcd(budget.steps, int(state.step), budget.chunk)
+    run = training.train_chunk(update, sample_batch, num_steps=chunk)
     settings = loop.Loop(
         num_steps=budget.steps,
-        chunk=budget.chunk,
+        chunk=chunk,
         save_every=budget.save_every,
         folder=folder,
         config=value,

@@ -142,6 +142,9 @@ def test_help_has_defaults_units_and_an_example(name, load, monkeypatch, capsys)
     assert "seconds" in printed.lower()
 
 
+Config = dataclasses.make_dataclass("Config", ["out", "gate"])
+
+
 def test_gate(load, tmp_path, monkeypatch):
     suite = load("suite")
     monkeypatch.setattr(sys, "argv", ["x.py"])
@@ -149,7 +152,7 @@ def test_gate(load, tmp_path, monkeypatch):
         suite.Metric("time", 10.0, "ms", tolerance=0.2),
         suite.Metric("rate", 100.0, "frames/s", "higher", tolerance=0.2),
     )
-    suite.report("x", [time, rate], tmp_path)
+    suite.report("x", [time, rate], Config(tmp_path, None), rows=[])
     baseline = tmp_path / "x.json"
     value = lambda metric, x: dataclasses.replace(metric, value=x)  # noqa: E731
     new = suite.Metric("new", 1e9, "ms")
@@ -160,7 +163,7 @@ def test_gate(load, tmp_path, monkeypatch):
     (few,) = suite.compare([time, value(rate, 80.0)], baseline)
     assert "rate" in few
     with pytest.raises(SystemExit) as stop:
-        suite.report("y", [value(time, 20.0)], tmp_path, gate=baseline)
+        suite.report("y", [value(time, 20.0)], Config(tmp_path, baseline), rows=[])
     assert stop.value.code == 1
     assert (tmp_path / "y.json").exists()
 
@@ -170,11 +173,11 @@ def test_bad_input_stops_before_the_work(load, tmp_path):
     file = tmp_path / "file"
     file.write_text("{}")
     with pytest.raises(OSError, match="file"):
-        suite.prepare(file / "below", None)
+        suite.prepare(Config(file / "below", None))
     with pytest.raises(ValueError, match="metrics"):
-        suite.prepare(tmp_path, file)
+        suite.prepare(Config(tmp_path, file))
     with pytest.raises(OSError, match="none.json"):
-        suite.prepare(tmp_path, tmp_path / "none.json")
+        suite.prepare(Config(tmp_path, tmp_path / "none.json"))
     chunks_of = load("rollout_batch").chunks_of
     assert chunks_of(16, (4, 0, 4)) == [4, None]
     with pytest.raises(ValueError, match="--chunks 5.*divisor of 16"):

@@ -35,7 +35,7 @@ def test_published_clips_are_written_mirrored_and_resampled(
 ):
     out = tmp_path / "data" / "b.npz"
     options = {"source": "bandai_namco/2", "out": out, "manual_dir": raw}
-    script.main(script.Config(**options, mirror=True, fps=60.0))
+    script.prepare(script.Config(**options, mirror=True, fps=60.0))
     found = clips_io.load_clips(out)
     assert (found.num_clips, found.fps, found.num_frames) == (4, 60.0, 4 * 7)
     assert found.clip_names[2:] == tuple(f"{n}_mirrored" for n in found.clip_names[:2])
@@ -45,11 +45,11 @@ def test_published_clips_are_written_mirrored_and_resampled(
         assert word in printed
     assert (tmp_path / "data" / "tfds").is_dir()
     with pytest.raises(FileExistsError, match="b.npz exists"):
-        script.main(script.Config(**options))
+        script.prepare(script.Config(**options))
     # A second reading sees that a clip is gone: nothing stale is reused.
     for path in raw.rglob("*run_active*"):
         path.unlink()
-    script.main(script.Config(**options, overwrite=True))
+    script.prepare(script.Config(**options, overwrite=True))
     assert clips_io.load_clips(out).clip_names == ("dataset-2_walk_elderly_001",)
 
 
@@ -57,7 +57,7 @@ def test_sets_with_captions_are_written(script, tmp_path, capsys):
     test_text_builders.put(tmp_path, 251, inner=".")
     out = tmp_path / "data" / "k.npz"
     options = {"source": "kit_ml", "out": out, "manual_dir": tmp_path / "raw"}
-    script.main(script.Config(**options, cut_fps=12.5))
+    script.prepare(script.Config(**options, cut_fps=12.5))
     found = text_motion_io.load_text_motions(out)
     assert (found.num_clips, found.num_features, found.fps) == (6, 251, 12.5)
     printed = capsys.readouterr().out
@@ -66,7 +66,7 @@ def test_sets_with_captions_are_written(script, tmp_path, capsys):
         assert word in printed
     for change in ({"mirror": True}, {"fps": 20.0}):
         with pytest.raises(ValueError, match="--mirror and --fps do not apply"):
-            script.main(script.Config(**options, overwrite=True, **change))
+            script.prepare(script.Config(**options, overwrite=True, **change))
 
 
 def test_humanact12_keeps_its_rate(script, tmp_path):
@@ -76,7 +76,7 @@ def test_humanact12_keeps_its_rate(script, tmp_path):
     content = {"poses": [pose], "joints3D": [joints], "y": [2]}
     (tmp_path / "raw" / "humanact12poses.pkl").write_bytes(pickle.dumps(content))
     out = tmp_path / "a.npz"
-    script.main(
+    script.prepare(
         script.Config(source="humanact12", out=out, manual_dir=tmp_path / "raw")
     )
     found = clips_io.load_clips(out)
@@ -88,7 +88,7 @@ def test_clips_with_a_ball_are_written(script, tmp_path, capsys):
     test_ballplay.write(tmp_path / "raw", test_ballplay.content())
     out = tmp_path / "data" / "b.npz"
     options = {"source": "ballplay", "out": out, "manual_dir": tmp_path / "raw"}
-    script.main(script.Config(**options))
+    script.prepare(script.Config(**options))
     found = ball_clips.load_ball_clips(out)
     assert (found.clips.num_clips, found.clips.fps, found.radius) == (3, 30.0, 0.112)
     printed = capsys.readouterr().out
@@ -103,14 +103,16 @@ def test_clips_with_a_ball_are_written(script, tmp_path, capsys):
         assert word in printed
     for change in ({"mirror": True}, {"fps": 60.0}):
         with pytest.raises(ValueError, match="--mirror and --fps do not apply"):
-            script.main(script.Config(**options, overwrite=True, **change))
+            script.prepare(script.Config(**options, overwrite=True, **change))
 
 
 def test_soccer_x_is_written(script, tmp_path):
     files = {"dribble_1.npz": test_soccer_x.sequence(33, 0)}
     test_soccer_x.write(tmp_path / "raw", files)
     out = tmp_path / "s.npz"
-    script.main(script.Config(source="soccer_x", out=out, manual_dir=tmp_path / "raw"))
+    script.prepare(
+        script.Config(source="soccer_x", out=out, manual_dir=tmp_path / "raw")
+    )
     found = ball_clips.load_ball_clips(out)
     assert (found.clips.num_frames, found.joints) == (5, (7, 8, 10, 11))
 
@@ -128,7 +130,7 @@ def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
     ]
     for change, error, message in cases:
         with pytest.raises(error, match=message):
-            script.main(script.Config(**{**base, **change}))
+            script.prepare(script.Config(**{**base, **change}))
     assert sorted(os.listdir(tmp_path)) == ["file", "raw"]
 
 
@@ -137,4 +139,4 @@ def test_a_folder_without_write_permission_is_an_error(script, raw, tmp_path):
     (tmp_path / "locked").mkdir(mode=0o500)
     out = tmp_path / "locked" / "o.npz"
     with pytest.raises(PermissionError):
-        script.main(script.Config(source="bandai_namco/2", manual_dir=raw, out=out))
+        script.prepare(script.Config(source="bandai_namco/2", manual_dir=raw, out=out))

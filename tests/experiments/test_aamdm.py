@@ -1,6 +1,6 @@
 """experiments/aamdm.py: train, evaluate and roll out on clips that the tests make."""
 
-import importlib.util
+import functools
 import json
 import re
 import runpy
@@ -18,8 +18,8 @@ from jaxmotion.learning import checkpoint
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "experiments" / "aamdm.py"
 SETTINGS = (
-    "--field style --labels --rows aamdm lmm --autoencoder-steps 100 "
-    "--polisher-steps 100 --generator-steps 100 --window-steps 100 --batch 8 "
+    "--field style --labels --rows aamdm lmm --autoencoder-steps 10 "
+    "--polisher-steps 10 --generator-steps 10 --window-steps 10 --batch 8 "
     "--width 32"
 )
 STAGES = {
@@ -33,20 +33,9 @@ pytestmark = pytest.mark.usefixtures("quick_compile")
 
 
 @pytest.fixture(scope="module")
-def call():
-    """Runs a command line in this process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(SCRIPT.parent))
-        spec = importlib.util.spec_from_file_location("aamdm_script", SCRIPT)
-        module = importlib.util.module_from_spec(spec)
-        patch.setitem(sys.modules, "aamdm_script", module)
-        spec.loader.exec_module(module)
-
-        def run(line):
-            patch.setattr(sys, "argv", [str(SCRIPT), *line.split()])
-            module.main()
-
-        yield run
+def call(invoke):
+    """Runs a command line."""
+    return functools.partial(invoke, "aamdm")
 
 
 @pytest.fixture(scope="module")
@@ -87,13 +76,13 @@ def test_training_leaves_every_stage(trained, data):
     assert len(config["clips"]) == 32
     for name, stage in STAGES.items():
         checkpoints = trained / name / "checkpoints"
-        assert checkpoint.latest_step(checkpoints) == 100
+        assert checkpoint.latest_step(checkpoints) == 10
         value = checkpoint.load_config(checkpoints)
         assert (value["system"], value["stage"]) == ("aamdm", stage)
         assert "procedural" in value["source"]
     for text in losses(trained).values():
         rows = [json.loads(line) for line in text.splitlines()]
-        assert [row["step"] for row in rows] == [100]
+        assert [row["step"] for row in rows] == [10]
         for row in rows:
             own = [value for name, value in row.items() if "loss" in name]
             assert own and np.isfinite(own).all()
@@ -104,7 +93,7 @@ def test_what_is_trained_is_not_trained_again(call, trained, data):
     call(f"train --data {data} --out {trained} {SETTINGS}")
     assert losses(trained) == before
     for name in STAGES:
-        assert checkpoint.latest_step(trained / name / "checkpoints") == 100
+        assert checkpoint.latest_step(trained / name / "checkpoints") == 10
 
 
 # --- evaluation --------------------------------------------------------------------
@@ -125,8 +114,10 @@ def test_an_evaluation_has_the_data_and_the_trained_rows(evaluated):
         assert STEERED | {"fps", "diverged_unbounded"} < set(rows[name])
         assert rows[name]["fps"]["value"] > 0
         assert rows[name]["diverged"]["samples"] == 4
-        whole = rows[name]["diverged"]["value"] == 0
-        assert (set(rows[name]) >= FREE) == whole
+        # Without finite positions there is nothing else; some may be far off.
+        free = FREE & set(rows[name])
+        assert free in (FREE, {"diverged"})
+        assert free == FREE or rows[name]["diverged"]["value"] > 0
     assert 0.0 < rows["data (trained on)"]["speed_m/s"]["value"] < 2.0
     assert "procedural" in found["source"]
 
@@ -226,18 +217,6 @@ def test_what_is_wrong_is_said_in_one_line(
     assert losses(trained) == before
 
 
-def run(line):
-    command = [sys.executable, str(SCRIPT), *line.split()]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-
-
-def test_from_a_shell_an_error_is_one_line(tmp_path):
-    done = run(f"evaluate --run {tmp_path / 'gone'}")
-    assert done.returncode == 1
-    assert done.stderr.strip().splitlines()[-1].startswith("error: ")
-    assert "gone" in done.stderr and "Traceback" not in done.stderr
-
-
 @pytest.mark.parametrize(
     ("command", "words"),
     [
@@ -247,13 +226,15 @@ def test_from_a_shell_an_error_is_one_line(tmp_path):
         ("rollout", ["(default: 20.0)", "Metres a second", "Example:"]),
     ],
 )
-def test_help_has_defaults_units_and_an_example(call, capsys, command, words):
-    with pytest.raises(SystemExit) as stop:
-        call(f"{command} --help")
-    assert stop.value.code == 0
-    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+def test_help_has_defaults_units_and_an_example(help_of, command, words):
+    text = help_of("aamdm", command)
     for word in words:
         assert word in text
+
+
+def run(line):
+    command = [sys.executable, str(SCRIPT), *line.split()]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
 @pytest.mark.slow

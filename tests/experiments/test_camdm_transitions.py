@@ -1,9 +1,6 @@
 """experiments/camdm_transitions.py: help, errors, and a tiny run."""
 
-import importlib
 import json
-import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,26 +12,9 @@ from tests.protocols import samples
 FOLDER = Path(__file__).parents[2] / "experiments"
 
 
-@pytest.fixture
-def call(monkeypatch):
-    """Runs a script's command line in this process."""
-    monkeypatch.syspath_prepend(str(FOLDER))
-
-    def run(script, line):
-        module = importlib.import_module(script)
-        monkeypatch.setattr(sys, "argv", [f"{script}.py", *line.split()])
-        module.main()
-
-    return run
-
-
-def test_the_help_has_units_defaults_and_an_example(call, capsys):
-    with pytest.raises(SystemExit) as stop:
-        call("camdm_transitions", "--help")
-    assert stop.value.code == 0
-    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+def test_the_help_has_units_and_defaults(help_of):
+    text = help_of("camdm_transitions")
     for words in (
-        "python experiments/camdm_transitions.py --run runs/camdm",
         "Seconds behind the command",
         "(default: 20)",
         "(default: 4.0)",
@@ -49,14 +29,14 @@ def test_the_help_has_units_defaults_and_an_example(call, capsys):
         ("--evaluator {folder}/none.npz", r"none\.npz"),
     ],
 )
-def test_what_is_missing_is_named(call, tmp_path, line, message):
+def test_what_is_missing_is_named(invoke, tmp_path, line, message):
     with pytest.raises((OSError, ValueError), match=message):
-        call("camdm_transitions", line.format(folder=tmp_path))
+        invoke("camdm_transitions", line.format(folder=tmp_path))
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_compile")
-def test_a_tiny_run_twice_gives_the_same_table(call, tmp_path):
+def test_a_tiny_run_twice_gives_the_same_table(invoke, tmp_path):
     clips = samples.clips()
     clips_io.save_clips(tmp_path / "clips.npz", clips)
     evaluators.save(
@@ -66,7 +46,7 @@ def test_a_tiny_run_twice_gives_the_same_table(call, tmp_path):
         ),
     )
     run = tmp_path / "run"
-    call(
+    invoke(
         "camdm",
         f"train --data {tmp_path}/clips.npz --out {run} --no-mirror --contents "
         "--held-out 0.3 --steps 2 --batch 4 --chunk 2 --save-every 2 --width 16 "
@@ -74,7 +54,7 @@ def test_a_tiny_run_twice_gives_the_same_table(call, tmp_path):
     )
     found = []
     for name in "ab":
-        call(
+        invoke(
             "camdm_transitions",
             f"--run {run} --replications 2 --before 1 --limit 1 --contents --chunk 2 "
             f"--evaluator {tmp_path}/judge.npz --out {tmp_path / name}",

@@ -1,11 +1,10 @@
 """experiments/report.py: claims decided each way, what is missing, what is damaged."""
 
 import dataclasses
-import importlib
+import functools
 import json
 import math
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,23 +17,9 @@ SCRIPT = Path(__file__).parents[2] / "experiments" / "report.py"
 
 
 @pytest.fixture(scope="module")
-def load():
-    """Imports modules as the script finds them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(SCRIPT.parent))
-        yield importlib.import_module
-
-
-@pytest.fixture
-def call(load, monkeypatch):
-    """Runs a command line in this process."""
-    module = load("report")
-
-    def run(line):
-        monkeypatch.setattr(sys, "argv", [str(SCRIPT), *line.split()])
-        module.main()
-
-    return run
+def call(invoke):
+    """Runs a command line."""
+    return functools.partial(invoke, "report")
 
 
 def cell(value, low=None, high=None, samples=20):
@@ -321,10 +306,7 @@ def test_a_damaged_file_is_named_with_its_field(call, runs, tmp_path, text):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_help_names_every_option(call, capsys):
-    with pytest.raises(SystemExit) as stop:
-        call("--help")
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
+def test_the_help_names_every_option(help_of):
+    text = help_of("report")
     for option in ("--runs", "--out", "--sweep-emdm", "--smgdiff"):
         assert option in text

@@ -14,7 +14,6 @@ import re
 import signal
 import socket
 import struct
-import sys
 import threading
 import time
 from pathlib import Path
@@ -574,12 +573,8 @@ def script(monkeypatch):
     gc.unfreeze()
 
 
-def test_help_has_defaults_the_protocol_and_an_example(script, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["serve.py", "--help"])
-    with pytest.raises(SystemExit) as stop:
-        script.main()
-    assert stop.value.code == 0
-    text = re.sub(r"[│\s]+", " ", capsys.readouterr().out)
+def test_help_has_defaults_the_protocol_and_an_example(help_of):
+    text = help_of("serve")
     for word in (
         "(default: 127.0.0.1)",
         "(default: 8)",

@@ -1,8 +1,6 @@
 """experiments/smgdiff.py: train, evaluate and roll out; dribble.py makes its data."""
 
-import importlib.util
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,30 +13,12 @@ from tests import ball_walker
 
 ROOT = Path(__file__).parents[2]
 SIZES = (
-    "--width 16 --depth 1 --steps 100 --draft-steps 100 --path-steps 100 --batch 4 "
+    "--width 16 --depth 1 --steps 10 --draft-steps 10 --path-steps 10 --batch 4 "
     "--held-out 0.3"
 )
 SHORT = "--windows 8 --replications 2 --recognizer-steps 20 --starts 2 --repeats 2"
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
-
-
-@pytest.fixture(scope="module")
-def call():
-    """Runs a script's command line in this process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "experiments"))
-
-        def run(script, line, *more):
-            path = ROOT / "experiments" / f"{script}.py"
-            spec = importlib.util.spec_from_file_location(f"{script}_script", path)
-            module = importlib.util.module_from_spec(spec)
-            patch.setitem(sys.modules, f"{script}_script", module)
-            spec.loader.exec_module(module)
-            patch.setattr(sys, "argv", [str(path), *line.split(), *more])
-            module.main()
-
-        yield run
 
 
 @pytest.fixture(scope="module")
@@ -49,16 +29,16 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(call, data, tmp_path_factory, quick_compile):
+def trained(invoke, data, tmp_path_factory, quick_compile):
     folder = tmp_path_factory.mktemp("runs") / "run"
-    call("smgdiff", f"train --data {data} --out {folder} {SIZES}")
+    invoke("smgdiff", f"train --data {data} --out {folder} {SIZES}")
     return folder
 
 
 @pytest.mark.slow
-def test_schedules_stand_beside_real_clips(call, trained):
+def test_schedules_stand_beside_real_clips(invoke, trained):
     line = f"evaluate --run {trained} --tables schedules steps {SHORT} --schedules"
-    call("smgdiff", line, "none", "end 2")
+    invoke("smgdiff", line, "none", "end 2")
     for name, wanted in (("schedules", "none"), ("steps", "8 steps")):
         report = json.loads(
             (trained / "evaluation" / name / "metrics.json").read_text()
@@ -72,8 +52,8 @@ def test_schedules_stand_beside_real_clips(call, trained):
         assert report["source"] and report["jax"]
 
 
-def test_a_rollout_is_a_motion_with_a_ball(call, trained, capsys):
-    call("smgdiff", f"rollout --run {trained} --seconds 2 --schedule none")
+def test_a_rollout_is_a_motion_with_a_ball(invoke, trained, capsys):
+    invoke("smgdiff", f"rollout --run {trained} --seconds 2 --schedule none")
     out = trained / "rollout"
     assert len(bvh_text.read_bvh(out / "rollout.bvh").values) == 60
     lines = (out / "rollout_ball.csv").read_text().splitlines()
@@ -86,13 +66,13 @@ def test_a_rollout_is_a_motion_with_a_ball(call, trained, capsys):
     assert "from the root" in capsys.readouterr().out
 
 
-def test_dribble_makes_skills_of_labels(call, tmp_path):
+def test_dribble_makes_skills_of_labels(invoke, tmp_path):
     from jaxmotion.data import procedural
 
     source, out = tmp_path / "clips.npz", tmp_path / "ball.npz"
     clips_io.save_clips(source, procedural.make_clips(minutes=1.0))
     styles = " ".join(procedural.make_clips(minutes=1.0).names("style")[:3])
-    call(
+    invoke(
         "dribble",
         f"--data {source} --out {out} --field style --dribble {styles} --sprint none "
         "--stand none --celebrate none",
@@ -101,7 +81,7 @@ def test_dribble_makes_skills_of_labels(call, tmp_path):
     assert data.clips.names("skill") == ("dribble", "off_ball")
     assert bool(data.touch.any()) and "synthetic ball" in data.clips.source
     with pytest.raises(FileExistsError, match="--overwrite"):
-        call("dribble", f"--data {source} --out {out}")
+        invoke("dribble", f"--data {source} --out {out}")
 
 
 BAD = {
@@ -116,12 +96,12 @@ BAD = {
 
 
 @pytest.mark.parametrize("line", BAD)
-def test_bad_input_is_one_clear_error(call, trained, data, tmp_path, line):
+def test_bad_input_is_one_clear_error(invoke, trained, data, tmp_path, line):
     places = dict(
         data=data, run=trained, new=tmp_path / "new", none=tmp_path / "none.npz"
     )
     with pytest.raises((OSError, ValueError), match=BAD[line]):
-        call(
+        invoke(
             "smgdiff",
             line.format(**places) + " " + (SHORT if "evaluate" in line else ""),
         )

@@ -92,6 +92,13 @@ def test_a_resumed_stage_ends_as_one_without_a_break(trained, tmp_path):
     assert [row["step"] for row in rows] == [2, 4]
 
 
+def test_any_number_of_updates_can_be_made_and_gone_on_from(trained, tmp_path):
+    """Three are not a multiple of the chunk of two."""
+    assert int(fit(tmp_path, steps=3).step) == 3
+    assert checkpoint.latest_step(tmp_path / "checkpoints") == 3
+    assert_same(fit(tmp_path), trained[1])
+
+
 def test_a_finished_stage_is_not_trained_again(trained):
     folder, state = trained
     before = (folder / "losses.jsonl").read_text()
