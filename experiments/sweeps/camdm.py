@@ -17,6 +17,7 @@ from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.protocols import camdm as protocol
 from jaxmotion.protocols import (
+    camdm_distances,
     camdm_evaluation,
     camdm_rows,
     camdm_runs,
@@ -144,7 +145,7 @@ def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
     dense = protocol.data_windows(run.train, stride=10, field=field)
     feature, hits = camdm_styles.recognized(bones, real, recognizer)
     reference, _ = camdm_styles.recognized(bones, dense, recognizer)
-    own = camdm_rows.random_half(
+    own = camdm_distances.random_half(
         np.asarray(dense.group), np.asarray(dense.label), job.seed
     )
     made = styles * ((ticks - camdm_evaluation.SKIP) // protocol.WINDOW)
@@ -157,30 +158,23 @@ def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
         count=min(made, len(feature), int(own.sum()), int((~own).sum())),
         labels=np.repeat(np.arange(styles), job.replications),
     )
-    distance = functools.partial(
-        camdm_rows.frechet_cell,
+    distances = functools.partial(
+        camdm_distances.frechet_cells,
         count=judge.count,
         seed=job.seed,
         repeats=job.replications,
     )
     return judge, {
-        GROUND_TRUTH: {"fid": distance(feature, reference)}
-        | _unbiased(job, feature, reference)
+        GROUND_TRUTH: distances(feature, reference)
         | camdm_rows.metric_row(bones, real, hits, height=height),
-        NOISE_FLOOR: {"fid": distance(reference[own], reference[~own])}
-        | _unbiased(job, reference[own], reference[~own]),
+        NOISE_FLOOR: distances(reference[own], reference[~own]),
     }
-
-
-def _unbiased(job: Job, features: np.ndarray, reference: np.ndarray) -> Row:
-    found = camdm_rows.unbiased_cell(features, reference, seed=job.seed)
-    return {} if found is None else {"fid_unbiased": found}
 
 
 def _fid(job: Job, judge: Judge, features: np.ndarray, owner: np.ndarray) -> Cell:
     """Fréchet distance of each replication's windows to the training windows."""
     found = [
-        camdm_rows.frechet_cell(
+        camdm_distances.frechet_cell(
             features[owner == i],
             judge.reference,
             count=judge.count,
@@ -214,7 +208,7 @@ def score(job: Job, judge: Judge, run: camdm_runs.Run) -> Row:
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
     health = camdm_rows.rollout_health(bones, frames, fps=fps, height=judge.root)
     row = {"fid": _fid(job, judge, features, owner)}
-    row |= _unbiased(job, features, judge.reference)
+    row |= camdm_distances.unbiased_cells(features, judge.reference, seed=job.seed)
     row |= camdm_rows.metric_row(bones, grouped, hits, height=judge.height)
     row["diversity_m2"] = camdm_rows.repeat_diversity(
         bones, made, repeats=job.replications

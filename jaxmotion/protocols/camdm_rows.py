@@ -11,16 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxmotion.evaluation import (
-    diversity,
-    frechet,
-    frechet_bias,
-    health,
-    locomotion,
-    table,
-)
+from jaxmotion.evaluation import diversity, health, locomotion, table
 from jaxmotion.learning import recognition
 from jaxmotion.motion import skeleton
+from jaxmotion.protocols import camdm_distances
 from jaxmotion.protocols.camdm import Windows
 from jaxmotion.protocols.camdm_styles import Recognized, in_batches, recognized
 from jaxmotion.systems import camdm_control
@@ -77,68 +71,6 @@ def metric_row(
         means = table.group_means(values[name], found.group, weight)
         row[column] = table.cell(means, scale=scale)
     return row
-
-
-def frechet_cell(
-    feature: np.ndarray,
-    reference: np.ndarray,
-    *,
-    count: int,
-    seed: int,
-    repeats: int = 5,
-) -> table.Cell:
-    """Fréchet distance to the reference, of random subsets of equal size.
-
-    Args:
-      feature: Features of the windows of a row.
-      reference: Features of the reference windows.
-      count: Windows of each subset, the same for all rows.
-      seed: Of the subsets.
-      repeats: Subsets.
-
-    Returns:
-      Mean, and interval over the subsets (not over clips).
-    """
-    generator = np.random.default_rng(seed)
-    target = frechet.moments(jnp.asarray(reference))
-    found = []
-    for _ in range(repeats):
-        chosen = generator.choice(len(feature), count, replace=False)
-        own = frechet.moments(jnp.asarray(feature[chosen]))
-        found.append(frechet.frechet_distance(own, target))
-    return table.cell(jnp.stack(found))
-
-
-def unbiased_cell(
-    feature: np.ndarray, reference: np.ndarray, *, seed: int, sizes: int = 5
-) -> table.Cell | None:
-    """Fréchet distance to the reference, extrapolated to infinitely many windows.
-
-    Distances of few windows are too large, and not by the same amount for all models.
-
-    Args:
-      feature: Features of all windows of a row.
-      reference: Features of the reference windows.
-      seed: Of the subsets.
-      sizes: Of the subsets, from as many windows as there are features to all.
-
-    Returns:
-      The distance, without an interval; None if there are too few windows for the
-      extrapolation to hold.
-
-    Source: `frechet_bias`.
-    """
-    count, least = feature.shape
-    if count < least + sizes - 1:
-        return None
-    found = frechet_bias.frechet_bias(
-        jax.random.key(seed),
-        jnp.asarray(feature),
-        frechet.moments(jnp.asarray(reference)),
-        sizes=frechet_bias.subset_sizes(count, number=sizes, least=least),
-        repeats=3,
-    )
-    return table.Cell(value=float(found.extrapolated), samples=count)
 
 
 def rollout_health(
@@ -219,29 +151,6 @@ def contact_height(bones: skeleton.Skeleton, real: Windows) -> float:
     return float(np.percentile(toes[..., 1], 1)) + 0.01
 
 
-def random_half(clips: np.ndarray, labels: np.ndarray, seed: int) -> np.ndarray:
-    """Which windows are of a random half of each style's clips.
-
-    Args:
-      clips: Clip of each window.
-      labels: Style of each window.
-      seed: Of the choice.
-
-    Returns:
-      True for the windows of that half.
-
-    Raises:
-      ValueError: if there is one clip only.
-    """
-    different, first = np.unique(clips, return_index=True)
-    if len(different) < 2:
-        raise ValueError("one clip, expected at least two to compare halves")
-    shuffled = np.random.default_rng(seed).permutation(len(different))
-    # Sorted by style, every second one: both halves hold every style alike.
-    order = shuffled[np.argsort(labels[first][shuffled], kind="stable")]
-    return np.isin(clips, different[order][::2])
-
-
 def evaluation_table(
     bones: skeleton.Skeleton,
     real: Windows,
@@ -274,17 +183,19 @@ def evaluation_table(
     real_feature, real_hits = recognized(bones, real, recognizer)
     made_feature, made_hits = recognized(bones, made, recognizer)
     reference, _ = recognized(bones, dense, recognizer)
-    own = random_half(np.asarray(dense.group), np.asarray(dense.label), seed)
+    own = camdm_distances.random_half(
+        np.asarray(dense.group), np.asarray(dense.label), seed
+    )
     count = min(len(real_feature), len(made_feature), int(own.sum()), int((~own).sum()))
-    distance = functools.partial(frechet_cell, count=count, seed=seed)
+    distances = functools.partial(camdm_distances.frechet_cells, count=count, seed=seed)
     rows = {
         "held-out (ground truth)": metric_row(bones, real, real_hits, height=height)
-        | {"fid": distance(real_feature, reference)},
-        "training half vs half (noise floor)": {
-            "fid": distance(reference[own], reference[~own])
-        },
+        | distances(real_feature, reference),
+        "training half vs half (noise floor)": distances(
+            reference[own], reference[~own]
+        ),
         "rollouts": metric_row(bones, made, made_hits, height=height)
-        | {"fid": distance(made_feature, reference)},
+        | distances(made_feature, reference),
     }
     if repeats > 1:
         found = repeat_diversity(bones, made, repeats=repeats)

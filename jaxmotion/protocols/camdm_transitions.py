@@ -197,11 +197,9 @@ def transition_row(
     done = transition(
         jnp.asarray(found), jnp.asarray(centres, jnp.float32), limit=changes.limit
     )
-    groups = int(changes.replication.max()) + 1
 
     def cell(values: Array) -> table.Cell:
-        own = np.asarray(values).reshape(groups, -1).mean(axis=1)
-        return table.cell(jnp.asarray(own, jnp.float32))
+        return table.cell(table.group_means(values, changes.replication))
 
     row = {
         "success_%": cell(100.0 * done.succeeded),
@@ -277,6 +275,4 @@ def clip_accuracy(run: Run, recognizer: Recognized) -> table.Cell:
     """
     real = protocol.data_windows(run.held_out, stride=STRIDE, field=run.field)
     _, hits = camdm_styles.recognized(run.model.bones, real, recognizer)
-    owner = np.asarray(real.group)
-    clips = [100.0 * hits[owner == i].mean() for i in np.unique(owner)]
-    return table.cell(jnp.asarray(clips, jnp.float32))
+    return table.cell(table.group_means(hits, real.group), scale=100.0)

@@ -10,7 +10,7 @@ import pytest
 
 from jaxmotion.data import selection
 from jaxmotion.evaluation import table
-from jaxmotion.protocols import artifacts, camdm_rows, camdm_styles
+from jaxmotion.protocols import artifacts, camdm_distances, camdm_rows, camdm_styles
 from jaxmotion.protocols import camdm as protocol
 from tests.protocols import samples
 
@@ -130,7 +130,7 @@ def test_frechet_distance_of_a_shift_is_its_square():
     rng = np.random.default_rng(0)
     reference = rng.normal(size=(400, 3)).astype(np.float32)
     shifted = reference + np.array([2.0, 0.0, 0.0], np.float32)
-    cell = camdm_rows.frechet_cell(shifted, reference, count=400, seed=0)
+    cell = camdm_distances.frechet_cell(shifted, reference, count=400, seed=0)
     assert cell.value == pytest.approx(4.0, rel=1e-3) and cell.samples == 5
 
 
@@ -138,7 +138,7 @@ def test_halves_of_the_clips_share_no_clip_and_hold_each_style_alike():
     clips, styles = np.repeat(np.arange(14), 5), np.repeat([0, 1, 0], [20, 30, 20])
     halves = set()
     for seed in range(5):
-        own = camdm_rows.random_half(clips, styles, seed=seed)
+        own = camdm_distances.random_half(clips, styles, seed=seed)
         assert not set(clips[own]) & set(clips[~own])
         for style in (0, 1):
             number = len(set(clips[own & (styles == style)]))
@@ -146,7 +146,7 @@ def test_halves_of_the_clips_share_no_clip_and_hold_each_style_alike():
         halves.add(tuple(own))
     assert len(halves) > 1
     with pytest.raises(ValueError, match="expected at least two"):
-        camdm_rows.random_half(np.zeros(5, int), np.zeros(5, int), seed=0)
+        camdm_distances.random_half(np.zeros(5, int), np.zeros(5, int), seed=0)
 
 
 def test_batches_put_together_are_the_whole():
@@ -187,12 +187,13 @@ def test_an_unbiased_distance_is_nearer_to_the_true_one():
     biased, unbiased = [], []
     for seed in range(8):
         features = draw(size=(120, 16)).astype(np.float32) + apart
-        cell = camdm_rows.unbiased_cell(features, reference, seed=seed)
+        whole = camdm_distances.unbiased_cells(features, reference, seed=seed)
+        cell = whole["fid_unbiased"]
         assert cell.samples == 120 and cell.low is None
         unbiased.append(cell.value)
         whole = dict(count=120, seed=seed, repeats=1)
-        biased.append(camdm_rows.frechet_cell(features, reference, **whole).value)
+        biased.append(camdm_distances.frechet_cell(features, reference, **whole).value)
     assert np.mean(biased) > 1.4
     error = np.std(unbiased, ddof=1) / np.sqrt(8)
     assert abs(np.mean(unbiased) - 1.0) < max(4 * error, 0.1) < 0.4
-    assert camdm_rows.unbiased_cell(features[:19], reference, seed=0) is None
+    assert camdm_distances.unbiased_cells(features[:19], reference, seed=0) == {}
