@@ -29,8 +29,11 @@ def frechet_cell(
       repeats: Subsets.
 
     Returns:
-      Mean, and interval over the subsets (not over clips).
+      Mean, and interval over the subsets (not over clips); no interval where a subset
+      is all there is.
     """
+    if count == len(feature):
+        repeats = 1
     generator = np.random.default_rng(seed)
     target = frechet.moments(jnp.asarray(reference))
     found = []

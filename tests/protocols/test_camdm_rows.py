@@ -131,7 +131,11 @@ def test_frechet_distance_of_a_shift_is_its_square():
     reference = rng.normal(size=(400, 3)).astype(np.float32)
     shifted = reference + np.array([2.0, 0.0, 0.0], np.float32)
     cell = camdm_distances.frechet_cell(shifted, reference, count=400, seed=0)
-    assert cell.value == pytest.approx(4.0, rel=1e-3) and cell.samples == 5
+    assert cell.value == pytest.approx(4.0, rel=1e-3)
+    # All windows are one subset: five times the same have no interval.
+    assert cell.samples == 1 and cell.low is None
+    half = camdm_distances.frechet_cell(shifted, reference, count=200, seed=0)
+    assert half.samples == 5 and half.low < half.value < half.high
 
 
 def test_halves_of_the_clips_share_no_clip_and_hold_each_style_alike():
