@@ -16,7 +16,7 @@ from scipy.signal import savgol_filter
 
 from jaxmotion.motion import rotation
 from jaxmotion.motion.facing import hip_facing, plain_names
-from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+from jaxmotion.motion.skeleton import Motion, Skeleton, from_root
 from jaxmotion.motion.trajectory import Trajectory
 
 # Windows of the filters in seconds (31 and 61 frames at 60 a second) and their degree.
@@ -135,14 +135,15 @@ def simulation_bone(skeleton: Skeleton, motion: Motion) -> Trajectory:
             f"{frames} frames at {motion.fps:g} a second, expected at least {least} "
             "for the simulation bone"
         )
-    positions = np.asarray(joint_positions(skeleton, motion), np.float64)
+    above = from_root(skeleton, motion.joint_rotation, chest)
+    positions = np.asarray(motion.root_position + above, np.float64)
     facing = np.asarray(hip_facing(skeleton, motion.joint_rotation), np.float64)
 
     def smooth(x: Float[np.ndarray, "f 2"], seconds: float) -> Float[np.ndarray, "f 2"]:
         window = max(_window(seconds, motion.fps), _DEGREE + 2)
         return savgol_filter(x, window, _DEGREE, axis=0, mode="interp")
 
-    position = smooth(positions[:, chest, ::2], _POSITION)
+    position = smooth(positions[:, ::2], _POSITION)
     facing = smooth(facing, _FACING)
     length = np.maximum(np.linalg.norm(facing, axis=-1, keepdims=True), 1e-6)
     return Trajectory(

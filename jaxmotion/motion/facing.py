@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxmotion.motion import ground, rotation
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion import ground
+from jaxmotion.motion.skeleton import Skeleton, from_root
 
 # Left and right hip joint in lower case, without separators and rig prefix.
 _HIPS = (
@@ -76,21 +76,6 @@ def facing_from_across(across: Float[Array, "*batch 3"]) -> Float[Array, "*batch
     return ground.unit(jnp.stack([-across[..., 2], across[..., 0]], axis=-1))
 
 
-def _from_root(
-    skeleton: Skeleton, joint_rotation: Float[Array, "*batch joints 6"], joint: int
-) -> Float[Array, "*batch 3"]:
-    """World vector from the root to a joint: kinematics of its own chain only."""
-    chain = [joint]
-    while skeleton.parents[chain[0]] > 0:
-        chain.insert(0, skeleton.parents[chain[0]])
-    turn = rotation.matrix_from_rot6d(joint_rotation[..., 0, :])
-    vector = turn @ skeleton.offsets[chain[0]]
-    for parent, child in zip(chain[:-1], chain[1:], strict=True):
-        turn = turn @ rotation.matrix_from_rot6d(joint_rotation[..., parent, :])
-        vector = vector + turn @ skeleton.offsets[child]
-    return vector
-
-
 def hip_facing(
     skeleton: Skeleton,
     joint_rotation: Float[Array, "*batch joints 6"],
@@ -114,6 +99,6 @@ def hip_facing(
     """
     left, right = hip_joints(skeleton) if hips is None else hips
     return facing_from_across(
-        _from_root(skeleton, joint_rotation, left)
-        - _from_root(skeleton, joint_rotation, right)
+        from_root(skeleton, joint_rotation, left)
+        - from_root(skeleton, joint_rotation, right)
     )

@@ -226,6 +226,30 @@ def joint_positions(
     return forward_kinematics(skeleton, motion.root_position, motion.joint_rotation)
 
 
+def from_root(
+    skeleton: Skeleton, joint_rotation: Float[Array, "*batch joints 6"], joint: int
+) -> Float[Array, "*batch 3"]:
+    """World vector from the root to a joint: kinematics of its own chain only.
+
+    Args:
+      skeleton: The bones.
+      joint_rotation: Parent-local rotations, two columns each; the root's is global.
+      joint: Any but the root.
+
+    Returns:
+      Metres.
+    """
+    chain = [joint]
+    while skeleton.parents[chain[0]] > 0:
+        chain.insert(0, skeleton.parents[chain[0]])
+    turn = rotation.matrix_from_rot6d(joint_rotation[..., 0, :])
+    vector = turn @ skeleton.offsets[chain[0]]
+    for parent, child in zip(chain[:-1], chain[1:], strict=True):
+        turn = turn @ rotation.matrix_from_rot6d(joint_rotation[..., parent, :])
+        vector = vector + turn @ skeleton.offsets[child]
+    return vector
+
+
 def joint_velocities(
     positions: Float[Array, "*batch frames joints 3"], fps: float
 ) -> Float[Array, "*batch frames-1 joints 3"]:

@@ -50,6 +50,17 @@ def test_forward_kinematics_agrees_with_products_of_matrices(bones):
     )
 
 
+@pytest.mark.parametrize("joint", range(1, len(PARENTS)))
+def test_a_joint_s_own_chain_leads_to_it(bones, joint):
+    _, matrices, rot6d = pose(1)
+    found = skeleton.from_root(bones, rot6d, joint)
+    for index in np.ndindex(SHAPE):
+        expected = reference.world_transforms(
+            OFFSETS, PARENTS, np.zeros(3), matrices[index]
+        )
+        np.testing.assert_allclose(found[index], expected[joint, :3, 3], atol=5e-6)
+
+
 def test_equivariance_under_rigid_motion(bones):
     root, matrices, rot6d = pose(2)
     turn = Rotation.from_rotvec([0.3, -1.1, 0.8]).as_matrix()
