@@ -8,6 +8,7 @@ each example is of the second kind with probability 0.2.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +49,7 @@ def network(config: Config) -> mlp.ConditionedMlp:
     )
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters."""
     x, t = jnp.zeros(config.features), jnp.ones((), jnp.int32)

@@ -11,6 +11,7 @@ is taken up by half instead of by inertialised blending.
 """
 
 import dataclasses
+import functools
 
 import flax.linen as nn
 import jax
@@ -61,6 +62,7 @@ def _nets(config: Config) -> tuple[Mlp, Mlp]:
     )
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters."""
     key_s, key_p = jax.random.split(key)

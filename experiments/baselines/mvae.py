@@ -6,6 +6,7 @@ epochs) are one probability per frame here.
 """
 
 import dataclasses
+import functools
 
 import flax.linen as nn
 import jax
@@ -90,6 +91,7 @@ def _nets(config: Config) -> tuple[Encoder, Decoder]:
     )
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters."""
     key_e, key_d = jax.random.split(key)

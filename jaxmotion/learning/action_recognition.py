@@ -73,6 +73,7 @@ def _initial_state(key: Key, batch: int, config: ActionRecognizerConfig) -> Arra
     return config.state_scale * jax.random.normal(key, (batch, 2, config.hidden))
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init_action_recognizer(key: Key, config: ActionRecognizerConfig) -> Params:
     """Initial parameters.
 

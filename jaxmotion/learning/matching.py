@@ -88,6 +88,7 @@ class Pairs:
 
 
 @functools.partial(jax.jit, static_argnames="config")
+@functools.partial(jax.jit, static_argnames="config")
 def init_matcher(key: Key, config: MatcherConfig) -> Params:
     """Initial parameters.
 

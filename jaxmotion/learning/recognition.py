@@ -75,6 +75,7 @@ def cross_entropy(
     return jnp.mean(losses), {"accuracy": accuracy}
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init_recognizer(key: Key, config: RecognizerConfig) -> Params:
     """Initial parameters.
 

@@ -17,6 +17,7 @@ sections 3.2-3.5. Sizes and the schedule are ours, since the paper gives none.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Literal
 
@@ -113,6 +114,7 @@ def discriminator(config: Config) -> mlp.PairDiscriminator:
     )
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters of the three networks.
 

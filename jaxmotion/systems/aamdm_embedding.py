@@ -14,6 +14,7 @@ paper gives none.
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -142,6 +143,7 @@ def _nets(config: Config) -> tuple[autoencoder.PoseEncoder, autoencoder.PoseDeco
     )
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters.
 

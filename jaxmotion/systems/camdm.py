@@ -13,6 +13,7 @@ what the paper leaves open is as in the released code, and said where it is used
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Literal
 
@@ -168,6 +169,7 @@ def network(config: Config) -> Network:
     return kind(features=config.num_features, **sizes)
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters.
 

@@ -18,6 +18,7 @@ High-Quality Motion Generation"; the released code where the paper is silent.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Literal
 
@@ -217,6 +218,7 @@ def judged_condition(
     return vector if config.discriminator_condition else vector[..., :0]
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> dict[str, Params]:
     """Initial parameters of both networks.
 
@@ -230,8 +232,7 @@ def init(key: Key, config: Config) -> dict[str, Params]:
     key_generator, key_discriminator = jax.random.split(key)
     x = jnp.zeros((1, config.frames, config.features))
     vector = jnp.zeros((1, config.condition_size))
-    keep, mask = jnp.ones(1, bool), jnp.ones((1, config.frames), bool)
-    t = jnp.ones(1, jnp.int32)
+    t, keep, mask = jnp.ones(1, int), jnp.ones(1, bool), jnp.ones(x.shape[:2], bool)
     latent = jnp.zeros((1, config.latent)) if config.latent else None
     make = generator(config).init(key_generator, x, t, vector, keep, mask, latent)
     found = {"generator": make["params"]}

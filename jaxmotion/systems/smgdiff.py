@@ -12,6 +12,7 @@ Source: SMGDiff, section 3; sizes, which its missing supplement has, are CAMDM's
 """
 
 import dataclasses
+import functools
 from typing import Literal
 
 import jax
@@ -124,6 +125,7 @@ def network(config: Config) -> transformer.CamdmTransformer:
     return transformer.CamdmTransformer(features=config.num_features, **sizes)
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters.
 

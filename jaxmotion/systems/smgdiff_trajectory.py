@@ -11,6 +11,7 @@ Source: SMGDiff, section 3.1, eq. 3.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -89,6 +90,7 @@ def network(config: Config) -> TrajectoryGenerator:
     return TrajectoryGenerator(**sizes)
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters.
 
