@@ -234,18 +234,21 @@ def from_root(
     Args:
       skeleton: The bones.
       joint_rotation: Parent-local rotations, two columns each; the root's is global.
-      joint: Any but the root.
+      joint: Where to.
 
     Returns:
-      Metres.
+      Metres; zeros for the root.
     """
-    chain = [joint]
-    while skeleton.parents[chain[0]] > 0:
-        chain.insert(0, skeleton.parents[chain[0]])
+    chain = []
+    while joint > 0:
+        chain.insert(0, joint)
+        joint = skeleton.parents[joint]
     turn = rotation.matrix_from_rot6d(joint_rotation[..., 0, :])
-    vector = turn @ skeleton.offsets[chain[0]]
-    for parent, child in zip(chain[:-1], chain[1:], strict=True):
-        turn = turn @ rotation.matrix_from_rot6d(joint_rotation[..., parent, :])
+    vector = jnp.zeros_like(turn[..., 0])
+    for child in chain:
+        parent = skeleton.parents[child]
+        if parent > 0:
+            turn = turn @ rotation.matrix_from_rot6d(joint_rotation[..., parent, :])
         vector = vector + turn @ skeleton.offsets[child]
     return vector
 
