@@ -50,6 +50,8 @@ class Train:
       hidden: Channels of the feed-forward layers.
       dropout: Rate (paper: 0.1; short trainings do without).
       frames_per_token: Frames of one token (paper: 1).
+      mask_frames: Hide what follows a motion's end, and average losses over all frames
+        of a batch (ours); --no-mask-frames is the released form (see emdm.Config).
       discriminator_width: Channels of the discriminator's first layers.
       recon: Weight R of the features' error; None for 1 (actions) or 100 (texts).
       geometry: Joints of the losses relative to the "root" (as released) or in the
@@ -85,6 +87,7 @@ class Train:
     hidden: int = 384
     dropout: float = 0.0
     frames_per_token: int = 4
+    mask_frames: bool = True
     discriminator_width: int = 128
     recon: float | None = None
     geometry: Literal["root", "world"] = "world"

@@ -40,6 +40,7 @@ def base_config(args: Any, recon: float) -> emdm.Config:
         dropout=args.dropout,
         frames_per_token=args.frames_per_token,
         norm="pre",
+        mask_frames=args.mask_frames,
         discriminator_width=args.discriminator_width,
         weight_recon=recon if args.recon is None else args.recon,
         geometry=args.geometry,

@@ -1,34 +1,51 @@
 """Losses on arrays: data, velocity, position and foot sliding.
 
-All are means over the elements that a mask keeps, so that they do not depend on padding
-or batch size. "Displacement" is the difference of neighbouring frames, in the unit of
-the input per frame: the losses of MDM and CAMDM are written so, with weight 1.
+All are means over the frames that a mask keeps, so padding has no part in them. Two
+means differ where the samples of a batch have different lengths:
+
+    average="frames"    every kept frame of the batch counts the same
+    average="samples"   every sample counts the same: the mean over its own frames
+                        first, then over the batch (released code of MDM, CAMDM, EMDM)
+
+"Displacement" is the difference of neighbouring frames, in the unit of the input per
+frame: the losses of MDM and CAMDM are written so, with weight 1.
 """
+
+from typing import Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+Average = Literal["frames", "samples"]
 
 
 def masked_mse(
     prediction: Float[Array, "*batch frames features"],
     target: Float[Array, "*batch frames features"],
     mask: Bool[Array, "*#batch frames"],
+    *,
+    average: Average = "frames",
 ) -> Float[Array, ""]:
     """Mean squared error over the frames that count.
 
     Args:
       prediction: Any features.
       target: The same features.
-      mask: Frames that count. A batch with none gives 0.
+      mask: Frames that count. Without any, a batch gives 0; so does a sample, which
+        still counts as one (the released code divides by zero).
+      average: See the module.
 
     Returns:
-      Mean over kept frames and all features.
+      Mean over kept frames (or samples) and all features.
 
     Source: MDM's masked L2; Chen et al. 2024 (CAMDM), eq. 2.
     """
     weight = jnp.broadcast_to(mask, prediction.shape[:-1]).astype(prediction.dtype)
-    square = jnp.mean((prediction - target) ** 2, axis=-1)
-    return jnp.sum(square * weight) / jnp.maximum(jnp.sum(weight), 1.0)
+    square = jnp.mean((prediction - target) ** 2, axis=-1) * weight
+    if average == "frames":
+        return jnp.sum(square) / jnp.maximum(jnp.sum(weight), 1.0)
+    count = jnp.maximum(jnp.sum(weight, axis=-1), 1.0)
+    return jnp.mean(jnp.sum(square, axis=-1) / count)
 
 
 def displacement(x: Float[Array, "*batch frames n"]) -> Array:
@@ -47,6 +64,8 @@ def velocity_loss(
     prediction: Float[Array, "*batch frames features"],
     target: Float[Array, "*batch frames features"],
     mask: Bool[Array, "*#batch frames"],
+    *,
+    average: Average = "frames",
 ) -> Float[Array, ""]:
     """Mean squared error of displacements; both frames of a pair must count.
 
@@ -54,34 +73,46 @@ def velocity_loss(
       prediction: Any features.
       target: The same features.
       mask: Frames that count.
+      average: See the module.
 
     Returns:
-      Mean over kept pairs and all features, per frame squared.
+      Mean over kept pairs (or samples) and all features, per frame squared.
 
     Source: MDM (Tevet et al. 2023), eq. 5.
     """
     pairs = mask[..., 1:] & mask[..., :-1]
-    return masked_mse(displacement(prediction), displacement(target), pairs)
+    return masked_mse(
+        displacement(prediction), displacement(target), pairs, average=average
+    )
 
 
 def foot_slide_loss(
     foot_positions: Float[Array, "*batch frames feet 3"],
     contact: Bool[Array, "*batch frames feet"],
+    mask: Bool[Array, "*#batch frames"],
+    *,
+    average: Average = "frames",
 ) -> Float[Array, ""]:
     """Squared displacement of feet that stand on the ground.
 
-    The mean runs over all frames and feet, standing or not, as in the released code
-    of CAMDM: so a moving character's loss is not dominated by its few stances.
+    The mean runs over all frames that count and all feet, standing or not, as in the
+    released code of CAMDM: so a moving character's loss is not dominated by its few
+    stances.
 
     Args:
       foot_positions: Predicted world positions, metres.
       contact: Whether the foot stands between this frame and the next (the last
         frame's value is unused).
+      mask: Frames that count; both of a pair must.
+      average: See the module.
 
     Returns:
       Mean squared displacement, square metres per frame squared.
 
     Source: MDM, eq. 4; released code of CAMDM.
     """
-    moved = foot_positions[..., 1:, :, :] - foot_positions[..., :-1, :, :]
-    return jnp.mean(moved**2 * contact[..., :-1, :, None])
+    flat = foot_positions.reshape(*foot_positions.shape[:-2], -1)
+    stands = jnp.repeat(contact[..., :-1, :], 3, axis=-1)
+    moved = jnp.where(stands, displacement(flat), 0.0)
+    pairs = mask[..., 1:] & mask[..., :-1]
+    return masked_mse(moved, jnp.zeros_like(moved), pairs, average=average)

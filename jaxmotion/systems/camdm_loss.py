@@ -238,5 +238,5 @@ def loss_terms(
         # As in MDM, the mean runs over x, y and z as well.
         "position": losses.masked_mse(flat(predicted), flat(wanted), every),
         "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
-        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands),
+        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands, every),
     }

@@ -53,9 +53,10 @@ class Config:
       frames_per_token: Frames of one token; ours, 1 in the paper.
       norm: Layer norms behind each sum ("post", the paper's) or before each branch
         ("pre", ours: learns faster in short runs).
-      mask_frames: Whether frames behind a motion's end are hidden from attention,
-        losses and discriminator (ours). Without, they are zeros that the network sees
-        and has to predict, as released.
+      mask_frames: What of the zeros that follow a motion's end is seen. True (ours):
+        nothing; every frame of a batch counts the same in the losses. False, as
+        released: attention and the discriminator see them, the losses do not; every
+        motion of a batch counts the same, whatever its length.
       discriminator_width: Channels of the discriminator's first layers.
       discriminator_condition: Whether the discriminator sees the condition.
       drop_condition: Probability that the condition is dropped in training.

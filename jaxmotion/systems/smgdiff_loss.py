@@ -181,7 +181,7 @@ def loss_terms(
         "velocity": losses.velocity_loss(prediction, target, every),
         "position": losses.masked_mse(flat(predicted), flat(wanted), every),
         "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
-        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands),
+        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands, every),
         "ball": losses.masked_mse(ball_error, none, is_near),
         "ball_acceleration": losses.velocity_loss(
             losses.displacement(ball_error),

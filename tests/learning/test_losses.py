@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.learning import losses
+from tests.reference import emdm as reference
 
 
 @pytest.fixture
@@ -67,18 +68,90 @@ def test_velocity_loss_does_not_see_a_constant(arrays):
     np.testing.assert_allclose(found, 0.0, atol=1e-10)
 
 
-def test_foot_slide_counts_standing_feet_only():
+def test_foot_slide_counts_standing_feet_of_the_frames_that_count():
     generator = np.random.default_rng(1)
     feet = generator.normal(size=(2, 5, 2, 3))
     contact = generator.random((2, 5, 2)) < 0.5
+    lengths = (3, 5)
     total, count = 0.0, 0
     for b, f, foot, axis in np.ndindex(2, 4, 2, 3):
+        if f + 1 >= lengths[b]:
+            continue
         moved = feet[b, f + 1, foot, axis] - feet[b, f, foot, axis]
         total += moved**2 if contact[b, f, foot] else 0.0
         count += 1
-    found = losses.foot_slide_loss(jnp.asarray(feet), jnp.asarray(contact))
+    mask = jnp.arange(5)[None] < jnp.array(lengths)[:, None]
+    found = losses.foot_slide_loss(jnp.asarray(feet), jnp.asarray(contact), mask)
     np.testing.assert_allclose(found, total / count, rtol=1e-5)
     last = jnp.asarray(contact).at[:, -1].set(~jnp.asarray(contact)[:, -1])
     np.testing.assert_array_equal(
-        losses.foot_slide_loss(jnp.asarray(feet), last), found
+        losses.foot_slide_loss(jnp.asarray(feet), last, mask), found
+    )
+
+
+# --- samples of different lengths ------------------------------------------------
+
+LENGTHS = (2, 10)
+
+
+def unequal():
+    """Features, targets and mask of samples of `LENGTHS`."""
+    generator = np.random.default_rng(2)
+    prediction, target = generator.normal(size=(2, 2, 10, 6))
+    return prediction, target, np.arange(10)[None] < np.array(LENGTHS)[:, None]
+
+
+def test_an_error_in_the_short_sample_counts_a_half_or_its_part_of_the_frames():
+    target = jnp.zeros((2, 10, 3)).at[0].set(1.0)
+    given = jnp.zeros_like(target), target, jnp.asarray(unequal()[2])
+    np.testing.assert_allclose(losses.masked_mse(*given), 2 / 12, rtol=1e-6)
+    found = losses.masked_mse(*given, average="samples")
+    np.testing.assert_allclose(found, 0.5, rtol=1e-6)
+
+
+def test_means_of_samples_are_those_of_the_release():
+    prediction, target, mask = unequal()
+    given = tuple(jnp.asarray(x) for x in (prediction, target, mask))
+    found = losses.masked_mse(*given, average="samples")
+    want = reference.masked_l2(prediction, target, mask)
+    np.testing.assert_allclose(found, want, rtol=1e-6)
+    found = losses.velocity_loss(*given, average="samples")
+    steps = (np.diff(x, axis=1) for x in (prediction, target))
+    np.testing.assert_allclose(
+        found, reference.masked_l2(*steps, mask[:, 1:]), rtol=1e-6
+    )
+    feet, truth = (x.reshape(2, 10, 2, 3) for x in (prediction, target))
+    stands = np.linalg.norm(np.diff(truth, axis=1), axis=-1) <= 2.5
+    assert 0.2 < stands.mean() < 0.8
+    contact = jnp.asarray(np.concatenate([stands, stands[:, -1:]], axis=1))
+    found = losses.foot_slide_loss(
+        jnp.asarray(feet), contact, given[2], average="samples"
+    )
+    want = reference.foot_loss(feet, truth, (0, 1), mask, speed=2.5)
+    np.testing.assert_allclose(found, want, rtol=1e-6)
+
+
+@pytest.mark.parametrize("average", ["frames", "samples"])
+def test_padding_changes_no_loss(average):
+    """Two more frames, which do not count, with any values in them."""
+    prediction, target, mask = unequal()
+    feet = prediction.reshape(2, 10, 2, 3)
+    contact = np.random.default_rng(3).random((2, 10, 2)) < 0.5
+
+    def terms(*arrays):
+        prediction, target, feet, contact, mask = (jnp.asarray(x) for x in arrays)
+        foot = losses.foot_slide_loss(feet, contact, mask, average=average)
+        return [
+            losses.masked_mse(prediction, target, mask, average=average),
+            losses.velocity_loss(prediction, target, mask, average=average),
+            foot,
+        ]
+
+    def longer(x, value):
+        return np.concatenate([x, np.full_like(x[:, :2], value)], axis=1)
+
+    given = prediction, target, feet, contact
+    padded = [longer(x, value) for x, value in zip(given, (9, -9, 9, 1), strict=True)]
+    np.testing.assert_allclose(
+        terms(*padded, longer(mask, False)), terms(*given, mask), rtol=1e-6
     )

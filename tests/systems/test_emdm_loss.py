@@ -342,14 +342,14 @@ def test_the_generator_is_told_where_motions_end(watch, mask_frames):
 # --- geometry ----------------------------------------------------------------------
 
 
-def oracle_terms(prediction, data, *, mask=None):
+def oracle_terms(prediction, data):
     prediction, x_0 = np.float64(prediction), np.float64(data.x_0)
     return reference.geometric_terms(
         prediction,
         x_0,
         joints(prediction),
         joints(x_0),
-        np.asarray(data.mask if mask is None else mask, float),
+        np.asarray(data.mask, float),
         GEOMETRY.feet,
         translation=slice(12, 15),
     )
@@ -400,14 +400,30 @@ def test_geometric_terms_of_a_motion_are_of_its_frames(length):
         np.testing.assert_allclose(value, found[name], rtol=1e-5)
 
 
-def test_without_masks_zeros_behind_the_end_are_predicted_too():
+def test_losses_of_unequal_lengths_are_the_released_ones():
     config = dataclasses.replace(CONFIG, mask_frames=False)
-    data = batch(3, 6)
+    data = batch(2, 3, 6)
     prediction = guess(data)
-    _, found = terms_of(prediction, data, config)
-    expected = oracle_terms(prediction, data, mask=np.ones((2, 6)))
+    total, found = terms_of(prediction, data, config)
+    expected = oracle_terms(prediction, data)
     for name, own in NAMES.items():
-        np.testing.assert_allclose(found[name], expected[own], rtol=1e-4)
+        np.testing.assert_allclose(found[name], expected[own], rtol=1e-5)
+    weighted = reference.geometric_loss(expected, **WEIGHTS)
+    np.testing.assert_allclose(total, weighted, rtol=1e-5)
+
+
+def test_every_frame_of_unequal_lengths_counts_the_same():
+    """The means of single motions, weighted by the frames or steps that they have."""
+    lengths = (2, 3, 6)
+    data = batch(*lengths)
+    prediction = guess(data)
+    _, found = terms_of(prediction, data)
+    cut = lambda x, i: jax.tree.map(lambda a: a[i : i + 1], x)  # noqa: E731
+    alone = [oracle_terms(prediction[i : i + 1], cut(data, i)) for i in range(3)]
+    for name, own in NAMES.items():
+        counts = np.array(lengths) - (name in ("velocity", "foot"))
+        expected = np.average([terms[own] for terms in alone], weights=counts)
+        np.testing.assert_allclose(found[name], expected, rtol=1e-5)
 
 
 def test_standing_feet_must_not_move_and_others_may():
