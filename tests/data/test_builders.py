@@ -1,4 +1,5 @@
 import json
+import re
 import subprocess
 import sys
 import zipfile
@@ -253,6 +254,26 @@ def test_style100_cuts_halves_labels_and_skips(tmp_path, caplog):
         np.asarray(expected.joint_rotation)[4:11:2, [0, 2, 3, 4, 5]],
         atol=1e-6,
     )
+
+
+@pytest.mark.parametrize("config", ["original", "mirror"])
+def test_style100_reads_joints_behind_a_rigs_prefix(tmp_path, config):
+    """As in the BVHs that CAMDM's pipeline leaves behind: mixamorig:LeftUpLeg."""
+    renamed = {
+        name: re.sub(r"(ROOT|JOINT) (.+)", r"\1 mixamorig:\2", text)
+        for name, text in style_files().items()
+    }
+    plain, prefixed = (
+        build(style100.Style100, tmp_path / kind, put(tmp_path / kind, files), config)
+        for kind, files in (("plain", style_files()), ("prefixed", renamed))
+    )
+    names = tuple(f"mixamorig:{name}" for name in plain.skeleton.names)
+    assert prefixed.skeleton.names == names
+    assert prefixed.skeleton.feet == plain.skeleton.feet == (2, 4)
+    assert prefixed.clip_names == plain.clip_names
+    for field in ("root_position", "joint_rotation", "offsets"):
+        np.testing.assert_array_equal(getattr(prefixed, field), getattr(plain, field))
+    np.testing.assert_array_equal(prefixed.skeleton.offsets, plain.skeleton.offsets)
 
 
 def test_style100_mirrors_symmetric_styles_under_the_same_label(tmp_path):

@@ -20,14 +20,16 @@ import tensorflow_datasets as tfds
 
 from jaxmotion.data import bvh, mirror
 from jaxmotion.data.builders import base
+from jaxmotion.motion.facing import plain_names
 from jaxmotion.motion.skeleton import Skeleton
 
 ACTIONS = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3")
 _DROPPED = ("eye", "index", "middle", "ring", "pinky", "thumb")
+# As `plain_names` has them: in any case, and behind a rig's prefix such as mixamorig:.
 _FEET = (
-    ("LeftToe_End", "RightToe_End"),
-    ("LeftToeBase", "RightToeBase"),
-    ("LeftToe", "RightToe"),
+    ("lefttoeend", "righttoeend"),
+    ("lefttoebase", "righttoebase"),
+    ("lefttoe", "righttoe"),
 )
 _LOG = logging.getLogger(__name__)
 
@@ -87,7 +89,9 @@ class Style100(base.MotionBuilder):
                 skipped["no cut"].append(name)
                 continue
             content = cut_clip(bvh.read_bvh(data, name=path), cuts[style, action])
-            skeleton, motion = bvh.motion_from_bvh(content, feet=_feet(content))
+            skeleton, motion = bvh.motion_from_bvh(content)
+            feet = _feet(skeleton, path)
+            skeleton = dataclasses.replace(skeleton, feet=feet)
             labels = {"style": style, "action": action}
             yield base.example(name, skeleton, motion, labels)
             if self.builder_config.mirror and symmetric[style]:
@@ -106,14 +110,15 @@ def _plan(skeleton: Skeleton) -> mirror.MirrorPlan:
     return mirror.mirror_plan(skeleton, tolerance=0.02)
 
 
-def _feet(content: bvh.Bvh) -> tuple[str, ...]:
+def _feet(skeleton: Skeleton, path: str) -> tuple[int, ...]:
     """The outermost pair of toe joints."""
+    plain = plain_names(skeleton)
     for pair in _FEET:
-        if set(pair) <= set(content.names):
-            return pair
+        if set(pair) <= set(plain):
+            return tuple(plain.index(name) for name in pair)
     raise bvh.BvhError(
-        f"{content.name}: no toes: expected one of the pairs {_FEET} among the joints "
-        f"{', '.join(content.names)}"
+        f"{path}: no toes: expected Left and RightToe_End, ToeBase or Toe among the "
+        f"joints {', '.join(skeleton.names)}"
     )
 
 
