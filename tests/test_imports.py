@@ -10,21 +10,24 @@ PACKAGE = ROOT / "jaxmotion"
 # Folder (or file) -> what of jaxmotion it may import. Imports point down.
 MAY_IMPORT = {
     "typing.py": set(),
+    # Files as they come, for whatever reads or writes one.
+    "files.py": set(),
     "diffusion": {"typing"},
     "motion": {"typing"},
     "networks": {"typing"},
     "evaluation": {"typing", "motion"},
     # networks: the recogniser is trained and used in learning/recognition.py.
-    "learning": {"typing", "motion", "networks"},
+    "learning": {"typing", "files", "motion", "networks"},
     "control": {"typing", "motion"},
-    "data": {"typing", "motion"},
+    "data": {"typing", "files", "motion"},
     # Sentences to vectors: tokenizers, weights from a folder, and their network.
-    "text": {"typing", "networks"},
+    "text": {"typing", "files", "networks"},
     # learning.checkpoint: a model is loaded as a value (systems/camdm_model.py).
     "systems": {"typing", "diffusion", "motion", "networks", "control", "learning"},
     # What an experiment measures and leaves behind: a method, its data, its pictures.
     "protocols": {
         "typing",
+        "files",
         "motion",
         "data",
         "evaluation",

@@ -1,12 +1,11 @@
 """Named arrays on disk: one npz file without pickles, written whole or not at all."""
 
-import io
 import os
-import zipfile
-import zlib
 from collections.abc import Mapping
 
 import numpy as np
+
+from jaxmotion import files
 
 
 def write_npz(path: str | os.PathLike, fields: Mapping[str, np.ndarray]) -> None:
@@ -19,49 +18,8 @@ def write_npz(path: str | os.PathLike, fields: Mapping[str, np.ndarray]) -> None
     Raises:
       OSError: if the file cannot be written.
     """
-    path = os.fspath(path)
-    os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
-    temporary = f"{path}.{os.getpid()}.partial"
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(file, **fields)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        if os.path.exists(temporary):
-            os.remove(temporary)
-
-
-def read_arrays(
-    file: str | os.PathLike | io.BytesIO, *, name: str, what: str
-) -> dict[str, np.ndarray]:
-    """All arrays of an npz file without pickles.
-
-    Args:
-      file: Its path, or its content.
-      name: Its path, for messages.
-      what: What it holds, for messages.
-
-    Returns:
-      The arrays.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is damaged or no npz file; names it.
-    """
-    try:
-        content = np.load(file, allow_pickle=False)
-        if not isinstance(content, np.lib.npyio.NpzFile):
-            raise ValueError("an array, not an npz archive")
-        with content:
-            return {field: content[field] for field in content.files}
-    except FileNotFoundError:
-        raise FileNotFoundError(f"no {what} file {name!r}") from None
-    except (ValueError, EOFError, KeyError, zlib.error, zipfile.BadZipFile) as error:
-        raise ValueError(
-            f"{name}: not a {what} file, or a damaged one ({error})"
-        ) from None
+    with files.replacing(path) as file:
+        np.savez(file, **fields)
 
 
 def read_npz(
@@ -91,7 +49,7 @@ def read_npz(
         the file and the field.
     """
     path = os.fspath(path)
-    fields = read_arrays(path, name=path, what=what)
+    fields = files.read_arrays(path, name=path, what=what)
     if str(fields.get("format")) != format_name:
         raise ValueError(
             f"{path}: not a {what} file: its field 'format' should be {format_name!r}; "

@@ -8,7 +8,6 @@ an interruption at any moment leaves the steps before it as they were.
 import json
 import os
 import tempfile
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from jaxmotion import files
 from jaxmotion.typing import Params
 
 
@@ -242,6 +242,26 @@ def export_params(
     os.replace(file.name, path)
 
 
+def _insert(path: str | Path, params: Params, name: str, array: np.ndarray) -> None:
+    """Puts an array among the parameters; raises unless it is one of numbers."""
+    with np.errstate(over="ignore"):
+        values = array.astype(np.float32) if array.dtype.kind == "f" else array
+    if values.dtype != np.float32 or not np.isfinite(values).all():
+        raise CheckpointError(
+            f"{path}: field {name!r} has values that are not finite float32 numbers "
+            f"({array.dtype} of shape {array.shape})"
+        )
+    *parents, last = name.split("/")
+    node = params
+    for parent in parents:
+        node = node.setdefault(parent, {})
+        if not isinstance(node, dict):
+            break
+    if not isinstance(node, dict) or last in node:
+        raise CheckpointError(f"{path}: field {name!r} is within another array")
+    node[last] = jax.numpy.asarray(values)
+
+
 def import_params(
     path: str | Path, like: Params | None = None
 ) -> tuple[Params, dict[str, Any]]:
@@ -258,23 +278,24 @@ def import_params(
       CheckpointError: if the file is no such export, or of another model.
     """
     try:
-        file = np.load(path, allow_pickle=False)
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ValueError("one array, expected an npz archive")
-        with file:
-            arrays = {name: file[name] for name in file.files}
-        config = json.loads(str(arrays.pop("config")))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        arrays = files.read_arrays(path, name=os.fspath(path), what="parameter")
+    except (OSError, ValueError) as error:
         raise CheckpointError(
             f"{path}: not an export of parameters: {error}"
         ) from error
+    try:
+        config = json.loads(str(arrays.pop("config")))
+    except (KeyError, ValueError, RecursionError) as error:
+        raise CheckpointError(
+            f"{path}: field 'config' is missing or no JSON: {error}"
+        ) from None
+    if not isinstance(config, dict):
+        raise CheckpointError(
+            f"{path}: field 'config' is a {type(config).__name__}, expected an object"
+        )
     params: dict[str, Any] = {}
     for name, array in arrays.items():
-        *parents, last = name.split("/")
-        node = params
-        for parent in parents:
-            node = node.setdefault(parent, {})
-        node[last] = jax.numpy.asarray(array, jax.numpy.float32)
+        _insert(path, params, name, array)
     if like is not None:
         want = jax.tree.map(lambda x: tuple(x.shape), like)
         got = jax.tree.map(lambda x: tuple(x.shape), params)

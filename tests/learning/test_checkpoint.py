@@ -1,6 +1,7 @@
 """Checkpoints: equal to the bit, whole or absent, and errors that name the folder."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -248,3 +249,31 @@ def test_import_of_something_else(tmp_path):
     checkpoint.export_params(path, state_of(0).params, {})
     with pytest.raises(checkpoint.CheckpointError, match="model.npz.*another model"):
         checkpoint.import_params(path, like=state_of(0, width=9).params)
+
+
+GARBAGE = {
+    "all NaN": (dict(a=np.full(3, np.nan, np.float32)), "field 'a' .*not finite"),
+    "float64 1e300": (dict(a=np.array([1e300])), "field 'a' .*not finite"),
+    "text": (dict(a=np.array(["x"])), "field 'a' .*not finite float32"),
+    "array in array": ({"a": np.zeros(2), "a/b": np.zeros(2)}, "'a/b' is within"),
+    "list as config": (dict(config=np.array("[1]")), "'config' is a list"),
+    "deep config": (dict(config=np.array("[" * 100_000)), "'config' is missing or no"),
+    "pickle": (dict(a=np.array([{}], object)), "field 'a': .*[Oo]bject"),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("case", GARBAGE)
+def test_import_of_garbage_names_the_field(tmp_path, case):
+    fields, message = GARBAGE[case]
+    np.savez(tmp_path / "model.npz", **{"config": np.array("{}")} | fields)
+    with pytest.raises(checkpoint.CheckpointError, match=message) as caught:
+        checkpoint.import_params(tmp_path / "model.npz")
+    assert str(caught.value).startswith(f"{tmp_path}/model.npz: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_import_of_a_pipe_does_not_wait(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(checkpoint.CheckpointError, match="pipe.*regular file"):
+        checkpoint.import_params(tmp_path / "pipe")

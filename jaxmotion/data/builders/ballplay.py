@@ -35,6 +35,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from jaxmotion import files
 from jaxmotion.data import npz
 from jaxmotion.data.builders import ball_base, base, chains
 from jaxmotion.motion.skeleton import Skeleton
@@ -147,7 +148,7 @@ def read_fields(path: str, data: bytes) -> dict[str, np.ndarray]:
       ValueError: if a field is missing, of another shape or not finite, or the clips'
         boundaries do not ascend; names the file and the field.
     """
-    fields = npz.read_arrays(io.BytesIO(data), name=path, what="BallPlay-M")
+    fields = files.read_arrays(io.BytesIO(data), name=path, what="BallPlay-M")
     wanted = {field: (kind, 1 + len(s)) for field, (kind, s) in _FRAMES.items()}
     wanted |= {field: (kind, 1) for field, kind in _CLIPS.items()} | {"fps": ("f", 0)}
     npz.check_fields(path, fields, wanted)

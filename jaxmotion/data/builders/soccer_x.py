@@ -38,6 +38,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxmotion import files
 from jaxmotion.data import npz
 from jaxmotion.data.builders import ball_base, base, chains, smpl
 from jaxmotion.motion.ball import ball_accelerations
@@ -85,7 +86,7 @@ def _arrays(
     path: str, data: bytes, shapes: dict[str, tuple[int | None, ...]], what: str
 ) -> dict[str, np.ndarray]:
     """Arrays of a file; finite, of those shapes."""
-    fields = npz.read_arrays(io.BytesIO(data), name=path, what=what)
+    fields = files.read_arrays(io.BytesIO(data), name=path, what=what)
     kinds = {field: ("f", len(shape)) for field, shape in shapes.items()}
     npz.check_fields(path, fields, kinds)
     for field, shape in shapes.items():

@@ -1,0 +1,170 @@
+"""Files as they come: damaged, foreign or hostile ones end in one clear line.
+
+Nothing that is read here runs code, waits for a pipe, or unpacks without a limit.
+"""
+
+import contextlib
+import io
+import os
+import stat
+import zipfile
+from collections.abc import Callable, Iterator
+from typing import Any, BinaryIO
+
+import numpy as np
+
+# What an archive may unpack to: so many bytes, or so many times its own size. Text of
+# motions shrinks about 4 times, still frames 20 times; bombs go up to 1,000 times.
+FREE_BYTES = 256 * 2**20
+FREE_RATIO = 50
+
+
+def open_regular(path: str | os.PathLike) -> BinaryIO:
+    """Opens a file for reading, unless it is a pipe or a device, which may never end.
+
+    Raises:
+      OSError: if it is none, or cannot be read; names it.
+    """
+    path = os.fspath(path)
+    # Before opening: to open a pipe is to wait for its other end.
+    mode = os.stat(path).st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise OSError(f"{path}: expected a regular file, found a pipe or a device")
+    return open(path, "rb")
+
+
+def read_bytes(path: str | os.PathLike) -> bytes:
+    """Content of a regular file.
+
+    Raises:
+      OSError: as of `open_regular`.
+    """
+    with open_regular(path) as file:
+        return file.read()
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike) -> Iterator[BinaryIO]:
+    """A file to write, which appears under its name only when it is whole.
+
+    Its folder is made if need be. After an error nothing of it is left.
+
+    Raises:
+      OSError: if the file cannot be written; names it.
+    """
+    path = os.fspath(path)
+    os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
+    temporary = f"{path}.{os.getpid()}.partial"
+    try:
+        with open(temporary, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        # Of a full disk Python knows the reason but not the file.
+        if error.filename is None and error.errno is not None:
+            raise OSError(error.errno, error.strerror, path) from error
+        raise
+    finally:
+        if os.path.exists(temporary):
+            os.remove(temporary)
+
+
+def _check_sizes(members: list[zipfile.ZipInfo], archive_bytes: int) -> None:
+    """Raises if members would unpack to more than an honest archive does."""
+    # A member is read up to the size that it states, never beyond.
+    limit = max(FREE_BYTES, FREE_RATIO * archive_bytes)
+    total = sum(member.file_size for member in members)
+    if total > limit:
+        largest = max(members, key=lambda member: member.file_size)
+        raise ValueError(
+            f"it would unpack to {total} bytes, more than {limit} (the larger of "
+            f"{FREE_BYTES} and {FREE_RATIO} times its size); the largest member is "
+            f"{largest.filename!r} with {largest.file_size}"
+        )
+
+
+def read_members(
+    path: str | os.PathLike, wanted: Callable[[str], bool]
+) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of members of a zip, sorted by name.
+
+    Args:
+      path: The zip.
+      wanted: Which members, by their names.
+
+    Raises:
+      OSError: if it cannot be read.
+      ValueError: if it is damaged, encrypted, packed in an unknown way, or would unpack
+        to far more than its size; names it and the member.
+    """
+    with open_regular(path) as file, _one_line(path, "unreadable zip"):
+        archive = zipfile.ZipFile(file)
+        members = [one for one in archive.infolist() if wanted(one.filename)]
+        _check_sizes(members, os.fstat(file.fileno()).st_size)
+        for member in sorted(members, key=lambda member: member.filename):
+            if member.flag_bits & 1:
+                raise ValueError(f"member {member.filename!r} is encrypted")
+            try:
+                data = archive.read(member)
+            except Exception as error:
+                raise ValueError(
+                    f"member {member.filename!r}: {type(error).__name__}: {error}"
+                ) from None
+            yield member.filename, data
+
+
+@contextlib.contextmanager
+def _one_line(name: str | os.PathLike, problem: str) -> Iterator[None]:
+    """Makes of whatever damaged bytes raise one line that names the file."""
+    try:
+        yield
+    except Exception as error:
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        words = " ".join(str(error).split()) or "truncated"
+        raise ValueError(f"{os.fspath(name)}: {problem} ({kind}{words})") from None
+
+
+def read_arrays(
+    file: str | os.PathLike | io.BytesIO, *, name: str, what: str
+) -> dict[str, np.ndarray]:
+    """All arrays of an npz file without pickles.
+
+    Args:
+      file: Its path, or its content.
+      name: Its path, for messages.
+      what: What it holds, for messages.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      OSError: if it cannot be read.
+      ValueError: if it is damaged or no npz file, or would unpack to far more than its
+        size; names it.
+    """
+    try:
+        opened = file if isinstance(file, io.BytesIO) else open_regular(file)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"no {what} file {name!r}") from None
+    with opened, _one_line(name, f"not a {what} file, or a damaged one"):
+        head = opened.read(6)
+        size = opened.seek(0, os.SEEK_END)
+        opened.seek(0)
+        if not head.startswith(b"PK"):
+            found = f"begins with {head!r}" if head else "is empty"
+            raise ValueError(f"expected an npz archive, the file {found}")
+        content = np.load(opened, allow_pickle=False)
+        _check_sizes(content.zip.infolist(), size)
+        return {field: _array(content, field) for field in content.files}
+
+
+def _array(content: np.lib.npyio.NpzFile, field: str) -> np.ndarray:
+    """One array of an archive, no larger than its member."""
+    try:
+        found: Any = content[field]
+    except Exception as error:
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        raise ValueError(f"field {field!r}: {kind}{error}") from None
+    if not isinstance(found, np.ndarray):
+        raise ValueError(f"field {field!r} is no array")
+    return found
