@@ -41,9 +41,10 @@ class Train:
     Attributes:
       data: Clips from prepare_data.py.
       out: Run folder: checkpoints, config.json, losses.jsonl.
-      preset: "small" for a CPU or a short run, or "paper" (whose authors train with
-        --optimizer adamw --learning-rate 1e-4 --batch 512), or "planted" for a second
-        training of a small model in which feet learn to stand.
+      preset: Sizes, weights and how they are trained: "small" for a CPU or a short run,
+        "paper" (AdamW, 1e-4, batch 512, no warm-up, clipping or averaging; its authors
+        made 100 epochs), or "planted" for a second training of a small model in which
+        feet learn to stand. Options given as None are the preset's.
       init: Run folder or exported model to start from; None for random parameters.
       contents: Use only clips of these contents (for Bandai-Namco walk, run ...);
         none: all clips.
@@ -55,7 +56,8 @@ class Train:
       optimizer: "muon" or "adamw".
       learning_rate: Peak of its rate; cosine to a tenth.
       warmup: Steps of linear rise.
-      ema: Decay of the parameters' moving average a step.
+      max_norm: Gradients are clipped to this global norm; 0 for no clipping.
+      ema: Decay per step of the parameters' moving average; 0 for no average.
       chunk: Steps of one compiled call.
       save_every: Steps between checkpoints.
       network: "transformer", or a denoiser of the ablation (table 3).
@@ -75,11 +77,12 @@ class Train:
     held_out: float = 0.1
     mirror: bool = True
     steps: int = 11000
-    batch: int = 48
-    optimizer: Literal["muon", "adamw"] = "muon"
-    learning_rate: float = 1e-3
-    warmup: int = 300
-    ema: float = 0.999
+    batch: int | None = None
+    optimizer: Literal["muon", "adamw"] | None = None
+    learning_rate: float | None = None
+    warmup: int | None = None
+    max_norm: float | None = None
+    ema: float | None = None
     chunk: int = 50
     save_every: int = 1000
     network: Literal["transformer", "mlp", "single_token"] = "transformer"
@@ -88,6 +91,13 @@ class Train:
     diffusion_steps: int = 8
     devices: int = 1
     seed: int = 0
+
+
+def with_preset(args: Train) -> Train:
+    """The arguments, with the preset's values of how to train in place of None."""
+    preset = camdm_training.FITTING[args.preset]
+    open_ = {k: v for k, v in preset.items() if getattr(args, k) is None}
+    return dataclasses.replace(args, **open_)
 
 
 def model_of(args: Train, clips: Clips) -> camdm_model.Model:
@@ -105,6 +115,7 @@ def model_of(args: Train, clips: Clips) -> camdm_model.Model:
 
 def train(args: Train) -> None:
     """Trains, with checkpoints."""
+    args = with_preset(args)
     loop.check_writable(args.out)
     clips, _ = camdm_runs.split_data(
         args.data, args.contents, args.label, args.held_out
@@ -124,6 +135,7 @@ def train(args: Train) -> None:
         optimizer=args.optimizer,
         learning_rate=args.learning_rate,
         warmup=args.warmup,
+        max_norm=args.max_norm,
         ema=args.ema,
         chunk=args.chunk,
         devices=args.devices,

@@ -73,6 +73,20 @@ def test_training_leaves_a_run_that_goes_on(data, trained):
     assert all(np.isfinite(row["loss"]) for row in rows)
 
 
+def test_a_preset_says_how_to_train_unless_an_option_does(call, data, tmp_path):
+    fields = "optimizer learning_rate batch warmup max_norm ema".split()
+
+    def trained_with(line):
+        out = tmp_path / "run"
+        sizes = SIZES.replace("--batch 4", "").replace("--warmup 1", "")
+        call(f"train --data {data} --out {out} {sizes} --steps 1 {line}")
+        found = json.loads((out / "config.json").read_text())["experiment"]
+        return [found[name] for name in fields]
+
+    found = trained_with("--preset paper --ema 0.9 --batch 3")
+    assert found == ["adamw", 1e-4, 3, 0, 0.0, 0.9]
+
+
 def check_rollout(folder, seconds):
     frames = round(30 * seconds)
     assert bvh_text.read_bvh(folder / "rollout.bvh").values.shape[0] == frames
