@@ -1,13 +1,14 @@
 """Checkpoints through orbax, and single-file exports of parameters.
 
-A checkpoint folder holds numbered steps; each has the state (arrays) and the config
-(JSON). Orbax writes a step under a temporary name and renames it when it is whole, so
-an interruption at any moment leaves the steps before it as they were.
+A checkpoint folder holds numbered steps; each has the state (arrays), the config (JSON)
+and checksums of both. Orbax writes a step under a temporary name and renames it when it
+is whole, so an interruption at any moment leaves the steps before it as they were. What
+is read is compared with its checksums, since the arrays' files have none of their own.
 """
 
 import json
 import os
-import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from jaxmotion import files
+from jaxmotion.learning import fingerprint
 from jaxmotion.typing import Params
 
 
@@ -28,8 +30,15 @@ def _manager(folder: Path, keep: int | None = None) -> ocp.CheckpointManager:
         max_to_keep=keep, enable_async_checkpointing=False, create=keep is not None
     )
     return ocp.CheckpointManager(
-        folder.absolute(), item_names=("state", "config"), options=options
+        folder.absolute(), item_names=("state", "config", "checksums"), options=options
     )
+
+
+def _checksums(state: Any, config: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "config": fingerprint.json_checksum(config),
+        "state": fingerprint.checksums(state),
+    }
 
 
 def save(
@@ -51,7 +60,9 @@ def save(
         manager.save(
             step,
             args=ocp.args.Composite(
-                state=ocp.args.StandardSave(state), config=ocp.args.JsonSave(config)
+                state=ocp.args.StandardSave(state),
+                config=ocp.args.JsonSave(config),
+                checksums=ocp.args.JsonSave(_checksums(state, config)),
             ),
             force=True,
         )
@@ -79,29 +90,72 @@ def _newest(folder: Path, step: int | None) -> int:
     return step
 
 
+def _read_json(folder: Path, step: int, item: str) -> dict[str, Any]:
+    try:
+        with _manager(folder) as manager:
+            args = ocp.args.Composite(**{item: ocp.args.JsonRestore()})
+            value = manager.restore(step, args=args)[item]
+    except Exception as error:
+        raise CheckpointError(
+            f"{folder}: step {step} has no readable {item}: {_first_line(error)}"
+        ) from error
+    if not isinstance(value, dict):
+        raise CheckpointError(
+            f"{folder}: step {step} has no readable {item}: found "
+            f"{type(value).__name__}, expected a JSON object"
+        )
+    return value
+
+
+def _read_checksums(folder: Path, step: int) -> dict[str, Any] | None:
+    if not (folder / str(step) / "checksums").exists():
+        warnings.warn(
+            f"{folder}: step {step} has no checksums (an earlier version wrote it): "
+            "damage to it would not be noticed",
+            stacklevel=4,
+        )
+        return None
+    value = _read_json(folder, step, "checksums")
+    if not isinstance(value.get("config"), str) or not isinstance(
+        value.get("state"), dict
+    ):
+        raise CheckpointError(f"{folder}: step {step} has no readable checksums")
+    return value
+
+
+def _check_state(folder: Path, step: int, state: Any) -> None:
+    """Raises if an array is not what was saved; parts of a state may be missing."""
+    checksums = _read_checksums(folder, step)
+    if checksums is None:
+        return
+    for name, found in fingerprint.checksums(state).items():
+        if checksums["state"].get(name) != found:
+            raise _damaged(folder, step, name)
+
+
+def _damaged(folder: Path, step: int, what: str) -> CheckpointError:
+    with _manager(folder) as manager:
+        others = sorted(set(manager.all_steps()) - {step})
+    hint = f"; without {folder / str(step)} step {others[-1]} counts" if others else ""
+    return CheckpointError(
+        f"{folder}: step {step} is corrupt: {what} is not what was saved (its checksum "
+        f"differs){hint}"
+    )
+
+
 def load_config(folder: str | Path, step: int | None = None) -> dict[str, Any]:
-    """Config of a step.
-
-    Args:
-      folder: The run's checkpoint folder.
-      step: Which; None for the newest.
-
-    Returns:
-      The JSON object that `save` was given.
+    """Config of a step; the newest if none is given.
 
     Raises:
-      CheckpointError: if there is none, or it is not readable; names the folder.
+      CheckpointError: if there is none, or it is not what was saved; names the folder.
     """
     folder = Path(folder)
     step = _newest(folder, step)
-    try:
-        with _manager(folder) as manager:
-            args = ocp.args.Composite(config=ocp.args.JsonRestore())
-            return manager.restore(step, args=args)["config"]
-    except Exception as error:
-        raise CheckpointError(
-            f"{folder}: step {step} has no readable config: {error}"
-        ) from error
+    value = _read_json(folder, step, "config")
+    checksums = _read_checksums(folder, step)
+    if checksums and checksums["config"] != fingerprint.json_checksum(value):
+        raise _damaged(folder, step, "config")
+    return value
 
 
 def restore(folder: str | Path, like: Any, step: int | None = None) -> Any:
@@ -128,14 +182,18 @@ def restore(folder: str | Path, like: Any, step: int | None = None) -> Any:
     except Exception as error:
         raise _foreign(folder, step, error) from error
     _check_shapes(folder, step, like, state)
+    _check_state(folder, step, state)
     return state
 
 
 def _foreign(folder: Path, step: int, error: Exception) -> CheckpointError:
-    lines = str(error).splitlines() or [type(error).__name__]
     return CheckpointError(
-        f"{folder}: step {step} is corrupt or of another model: {lines[0]}"
+        f"{folder}: step {step} is corrupt or of another model: {_first_line(error)}"
     )
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _check_shapes(folder: Path, step: int, like: Any, found: Any) -> None:
@@ -183,19 +241,25 @@ def restore_part(
     )
     saved = folder.absolute() / str(step) / "state"
     try:
-        with ocp.PyTreeCheckpointer() as reader:
-            stored = reader.metadata(saved).item_metadata.tree
+        # The handler itself: a Checkpointer looks for a metadata file that only whole
+        # steps have, and warns.
+        reader = ocp.PyTreeCheckpointHandler()
+        try:
+            stored = reader.metadata(saved).tree
             if within is not None:
                 stored = stored.get(within) or {}
             # Orbax would hand back what `like` has where the disk has nothing.
             _check_part(folder, step, like, {name: stored.get(name) for name in like})
             found = reader.restore(saved, args=part)
-        found = found if within is None else found[within]
-        return jax.tree.map(jax.numpy.asarray, found)
+        finally:
+            reader.close()
     except CheckpointError:
         raise
     except Exception as error:
         raise _foreign(folder, step, error) from error
+    _check_state(folder, step, found)
+    found = found if within is None else found[within]
+    return jax.tree.map(jax.numpy.asarray, found)
 
 
 def _check_part(folder: Path, step: int, like: Any, stored: Any) -> None:
@@ -235,11 +299,16 @@ def export_params(
         for keys, leaf in leaves
     }
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        np.savez_compressed(file, config=np.array(json.dumps(config)), **arrays)
-    os.chmod(file.name, 0o644)
-    os.replace(file.name, path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder, expected a file to write")
+    text = json.dumps(config)
+    checksum = np.array(_export_checksum(text, arrays))
+    with files.replacing(path) as file:
+        np.savez_compressed(file, config=np.array(text), checksum=checksum, **arrays)
+
+
+def _export_checksum(config: str, arrays: dict[str, np.ndarray]) -> str:
+    return fingerprint.json_checksum([config, fingerprint.checksums(arrays)])
 
 
 def _insert(path: str | Path, params: Params, name: str, array: np.ndarray) -> None:
@@ -281,10 +350,11 @@ def import_params(
         arrays = files.read_arrays(path, name=os.fspath(path), what="parameter")
     except (OSError, ValueError) as error:
         raise CheckpointError(
-            f"{path}: not an export of parameters: {error}"
+            f"{path}: not an export of parameters: {_first_line(error)}"
         ) from error
     try:
-        config = json.loads(str(arrays.pop("config")))
+        text = str(arrays.pop("config"))
+        config = json.loads(text)
     except (KeyError, ValueError, RecursionError) as error:
         raise CheckpointError(
             f"{path}: field 'config' is missing or no JSON: {error}"
@@ -293,6 +363,9 @@ def import_params(
         raise CheckpointError(
             f"{path}: field 'config' is a {type(config).__name__}, expected an object"
         )
+    checksum = arrays.pop("checksum", None)
+    if checksum is not None and str(checksum) != _export_checksum(text, arrays):
+        raise CheckpointError(f"{path}: corrupt: its checksum differs from its content")
     params: dict[str, Any] = {}
     for name, array in arrays.items():
         _insert(path, params, name, array)
@@ -301,4 +374,10 @@ def import_params(
         got = jax.tree.map(lambda x: tuple(x.shape), params)
         if want != got:
             raise CheckpointError(f"{path}: parameters of another model")
+    if checksum is None:
+        warnings.warn(
+            f"{path}: no checksum (an earlier version wrote it): damage to it would "
+            "not be noticed",
+            stacklevel=2,
+        )
     return params, config

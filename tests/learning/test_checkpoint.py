@@ -1,7 +1,9 @@
 """Checkpoints: equal to the bit, whole or absent, and errors that name the folder."""
 
 import json
+import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +17,8 @@ import optax
 import pytest
 
 from jaxmotion.learning import checkpoint, training
+
+absl = logging.getLogger("absl")
 
 # Orbax abandons its other reads when one fails.
 pytestmark = pytest.mark.filterwarnings(
@@ -156,6 +160,101 @@ def test_corrupt(tmp_path, how):
             read()
 
 
+def flipped(path, bit):
+    """Turns one bit of a file over; the second time turns it back."""
+    content = bytearray(path.read_bytes())
+    content[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(bytes(content))
+
+
+def equal(found, expected):
+    if jax.tree.structure(found) != jax.tree.structure(expected):
+        return False
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
+    return all(
+        np.array_equal(a, b) and np.asarray(a).dtype == np.asarray(b).dtype
+        for a, b in pairs
+    )
+
+
+def test_a_flipped_bit_in_any_file_is_noticed_or_changes_nothing(tmp_path):
+    folder = tmp_path / "checkpoints"
+    config = {"width": 8, "name": "small"}
+    state = state_of(7, width=64)
+    checkpoint.save(folder, 7, state, config)
+    like = jax.eval_shape(lambda: state)
+    reads = (
+        (lambda: checkpoint.restore(folder, like), state),
+        (
+            lambda: checkpoint.restore_part(folder, {"ema_params": like.ema_params}),
+            {"ema_params": state.ema_params},
+        ),
+        (lambda: checkpoint.load_config(folder), config),
+    )
+    files = sorted(path for path in (folder / "7").rglob("*") if path.is_file())
+    assert len(files) > 10
+    generator = np.random.default_rng(0)
+    noticed = 0
+    for path in files:
+        for bit in generator.integers(0, 8 * path.stat().st_size, size=4).tolist():
+            flipped(path, bit)
+            for read, expected in reads:
+                try:
+                    found = read()
+                except checkpoint.CheckpointError as error:
+                    noticed += 1
+                    assert str(folder) in str(error) and "\n" not in str(error)
+                else:
+                    assert equal(found, expected), (path, bit)
+            flipped(path, bit)
+    assert noticed > 20
+    assert equal(checkpoint.restore(folder, like), state)
+
+
+def test_a_damaged_step_says_which_other_step_counts_without_it(tmp_path):
+    folder = tmp_path / "checkpoints"
+    for step in (1, 2):
+        checkpoint.save(folder, step, state_of(step), {})
+    where = folder / "2" / "checksums" / "metadata"
+    value = json.loads(where.read_text())
+    value["state"]["params/bias"] = 64 * "0"
+    where.write_text(json.dumps(value))
+    with pytest.raises(checkpoint.CheckpointError, match="2 is corrupt.*step 1 counts"):
+        checkpoint.restore(folder, state_of(0))
+
+
+def test_a_step_without_checksums_is_read_with_a_warning(tmp_path):
+    """As earlier versions wrote them."""
+    folder = tmp_path / "checkpoints"
+    checkpoint.save(folder, 7, state_of(7), {"a": 1})
+    shutil.rmtree(folder / "7" / "checksums")
+    with pytest.warns(UserWarning, match="step 7 has no checksums"):
+        found = checkpoint.restore(folder, state_of(0))
+    assert equal(found, state_of(7))
+    with pytest.warns(UserWarning, match="step 7 has no checksums"):
+        assert checkpoint.load_config(folder) == {"a": 1}
+
+
+def test_a_config_that_is_no_object(tmp_path):
+    folder = tmp_path / "checkpoints"
+    checkpoint.save(folder, 7, state_of(7), {})
+    for text in ("[1]", "5", "null", "{"):
+        (folder / "7" / "config" / "metadata").write_text(text)
+        with pytest.raises(checkpoint.CheckpointError, match="no readable config"):
+            checkpoint.load_config(folder)
+
+
+def test_reading_a_part_warns_of_nothing(tmp_path, caplog):
+    folder = tmp_path / "checkpoints"
+    checkpoint.save(folder, 7, state_of(7), {})
+    # absl logs past pytest's handler unless it is told.
+    with caplog.at_level(logging.WARNING, logger="absl"):
+        absl.addHandler(caplog.handler)
+        checkpoint.restore_part(folder, {"ema_params": state_of(0).ema_params})
+        absl.removeHandler(caplog.handler)
+    assert caplog.text == ""
+
+
 def test_a_torn_step_does_not_count(tmp_path):
     """What a kill in the midst of a save leaves behind is neither read nor fatal."""
     folder = tmp_path / "checkpoints"
@@ -221,6 +320,54 @@ def test_export_and_import(tmp_path):
     assert half["bias"].dtype == jnp.float32
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), half, params)
     assert [p.name for p in path.parent.iterdir()] == ["model.npz"]
+
+
+def test_a_flipped_bit_of_an_export_is_noticed_or_changes_nothing(tmp_path):
+    path = tmp_path / "model.npz"
+    params = state_of(3, width=64).params
+    checkpoint.export_params(path, params, {"a": [1, 2]}, dtype=np.float32)
+    generator = np.random.default_rng(0)
+    noticed = 0
+    for bit in generator.integers(0, 8 * path.stat().st_size, size=300).tolist():
+        flipped(path, bit)
+        try:
+            found, config = checkpoint.import_params(path)
+        except checkpoint.CheckpointError:
+            noticed += 1
+        else:
+            assert equal(found, params) and config == {"a": [1, 2]}, bit
+        flipped(path, bit)
+    assert noticed > 200
+
+
+def test_an_export_that_was_changed_and_one_without_a_checksum(tmp_path):
+    """Its zip archive is whole, so only the checksum can tell."""
+    path = tmp_path / "model.npz"
+    checkpoint.export_params(path, state_of(3).params, {"width": 8})
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **arrays | {"config": np.array('{"width": 9}')})
+    with pytest.raises(checkpoint.CheckpointError, match="model.npz: corrupt"):
+        checkpoint.import_params(path)
+    np.savez(path, **arrays | {"bias": arrays["bias"] + 1})
+    with pytest.raises(checkpoint.CheckpointError, match="model.npz: corrupt"):
+        checkpoint.import_params(path)
+    del arrays["checksum"]
+    np.savez(path, **arrays)
+    with pytest.warns(UserWarning, match="model.npz: no checksum"):
+        checkpoint.import_params(path)
+    np.savez(path, **arrays | {"config": np.array("[1]")})
+    with pytest.raises(
+        checkpoint.CheckpointError, match="'config' is a list, expected an object"
+    ):
+        checkpoint.import_params(path)
+
+
+def test_an_export_to_a_folder_leaves_nothing_beside_it(tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match="folder.*expected a file"):
+        checkpoint.export_params(tmp_path / "folder", state_of(0).params, {})
+    assert [path.name for path in tmp_path.rglob("*")] == ["folder"]
 
 
 def test_import_of_something_else(tmp_path):
