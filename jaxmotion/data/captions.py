@@ -14,8 +14,6 @@ punctuation nor hyphens occur. Labels are read as plain English. That is a guess
 "guide", "respond", "call", "musical" and "chimpira" (a young thug), which their
 publisher does not explain.
 
-`text_tags.tag_class` gives the class of a tagged word.
-
 Source: own.
 """
 

@@ -11,10 +11,28 @@ makes a clip of its own.
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+
+
+def read_array(path: Path) -> Float[np.ndarray, "..."]:
+    """An array of numbers in an npy file, as float32.
+
+    Raises:
+      ValueError: if it is missing, damaged or of other contents; names it.
+    """
+    try:
+        array = np.load(path, allow_pickle=False)
+        if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
+            raise ValueError("not an array of floating-point numbers")
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{path}: not a feature file, or damaged ({error})") from None
+    return array.astype(np.float32)
 
 
 class Caption(NamedTuple):

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.learning import training
-from jaxmotion.networks.matching import UNIT, Matcher
+from jaxmotion.networks.matching import UNIT, Matcher, Rest
 from jaxmotion.typing import Key, Params
 
 MARGIN = 10.0
@@ -35,6 +35,30 @@ TAGS = (
     *("VERB", "NOUN", "DET", "ADP", "NUM", "AUX", "PRON", "ADJ", "ADV"),
     *("Loc_VIP", "Body_VIP", "Obj_VIP", "Act_VIP", "Desc_VIP", "OTHER"),
 )
+# Words whose class is that of the list they are in, whatever their part of speech: as
+# published weights know them. Lemmas, mostly.
+SPECIAL_WORDS: Mapping[str, frozenset[str]] = {
+    "Loc_VIP": frozenset(
+        "anticlockwise back backward clockwise counterclockwise curve down forward "
+        "left right straight up".split()
+    ),
+    "Body_VIP": frozenset(
+        "arm chin eye face feet foot hand knee leg mouth shoulder thigh waist".split()
+    ),
+    "Obj_VIP": frozenset(
+        "ball baseball basketball car chair dumbbell floor handrail stair "
+        "window".split()
+    ),
+    "Act_VIP": frozenset(
+        "balance bend bring climb dance flap hop jog jump kick kneel lean lift lower "
+        "pick put raise rotate rub run shuffle sit spin spread squat stand stop stroll "
+        "stumble swing throw turn walk wash".split()
+    ),
+    "Desc_VIP": frozenset(
+        "angrily angry careful carefully fast happily happy quickly sad sadly slow "
+        "slowly".split()
+    ),
+}
 _NORM = 6.0  # about that of a GloVe vector of a common word
 
 
@@ -88,7 +112,6 @@ class Pairs:
 
 
 @functools.partial(jax.jit, static_argnames="config")
-@functools.partial(jax.jit, static_argnames="config")
 def init_matcher(key: Key, config: MatcherConfig) -> Params:
     """Initial parameters.
 
@@ -110,13 +133,14 @@ def init_matcher(key: Key, config: MatcherConfig) -> Params:
     )["params"]
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@functools.partial(jax.jit, static_argnames=("config", "rest"))
 def embed_motion(
     params: Params,
     features: Float[Array, "batch frames channels"],
     frames: Int[Array, " batch"],
     *,
     config: MatcherConfig,
+    rest: Rest = "zeros",
 ) -> Float[Array, "batch embedding"]:
     """Embeds motions.
 
@@ -125,12 +149,13 @@ def embed_motion(
       features: As in `Pairs`; all padded to the length used in training.
       frames: Of each motion, at least 4; those beyond a multiple of 4 do not count.
       config: Its size.
+      rest: What follows a motion's frames: "zeros", or "kept", that is, what is there.
 
     Returns:
       Embeddings, for every measure of text-to-motion.
     """
     return config.network.apply(
-        {"params": params}, features, frames, method="embed_motion"
+        {"params": params}, features, frames, rest=rest, method="embed_motion"
     )
 
 
@@ -258,15 +283,26 @@ def word_vectors(words: Sequence[str]) -> Float[np.ndarray, "words 300"]:
     return (_NORM * centred / norm).astype(np.float32)
 
 
+def word_class(word: str, part_of_speech: str) -> str:
+    """One of `TAGS`: that of a list of `SPECIAL_WORDS`, or else the part of speech.
+
+    Parts of speech that have no class, such as CCONJ, are "OTHER".
+    """
+    for name, words in SPECIAL_WORDS.items():
+        if word in words:
+            return name
+    return part_of_speech if part_of_speech in TAGS else "OTHER"
+
+
 def encode_tokens(
     tokens: Sequence[str], vocabulary: Mapping[str, np.ndarray] | None = None
 ) -> tuple[Float[np.ndarray, "22 300"], Float[np.ndarray, "22 15"], int]:
     """A sentence as the evaluator reads it, between marks of start and end.
 
     Args:
-      tokens: Words with their class, "walk/VERB"; after 20 the rest is cut, as in the
-        source. A class not in `TAGS` counts as "OTHER".
-      vocabulary: Vectors of words, from `published.load_glove`; a word that it lacks
+      tokens: Words with their part of speech, "walk/VERB"; after 20 the rest is cut, as
+        in the source. For their classes see `word_class`.
+      vocabulary: Vectors of words, GloVe's for published weights; a word that it lacks
         is "unk/OTHER", as in the source. None for `word_vectors`.
 
     Returns:
@@ -274,7 +310,7 @@ def encode_tokens(
       words including both marks.
 
     Raises:
-      ValueError: if a token has no class.
+      ValueError: if a token has no part of speech.
     """
     pairs = [("sos", "OTHER")]
     for token in tokens[:MAX_WORDS]:
@@ -282,7 +318,7 @@ def encode_tokens(
         if not slash:
             raise ValueError(f"token {token!r}, expected 'word/CLASS'")
         known = vocabulary is None or word in vocabulary
-        pairs.append((word, tag) if known else ("unk", "OTHER"))
+        pairs.append((word, word_class(word, tag)) if known else ("unk", "OTHER"))
     pairs.append(("eos", "OTHER"))
     words = [word for word, _ in pairs]
     vectors = np.zeros((MAX_WORDS + 2, WORD_SIZE), np.float32)
@@ -292,5 +328,5 @@ def encode_tokens(
         vectors[: len(words)] = [vocabulary[word] for word in words]
     tags = np.zeros((MAX_WORDS + 2, len(TAGS)), np.float32)
     for row, (_, tag) in enumerate(pairs):
-        tags[row, TAGS.index(tag if tag in TAGS else "OTHER")] = 1.0
+        tags[row, TAGS.index(tag)] = 1.0
     return vectors, tags, len(pairs)

@@ -19,7 +19,6 @@ from jaxmotion.learning.matching import TAGS, WORD_SIZE, MatcherConfig
 from jaxmotion.typing import Params
 
 _MODULES = ("movement_encoder", "motion_encoder", "text_encoder")
-_MARKS = ("sos", "eos", "unk")
 Weights = dict[str, np.ndarray]
 
 
@@ -64,39 +63,6 @@ def load_matcher(
         },
     }
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
-
-
-def load_glove(folder: str | os.PathLike) -> dict[str, np.ndarray]:
-    """Reads the published word vectors.
-
-    The released list of words is a pickle, which could run code, so it is not read:
-    write it once as text, one word a line in the order of the rows.
-
-    Args:
-      folder: Has our_vab_data.npy [words, 300] and our_vab_words.txt.
-
-    Returns:
-      Vectors by word, for `matching.encode_tokens`.
-
-    Raises:
-      FileNotFoundError: if a file is missing.
-      ValueError: if rows and words differ in number, rows are not of 300 numbers, or
-        one of the words sos, eos and unk is missing.
-    """
-    folder = os.fspath(folder)
-    rows = np.load(os.path.join(folder, "our_vab_data.npy"), allow_pickle=False)
-    names = os.path.join(folder, "our_vab_words.txt")
-    with open(names, encoding="utf-8") as file:
-        words = file.read().splitlines()
-    if rows.shape != (len(words), WORD_SIZE):
-        raise ValueError(
-            f"{names} has {len(words)} words, so our_vab_data.npy should have the "
-            f"shape {(len(words), WORD_SIZE)}, found {rows.shape}"
-        )
-    missing = [word for word in _MARKS if word not in words]
-    if missing:
-        raise ValueError(f"{names}: no {', '.join(missing)} among the words")
-    return dict(zip(words, rows.astype(np.float32), strict=True))
 
 
 def _read_torch(path: str) -> Weights:

@@ -14,12 +14,15 @@ but r and z have one bias where PyTorch adds two.
 Source: Guo et al. 2022 (T2M), text and motion feature extractors; released code.
 """
 
+from typing import Literal
+
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.networks.convolution import convolve
 
+Rest = Literal["zeros", "kept"]
 UNIT = 4  # frames of a movement: two convolutions of stride 2
 
 _XAVIER = nn.initializers.xavier_normal()
@@ -175,24 +178,28 @@ class Matcher(nn.Module):
         frames: Int[Array, " batch"],
         *,
         train: bool = False,
+        rest: Rest = "zeros",
     ) -> Float[Array, "batch embedding"]:
         """Embeds motions of different lengths.
 
-        Only whole movements count, and what follows them is read as zeros. As in the
-        source the last movement's convolutions reach into that padding, so motions
-        that are to be compared are padded to one length (there 196 frames).
+        Only whole movements count, but as in the source the last one's convolutions
+        reach 3 frames beyond it, so motions that are to be compared are padded to one
+        length (there 196 frames).
 
         Args:
           features: Normalised to mean 0 and deviation 1, without contact labels.
           frames: Of each motion, at least `UNIT`.
           train: Whether to drop; needs rngs={"dropout": key}.
+          rest: How what follows the whole movements is read: as "zeros", or "kept" as
+            it is.
 
         Returns:
           Embeddings.
         """
         units = frames // UNIT
-        inside = jnp.arange(features.shape[1])[None] < UNIT * units[:, None]
-        features = jnp.where(inside[..., None], features, 0.0)
+        if rest == "zeros":
+            inside = jnp.arange(features.shape[1])[None] < UNIT * units[:, None]
+            features = jnp.where(inside[..., None], features, 0.0)
         return self.motion(self.movement(features, train=train), units)
 
     def embed_text(

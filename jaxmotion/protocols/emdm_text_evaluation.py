@@ -8,7 +8,7 @@ Source: Guo et al. 2022 (T2M); Zhou et al. 2024 (EMDM), section 4.2.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxmotion.data.plain_pickle import read_plain_pickle
+from jaxmotion.data.text_files import read_array
+from jaxmotion.data.text_motion import check_statistics
 from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
 from jaxmotion.evaluation import diversity, frechet, matching
 from jaxmotion.learning import checkpoint, published, training
@@ -28,6 +31,18 @@ from jaxmotion.typing import Key, Params
 # Of the evaluator that is trained here, on a CPU.
 SMALL = dict(movement_width=192, motion_width=192, text_width=128, embedding=128)
 _CONTACTS = 4
+# Statistics of the published evaluators, as their releases name them.
+_STATISTICS = (
+    ("mean.npy", "std.npy"),
+    ("t2m_mean.npy", "t2m_std.npy"),
+    ("kit_mean.npy", "kit_std.npy"),
+    ("Mean.npy", "Std.npy"),
+)
+_MARKS = ("sos", "eos", "unk")
+_GLOVE = ("our_vab_data.npy", "our_vab_words.pkl", "our_vab_idx.pkl")
+# Deviations of the root and of contact labels were divided twice by 5 there.
+_SHRUNK = 1 / 25
+Vocabulary = Mapping[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,6 +55,7 @@ class Evaluator:
       mean: Of the features as it was trained on them.
       std: Likewise.
       name: What it is, for tables.
+      vocabulary: Vectors of the words that it knows; None for hashed ones.
     """
 
     params: Params
@@ -47,6 +63,7 @@ class Evaluator:
     mean: Float[np.ndarray, " features"]
     std: Float[np.ndarray, " features"]
     name: str
+    vocabulary: Vocabulary | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -67,17 +84,12 @@ class Sentences:
     index: Int[Array, " captions"]
 
 
-def sentences(run: TextRun) -> Sentences:
-    """Encodes the captions of a run for its evaluator.
-
-    Args:
-      run: The run.
-
-    Returns:
-      The sentences.
-    """
+def sentences(run: TextRun, vocabulary: Vocabulary | None = None) -> Sentences:
+    """Encodes the captions of a run as `matching.encode_tokens` does."""
     distinct, index = np.unique(np.array(run.motions.tokens), return_inverse=True)
-    coded = [evaluator.encode_tokens(str(tokens).split()) for tokens in distinct]
+    coded = [
+        evaluator.encode_tokens(str(tokens).split(), vocabulary) for tokens in distinct
+    ]
     return Sentences(
         vectors=jnp.asarray(np.stack([vectors for vectors, _, _ in coded])),
         tags=jnp.asarray(np.stack([tags for _, tags, _ in coded])),
@@ -114,6 +126,7 @@ def train_evaluator(
         "seed": seed,
         "frames": frames,
         "source": run.motions.source,
+        "special_words": "released",
     }
     if checkpoint.latest_step(folder) is None:
         data = (
@@ -156,37 +169,123 @@ def _pairs(key: Key, data: Any) -> evaluator.Pairs:
     )
 
 
-def published_evaluator(run: TextRun, path: Path) -> Evaluator:
-    """An evaluator with published weights; Mean.npy and Std.npy lie beside them.
+def load_glove(folder: Path) -> dict[str, np.ndarray]:
+    """Reads the word vectors that published weights were trained with.
+
+    Args:
+      folder: Has our_vab_data.npy [words, 300], our_vab_words.pkl (the words) and
+        our_vab_idx.pkl (row of each); nothing in the pickles is run.
+
+    Returns:
+      Vectors by word, for `matching.encode_tokens`.
+
+    Raises:
+      ValueError: if a file is missing, damaged or does not fit the others; names it.
+    """
+    data, listed, rows = (folder / name for name in _GLOVE)
+    vectors = read_array(data)
+    words, index = (_read_pickle(path) for path in (listed, rows))
+    if vectors.ndim != 2 or vectors.shape[1] != evaluator.WORD_SIZE:
+        raise ValueError(
+            f"{data}: expected rows of {evaluator.WORD_SIZE} numbers, found shape "
+            f"{vectors.shape}"
+        )
+    if not np.isfinite(vectors).all():
+        row = int(np.argwhere(~np.isfinite(vectors))[0, 0])
+        raise ValueError(f"{data}: row {row} is not finite")
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise ValueError(f"{listed}: expected a list of words")
+    if not isinstance(index, dict):
+        raise ValueError(f"{rows}: expected a row for each word")
+    for word in (*_MARKS, *words):
+        row = index.get(word)
+        if type(row) is not int or not 0 <= row < len(vectors):
+            raise ValueError(
+                f"{rows}: the row of {word!r} is {row!r}, expected one of the "
+                f"{len(vectors)} in {data.name}"
+            )
+    if missing := [mark for mark in _MARKS if mark not in words]:
+        raise ValueError(f"{listed}: no {', '.join(missing)} among the words")
+    return {word: vectors[index[word]] for word in words}
+
+
+def _read_pickle(path: Path) -> Any:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
+    return read_plain_pickle(data, name=str(path))
+
+
+def read_statistics(
+    folder: Path, num_features: int
+) -> tuple[Float[np.ndarray, " features"], Float[np.ndarray, " features"]]:
+    """Mean and deviations of a published evaluator, told apart from a data set's.
+
+    A contact label is 0 or 1, so that its deviation follows from its mean p: it is
+    sqrt(p (1 - p)). In both published evaluators (HumanML3D's and KIT-ML's) it is a
+    25th of that, in the statistics of a data set once that.
+
+    Args:
+      folder: Has mean.npy and std.npy, as in the evaluator's meta folder, or the same
+        under another of the released names.
+      num_features: Of a frame, with the 4 contact labels at its end.
+
+    Raises:
+      ValueError: if there are none, they are no statistics of so many features, or not
+        an evaluator's; names the file.
+    """
+    for names in _STATISTICS:
+        paths = [folder / name for name in names]
+        if all(path.exists() for path in paths):
+            break
+    else:
+        raise ValueError(
+            f"{folder}: expected mean.npy and std.npy of the evaluator's meta folder "
+            "beside its weights, found neither they nor t2m_mean.npy, kit_mean.npy or "
+            "Mean.npy with their deviations"
+        )
+    mean, std = (read_array(path) for path in paths)
+    check_statistics(mean, std, num_features, names=(str(paths[0]), str(paths[1])))
+    share = mean[-_CONTACTS:]
+    if not ((share > 0) & (share < 1)).all():
+        raise ValueError(
+            f"{paths[0]}: the last {_CONTACTS} numbers, means of contact labels, "
+            f"should be between 0 and 1, found {share.tolist()}"
+        )
+    ratio = float(std[-_CONTACTS:].mean() / np.sqrt(share * (1 - share)).mean())
+    if not abs(ratio / _SHRUNK - 1) < 0.05:
+        raise ValueError(
+            f"{paths[1]}: contact labels deviate {ratio:.3g} times as much as their "
+            f"mean implies, expected {_SHRUNK:.3g}: not the evaluator's own statistics "
+            "(of its meta folder) but those of a data set or of other features"
+        )
+    return mean, std
+
+
+def published_evaluator(run: TextRun, path: Path, *, glove: Path) -> Evaluator:
+    """An evaluator with published weights; its statistics lie beside them.
 
     Args:
       run: The run.
       path: File of the weights (finest.tar or safetensors).
-
-    Returns:
-      The evaluator.
+      glove: Folder of its word vectors, for `load_glove`.
 
     Raises:
-      OSError: if a file is missing.
-      ValueError: if weights or statistics do not fit; names them.
+      OSError: if the weights are missing.
+      ValueError: if weights, statistics or word vectors do not fit; names them.
     """
     width = run.motions.num_features
     config = evaluator.MatcherConfig(num_features=width - _CONTACTS)
-    statistics = []
-    for name in ("Mean.npy", "Std.npy"):
-        values = np.load(path.parent / name, allow_pickle=False)
-        if values.shape != (width,) or (name == "Std.npy" and not (values > 0).all()):
-            raise ValueError(
-                f"{path.parent / name}: expected {width} numbers (positive ones in "
-                f"Std.npy), found shape {values.shape}"
-            )
-        statistics.append(values.astype(np.float32))
+    mean, std = read_statistics(path.parent, width)
+    vocabulary = load_glove(glove)
     return Evaluator(
         params=published.load_matcher(path, config=config),
         config=config,
-        mean=statistics[0],
-        std=statistics[1],
-        name=f"published weights {path.name}",
+        mean=mean,
+        std=std,
+        name=f"published weights {path.name}, {len(vocabulary)} words of GloVe",
+        vocabulary=vocabulary,
     )
 
 
@@ -195,6 +294,8 @@ def embed(
     judge: Evaluator,
     x: Float[Array, "batch frames features"],
     frames: Int[Array, " batch"],
+    *,
+    rest: evaluator.Rest = "zeros",
 ) -> Float[Array, "batch embedding"]:
     """Embeds motions, de-normalised and normalised again as the evaluator expects.
 
@@ -203,32 +304,35 @@ def embed(
       judge: The evaluator.
       x: Z-scored features of the run.
       frames: Of each motion.
+      rest: What the evaluator sees behind a motion's end: "zeros", as behind real
+        motions, or what is there, "kept". The release has it so for generated motions.
 
     Returns:
       One row each.
     """
     row = lambda v: jnp.asarray(v)[None, None]  # noqa: E731
     raw = x * row(run.motions.std) + row(run.motions.mean)
-    scored = (raw - row(judge.mean)) / row(judge.std)
-    inside = jnp.arange(x.shape[1])[None] < frames[:, None]
-    scored = jnp.where(inside[..., None], scored, 0.0)[..., :-_CONTACTS]
-    return evaluator.embed_motion(judge.params, scored, frames, config=judge.config)
+    scored = ((raw - row(judge.mean)) / row(judge.std))[..., :-_CONTACTS]
+    return evaluator.embed_motion(
+        judge.params, scored, frames, config=judge.config, rest=rest
+    )
 
 
 def make_scorer(
-    run: TextRun, judge: Evaluator
+    run: TextRun, judge: Evaluator, *, rest: evaluator.Rest = "zeros"
 ) -> Callable[[Key, Array, Array, Array, frechet.Moments], dict[str, Array]]:
     """Scores of a set of motions, as one compiled program.
 
     Args:
       run: The run.
       judge: The evaluator.
+      rest: As in `embed`.
 
     Returns:
       `score(key, x, frames, caption, reference) -> scores`: z-scored features, frames
       and caption of each motion, and moments of the real motions' embeddings.
     """
-    coded = sentences(run)
+    coded = sentences(run, judge.vocabulary)
 
     @jax.jit
     def score(
@@ -242,7 +346,7 @@ def make_scorer(
             coded.words[row],
             config=judge.config,
         )
-        motion = embed(run, judge, x, frames)
+        motion = embed(run, judge, x, frames, rest=rest)
         precision = matching.r_precision(text, motion)
         return {
             "R-precision 1": precision[0],

@@ -4,7 +4,7 @@ import re
 import numpy as np
 import pytest
 
-from jaxmotion.data import captions, text_tags
+from jaxmotion.data import captions
 from jaxmotion.data.builders import bandai_namco
 
 PAIRS = [
@@ -158,32 +158,3 @@ def test_what_is_unknown_is_named(change, message):
         captions.captions_for(
             given.pop("content"), given.pop("style"), seed=0, index=0, **given
         )
-
-
-@pytest.mark.parametrize(
-    ("word", "pos", "expected"),
-    [
-        ("walk", "VERB", "Act_VIP"),
-        ("left", "ADJ", "Loc_VIP"),
-        ("hand", "NOUN", "Body_VIP"),
-        ("chair", "NOUN", "Obj_VIP"),
-        ("sadly", "ADV", "Desc_VIP"),
-        ("respond", "VERB", "VERB"),
-        ("person", "NOUN", "NOUN"),
-        ("is", "AUX", "AUX"),
-        ("and", "CCONJ", "OTHER"),
-        ("to", "PART", "OTHER"),
-    ],
-)
-def test_tag_classes(word, pos, expected):
-    assert text_tags.tag_class(word, pos) == expected
-
-
-def test_special_words_are_lemmas_of_one_class_and_can_be_given():
-    assert len(set(text_tags.TAG_CLASSES)) == 15
-    words = [w for words in text_tags.SPECIAL_WORDS.values() for w in words]
-    assert len(set(words)) == len(words)
-    assert set(text_tags.SPECIAL_WORDS) == set(text_tags.TAG_CLASSES[9:14])
-    own = {"Obj_VIP": frozenset({"person"})}
-    assert text_tags.tag_class("person", "NOUN", special=own) == "Obj_VIP"
-    assert text_tags.tag_class("walk", "VERB", special=own) == "VERB"

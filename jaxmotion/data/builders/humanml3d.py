@@ -18,7 +18,7 @@ import numpy as np
 import tensorflow_datasets as tfds
 from jaxtyping import Float
 
-from jaxmotion.data.text_files import cut_recording, parse_captions
+from jaxmotion.data.text_files import cut_recording, parse_captions, read_array
 from jaxmotion.data.text_motion import (
     SPLITS,
     TextMotions,
@@ -113,7 +113,7 @@ class HumanML3D(tfds.core.GeneratorBasedBuilder, skip_registration=True):
             texts = _read_text(folder / "texts" / f"{name}.txt")
             parse_captions(texts, path=str(folder / "texts" / f"{name}.txt"))
             path = folder / "new_joint_vecs" / f"{name}.npy"
-            features = _read_array(path)
+            features = read_array(path)
             width = self.builder_config.num_features
             if features.ndim != 2 or features.shape[1] != width:
                 raise ValueError(
@@ -145,19 +145,6 @@ def _find_folder(folder: Path) -> Path:
     return found[0]
 
 
-def _read_array(path: Path) -> Float[np.ndarray, "..."]:
-    """An array of numbers, as float32."""
-    try:
-        array = np.load(path, allow_pickle=False)
-        if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
-            raise ValueError("not an array of floating-point numbers")
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: not a feature file, or damaged ({error})") from None
-    return array.astype(np.float32)
-
-
 def _read_text(path: Path) -> str:
     """Content of a text file."""
     try:
@@ -173,7 +160,7 @@ def _read_statistics(
 ) -> tuple[Float[np.ndarray, "features"], Float[np.ndarray, "features"]]:
     """Mean.npy and Std.npy, checked."""
     paths = folder / "Mean.npy", folder / "Std.npy"
-    mean, std = (_read_array(path) for path in paths)
+    mean, std = (read_array(path) for path in paths)
     check_statistics(mean, std, num_features, names=(str(paths[0]), str(paths[1])))
     return mean, std
 
