@@ -19,7 +19,8 @@ import tyro
 from emdm_tasks import evaluation, sampling, setup
 
 from jaxmotion.learning import loop
-from jaxmotion.protocols import emdm_rows, emdm_runs, script, stages
+from jaxmotion.learning.matching import Padding
+from jaxmotion.protocols import emdm_rows, emdm_runs, emdm_text, script, stages
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +39,9 @@ class Train:
       merge: Labels that name the same action as others, "old=new".
       least: Fewest clips of an action.
       encoder: Of texts: "wordllama", "hashed", or a folder with CLIP's weights.
+      text_form: "released": CLIP's vectors as they are, of the first 20 tokens of a
+        text; "unit" (ours): vectors of whole texts, scaled to mean square 1. None for
+        "released" with CLIP, "unit" with the other encoders, which no release has.
       unseen: "content/style" pairs whose clips are kept for evaluation (texts).
       frames: Longest motion; None for 60 (actions) or 120 (texts).
       fps: Frames a second; None for 15 (actions) or 20 (texts).
@@ -70,6 +74,7 @@ class Train:
     merge: tuple[str, ...] = setup.MERGE
     least: int = 10
     encoder: str = "wordllama"
+    text_form: emdm_text.TextForm | None = None
     unseen: tuple[str, ...] = (
         "walk-turn-left/elderly",
         "run/feminine",
@@ -116,7 +121,13 @@ class Evaluate:
         actions, 600 of the text-motion evaluator, whose updates are ten times as dear.
       evaluator: File of a frozen recogniser of actions, from evaluator.py; None trains
         one here.
-      matcher: Published weights of the text-motion evaluator; None trains one here.
+      matcher: Published weights of the text-motion evaluator (finest.tar), beside them
+        mean.npy and std.npy of its meta folder; None trains one here.
+      glove: Folder of the word vectors that the published weights read:
+        our_vab_data.npy, our_vab_words.pkl and our_vab_idx.pkl. Needed with --matcher.
+      padding: What the text-motion evaluator sees beyond the end of generated motions:
+        "zeros" (ours), as beyond that of real ones, or "kept", what the model put there
+        (as released).
       seed: Of noise and pairs.
     """
 
@@ -130,6 +141,8 @@ class Evaluate:
     evaluator_steps: int | None = None
     evaluator: Path | None = None
     matcher: Path | None = None
+    glove: Path | None = None
+    padding: Padding = "zeros"
     seed: int = 0
 
 

@@ -32,6 +32,17 @@ def make_judge(args: Any) -> Judge:
       ValueError: if the run has other data, there are too few samples, or a frozen
         evaluator does not fit.
     """
+    for name in ("matcher", "glove"):
+        if (found := getattr(args, name)) is not None:
+            raise ValueError(
+                f"{name} is {found}, but {args.run} does not make motions from texts: "
+                "expected none"
+            )
+    if args.padding != "zeros":
+        raise ValueError(
+            f"padding is {args.padding!r}, but {args.run} does not make motions from "
+            "texts: expected 'zeros'"
+        )
     run = emdm_action.load_run(args.run)
     number = len(run.actions)
     each = args.samples // number

@@ -99,4 +99,5 @@ def evaluate(args: Any, out: Path) -> None:
         "run": value,
         "evaluator": judge.describe,
     } | provenance.provenance()
-    artifacts.write_table(out, found, report, (evaluators.note(judge.describe),))
+    notes = (evaluators.note(judge.describe), *judge.notes)
+    artifacts.write_table(out, found, report, notes)

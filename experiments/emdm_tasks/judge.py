@@ -21,6 +21,7 @@ class Judge:
       one: Condition of one motion, to measure times with.
       samples: Motions of a replication.
       describe: JSON that says what the evaluator is.
+      notes: Lines below the table.
     """
 
     real: dict[str, dict[str, Cell]]
@@ -29,3 +30,4 @@ class Judge:
     one: emdm.Condition
     samples: int
     describe: dict[str, Any]
+    notes: tuple[str, ...] = ()

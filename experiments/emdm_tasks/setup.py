@@ -13,7 +13,6 @@ from jaxmotion.protocols import (
     emdm_text,
 )
 from jaxmotion.systems import emdm
-from jaxmotion.text import encoder as text_encoder
 
 # Labels of Bandai-Namco that name the same action as others.
 MERGE = ("bye=wave-right-hand", "byebye=wave-both-hands", "dash=run")
@@ -127,10 +126,12 @@ def _prepare_actions(args: Any) -> emdm_runs.Task:
 
 
 def _prepare_texts(args: Any) -> emdm_runs.Task:
+    form = args.text_form or emdm_text.default_form(args.encoder)
     made = dict(
         task=args.task,
         data=[str(path) for path in args.data],
         encoder=args.encoder,
+        text_form=form,
         unseen=list(args.unseen),
         fps=args.fps or 20.0,
         frames=args.frames or 120,
@@ -138,7 +139,7 @@ def _prepare_texts(args: Any) -> emdm_runs.Task:
     )
     if not _same(args.out, made):
         # An encoder that is not there should be said before the features are made.
-        text_encoder.make_encoder(args.encoder)
+        emdm_text.make_encoder(args.encoder, form)
         motions = _text_motions(args, made["fps"])
         text_motion_io.save_text_motions(args.out / "data.npz", motions)
         emdm_runs.write_config(args.out, made)
@@ -146,7 +147,7 @@ def _prepare_texts(args: Any) -> emdm_runs.Task:
     counts = {s: run.motions.clips_of(s).size for s in run.motions.split_names}
     print(
         f"{run.motions.num_clips} clips {counts}, {len(run.vectors)} distinct "
-        f"captions, encoded by {run.encoder.name}"
+        f"captions, encoded by {run.encoder.name}, {form}"
     )
     return emdm_text.make_task(run, base_config(args, 100.0), frames=made["frames"])
 

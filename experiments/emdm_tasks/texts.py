@@ -18,6 +18,7 @@ from jaxmotion.systems import emdm
 
 # Multimodality: sentences, motions of each, pairs of them.
 _SENTENCES, _REPEATS, _PAIRS = 16, 8, 10
+_SEEN = {"zeros": "zeros", "kept": "the model's output, as in the released evaluation"}
 
 
 def make_judge(args: Any) -> Judge:
@@ -38,12 +39,18 @@ def make_judge(args: Any) -> Judge:
             f"evaluator is {args.evaluator}, but {args.run} makes motions from texts: "
             "expected none, or --matcher"
         )
+    if (args.matcher is None) != (args.glove is None):
+        raise ValueError(
+            f"matcher is {args.matcher} and glove is {args.glove}: published weights "
+            "read GloVe's vectors, so give both, --glove the folder with "
+            f"{', '.join(protocol.GLOVE)}, or neither"
+        )
     run = emdm_text.load_run(args.run)
     frames, number = run.config["frames"], args.samples // 32 * 32
     if number < 64:
         raise ValueError(f"samples is {args.samples}, expected at least 64")
     judge = (
-        protocol.published_evaluator(run, args.matcher)
+        protocol.published_evaluator(run, args.matcher, glove=args.glove)
         if args.matcher
         else protocol.train_evaluator(
             run, frames=frames, num_steps=args.evaluator_steps or 600, seed=0
@@ -55,13 +62,21 @@ def make_judge(args: Any) -> Judge:
         if run.motions.clips_of(split).size
     }
     draw = jax.jit(sample_text_batch, static_argnames="batch")
-    embed = jax.jit(lambda x, frames: protocol.embed(run, judge, x, frames))
-    score = protocol.make_scorer(run, judge)
+    embed = jax.jit(
+        lambda x, frames, padding: protocol.embed(
+            run, judge, x, frames, padding=padding
+        ),
+        static_argnums=2,
+    )
+    score = {
+        padding: protocol.make_scorer(run, judge, padding=padding)
+        for padding in {"zeros", args.padding}
+    }
 
     def moments(split: str) -> frechet.Moments:
         key = jax.random.key(args.seed)
         x, length, _ = draw(key, arrays[split], batch=number)
-        return frechet.moments(embed(x, length))
+        return frechet.moments(embed(x, length, "zeros"))
 
     references = {split: moments(split) for split in arrays}
 
@@ -69,7 +84,7 @@ def make_judge(args: Any) -> Judge:
         def once(key: Array) -> dict[str, Array]:
             key_draw, key_score = jax.random.split(key)
             x, length, caption = draw(key_draw, arrays[split], batch=number)
-            return score(key_score, x, length, caption, references[split])
+            return score["zeros"](key_score, x, length, caption, references[split])
 
         keys = jax.random.split(jax.random.key(args.seed + 7), args.replications)
         return cells.row([once(key) for key in keys], order=ORDER)
@@ -89,7 +104,7 @@ def make_judge(args: Any) -> Judge:
         key_draw, key_sample, key_score = jax.random.split(key, 3)
         _, length, caption = draw(key_draw, arrays[split], batch=number)
         x = many(key_sample, conditions(caption, length), scale)
-        return score(key_score, x, length, caption, references[split])
+        return score[args.padding](key_score, x, length, caption, references[split])
 
     def score_row(key: Array, many) -> dict[str, Array]:
         key_own, key_draw, key_sample, key_pairs, key_unseen = jax.random.split(key, 5)
@@ -97,7 +112,7 @@ def make_judge(args: Any) -> Judge:
         _, length, caption = draw(key_draw, arrays["test"], batch=_SENTENCES)
         length, caption = (jnp.repeat(v, _REPEATS) for v in (length, caption))
         x = many(key_sample, conditions(caption, length), scale)
-        features = embed(x, length).reshape(_SENTENCES, _REPEATS, -1)
+        features = embed(x, length, args.padding).reshape(_SENTENCES, _REPEATS, -1)
         found["multimodality"] = diversity.multimodality(
             key_pairs, features, num_pairs=_PAIRS
         )
@@ -122,7 +137,12 @@ def make_judge(args: Any) -> Judge:
             "fingerprint": fingerprint(judge.params),
             "origin": judge.name,
             "matcher": dataclasses.asdict(judge.config) | {"name": judge.name},
-            "texts": run.encoder.name,
+            "texts": f"{run.encoder.name}, {run.config['text_form']}",
+            "padding": args.padding,
             "reference": f"{number} real motions of the same split",
         },
+        notes=(
+            "Beyond the end of generated motions the evaluator sees "
+            f"{_SEEN[args.padding]}.",
+        ),
     )

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.learning import training
-from jaxmotion.networks.matching import UNIT, Matcher, Rest
+from jaxmotion.networks.matching import UNIT, Matcher, Padding
 from jaxmotion.typing import Key, Params
 
 MARGIN = 10.0
@@ -133,14 +133,14 @@ def init_matcher(key: Key, config: MatcherConfig) -> Params:
     )["params"]
 
 
-@functools.partial(jax.jit, static_argnames=("config", "rest"))
+@functools.partial(jax.jit, static_argnames=("config", "padding"))
 def embed_motion(
     params: Params,
     features: Float[Array, "batch frames channels"],
     frames: Int[Array, " batch"],
     *,
     config: MatcherConfig,
-    rest: Rest = "zeros",
+    padding: Padding = "zeros",
 ) -> Float[Array, "batch embedding"]:
     """Embeds motions.
 
@@ -149,13 +149,13 @@ def embed_motion(
       features: As in `Pairs`; all padded to the length used in training.
       frames: Of each motion, at least 4; those beyond a multiple of 4 do not count.
       config: Its size.
-      rest: What follows a motion's frames: "zeros", or "kept", that is, what is there.
+      padding: What is seen beyond a motion's frames: "zeros", or "kept", what is there.
 
     Returns:
       Embeddings, for every measure of text-to-motion.
     """
     return config.network.apply(
-        {"params": params}, features, frames, rest=rest, method="embed_motion"
+        {"params": params}, features, frames, padding=padding, method="embed_motion"
     )
 
 

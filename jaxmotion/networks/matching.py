@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.networks.convolution import convolve
 
-Rest = Literal["zeros", "kept"]
+Padding = Literal["zeros", "kept"]
 UNIT = 4  # frames of a movement: two convolutions of stride 2
 
 _XAVIER = nn.initializers.xavier_normal()
@@ -178,7 +178,7 @@ class Matcher(nn.Module):
         frames: Int[Array, " batch"],
         *,
         train: bool = False,
-        rest: Rest = "zeros",
+        padding: Padding = "zeros",
     ) -> Float[Array, "batch embedding"]:
         """Embeds motions of different lengths.
 
@@ -190,14 +190,14 @@ class Matcher(nn.Module):
           features: Normalised to mean 0 and deviation 1, without contact labels.
           frames: Of each motion, at least `UNIT`.
           train: Whether to drop; needs rngs={"dropout": key}.
-          rest: How what follows the whole movements is read: as "zeros", or "kept" as
-            it is.
+          padding: What is seen beyond the whole movements: "zeros", or "kept", what is
+            there.
 
         Returns:
           Embeddings.
         """
         units = frames // UNIT
-        if rest == "zeros":
+        if padding == "zeros":
             inside = jnp.arange(features.shape[1])[None] < UNIT * units[:, None]
             features = jnp.where(inside[..., None], features, 0.0)
         return self.motion(self.movement(features, train=train), units)

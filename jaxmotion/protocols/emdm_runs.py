@@ -266,4 +266,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         ) from error
     if found != "emdm":
         raise ValueError(f"{path}: field 'system' is {found!r}, expected 'emdm'")
+    if value.get("task") == "text":
+        # Folders from before there was a choice.
+        value.setdefault("text_form", "unit")
     return value

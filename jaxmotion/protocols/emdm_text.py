@@ -6,7 +6,7 @@ A caption's vector comes from a text encoder once and is data from then on.
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +24,10 @@ from jaxmotion.typing import Key
 
 # CLIP reads 77 tokens; no caption of the published sets comes near so many words.
 MAX_WORDS = 75
+# "released": CLIP's vectors as they are, of a text's first 20 tokens and its two ends.
+# "unit" (ours): of whole texts, scaled to mean square 1 over the captions of a run.
+TextForm = Literal["released", "unit"]
+_RELEASED_TOKENS = 22
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -35,9 +39,9 @@ class TextRun:
       config: JSON of how the data were made.
       motions: Clips with captions.
       encoder: Of sentences.
-      vectors: Of the captions' distinct sentences, mean square 1.
+      vectors: Of the captions' distinct sentences, as the networks take them.
       index: Vector of each caption.
-      scale: What the encoder's vectors were multiplied with.
+      scale: What the encoder's vectors were multiplied with; 1 as released.
     """
 
     folder: Path
@@ -53,6 +57,28 @@ class TextRun:
         """Which of the two published skeletons the features describe."""
         layouts = {layout.num_features: layout for layout in (HUMANML3D, KIT_ML)}
         return layouts[self.motions.num_features]
+
+
+def default_form(encoder: str) -> TextForm:
+    """As released for CLIP; "unit" for the other encoders, which no release has."""
+    return "unit" if encoder in text_encoder.OWN else "released"
+
+
+def make_encoder(name: str, form: TextForm) -> text_encoder.TextEncoder:
+    """The encoder that a user asks for, reading as much of a text as the form says.
+
+    Raises:
+      ModuleNotFoundError: if a package is missing; says how to install it.
+      ValueError: if there is no such encoder, or it is not CLIP and the form is
+        "released"; names it.
+    """
+    if form == "released" and name in text_encoder.OWN:
+        raise ValueError(
+            f"text form is 'released', which is of CLIP's vectors, but encoder is "
+            f"{name!r}: expected 'unit', or a folder with CLIP's weights"
+        )
+    limit = _RELEASED_TOKENS if form == "released" else None
+    return text_encoder.make_encoder(name, max_tokens=limit)
 
 
 def check_words(texts: Sequence[str]) -> None:
@@ -91,11 +117,12 @@ def load_run(folder: Path) -> TextRun:
             "expected 'text'"
         )
     motions = text_motion_io.load_text_motions(folder / "data.npz")
-    encoder = text_encoder.make_encoder(value["encoder"])
+    form = value["text_form"]
+    encoder = make_encoder(value["encoder"], form)
     cache = folder / "texts.npz"
     unique = text_encoder.encode_unique(encoder, motions.captions, cache=cache)
     vectors = np.asarray(unique.vectors)
-    scale = float(1.0 / np.sqrt(np.mean(vectors**2)))
+    scale = 1.0 if form == "released" else float(np.mean(vectors**2) ** -0.5)
     return TextRun(
         folder=folder,
         config=value,

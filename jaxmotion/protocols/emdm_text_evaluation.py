@@ -39,7 +39,7 @@ _STATISTICS = (
     ("Mean.npy", "Std.npy"),
 )
 _MARKS = ("sos", "eos", "unk")
-_GLOVE = ("our_vab_data.npy", "our_vab_words.pkl", "our_vab_idx.pkl")
+GLOVE = ("our_vab_data.npy", "our_vab_words.pkl", "our_vab_idx.pkl")
 # Deviations of the root and of contact labels were divided twice by 5 there.
 _SHRUNK = 1 / 25
 Vocabulary = Mapping[str, np.ndarray]
@@ -182,7 +182,7 @@ def load_glove(folder: Path) -> dict[str, np.ndarray]:
     Raises:
       ValueError: if a file is missing, damaged or does not fit the others; names it.
     """
-    data, listed, rows = (folder / name for name in _GLOVE)
+    data, listed, rows = (folder / name for name in GLOVE)
     vectors = read_array(data)
     words, index = (_read_pickle(path) for path in (listed, rows))
     if vectors.ndim != 2 or vectors.shape[1] != evaluator.WORD_SIZE:
@@ -295,38 +295,42 @@ def embed(
     x: Float[Array, "batch frames features"],
     frames: Int[Array, " batch"],
     *,
-    rest: evaluator.Rest = "zeros",
+    padding: evaluator.Padding = "zeros",
 ) -> Float[Array, "batch embedding"]:
-    """Embeds motions, de-normalised and normalised again as the evaluator expects.
+    """Embeds motions, normalised anew as the evaluator expects.
 
     Args:
       run: The run.
       judge: The evaluator.
       x: Z-scored features of the run.
       frames: Of each motion.
-      rest: What the evaluator sees behind a motion's end: "zeros", as behind real
-        motions, or what is there, "kept". The release has it so for generated motions.
+      padding: What the evaluator sees beyond a motion's end: "zeros", as beyond that
+        of real motions, or "kept", what is there. The release keeps generated motions
+        as they are, and so are its embeddings of them.
 
     Returns:
       One row each.
     """
-    row = lambda v: jnp.asarray(v)[None, None]  # noqa: E731
-    raw = x * row(run.motions.std) + row(run.motions.mean)
-    scored = ((raw - row(judge.mean)) / row(judge.std))[..., :-_CONTACTS]
+    # At once, and not by way of the raw features, which would lose digits.
+    wide = lambda v: np.asarray(v, np.float64)  # noqa: E731
+    scale = wide(run.motions.std) / judge.std
+    shift = (wide(run.motions.mean) - judge.mean) / judge.std
+    row = lambda v: jnp.asarray(v, jnp.float32)[None, None]  # noqa: E731
+    scored = (x * row(scale) + row(shift))[..., :-_CONTACTS]
     return evaluator.embed_motion(
-        judge.params, scored, frames, config=judge.config, rest=rest
+        judge.params, scored, frames, config=judge.config, padding=padding
     )
 
 
 def make_scorer(
-    run: TextRun, judge: Evaluator, *, rest: evaluator.Rest = "zeros"
+    run: TextRun, judge: Evaluator, *, padding: evaluator.Padding = "zeros"
 ) -> Callable[[Key, Array, Array, Array, frechet.Moments], dict[str, Array]]:
     """Scores of a set of motions, as one compiled program.
 
     Args:
       run: The run.
       judge: The evaluator.
-      rest: As in `embed`.
+      padding: As in `embed`.
 
     Returns:
       `score(key, x, frames, caption, reference) -> scores`: z-scored features, frames
@@ -346,7 +350,7 @@ def make_scorer(
             coded.words[row],
             config=judge.config,
         )
-        motion = embed(run, judge, x, frames, rest=rest)
+        motion = embed(run, judge, x, frames, padding=padding)
         precision = matching.r_precision(text, motion)
         return {
             "R-precision 1": precision[0],

@@ -22,6 +22,8 @@ from jaxmotion.text import clip, hashing, wordllama
 
 _FORMAT = "jaxmotion-text-vectors"
 _VERSION = 1
+# Encoders that `make_encoder` knows by name; any other name is a folder of CLIP.
+OWN = ("wordllama", "hashed")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,11 +140,12 @@ def clip_encoder(
     )
 
 
-def make_encoder(name: str) -> TextEncoder:
+def make_encoder(name: str, *, max_tokens: int | None = None) -> TextEncoder:
     """The encoder that a user asks for.
 
     Args:
       name: "wordllama", "hashed" (256 components), or a folder with CLIP's files.
+      max_tokens: See `clip_encoder`; the others read any text whole.
 
     Returns:
       The encoder.
@@ -160,7 +163,7 @@ def make_encoder(name: str) -> TextEncoder:
             f"text encoder should be 'wordllama', 'hashed' or a folder with CLIP's "
             f"weights; {name!r} is neither, and no such folder exists"
         )
-    return clip_encoder(name)
+    return clip_encoder(name, max_tokens=max_tokens)
 
 
 class UniqueTexts(NamedTuple):

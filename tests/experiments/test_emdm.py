@@ -140,12 +140,25 @@ def test_texts_are_scored_and_sampled(call, texts, tmp_path):
     assert {"FID", "MM-Dist", "diversity", "multimodality"} <= set(row)
     report = rows_of(texts / "evaluation")
     assert "hashed" in report["evaluator"]["texts"]
+    assert "unit" in report["evaluator"]["texts"]
+    note = "Beyond the end of generated motions the evaluator sees "
+    assert f"{note}zeros." in (texts / "evaluation" / "table.md").read_text()
     call(
-        f"sample --run {texts} --frames 24 --out {tmp_path}",
+        f"evaluate --run {texts} --samples 64 --replications 2 --evaluator-steps 20 "
+        f"--padding kept --out {tmp_path / 'kept'}"
+    )
+    kept = rows_of(tmp_path / "kept")["rows"]
+    assert kept["real (held-out clips)"] == rows["real (held-out clips)"]
+    for column in ("FID", "MM-Dist", "multimodality"):
+        assert kept["emdm"][column]["value"] != row[column]["value"]
+    table = (tmp_path / "kept" / "table.md").read_text()
+    assert f"{note}the model's output, as in the released evaluation." in table
+    call(
+        f"sample --run {texts} --frames 24 --out {tmp_path / 'samples'}",
         "--text",
         "an elderly person walks",
     )
-    names = {path.name for path in tmp_path.iterdir()}
+    names = {path.name for path in (tmp_path / "samples").iterdir()}
     stem = "an_elderly_person_walks"
     assert {f"{stem}.bvh", f"{stem}.gif", f"{stem}.html"} == names
 
@@ -179,6 +192,19 @@ BAD = {
     "train --task text --data {data} --out {new} --encoder nowhere": "'nowhere'",
     "train --task text --data {data} --out {new} --unseen walk/x": "'walk/x'",
     "train --out {new} --rows ddim_10": "samples 'ddpm_1000'",
+    "train --task text --data {data} --out {new} --encoder hashed --text-form "
+    "released": "text form is 'released'.*encoder is 'hashed'",
+    "evaluate --run {texts} --matcher finest.tar": (
+        "matcher is finest.tar and glove is None.*our_vab_data.npy, our_vab_words.pkl"
+    ),
+    "evaluate --run {texts} --glove glove": "matcher is None and glove is glove",
+    "evaluate --run {texts} --matcher {new}/finest.tar --glove glove": (
+        "expected mean.npy and std.npy of the evaluator's meta folder"
+    ),
+    "evaluate --run {actions} --matcher finest.tar --glove glove": (
+        "matcher is finest.tar.*does not make motions from texts"
+    ),
+    "evaluate --run {actions} --padding kept": "padding is 'kept'",
     "evaluate --run {actions} --samples 3": "samples is 3",
     "evaluate --run {texts} --samples 3": "samples is 3",
 }

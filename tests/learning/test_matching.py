@@ -199,8 +199,37 @@ def test_a_token_without_class_is_named():
         matching.encode_tokens(["a/DET", "walk"])
 
 
-def test_tags_are_those_of_the_captions():
-    """Written twice, since neither package may import the other."""
-    from jaxmotion.data import text_tags
+def test_special_words_are_the_released_ones():
+    """Their number, and SHA-256 of the words of the released lists, sorted."""
+    released = {
+        "Loc_VIP": (12, "47f1921d3164245b"),
+        "Body_VIP": (13, "d35c4a105ef2da94"),
+        "Obj_VIP": (10, "c68f35a2cf0a2175"),
+        "Act_VIP": (34, "a2a974289ebe4295"),
+        "Desc_VIP": (12, "cbb867b24694e7e9"),
+    }
+    found = {}
+    for name, words in matching.SPECIAL_WORDS.items():
+        digest = hashlib.sha256(" ".join(sorted(words)).encode()).hexdigest()
+        found[name] = len(words), digest[:16]
+    assert found == released and tuple(found) == matching.TAGS[9:14]
 
-    assert tuple(matching.TAGS) == tuple(text_tags.TAG_CLASSES)
+
+@pytest.mark.parametrize(
+    ("token", "expected"),
+    [
+        ("walk/VERB", "Act_VIP"),
+        ("walk/NOUN", "Act_VIP"),
+        ("left/ADJ", "Loc_VIP"),
+        ("feet/NOUN", "Body_VIP"),
+        ("chair/NOUN", "Obj_VIP"),
+        ("slowly/ADV", "Desc_VIP"),
+        ("walks/VERB", "VERB"),
+        ("person/NOUN", "NOUN"),
+        ("and/CCONJ", "OTHER"),
+        ("to/PART", "OTHER"),
+    ],
+)
+def test_special_words_override_the_part_of_speech(token, expected):
+    _, tags, _ = matching.encode_tokens([token])
+    np.testing.assert_array_equal(tags[1], np.eye(15)[matching.TAGS.index(expected)])

@@ -133,32 +133,3 @@ def test_code_in_a_file_is_not_run(state, tmp_path, capsys):
     with pytest.raises(ValueError, match="not a file of weights alone"):
         published.load_matcher(save(state | {"epoch": Code()}, tmp_path), config=CONFIG)
     assert capsys.readouterr().out == ""
-
-
-def write_glove(folder, words, rows):
-    np.save(folder / "our_vab_data.npy", rows)
-    (folder / "our_vab_words.txt").write_text("\n".join(words) + "\n", encoding="utf-8")
-
-
-def test_glove_by_word(tmp_path):
-    words = ["unk", "walk", "sos", "eos", "naïve"]
-    rows = np.random.default_rng(0).normal(size=(5, 300))
-    write_glove(tmp_path, words, rows)
-    vocabulary = published.load_glove(tmp_path)
-    vectors, tags, count = matching.encode_tokens(
-        ["walk/VERB", "zzz/NOUN", "naïve/ADJ"], vocabulary
-    )
-    assert count == 5
-    want = rows[[2, 1, 0, 4, 3]].astype(np.float32)
-    np.testing.assert_array_equal(vectors[:5], want)
-    found = [matching.TAGS[i] for i in tags[:5].argmax(axis=-1)]
-    assert found == ["OTHER", "VERB", "OTHER", "ADJ", "OTHER"]
-
-
-def test_bad_glove_is_named(tmp_path):
-    write_glove(tmp_path, ["unk", "sos", "eos"], np.zeros((2, 300)))
-    with pytest.raises(ValueError, match=r"3 words.*\(3, 300\), found \(2, 300\)"):
-        published.load_glove(tmp_path)
-    write_glove(tmp_path, ["unk", "walk"], np.zeros((2, 300)))
-    with pytest.raises(ValueError, match="no sos, eos among"):
-        published.load_glove(tmp_path)

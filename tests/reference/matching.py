@@ -80,6 +80,23 @@ def text(params, vectors, tags, words):
     return sequence(params["text"]["sequence"], x[:words])
 
 
+def read_sentence(tokens, vectors, words, row, special):
+    """Rows of words and numbers of classes as the release reads a sentence.
+
+    Args: vectors and words are those of its two files, row that of its third; special
+    maps words to the number of their class.
+    """
+    classes = "VERB NOUN DET ADP NUM AUX PRON ADJ ADV".split()
+    rows, tags = [], []
+    for token in ["sos/OTHER", *tokens[:20], "eos/OTHER"]:
+        word, part = token.split("/")
+        known = word in words
+        rows.append(vectors[row[word if known else "unk"]])
+        number = classes.index(part) if part in classes else 14
+        tags.append(special.get(word, number) if known else 14)
+    return np.array(rows), np.array(tags)
+
+
 def contrastive_loss(text, motion, shift, margin=10.0):
     """Terms of matched pairs and of pairs some rows apart."""
     matched, mismatched = [], []
