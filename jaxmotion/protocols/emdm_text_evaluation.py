@@ -267,7 +267,7 @@ def published_evaluator(run: TextRun, path: Path, *, glove: Path) -> Evaluator:
     """An evaluator with published weights; its statistics lie beside them.
 
     Args:
-      run: The run.
+      run: Of HumanML3D's features, or KIT-ML's for its evaluator.
       path: File of the weights (finest.tar or safetensors).
       glove: Folder of its word vectors, for `load_glove`.
 
@@ -305,8 +305,8 @@ def embed(
       x: Z-scored features of the run.
       frames: Of each motion.
       padding: What the evaluator sees beyond a motion's end: "zeros", as beyond that
-        of real motions, or "kept", what is there. The release keeps generated motions
-        as they are, and so are its embeddings of them.
+        of real motions, or "kept", what is there, as the release does with generated
+        motions.
 
     Returns:
       One row each.
