@@ -49,7 +49,9 @@ class Train:
       contents: Use only clips of these contents (for Bandai-Namco walk, run ...);
         none: all clips.
       label: Field of the clips that is the style.
+      labels: Use only clips of these styles; none: all.
       held_out: Fraction of clips kept for evaluation, in (0, 1).
+      held_out_clips: Keep these clips for evaluation, by name, instead of a fraction.
       mirror: Add a mirrored copy of every training clip.
       steps: Optimiser steps of the whole run.
       batch: Windows a step (of 55 frames: 10 past, 45 future).
@@ -63,6 +65,8 @@ class Train:
       network: "transformer", or a denoiser of the ablation (table 3).
       width: Channels of a token; None for the preset's.
       depth: Layers; None for the preset's.
+      token_margin: Frames that neighboring output tokens share; None for the preset's.
+      token_window: How they are cross-faded.
       diffusion_steps: Steps T of the diffusion.
       devices: Split each batch over so many devices; 1 for no mesh.
       seed: Of everything random.
@@ -74,7 +78,9 @@ class Train:
     init: Path | None = None
     contents: tuple[str, ...] = camdm_runs.CONTENTS
     label: str = "style"
+    labels: tuple[str, ...] = ()
     held_out: float = 0.1
+    held_out_clips: tuple[str, ...] = ()
     mirror: bool = True
     steps: int = 11000
     batch: int | None = None
@@ -88,6 +94,8 @@ class Train:
     network: Literal["transformer", "mlp", "single_token"] = "transformer"
     width: int | None = None
     depth: int | None = None
+    token_margin: int | None = None
+    token_window: Literal["hann", "trapezoid"] = "hann"
     diffusion_steps: int = 8
     devices: int = 1
     seed: int = 0
@@ -110,6 +118,9 @@ def model_of(args: Train, clips: Clips) -> camdm_model.Model:
         sizes |= {"width": args.width, "hidden": 4 * args.width}
     if args.depth:
         sizes |= {"depth": args.depth}
+    if args.token_margin is not None:
+        sizes |= {"token_margin": args.token_margin}
+    sizes |= {"token_window": args.token_window}
     return camdm_training.make_model(clips, field=args.label, **sizes)
 
 
@@ -118,7 +129,12 @@ def train(args: Train) -> None:
     args = with_preset(args)
     loop.check_writable(args.out)
     clips, _ = camdm_runs.split_data(
-        args.data, args.contents, args.label, args.held_out
+        args.data,
+        args.contents,
+        args.label,
+        args.held_out,
+        labels=args.labels,
+        held_out_clips=args.held_out_clips,
     )
     if args.mirror:  # first, for it may add labels: left of what was only right
         clips = selection.concatenate([clips, mirror.mirror_clips(clips)])

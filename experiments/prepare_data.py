@@ -33,6 +33,7 @@ Source = Literal[
     "bandai_namco/1",
     "bandai_namco/2",
     "lafan1",
+    "o3de_motion_matching",
     "style100",
     "humanact12",
     "humanml3d",
@@ -131,6 +132,7 @@ def read_published(config: Config) -> Clips | BallClips | TextMotions:
         humanact12,
         humanml3d,
         lafan1,
+        o3de,
         soccer_x,
         style100,
     )
@@ -143,6 +145,7 @@ def read_published(config: Config) -> Clips | BallClips | TextMotions:
     classes = {
         "bandai_namco": bandai_namco.BandaiNamco,
         "lafan1": lafan1.Lafan1,
+        "o3de_motion_matching": o3de.O3deMotionMatching,
         "style100": style100.Style100,
         "humanact12": humanact12.Humanact12,
         "humanml3d": humanml3d.HumanML3D,

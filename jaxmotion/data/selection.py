@@ -149,6 +149,32 @@ def split_clips(
     return take_clips(clips, train), take_clips(clips, sorted(held_out))
 
 
+def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
+    """Splits clips by their names.
+
+    Args:
+      clips: The clips.
+      held_out: Names of the clips to hold out.
+
+    Returns:
+      The training clips and the held-out clips, both in the original order.
+
+    Raises:
+      ValueError: if a name is unknown, or no clip would be left to train on.
+    """
+    unknown = [name for name in held_out if name not in clips.clip_names]
+    if unknown:
+        raise ValueError(
+            f"no clip named {', '.join(map(repr, unknown))}: the clips are "
+            f"{', '.join(clips.clip_names)}"
+        )
+    out = np.isin(np.asarray(clips.clip_names), held_out)
+    if out.all():
+        raise ValueError("all clips are held out, expected some to train on")
+    train, rest = np.flatnonzero(~out), np.flatnonzero(out)
+    return take_clips(clips, train), take_clips(clips, rest)
+
+
 def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
     """Puts several sets of clips of one skeleton behind each other.
 

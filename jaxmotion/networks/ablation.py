@@ -71,9 +71,7 @@ class _OneVectorCondition(nn.Module):
 
     def _setup_condition(self):
         self.embed_time = blocks.TimeEmbedding(self.width)
-        self.embed_label = nn.Embed(
-            self.num_labels, self.width, embedding_init=nn.initializers.normal(1.0)
-        )
+        self.embed_label = blocks.LabelEmbedding(self.num_labels, self.width)
         self.embed_condition = nn.Dense(self.width)
         self.out_condition = nn.Dense(self.width)
         self.drop = nn.Dropout(self.dropout)

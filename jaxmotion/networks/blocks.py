@@ -23,7 +23,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 
 def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
@@ -81,6 +81,74 @@ def fold_frames(x: Float[Array, "*batch frames features"], n: int) -> Array:
     if frames % n:
         raise ValueError(f"{frames} frames are no multiple of frames_per_token {n}")
     return x.reshape(*x.shape[:-2], frames // n, n * features)
+
+
+Window = Literal["hann", "trapezoid"]
+
+
+def unfold_weights(
+    tokens: int, n: int, *, margin: int, window: Window
+) -> Float[np.ndarray, "frames predictions"]:
+    """How overlapping tokens share their frames: the matrix of `unfold_frames`.
+
+    Token i speaks for the frames [i n - margin, (i + 1) n + margin) that exist. Its
+    window is sin^2 over all of them ("hann"), or rises over the margin, is flat over
+    its own frames and falls ("trapezoid"). Windows are normalized over tokens: the
+    weights of a frame sum to 1.
+
+    Args:
+      tokens: Number of tokens.
+      n: Own frames of a token.
+      margin: Frames beyond them on either side.
+      window: Shape of the cross-fade.
+
+    Returns:
+      One row per frame, one column per prediction (token by token).
+    """
+    size = n + 2 * margin
+    place = np.arange(size) + 0.5
+    if window == "hann":
+        shape = np.sin(np.pi * place / size) ** 2
+    else:
+        shape = np.minimum(1.0, np.minimum(place, size - place) / (margin + 0.5))
+    matrix = np.zeros((tokens * n, tokens, size))
+    for token in range(tokens):
+        frame = token * n - margin + np.arange(size)
+        inside = (frame >= 0) & (frame < tokens * n)
+        matrix[frame[inside], token, np.flatnonzero(inside)] = shape[inside]
+    matrix /= matrix.sum(axis=(1, 2), keepdims=True)
+    return matrix.reshape(tokens * n, tokens * size)
+
+
+def unfold_frames(
+    x: Float[Array, "*batch tokens predictions"],
+    n: int,
+    *,
+    margin: int = 0,
+    window: Window = "hann",
+) -> Float[Array, "*batch frames features"]:
+    """Frames of tokens that each predict n frames and `margin` more on either side.
+
+    Without a margin this is the inverse of `fold_frames`, and the motion may jump
+    where one token ends and the next begins: nothing but the network's own effort
+    joins them. With one, neighbours predict the same frames and are cross-faded.
+
+    Args:
+      x: Outputs, n + 2 margin frames of features in each token.
+      n: Own frames of a token.
+      margin: Frames beyond them on either side.
+      window: Shape of the cross-fade.
+
+    Returns:
+      n frames per token.
+    """
+    *batch, tokens, channels = x.shape
+    features = channels // (n + 2 * margin)
+    if margin == 0:
+        return x.reshape(*batch, tokens * n, features)
+    weights = unfold_weights(tokens, n, margin=margin, window=window)
+    predictions = x.reshape(*batch, tokens * (n + 2 * margin), features)
+    return jnp.einsum("fp,...pd->...fd", jnp.asarray(weights, x.dtype), predictions)
 
 
 def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -141,6 +209,19 @@ class TimeEmbedding(nn.Module):
         codes = sinusoidal_positions(num_steps, self.width)
         codes = jnp.concatenate([codes[:1], codes])
         return self.out(nn.silu(self.hidden(codes)))
+
+
+class LabelEmbedding(nn.Embed):
+    """A learned row for each label: `nn.Embed` for any number of labels, one included.
+
+    Labels out of range take the nearest row, so that a compiled program never makes
+    NaN of them; they are refused where they come in.
+    """
+
+    embedding_init: nn.initializers.Initializer = nn.initializers.normal(1.0)
+
+    def __call__(self, label: Int[Array, "*batch"]) -> Float[Array, "*batch width"]:
+        return jnp.take(self.embedding, label, axis=0, mode="clip")
 
 
 class EncoderLayer(nn.Module):

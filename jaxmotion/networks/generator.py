@@ -74,6 +74,9 @@ class SequenceGenerator(nn.Module):
       hidden: Channels of the feed-forward layers.
       dropout: Rate, after the positions and in every layer.
       frames_per_token: Frames of one token; 1 in the paper. Divides `frames`.
+      token_margin: Frames beyond its own, on either side, that a token predicts and
+        shares with its neighbors (ours; 0 in the paper).
+      token_window: How shared frames are cross-faded; see `blocks.unfold_weights`.
       norm: "post" in the paper; "pre" (ours) has one more norm before the output.
     """
 
@@ -88,6 +91,8 @@ class SequenceGenerator(nn.Module):
     hidden: int = 1024
     dropout: float = 0.1
     frames_per_token: int = 1
+    token_margin: int = 0
+    token_window: blocks.Window = "hann"
     norm: Literal["post", "pre"] = "post"
 
     def setup(self):
@@ -111,7 +116,9 @@ class SequenceGenerator(nn.Module):
         ]
         if self.norm == "pre":
             self.norm_out = nn.LayerNorm(epsilon=1e-5)
-        self.out = nn.Dense(self.features * self.frames_per_token)
+        self.out = nn.Dense(
+            self.features * (self.frames_per_token + 2 * self.token_margin)
+        )
         self.drop = nn.Dropout(self.dropout)
 
     @property
@@ -186,7 +193,12 @@ class SequenceGenerator(nn.Module):
             x = layer(x, train=train, last=last, mask=mask)
         if self.norm == "pre":
             x = self.norm_out(x)
-        return self.out(x).reshape(*batch, self.frames, self.features)
+        return blocks.unfold_frames(
+            self.out(x),
+            self.frames_per_token,
+            margin=self.token_margin,
+            window=self.token_window,
+        )
 
     def __call__(
         self,

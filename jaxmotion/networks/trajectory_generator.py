@@ -30,6 +30,8 @@ class TrajectoryGenerator(nn.Module):
       heads: Attention heads.
       hidden: Channels of the feed-forward layers.
       frames_per_token: Frames of one token.
+      token_margin: As in `transformer.CamdmTransformer`.
+      token_window: Likewise there.
     """
 
     past: int
@@ -41,13 +43,13 @@ class TrajectoryGenerator(nn.Module):
     heads: int
     hidden: int
     frames_per_token: int
+    token_margin: int = 0
+    token_window: blocks.Window = "hann"
 
     def setup(self):
         """Makes embeddings and layers."""
         self.embed_time = blocks.TimeEmbedding(self.width)
-        self.embed_label = nn.Embed(
-            self.num_labels, self.width, embedding_init=nn.initializers.normal(1.0)
-        )
+        self.embed_label = blocks.LabelEmbedding(self.num_labels, self.width)
         self.embed_target = nn.Dense(self.width)
         self.embed_past = nn.Dense(self.width)
         self.embed_noisy = nn.Dense(self.width)
@@ -56,7 +58,7 @@ class TrajectoryGenerator(nn.Module):
             for _ in range(self.depth)
         ]
         self.norm_out = nn.LayerNorm(epsilon=1e-5)
-        self.out = nn.Dense(CHANNELS * self.frames_per_token)
+        self.out = nn.Dense(CHANNELS * (self.frames_per_token + 2 * self.token_margin))
 
     def __call__(
         self,
@@ -97,4 +99,9 @@ class TrajectoryGenerator(nn.Module):
         for i, layer in enumerate(self.layers, start=1):
             outputs = self.future // n if i == self.depth else None
             tokens = layer(tokens, train=False, last=outputs)
-        return self.out(self.norm_out(tokens)).reshape(*batch, self.future, CHANNELS)
+        return blocks.unfold_frames(
+            self.out(self.norm_out(tokens)),
+            n,
+            margin=self.token_margin,
+            window=self.token_window,
+        )

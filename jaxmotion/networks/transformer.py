@@ -61,6 +61,9 @@ class CamdmTransformer(nn.Module):
       hidden: Channels of the feed-forward layers.
       dropout: Rate, after the positions and in every layer.
       frames_per_token: Frames of one token; 1 in the paper.
+      token_margin: Frames beyond its own, on either side, that a token predicts and
+        shares with its neighbors (ours; 0 in the paper).
+      token_window: How shared frames are cross-faded; see `blocks.unfold_weights`.
       norm: "post" in the paper; "pre" (ours) has one more norm before the output.
     """
 
@@ -75,14 +78,14 @@ class CamdmTransformer(nn.Module):
     hidden: int = 1024
     dropout: float = 0.2
     frames_per_token: int = 1
+    token_margin: int = 0
+    token_window: blocks.Window = "hann"
     norm: Literal["post", "pre"] = "post"
 
     def setup(self):
         """Makes embeddings and layers."""
         self.embed_time = blocks.TimeEmbedding(self.width)
-        self.embed_label = nn.Embed(
-            self.num_labels, self.width, embedding_init=nn.initializers.normal(1.0)
-        )
+        self.embed_label = blocks.LabelEmbedding(self.num_labels, self.width)
         self.embed_path = nn.Dense(self.width)
         self.embed_facing = nn.Dense(self.width)
         self.embed_past = nn.Dense(self.width)
@@ -95,7 +98,9 @@ class CamdmTransformer(nn.Module):
         ]
         if self.norm == "pre":
             self.norm_out = nn.LayerNorm(epsilon=1e-5)
-        self.out = nn.Dense(self.features * self.frames_per_token)
+        self.out = nn.Dense(
+            self.features * (self.frames_per_token + 2 * self.token_margin)
+        )
         self.drop = nn.Dropout(self.dropout)
 
     @property
@@ -203,7 +208,12 @@ class CamdmTransformer(nn.Module):
             x = layer(x, train=train, last=outputs if i == self.depth else None)
         if self.norm == "pre":
             x = self.norm_out(x)
-        return self.out(x).reshape(*batch, self.future, self.features)
+        return blocks.unfold_frames(
+            self.out(x),
+            self.frames_per_token,
+            margin=self.token_margin,
+            window=self.token_window,
+        )
 
     def __call__(
         self,

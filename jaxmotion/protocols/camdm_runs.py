@@ -48,7 +48,13 @@ def arguments_json(arguments: Any) -> dict[str, Any]:
 
 
 def split_data(
-    data: Path, contents: tuple[str, ...], label: str, held_out: float
+    data: Path,
+    contents: tuple[str, ...],
+    label: str,
+    held_out: float,
+    *,
+    labels: tuple[str, ...] = (),
+    held_out_clips: tuple[str, ...] = (),
 ) -> tuple[Clips, Clips]:
     """Training and held-out clips; the same for every run with these arguments.
 
@@ -58,6 +64,8 @@ def split_data(
         field: keep all.
       label: Label field that is the style.
       held_out: Part of each style's clips to hold out, in (0, 1).
+      labels: Keep only clips of these styles, and forget the others; none: keep all.
+      held_out_clips: Hold out these clips, by name, instead of a part.
 
     Returns:
       Both parts.
@@ -70,6 +78,10 @@ def split_data(
     clips.names(label)
     if contents and "content" in dict(clips.label_names):
         clips = selection.select(clips, "content", contents)
+    if labels:
+        clips = selection.relabel(selection.select(clips, label, labels), label)
+    if held_out_clips:
+        return selection.split_by_name(clips, held_out_clips)
     return selection.split_clips(clips, fraction=held_out, seed=0, field=label)
 
 
@@ -118,7 +130,8 @@ def load_run(
     """
     model, params, value = camdm_model.load(run)
     made_by = value.get("experiment", {})
-    missing = {"data", "contents", "label", "held_out"} - set(made_by)
+    wanted = {"data", "contents", "label", "labels", "held_out", "held_out_clips"}
+    missing = wanted - set(made_by)
     if missing:
         raise ValueError(
             f"{run}: field 'experiment' lacks {', '.join(sorted(missing))}: expected a "
@@ -130,6 +143,8 @@ def load_run(
         tuple(made_by["contents"]),
         field,
         made_by["held_out"],
+        labels=tuple(made_by["labels"]),
+        held_out_clips=tuple(made_by["held_out_clips"]),
     )
     if contents and "content" in dict(parts[0].label_names):
         parts = tuple(selection.select(part, "content", contents) for part in parts)

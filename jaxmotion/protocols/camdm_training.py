@@ -30,6 +30,7 @@ PRESETS = {
         width=192,
         hidden=768,
         frames_per_token=5,
+        token_margin=4,
         norm="pre",
         heading="facing",
         rotation_scale=4.0,

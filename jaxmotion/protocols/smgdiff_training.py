@@ -25,6 +25,7 @@ PRESETS = {
         width=192,
         hidden=768,
         frames_per_token=5,
+        token_margin=4,
         norm="pre",
         dropout=0.0,
         weight_velocity=3.0,

@@ -45,6 +45,9 @@ class Config:
       hidden: Channels of the feed-forward layers.
       dropout: Rate.
       frames_per_token: Frames of one token; ours, 1 in the paper.
+      token_margin: Frames beyond its own, on either side, that an output token predicts
+        and shares with its neighbors; ours, 0 in the paper.
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
       norm: Layer norms of the transformer behind each sum ("post", the paper's) or
         before each branch ("pre", ours: learns the legs' phase in a tenth of the
         steps).
@@ -81,6 +84,8 @@ class Config:
     hidden: int = 1024
     dropout: float = 0.2
     frames_per_token: int = 1
+    token_margin: int = 0
+    token_window: Literal["hann", "trapezoid"] = "hann"
     norm: Literal["post", "pre"] = "post"
     rotation_layout: Literal["rows", "columns"] = "rows"
     heading: Literal["random", "facing"] = "random"

@@ -51,6 +51,9 @@ class Config:
       hidden: Channels of its feed-forward layers.
       dropout: Rate.
       frames_per_token: Frames of one token; ours, 1 in the paper.
+      token_margin: Frames beyond its own, on either side, that an output token predicts
+        and shares with its neighbors; ours, 0 in the paper.
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
       norm: Layer norms behind each sum ("post", the paper's) or before each branch
         ("pre", ours: learns faster in short runs).
       mask_frames: What of the zeros that follow a motion's end is seen. True (ours):
@@ -84,6 +87,8 @@ class Config:
     hidden: int = 1024
     dropout: float = 0.1
     frames_per_token: int = 1
+    token_margin: int = 0
+    token_window: Literal["hann", "trapezoid"] = "hann"
     norm: Literal["post", "pre"] = "post"
     mask_frames: bool = True
     discriminator_width: int = 1024

@@ -42,6 +42,9 @@ class Config:
       hidden: Channels of the feed-forward layers.
       dropout: Rate.
       frames_per_token: Frames of one token; ours, 1 in CAMDM.
+      token_margin: Frames beyond its own, on either side, that an output token predicts
+        and shares with its neighbors; ours, 0 in the paper.
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
       norm: Layer norms behind each sum ("post") or before each branch ("pre", ours).
       weight_data: Weight of the mean squared error of features.
       weight_velocity: Of the displacements of features.
@@ -66,6 +69,8 @@ class Config:
     hidden: int = 1024
     dropout: float = 0.1
     frames_per_token: int = 1
+    token_margin: int = 0
+    token_window: Literal["hann", "trapezoid"] = "hann"
     norm: Literal["post", "pre"] = "post"
     weight_data: float = 1.0
     weight_velocity: float = 1.0

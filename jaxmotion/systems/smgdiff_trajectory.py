@@ -13,6 +13,7 @@ Source: SMGDiff, section 3.1, eq. 3.
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +40,9 @@ class Config:
       heads: Attention heads.
       hidden: Channels of the feed-forward layers.
       frames_per_token: Frames of one token.
+      token_margin: Frames beyond its own, on either side, that an output token predicts
+        and shares with its neighbors; ours, 0 in the paper.
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
       metres: Unit of the network's positions.
       weight_velocity: Of the displacements, beside the data's 1.
     """
@@ -52,6 +56,8 @@ class Config:
     heads: int = 4
     hidden: int = 256
     frames_per_token: int = 5
+    token_margin: int = 0
+    token_window: Literal["hann", "trapezoid"] = "hann"
     metres: float = 1.0
     weight_velocity: float = 1.0
 
