@@ -109,6 +109,7 @@ def test_our_own_options_are_off_by_default():
     small = camdm_training.PRESETS["small"]
     for name, off in (
         ("frames_per_token", 1),
+        ("token_margin", 0),
         ("heading", "random"),
         ("rotation_scale", 1.0),
         ("norm", "post"),

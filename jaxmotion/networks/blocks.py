@@ -211,14 +211,24 @@ class TimeEmbedding(nn.Module):
         return self.out(nn.silu(self.hidden(codes)))
 
 
-class LabelEmbedding(nn.Embed):
-    """A learned row for each label: `nn.Embed` for any number of labels, one included.
+class LabelEmbedding(nn.Module):
+    """A learned row for each label; `nn.Embed` cannot look up one label of one.
 
     Labels out of range take the nearest row, so that a compiled program never makes
     NaN of them; they are refused where they come in.
+
+    Attributes:
+      num_labels: Rows.
+      width: Channels.
     """
 
-    embedding_init: nn.initializers.Initializer = nn.initializers.normal(1.0)
+    num_labels: int
+    width: int
+
+    def setup(self):
+        """Makes the table."""
+        shape = (self.num_labels, self.width)
+        self.embedding = self.param("embedding", nn.initializers.normal(1.0), shape)
 
     def __call__(self, label: Int[Array, "*batch"]) -> Float[Array, "*batch width"]:
         return jnp.take(self.embedding, label, axis=0, mode="clip")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.data import bvh, clips
-from jaxmotion.data.builders import bandai_namco, base, lafan1, style100
+from jaxmotion.data.builders import bandai_namco, base, lafan1, o3de, style100
 from jaxmotion.data.bvh_text import format_bvh
 from tests.data import samples
 
@@ -190,6 +190,38 @@ def test_lafan1_reads_takes_and_cuts_from_two_zips(tmp_path):
     walk = clips.clip_motion(found, 1)
     np.testing.assert_allclose(walk.joint_rotation, expected.joint_rotation, atol=1e-6)
     np.testing.assert_allclose(walk.root_position, expected.root_position, atol=1e-6)
+
+
+def test_o3de_labels_takes_and_cuts_those_of_two_styles(tmp_path):
+    """A second of 30 frames; the cut of the crouching take is at two seconds."""
+    source = tmp_path / "raw"
+    motions = {
+        "Walk1": samples.motion(5, 0),
+        "Crouching1": samples.motion(70, 1),
+        "Jumps1": samples.motion(6, 2),
+        "TurnOnSpot1": samples.motion(7, 3),
+    }
+    texts = {
+        f"{name}.bvh": format_bvh(bvh.bvh_from_motion(samples.skeleton(), motion))
+        for name, motion in motions.items()
+    }
+    put(source, texts, "o3de_motion_matching.zip")
+    found = build(o3de.O3deMotionMatching, tmp_path, source)
+    style = [found.names("style")[i] for i in found.labels["style"]]
+    frames = np.diff(found.offsets).tolist()
+    assert list(zip(found.clip_names, style, frames, strict=True)) == [
+        ("Crouching1_0", "neutral", 60),
+        ("Crouching1_1", "crouch", 10),
+        ("Jumps1", "jump", 6),
+        ("TurnOnSpot1_0", "neutral", 7),
+        ("Walk1", "neutral", 5),
+    ]
+    assert [found.skeleton.names[i] for i in found.skeleton.feet] == [
+        "LeftToe",
+        "RightToe",
+    ]
+    cut = clips.clip_motion(found, 1).root_position
+    np.testing.assert_allclose(cut, motions["Crouching1"].root_position[60:], atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["walk1", "walk1_actor5", "walk1_subject5_a_b", "1_2"])

@@ -186,6 +186,17 @@ def test_split_depends_on_the_seed_only():
             selection.split_clips(samples.clips(), fraction=fraction, seed=0)
 
 
+def test_split_by_name():
+    clips = samples.clips()
+    train, held_out = selection.split_by_name(clips, ("clip5", "clip2"))
+    assert held_out.clip_names == ("clip2", "clip5")
+    assert sorted(train.clip_names + held_out.clip_names) == sorted(clips.clip_names)
+    with pytest.raises(ValueError, match="no clip named 'clip9': the clips are clip0"):
+        selection.split_by_name(clips, ("clip9",))
+    with pytest.raises(ValueError, match="all clips are held out"):
+        selection.split_by_name(clips, clips.clip_names)
+
+
 def test_concatenate_merges_labels_by_name():
     clips = samples.clips()
     other = build(

@@ -1,0 +1,58 @@
+"""Roughness by place: planted jumps show where they were planted, and only there."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion.evaluation import by_frame, smoothness
+from jaxmotion.motion import skeleton
+from tests import tiny
+
+
+def still(frames):
+    motion = tiny.walk(1)
+    return skeleton.Motion(
+        root_position=jnp.repeat(motion.root_position, frames, axis=0),
+        joint_rotation=jnp.repeat(motion.joint_rotation, frames, axis=0),
+        fps=30.0,
+    )
+
+
+def test_frames_since_the_last_plan():
+    planned = jnp.array([[0, 1, 0, 0, 1, 0], [1, 0, 0, 0, 0, 0]], bool)
+    expected = [[-1, 0, 1, 2, 0, 1], [0, 1, 2, 3, 4, 5]]
+    np.testing.assert_array_equal(by_frame.frames_since(planned), expected)
+
+
+def test_a_jump_at_a_border_shows_in_three_frames(bones):
+    """1 cm sideways between frames 4 and 5 of each ten: jerk 1:2:1, slide in one."""
+    motion = still(40)
+    hops = jnp.asarray((np.arange(40) + 5) // 10 * 0.01, jnp.float32)
+    motion = dataclasses.replace(
+        motion, root_position=motion.root_position.at[:, 0].add(hops)
+    )
+    found = by_frame.by_frame(
+        bones, motion, jnp.arange(40) % 10, num_places=10, contact_height=1.0
+    )
+    jerk = np.zeros(10)
+    jerk[5:8] = np.array([1, 2, 1]) * 0.01 * 30**3
+    np.testing.assert_allclose(found.jerk, jerk, rtol=1e-3, atol=1.0)
+    slide = np.zeros(10)
+    slide[5] = 0.01 * 30
+    np.testing.assert_allclose(found.slide, slide, atol=1e-4)
+    assert found.frames.tolist() == [4] * 10
+
+
+def test_the_mean_over_places_is_the_metric(bones):
+    motion = tiny.walk(33, turn=0.5)
+    positions = skeleton.joint_positions(bones, motion)
+    found = by_frame.by_frame(
+        bones, motion, jnp.zeros(33, jnp.int32), num_places=2, contact_height=0.0
+    )
+    np.testing.assert_allclose(
+        found.jerk[0], smoothness.jerk(positions, 30.0), rtol=1e-5
+    )
+    assert np.isnan(found.jerk[1]) and found.slide.tolist() == [0, 0]
+    text = by_frame.to_markdown({"row": found})
+    assert "| row, jerk m/s³ |" in text and "nan" in text
