@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmotion.data import clips_io, npz
 from jaxmotion.data.clips import Clips, take_clips
 from jaxmotion.motion.ball import Scene
-from jaxmotion.motion.skeleton import Motion
+from jaxmotion.motion.skeleton import MAX_METRES, Motion
 
 _FIELDS = {
     "ball_position": ("f", 2),
@@ -78,16 +78,20 @@ def ball_clips(
             raise ValueError(
                 f"field {name!r} has shape {found.shape}, expected {shape}"
             )
-    if not np.isfinite(position).all():
-        frame = int(np.argwhere(~np.isfinite(position))[0, 0])
-        raise ValueError(f"field 'ball_position' of frame {frame} is not finite")
+    inside = np.abs(position) <= MAX_METRES
+    if not inside.all():
+        frame = int(np.argwhere(~inside)[0, 0])
+        raise ValueError(
+            f"field 'ball_position' of frame {frame} is {position[frame].tolist()}, "
+            f"expected numbers within {MAX_METRES:g} m"
+        )
     if not joints or not all(0 <= j < clips.skeleton.num_joints for j in joints):
         raise ValueError(
             f"field 'ball_joints' is {joints}, expected joints in "
             f"0..{clips.skeleton.num_joints - 1}"
         )
-    if not 0 < radius < np.inf:
-        raise ValueError(f"field 'ball_radius' is {radius}, expected it positive")
+    if not 0 < radius <= 10:
+        raise ValueError(f"field 'ball_radius' is {radius}, expected 0 < radius <= 10")
     return BallClips(
         clips=clips,
         position=jnp.asarray(position, jnp.float32),

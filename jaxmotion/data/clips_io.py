@@ -7,10 +7,12 @@ import numpy as np
 
 from jaxmotion.data import npz
 from jaxmotion.data.clips import Clips
-from jaxmotion.motion.skeleton import Skeleton, check_parents
+from jaxmotion.motion.skeleton import MAX_METRES, Skeleton, check_skeleton
 
 _FORMAT = "jaxmotion-clips"
 _VERSION = 1
+RATES = (1e-3, 1e5)  # frames per second
+ROTATION_ERROR = 0.02  # of squared lengths and of the columns' product
 # Kind of each field's numbers ("f" float, "i" integer, "U" text) and its axes.
 _FIELDS = {
     "root_position": ("f", 2),
@@ -71,8 +73,11 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
 
     Raises:
       OSError: if the file cannot be written.
+      ValueError: if the fields do not agree, as of `load_clips`; nothing is written.
     """
-    npz.write_npz(path, to_fields(clips))
+    fields = to_fields(clips)
+    _check_fields(os.fspath(path), fields)
+    npz.write_npz(path, fields)
 
 
 def read_fields(path: str | os.PathLike) -> dict[str, np.ndarray]:
@@ -116,18 +121,46 @@ def _check_fields(path: str, fields: dict[str, np.ndarray]) -> None:
                 f"{path}: field {name!r} has shape {fields[name].shape}, expected "
                 f"{shape}"
             )
-    for name in ("root_position", "joint_rotation", "skeleton_offsets"):
-        if not np.isfinite(fields[name]).all():
-            index = np.argwhere(~np.isfinite(fields[name]))[0].tolist()
-            raise ValueError(f"{path}: field {name!r} is not finite at {index}")
-    _check_ranges(path, fields, num_frames, num_joints)
+    position = fields["root_position"]
+    if not (np.abs(position) <= MAX_METRES).all():
+        index = np.argwhere(~(np.abs(position) <= MAX_METRES))[0].tolist()
+        raise ValueError(
+            f"{path}: field 'root_position' is not within {MAX_METRES:g} m at {index}: "
+            f"found {position[tuple(index)]}"
+        )
+    _check_rotations(path, fields["joint_rotation"])
+    _check_ranges(path, fields, num_frames)
+    try:
+        check_skeleton(
+            **{
+                name: fields[f"skeleton_{name}"].tolist()
+                for name in ("offsets", "parents", "names", "feet")
+            }
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: field 'skeleton': {error}") from None
 
 
-def _check_ranges(
-    path: str, fields: dict[str, np.ndarray], num_frames: int, num_joints: int
-) -> None:
-    """Raises unless clips, rate, feet and labels are in range."""
-    offsets = fields["offsets"]
+def _check_rotations(path: str, columns: np.ndarray) -> None:
+    """Raises unless the numbers are two columns of rotations, to a hundredth."""
+    x, y = columns[..., :3], columns[..., 3:]
+    with np.errstate(all="ignore"):
+        products = [np.sum(a * b, -1) for a, b in ((x, x), (y, y), (x, y))]
+    wrong = np.zeros(columns.shape[:-1], bool)
+    for product, expected in zip(products, (1.0, 1.0, 0.0), strict=True):
+        wrong |= ~(np.abs(product - expected) <= ROTATION_ERROR)
+    if wrong.any():
+        frame, joint = np.argwhere(wrong)[0].tolist()
+        raise ValueError(
+            f"{path}: field 'joint_rotation' of frame {frame}, joint {joint} is no "
+            f"rotation: expected two orthogonal columns of length 1, found "
+            f"{columns[frame, joint].tolist()}"
+        )
+
+
+def _check_ranges(path: str, fields: dict[str, np.ndarray], num_frames: int) -> None:
+    """Raises unless clips, rate and labels are in range."""
+    offsets = fields["offsets"].astype(np.int64)
     num_clips = offsets.size - 1
     if num_clips < 1 or offsets[0] != 0 or offsets[-1] != num_frames:
         raise ValueError(
@@ -136,18 +169,31 @@ def _check_ranges(
     if (np.diff(offsets) < 1).any():
         clip = int(np.argmax(np.diff(offsets) < 1))
         raise ValueError(f"{path}: field 'offsets': clip {clip} has no frames")
-    if not 0 < fields["fps"] < np.inf:
-        raise ValueError(f"{path}: field 'fps' should be positive: {fields['fps']}")
-    feet = fields["skeleton_feet"]
-    if feet.size and not (0 <= feet.min() and feet.max() < num_joints):
-        raise ValueError(f"{path}: field 'skeleton_feet' names no joint: {feet}")
-    for field in fields["label_fields"]:
+    check_rate(path, fields["fps"])
+    words = [str(field) for field in fields["label_fields"]]
+    if len(set(words)) != len(words):
+        raise ValueError(f"{path}: field 'label_fields' has one twice: {words}")
+    for field in words:
         label, count = fields[f"label.{field}"], fields[f"names.{field}"].size
         if label.min() < 0 or label.max() >= count:
             raise ValueError(
                 f"{path}: field 'label.{field}' should be in 0..{count - 1}, found "
                 f"{label.min()}..{label.max()}"
             )
+
+
+def check_rate(path: str, fps: np.ndarray | float) -> None:
+    """Raises unless a rate is one of motions.
+
+    Raises:
+      ValueError: names the file.
+    """
+    low, high = RATES
+    if not low <= fps <= high:
+        raise ValueError(
+            f"{path}: field 'fps' should be in {low:g}..{high:g} frames per second, "
+            f"found {fps}"
+        )
 
 
 def load_clips(path: str | os.PathLike) -> Clips:
@@ -181,11 +227,6 @@ def from_fields(path: str, fields: dict[str, np.ndarray]) -> Clips:
       ValueError: if the fields do not agree; names the file and the field.
     """
     _check_fields(path, fields)
-    parents = tuple(int(parent) for parent in fields["skeleton_parents"])
-    try:
-        check_parents(parents)
-    except ValueError as error:
-        raise ValueError(f"{path}: field 'skeleton_parents': {error}") from None
     label_fields = [str(field) for field in fields["label_fields"]]
     return Clips(
         root_position=jnp.asarray(fields["root_position"], jnp.float32),
@@ -197,7 +238,7 @@ def from_fields(path: str, fields: dict[str, np.ndarray]) -> Clips:
         },
         skeleton=Skeleton(
             offsets=jnp.asarray(fields["skeleton_offsets"], jnp.float32),
-            parents=parents,
+            parents=tuple(int(parent) for parent in fields["skeleton_parents"]),
             names=tuple(str(name) for name in fields["skeleton_names"]),
             feet=tuple(int(foot) for foot in fields["skeleton_feet"]),
         ),

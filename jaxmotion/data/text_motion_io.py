@@ -5,7 +5,7 @@ import zipfile
 
 import numpy as np
 
-from jaxmotion.data import npz
+from jaxmotion.data import clips_io, npz
 from jaxmotion.data.text_motion import TextMotions, check_statistics
 
 _FORMAT = "jaxmotion-text-motions"
@@ -64,7 +64,7 @@ def _check_fields(path: str, fields: dict[str, np.ndarray]) -> None:
             )
     if not np.isfinite(fields["features"]).all():
         index = np.argwhere(~np.isfinite(fields["features"]))[0].tolist()
-        raise ValueError(f"{path}: field 'features' is not finite at {index}")
+        raise ValueError(f"{path}: field 'features' is not a finite float32 at {index}")
     check_statistics(
         fields["mean"],
         fields["std"],
@@ -99,8 +99,7 @@ def _check_ranges(
             f"{path}: field 'split' should be in 0..{count - 1}, found "
             f"{split.min()}..{split.max()}"
         )
-    if not 0 < fields["fps"] < np.inf:
-        raise ValueError(f"{path}: field 'fps' should be positive: {fields['fps']}")
+    clips_io.check_rate(path, fields["fps"])
 
 
 def load_text_motions(path: str | os.PathLike) -> TextMotions:
@@ -121,13 +120,17 @@ def load_text_motions(path: str | os.PathLike) -> TextMotions:
     fields = npz.read_npz(
         path, _FIELDS, what="text motions", format_name=_FORMAT, version=_VERSION
     )
+    with np.errstate(over="ignore"):  # what overflows is refused next
+        for name in ("features", "mean", "std"):
+            fields[name] = fields[name].astype(np.float32, copy=False)
+    for name in ("offsets", "caption_clip", "split"):
+        fields[name] = fields[name].astype(np.int64)
     _check_fields(path, fields)
     arrays = {
-        name: fields[name].astype(np.float32, copy=False)
-        for name in ("features", "mean", "std")
+        name: fields[name]
+        for name, (_, axes) in _FIELDS.items()
+        if name not in _TEXTS and axes > 0
     }
-    for name in ("offsets", "caption_clip", "split"):
-        arrays[name] = fields[name]
     texts = {name: tuple(fields[name].tolist()) for name in _TEXTS}
     return TextMotions(
         **arrays, **texts, fps=float(fields["fps"]), source=str(fields["source"])

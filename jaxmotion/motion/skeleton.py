@@ -11,12 +11,17 @@ Units: metres, seconds; world axes y up, right-handed.
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmotion.motion import rotation
+
+# Beyond it float32 resolves 6 cm at best: no position of a character.
+MAX_METRES = 1e6
 
 
 @jax.tree_util.register_dataclass
@@ -90,6 +95,46 @@ def check_parents(parents: tuple[int, ...]) -> None:
         if not expected:
             rule = "-1 (joint 0 is the root)" if joint == 0 else f"in 0..{joint - 1}"
             raise ValueError(f"parent of joint {joint} is {parent}, expected {rule}")
+
+
+def check_skeleton(*, offsets: Any, parents: Any, names: Any, feet: Any) -> None:
+    """Raises unless values, which may come from a file, are fields of a `Skeleton`.
+
+    Raises:
+      ValueError: names the field, what was expected and what was found.
+    """
+    for field, values in (("parents", parents), ("feet", feet)):
+        for value in values:
+            if type(value) is not int:
+                raise ValueError(f"{field} should be whole numbers, found {value!r}")
+    if not parents:
+        raise ValueError("parents: expected at least one joint, found none")
+    check_parents(tuple(parents))
+    count = len(parents)
+    try:
+        found = np.asarray(offsets, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"offsets should be {count} rows of 3 numbers") from None
+    if found.shape != (count, 3):
+        raise ValueError(f"offsets have shape {found.shape}, expected {(count, 3)}")
+    if not (np.abs(found) <= MAX_METRES).all():
+        joint = int(np.argwhere(~(np.abs(found) <= MAX_METRES))[0, 0])
+        raise ValueError(
+            f"offset of joint {joint} is {found[joint].tolist()}, expected numbers "
+            f"within {MAX_METRES:g} m"
+        )
+    if len(names) != count:
+        raise ValueError(f"{len(names)} names for {count} joints")
+    for joint, name in enumerate(names):
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"name of joint {joint} should be text, found {name!r}")
+        if name in names[:joint]:
+            raise ValueError(f"two joints have the name {name!r}")
+    for foot in feet:
+        if not 0 <= foot < count or list(feet).count(foot) > 1:
+            raise ValueError(
+                f"feet {list(feet)}: expected different joints in 0..{count - 1}"
+            )
 
 
 def _times(a: Array, b: Array) -> Array:

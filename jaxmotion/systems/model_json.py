@@ -5,7 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion.motion.skeleton import Skeleton, check_parents
+from jaxmotion.motion.skeleton import Skeleton, check_skeleton
 
 
 def skeleton_to_json(bones: Skeleton) -> dict[str, Any]:
@@ -36,12 +36,16 @@ def skeleton_from_json(value: dict[str, Any]) -> Skeleton:
 
     Raises:
       KeyError, TypeError: if a field is missing or of the wrong type.
-      ValueError: if the parents are not those of a skeleton.
+      ValueError: if the fields are not those of a skeleton; says what is wrong.
     """
-    check_parents(tuple(value["parents"]))
+    fields = {name: value[name] for name in ("offsets", "parents", "names", "feet")}
+    for name, found in fields.items():
+        if not isinstance(found, list):
+            raise ValueError(f"{name} should be a list, found {found!r:.100}")
+    check_skeleton(**fields)
     return Skeleton(
-        offsets=jnp.asarray(value["offsets"], jnp.float32),
-        parents=tuple(value["parents"]),
-        names=tuple(value["names"]),
-        feet=tuple(value["feet"]),
+        offsets=jnp.asarray(np.asarray(fields["offsets"], np.float32)),
+        parents=tuple(fields["parents"]),
+        names=tuple(fields["names"]),
+        feet=tuple(fields["feet"]),
     )

@@ -1,3 +1,4 @@
+import dataclasses
 import os
 
 import jax
@@ -44,7 +45,7 @@ def test_an_interrupted_write_leaves_the_old_file(saved, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(clips_io.os, "fsync", stop)
+    monkeypatch.setattr(os, "fsync", stop)
     with pytest.raises(KeyboardInterrupt):
         clips_io.save_clips(saved, samples.clips())
     assert saved.read_bytes() == before
@@ -87,6 +88,8 @@ def test_pickles_are_not_opened(tmp_path):
 
 
 NAN = np.full((52, 3), np.nan, np.float32)
+FOUR = {"clip_names": np.array(list("abcd"))}
+FOUR |= {f"label.{field}": np.zeros(4, int) for field in ("style", "content")}
 BAD = {
     "other version": ({"version": np.array(2)}, "version 2.*expected 1"),
     "no version": ({"version": None}, "version None.*expected 1"),
@@ -99,7 +102,7 @@ BAD = {
         {"root_position": np.zeros((5, 3))},
         "'root_position' has shape",
     ),
-    "nan": ({"root_position": NAN}, r"'root_position' is not finite at \[0, 0\]"),
+    "nan": ({"root_position": NAN}, r"'root_position' is not within .* at \[0, 0\]"),
     "rows of 9": ({"joint_rotation": np.zeros((52, 6, 9))}, "'joint_rotation' has sh"),
     "other joints": ({"skeleton_offsets": np.zeros((5, 3))}, "'skeleton_offsets' has"),
     "offsets end": ({"offsets": np.arange(9)}, "'offsets' should run from 0 to 52"),
@@ -108,10 +111,50 @@ BAD = {
         "'offsets': clip 0 has no frames",
     ),
     "clip names": ({"clip_names": np.array(["a"])}, "'clip_names' has shape"),
-    "rate": ({"fps": np.array(0.0)}, "'fps' should be positive"),
-    "feet": ({"skeleton_feet": np.array([6])}, "'skeleton_feet' names no joint"),
+    "rate": ({"fps": np.array(0.0)}, "'fps' should be in .*, found 0.0"),
+    "negative rate": ({"fps": np.array(-1.0)}, "'fps' should be in .*, found -1.0"),
+    "wild rate": ({"fps": np.array(1e300)}, r"'fps' should be in .*, found 1e\+300"),
+    "feet": ({"skeleton_feet": np.array([6])}, "'skeleton': feet .*in 0..5"),
+    "a foot twice": ({"skeleton_feet": np.array([3, 3])}, "'skeleton': feet .*differ"),
+    "joint twice": (
+        {"skeleton_names": np.array(["Hips", "Hips", *"abcd"])},
+        "'skeleton': two joints have the name 'Hips'",
+    ),
+    "nan bone": (
+        {"skeleton_offsets": np.full((6, 3), np.nan)},
+        "'skeleton': offset of joint 0 is .nan",
+    ),
+    "bone of 1e39": (
+        {"skeleton_offsets": np.full((6, 3), 1e39)},
+        r"'skeleton': offset of joint 0 is .1e\+39",
+    ),
+    "float64 1e300": (
+        {"root_position": np.full((52, 3), 1e300)},
+        r"'root_position' is not within 1e\+06 m at \[0, 0\]: found 1e\+300",
+    ),
+    "no rotations": (
+        {"joint_rotation": np.zeros((52, 6, 6))},
+        "'joint_rotation' of frame 0, joint 0 is no rotation",
+    ),
+    "rotations of 1e30": (
+        {"joint_rotation": np.full((52, 6, 6), 1e30)},
+        "'joint_rotation' of frame 0, joint 0 is no rotation",
+    ),
+    "nan rotations": (
+        {"joint_rotation": np.full((52, 6, 6), np.nan)},
+        "'joint_rotation' of frame 0, joint 0 is no rotation",
+    ),
+    "small offsets": (
+        # As int8 the difference of 100 and -128 would be 28 again.
+        {"offsets": np.array([0, 10, 100, -128, 52], np.int8), **FOUR},
+        "'offsets': clip 2 has no frames",
+    ),
+    "label field twice": (
+        {"label_fields": np.array(["style", "style"])},
+        "'label_fields' has one twice",
+    ),
     "label": ({"label.style": np.full(8, 3)}, r"'label.style' should be in 0\.\.2"),
-    "parents": ({"skeleton_parents": np.arange(6)}, "'skeleton_parents': parent of"),
+    "parents": ({"skeleton_parents": np.arange(6)}, "'skeleton': parent of"),
 }
 
 
@@ -121,3 +164,17 @@ def test_inconsistent_fields_are_named(saved, case):
     rewrite(saved, **changes)
     with pytest.raises(ValueError, match=f"c.npz.*{message}"):
         clips_io.load_clips(saved)
+
+
+def test_what_cannot_be_read_is_not_written(tmp_path):
+    clips = samples.clips()
+    broken = dataclasses.replace(clips, joint_rotation=0.0 * clips.joint_rotation)
+    with pytest.raises(ValueError, match="c.npz: field 'joint_rotation' of frame 0"):
+        clips_io.save_clips(tmp_path / "c.npz", broken)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_pipe_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="pipe: expected a regular file"):
+        clips_io.load_clips(tmp_path / "pipe")
