@@ -8,6 +8,8 @@ Z, X, Y mean R = Rz Rx Ry.
 """
 
 import dataclasses
+import decimal
+import math
 from collections.abc import Collection
 
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmotion.data.bvh_text import Bvh, BvhError, parse_bvh, read_bvh, write_bvh
-from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.skeleton import MAX_METRES, Motion, Skeleton
 
 __all__ = [
     "Bvh",
@@ -29,6 +31,8 @@ __all__ = [
     "without_joints",
     "write_bvh",
 ]
+
+_CUSTOMARY = (24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 200, 240)
 
 
 def _axis_rotation(
@@ -165,10 +169,19 @@ def motion_from_bvh(
       The skeleton (root offset zero) and the motion at 1 / frame_time frames a second.
 
     Raises:
-      BvhError: for an unknown joint name, or a bone whose length changes.
+      BvhError: for an unknown joint name, a bone whose length changes, or a position
+        beyond `MAX_METRES`.
     """
     top = 0 if root is None else _require_joint(bvh, root)
     positions, rotations = bvh_transforms(bvh)
+    inside = np.abs(positions) * scale <= MAX_METRES
+    if not inside.all():
+        frame, joint, axis = np.argwhere(~inside)[0].tolist()
+        raise BvhError(
+            f"{bvh.name}: {bvh.names[joint]!r} is {positions[frame, joint, axis]:g} "
+            f"from its parent along {'xyz'[axis]} in frame {frame} (OFFSET or position "
+            f"channels), expected less than {MAX_METRES / scale:g}"
+        )
     position, turn = _world(bvh.parents, positions, rotations, top)
     joints = _subtree(bvh, top)
     index = {joint: i for i, joint in enumerate(joints)}
@@ -203,19 +216,31 @@ def motion_from_bvh(
 
 
 def frame_rate(frame_time: float) -> float:
-    """Frames a second, freed of the rounding of a written frame time.
+    """Frames per second, freed of the rounding of a written frame time.
 
-    Files write 1/30 s as 0.033333 or 0.0333333: the nearest whole rate is meant when
-    it is within 0.05 %, which is half of what separates 30 from 29.97.
+    Files write 1/30 s as 0.033333, 0.0333 or 0.033. A rate is meant when it alone of
+    the customary ones, or of all whole ones, rounds or is cut to the written decimals;
+    or the nearest whole one within 0.05 %, half of what separates 30 from 29.97.
 
     Args:
-      frame_time: Seconds a frame.
-
-    Returns:
-      Frames a second.
+      frame_time: Seconds per frame.
     """
     rate = 1.0 / frame_time
-    return float(round(rate)) if abs(rate - round(rate)) < 5e-4 * rate else rate
+    error = abs(rate - round(rate)) / rate
+    # The shortest decimals of the number are those that the file wrote.
+    unit = 10.0 ** int(decimal.Decimal(repr(frame_time)).as_tuple().exponent)
+    least = math.ceil(1.0 / (frame_time + unit))
+    most = math.floor(1.0 / max(frame_time - unit / 2, unit / 2))
+    customary = [one for one in _CUSTOMARY if least <= one <= most]
+    if error < 1e-9:
+        return float(round(rate))
+    if len(customary) == 1:
+        return float(customary[0])
+    if least == most:
+        return float(least)
+    if error < 5e-4:
+        return float(round(rate))
+    return rate
 
 
 def _zyx_degrees(

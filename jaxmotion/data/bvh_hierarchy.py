@@ -14,6 +14,17 @@ class BvhError(ValueError):
     """A BVH file that cannot be used; the message names the file and the line."""
 
 
+def number(word: str) -> float:
+    """A number as other readers take it: Python's float() knows more spellings.
+
+    Raises:
+      ValueError: if it is none.
+    """
+    if not word.isascii() or "_" in word:
+        raise ValueError(f"no number: {word!r}")
+    return float(word)
+
+
 class Hierarchy:
     """Reads the tokens of a HIERARCHY block into lists, one entry a joint."""
 
@@ -55,7 +66,7 @@ class Hierarchy:
         for _ in range(3):
             word = self.take(f"a number of {what}")
             try:
-                values.append(float(word))
+                values.append(number(word))
             except ValueError:
                 self.fail(f"{what} needs three numbers, found {word!r}")
             if not np.isfinite(values[-1]):
@@ -81,8 +92,9 @@ class Hierarchy:
     def channel_list(self) -> tuple[str, ...]:
         """CHANNELS n name ... name, in canonical spelling."""
         word = self.take("the number of channels")
-        if not word.isdigit() or int(word) > len(CHANNELS):
-            self.fail(f"CHANNELS needs a number in 0..6, found {word!r}")
+        # One ASCII digit: isdigit() takes superscripts, and int() refuses 5,000 digits.
+        if word not in tuple("0123456"):
+            self.fail(f"CHANNELS needs a number in 0..6, found {word[:40]!r}")
         found: list[str] = []
         for _ in range(int(word)):
             channel = self.take("a channel name")

@@ -15,11 +15,13 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from jaxmotion.data.bvh_hierarchy import BvhError, Hierarchy
+from jaxmotion import files
+from jaxmotion.data.bvh_hierarchy import BvhError, Hierarchy, number
 
 _MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.IGNORECASE | re.MULTILINE)
 _FRAMES = re.compile(r"\s*Frames\s*:?\s*(\S+)\s*", re.IGNORECASE)
 _FRAME_TIME = re.compile(r"\s*Frame\s+Time\s*:?\s*(\S+)\s*", re.IGNORECASE)
+_FRAME_TIMES = (1e-5, 1e3)  # seconds
 
 
 @runtime_checkable
@@ -66,23 +68,23 @@ class Bvh:
         return self.values.shape[0]
 
 
-def _header_number(lines: list[str], number: int, pattern, name: str, what: str):
+def _header_number(lines: list[str], at: int, pattern, name: str, what: str):
     """The number behind 'Frames:' or 'Frame Time:'; returns it and the next index."""
-    while number < len(lines) and not lines[number].strip():
-        number += 1
-    if number >= len(lines):
+    while at < len(lines) and not lines[at].strip():
+        at += 1
+    if at >= len(lines):
         raise BvhError(f"{name}: the file ends where '{what}' was expected (truncated)")
-    match = pattern.fullmatch(lines[number])
+    match = pattern.fullmatch(lines[at])
     try:
-        value = float(match.group(1)) if match else np.nan
+        value = number(match.group(1)) if match else np.nan
     except ValueError:
         value = np.nan
     if not (np.isfinite(value) and value > 0):
         raise BvhError(
-            f"{name}, line {number + 1}: expected '{what} <positive number>', "
-            f"found {lines[number].strip()!r}"
+            f"{name}, line {at + 1}: expected '{what} <positive number>', "
+            f"found {lines[at].strip()!r:.80}"
         )
-    return value, number + 1
+    return value, at + 1
 
 
 def _rows(lines: list[str], start: int, shape: tuple[int, int], name: str):
@@ -149,6 +151,11 @@ def parse_bvh(text: str, *, name: str = "bvh") -> Bvh:
     if count != int(count):
         raise BvhError(f"{name}, line {start}: 'Frames:' is no whole number: {count}")
     frame_time, start = _header_number(lines, start, _FRAME_TIME, name, "Frame Time:")
+    if not _FRAME_TIMES[0] <= frame_time <= _FRAME_TIMES[1]:
+        raise BvhError(
+            f"{name}, line {start}: 'Frame Time:' should be in {_FRAME_TIMES[0]:g}.."
+            f"{_FRAME_TIMES[1]:g} seconds, found {frame_time:g}"
+        )
     width = sum(len(channels) for channels in hierarchy.channels)
     # The number of lines bounds the rows: a wild 'Frames:' must not allocate memory.
     if count > len(lines):
@@ -189,8 +196,7 @@ def read_bvh(
     elif hasattr(source, "read"):
         data, default = source.read(), str(getattr(source, "name", "bvh"))
     else:
-        with open(source, "rb") as file:
-            data, default = file.read(), os.fspath(source)
+        data, default = files.read_bytes(source), os.fspath(source)
     name = default if name is None else name
     try:
         text = data.decode("utf-8")
@@ -199,21 +205,37 @@ def read_bvh(
     return parse_bvh(text, name=name)
 
 
-def _joint_lines(bvh: Bvh, joint: int, depth: int, order: list[int]) -> list[str]:
-    """Lines of one joint and those below it; appends them to `order`."""
-    order.append(joint)
-    indent = "\t" * depth
-    kind = "ROOT" if bvh.parents[joint] < 0 else "JOINT"
-    lines = [f"{indent}{kind} {bvh.names[joint]}", f"{indent}{{"]
-    lines.append(f"{indent}\tOFFSET {_numbers(bvh.offsets[joint])}")
-    channels = bvh.channels[joint]
-    lines.append(" ".join([f"{indent}\tCHANNELS", str(len(channels)), *channels]))
-    for child in (j for j, parent in enumerate(bvh.parents) if parent == joint):
-        lines += _joint_lines(bvh, child, depth + 1, order)
-    for site in bvh.end_sites[joint]:
-        inner = [f"End Site\n{indent}\t{{", f"\tOFFSET {_numbers(site)}", "}"]
-        lines += [f"{indent}\t{line}" for line in inner]
-    return [*lines, f"{indent}}}"]
+def _joint_lines(bvh: Bvh) -> tuple[list[str], list[int]]:
+    """Lines of all joints, depth first, and the joints in that order."""
+    children: list[list[int]] = [[] for _ in bvh.names]
+    for joint, parent in enumerate(bvh.parents[1:], start=1):
+        children[parent].append(joint)
+    lines, order = [], []
+    # A joint to open, or lines that close one; a stack, since chains may be long.
+    todo: list[tuple[int, int] | list[str]] = [(0, 0)]
+    while todo:
+        if isinstance(item := todo.pop(), list):
+            lines += item
+            continue
+        joint, depth = item
+        order.append(joint)
+        # Indents of a chain would otherwise grow with the square of its length.
+        indent = "\t" * min(depth, 64)
+        kind = "ROOT" if bvh.parents[joint] < 0 else "JOINT"
+        channels = bvh.channels[joint]
+        lines += [
+            f"{indent}{kind} {bvh.names[joint]}",
+            f"{indent}{{",
+            f"{indent}\tOFFSET {_numbers(bvh.offsets[joint])}",
+            " ".join([f"{indent}\tCHANNELS", str(len(channels)), *channels]),
+        ]
+        end = []
+        for site in bvh.end_sites[joint]:
+            inner = ["End Site", "{", f"\tOFFSET {_numbers(site)}", "}"]
+            end += [f"{indent}\t{line}" for line in inner]
+        todo.append([*end, f"{indent}}}"])
+        todo += [(child, depth + 1) for child in reversed(children[joint])]
+    return lines, order
 
 
 def _numbers(values) -> str:
@@ -238,8 +260,8 @@ def format_bvh(bvh: Bvh, *, decimals: int = 6) -> str:
     Returns:
       The text, with Unix line ends.
     """
-    order: list[int] = []
-    lines = ["HIERARCHY", *_joint_lines(bvh, 0, 0, order), "MOTION"]
+    joints, order = _joint_lines(bvh)
+    lines = ["HIERARCHY", *joints, "MOTION"]
     lines += [f"Frames: {bvh.num_frames}", f"Frame Time: {bvh.frame_time:.9g}"]
     first = np.cumsum([0] + [len(channels) for channels in bvh.channels])
     columns = [c for joint in order for c in range(first[joint], first[joint + 1])]
@@ -262,11 +284,5 @@ def write_bvh(path: str | os.PathLike, bvh: Bvh, *, decimals: int = 6) -> None:
       OSError: if the file cannot be written.
     """
     text = format_bvh(bvh, decimals=decimals)
-    temporary = f"{os.fspath(path)}.{os.getpid()}.partial"
-    try:
-        with open(temporary, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-        os.replace(temporary, path)
-    finally:
-        if os.path.exists(temporary):
-            os.remove(temporary)
+    with files.replacing(path) as file:
+        file.write(text.encode("utf-8"))

@@ -182,7 +182,7 @@ def test_write_then_read_gives_the_same_content(tmp_path):
     assert format_bvh(found) == path.read_text()
     assert os.listdir(tmp_path) == ["a.bvh"]
     with pytest.raises(OSError):
-        bvh.write_bvh(tmp_path / "missing" / "a.bvh", content)
+        bvh.write_bvh(path / "a.bvh", content)
 
 
 def test_writing_puts_breadth_first_joints_depth_first(tmp_path):
@@ -291,3 +291,72 @@ def test_ten_recordings_agree_with_the_second_library():
         found = np.asarray(skeletons.joint_positions(skeleton, motion))[frames]
         order = [names.index(name) for name in skeleton.names]
         np.testing.assert_allclose(100 * found, expected[:, order], atol=1e-3)
+
+
+def chain(num_joints: int) -> bvh.Bvh:
+    """Every joint the child of the one before."""
+    return bvh.Bvh(
+        names=tuple(f"j{i}" for i in range(num_joints)),
+        parents=tuple(range(-1, num_joints - 1)),
+        offsets=np.arange(3.0 * num_joints).reshape(num_joints, 3),
+        channels=(("Yrotation",),) * num_joints,
+        end_sites=((),) * (num_joints - 1) + (((0.0, 1.0, 0.0),),),
+        values=np.ones((1, num_joints)),
+        frame_time=0.1,
+    )
+
+
+def test_long_chains_are_written_and_read():
+    text = format_bvh(chain(5000))
+    assert len(text) < 5_000_000
+    found = bvh.parse_bvh(text)
+    assert found.parents == chain(5000).parents
+    np.testing.assert_array_equal(found.offsets, chain(5000).offsets)
+
+
+@pytest.mark.parametrize("rate", [24, 25, 30, 50, 60, 72, 90, 100, 120, 144, 240])
+@pytest.mark.parametrize("decimals", [4, 5, 6, 7, 9])
+def test_rates_survive_few_decimals(rate, decimals):
+    unit = 10**decimals
+    rounded, cut = round(unit / rate) / unit, int(unit / rate) / unit
+    assert bvh.frame_rate(rounded) == rate
+    # Cut to 4 decimals, 240 frames per second are 243.9 and what not.
+    if decimals > 4 or rate <= 60:
+        assert bvh.frame_rate(cut) == rate
+
+
+@pytest.mark.parametrize(
+    ("frame_time", "rate"),
+    [
+        (0.0333, 30),
+        (0.033, 30),
+        (0.03, 33.333),  # 25, cut, or 30, rounded
+        (0.0167, 60),
+        (0.017, 60),
+        (0.008, 125),  # exactly
+        (0.05, 20),
+        (0.02, 50),
+        (1.0, 1),
+        (0.033366667, 29.97),
+        (0.0333667, 29.97),
+        (0.03337, 29.967),
+        (0.041708, 23.976),
+        (0.0299, 33.445),
+    ],
+)
+def test_rates_that_are_not_whole_stay(frame_time, rate):
+    assert bvh.frame_rate(frame_time) == pytest.approx(rate, abs=1e-3)
+
+
+@pytest.mark.parametrize("place", ["OFFSET 0.0 50.0 0.0", "OFFSET 10.0 -5.0 0.5"])
+def test_positions_beyond_float32_are_refused(place):
+    text = samples.bvh_text(constant_bone_values()).replace(place, "OFFSET 0 1e39 0")
+    content = bvh.parse_bvh(text, name="far.bvh")
+    with pytest.raises(bvh.BvhError, match=r"far.bvh: '.*' is 1e\+39 .* along y"):
+        bvh.motion_from_bvh(content)
+
+
+def test_a_pipe_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.bvh")
+    with pytest.raises(OSError, match="pipe.bvh: expected a regular file"):
+        bvh.read_bvh(tmp_path / "pipe.bvh")

@@ -60,6 +60,27 @@ BAD = {
     "channel": (samples.BVH.replace("6 Xpos", "6 Wpos"), "line 5: unknown.*Wposition"),
     "channel twice": (samples.BVH.replace("6 X", "6 Y"), "line 5.*twice"),
     "channel count": (samples.BVH.replace("6 X", "5 X"), "line 5: expected.*Yrotation"),
+    "tiny frame time": (
+        samples.BVH.replace("0.016667", "1e-310"),
+        f"line {line('Frame T')}: 'Frame Time:' should be in 1e-05..1000 s.*1e-310",
+    ),
+    "frames with an underscore": (
+        samples.BVH.replace(": 3", ": 0_3"),
+        f"line {line('Frames')}: expected",
+    ),
+    "offset with an underscore": (
+        samples.BVH.replace("90.0", "9_0.0"),
+        "line 8: OFFSET needs three numbers, found '9_0.0'",
+    ),
+    "offset of other digits": (
+        samples.BVH.replace("90.0", "\u0669"),
+        "line 8: OFFSET needs three numbers",
+    ),
+    "superscript": (samples.BVH.replace("6 X", "\u00b2 X"), "line 5: CHANNELS needs"),
+    "5,000 digits": (
+        samples.BVH.replace("6 X", "6" * 5000 + " X"),
+        "line 5: CHANNELS needs a number in 0..6, found '6{40}'$",
+    ),
     "channel number": (samples.BVH.replace("6 X", "x X"), "line 5.*found 'x'"),
     "joint twice": (
         samples.BVH.replace("Head", "Root"),
