@@ -83,13 +83,16 @@ def check_config(config: Config) -> None:
       FileNotFoundError: if the folder of the published files is missing.
       FileExistsError: if the output exists and is not to be replaced.
       OSError: if the output cannot be written.
-      ValueError: if a rate is not positive, or a setting does not apply to the set.
+      ValueError: if a rate or the seed is out of range, or a setting does not fit.
     """
     for name in ("fps", "cut_fps"):
         rate = getattr(config, name)
-        if rate is not None and not (np.isfinite(rate) and rate > 0):
+        low, high = clips_io.RATES
+        if rate is not None and not low <= rate <= high:
             option = name.replace("_", "-")
-            raise ValueError(f"--{option} should be positive, found {rate}")
+            raise ValueError(f"--{option} should be in {low:g}..{high:g}, found {rate}")
+    if not 0 <= config.seed < 2**32:
+        raise ValueError(f"--seed should be in 0..2**32 - 1, found {config.seed}")
     if config.source in TEXT_SOURCES and (config.mirror or config.fps is not None):
         raise ValueError(
             f"{config.source} is published with mirror images and at its own rate: "

@@ -85,11 +85,11 @@ def test_damaged_arrays_are_one_line(tmp_path, case):
         assert words.startswith("x.npz: not a clips file") and "\n" not in words
 
 
-def zeros(path, size: int, **options) -> None:
+def zeros(path, size: int, *, name: str = "a.npy") -> None:
     """A zip with a member of that many zeros, written in pieces."""
     with (
-        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, **options) as archive,
-        archive.open("a.npy", "w", force_zip64=True) as file,
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open(name, "w", force_zip64=True) as file,
     ):
         piece = bytes(2**20)
         for _ in range(size // len(piece)):

@@ -10,6 +10,7 @@ import pytest
 from jaxmotion.data import bvh, clips
 from jaxmotion.data.builders import bandai_namco, base, lafan1, o3de, style100
 from jaxmotion.data.bvh_text import format_bvh
+from tests import test_files
 from tests.data import samples
 
 
@@ -165,7 +166,7 @@ def test_missing_folders_and_damaged_zips_are_named(tmp_path):
     source = put(tmp_path / "raw", {"walk1_subject1.bvh": "x" * 5000}, "lafan1.zip")
     data = (source / "lafan1.zip").read_bytes()
     (source / "lafan1.zip").write_bytes(data[:-100])
-    with pytest.raises(ValueError, match="lafan1.zip: damaged zip"):
+    with pytest.raises(ValueError, match="lafan1.zip: unreadable zip"):
         build(lafan1.Lafan1, tmp_path, source)
 
 
@@ -350,3 +351,62 @@ def test_tensorflow_is_never_imported():
         "style100; sys.exit('tensorflow' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_files_of_one_name_in_two_folders_are_both_named(tmp_path):
+    name, text = "walk1_subject1.bvh", lafan_text(0)
+    files = {f"a/{name}": text, f"b/{name}": text}
+    for source in (
+        put(tmp_path / "loose", files),
+        put(tmp_path / "zipped", files, "lafan1.zip"),
+    ):
+        with pytest.raises(ValueError, match=name) as caught:
+            build(lafan1.Lafan1, tmp_path, source)
+        words = str(caught.value)
+        assert f"a/{name} and {source}" in words and f"b/{name}" in words
+    # Of two zips as well.
+    put(tmp_path / "two", {name: text}, "lafan1.zip")
+    put(tmp_path / "two", {name: text}, "lafan1_cuts.zip")
+    with pytest.raises(ValueError, match=f"lafan1.zip/{name} and .*cuts.zip/{name}"):
+        build(lafan1.Lafan1, tmp_path, tmp_path / "two")
+
+
+class Twice(base.MotionBuilder):
+    """A set with a clip of the same name again."""
+
+    name = "twice"
+    MANUAL_DOWNLOAD_INSTRUCTIONS = "None."
+
+    def _generate_examples(self, folder):
+        for seed in range(2):
+            yield base.example("walk", samples.skeleton(), samples.motion(5, seed), {})
+
+
+def test_clips_of_one_name_are_named(tmp_path):
+    source = put(tmp_path / "raw", {"a.txt": ""})
+    with pytest.raises(ValueError, match="two clips have the name 'walk'"):
+        build(Twice, tmp_path, source)
+
+
+def test_zips_that_cannot_be_unpacked_are_one_line(tmp_path):
+    source = put(tmp_path / "raw", {"walk1_subject1.bvh": lafan_text(0)}, "lafan1.zip")
+    path = source / "lafan1.zip"
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\x03\x04") + 6] |= 1
+    data[data.index(b"PK\x01\x02") + 8] |= 1
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="lafan1.zip: .*subject1.bvh' is encrypted"):
+        build(lafan1.Lafan1, tmp_path, source)
+    test_files.zeros(path, 300 * 2**20, name="walk1_subject1.bvh")
+    with pytest.raises(ValueError, match="lafan1.zip: .*unpack to 314572800 bytes"):
+        build(lafan1.Lafan1, tmp_path, source)
+
+
+@pytest.mark.parametrize("cls", [bandai_namco.BandaiNamco, style100.Style100])
+def test_tables_that_are_no_text_are_named(tmp_path, cls):
+    is_style = cls is style100.Style100
+    source = put(tmp_path / "raw", style_files() if is_style else bandai_files())
+    table = next(source.rglob("Frame_Cuts.csv" if is_style else "style_label.txt"))
+    table.write_bytes(b"\xff\xfe")
+    with pytest.raises(ValueError, match=f"{table.name}: not UTF-8 text"):
+        build(cls, tmp_path, source, "original" if is_style else "2")

@@ -1,6 +1,7 @@
 import importlib.util
 import os
 import pickle
+import subprocess
 import sys
 from pathlib import Path
 
@@ -126,6 +127,8 @@ def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
         ({"out": tmp_path / "file" / "o.npz"}, OSError, "file"),
         ({"out": tmp_path}, IsADirectoryError, "is a folder"),
         ({"fps": 0.0}, ValueError, "--fps"),
+        ({"fps": 1e300}, ValueError, "--fps should be in 0.001..100000, found 1e.300"),
+        ({"seed": -1}, ValueError, "--seed should be in 0..2"),
         ({"cut_fps": -1.0}, ValueError, "--cut-fps"),
     ]
     for change, error, message in cases:
@@ -140,3 +143,39 @@ def test_a_folder_without_write_permission_is_an_error(script, raw, tmp_path):
     out = tmp_path / "locked" / "o.npz"
     with pytest.raises(PermissionError):
         script.prepare(script.Config(source="bandai_namco/2", manual_dir=raw, out=out))
+
+
+# Larger files than allowed stand for a full disk.
+FULL = """
+import resource, runpy, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def run_full(*arguments) -> tuple[int, str]:
+    """Exit status and last line of the script with almost no room to write."""
+    line = [sys.executable, "-c", FULL, str(SCRIPT), *map(str, arguments)]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert "Traceback" not in done.stderr
+    return done.returncode, done.stderr[done.stderr.rindex("error: ") :].strip()
+
+
+def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path):
+    out = tmp_path / "made" / "w.npz"
+    status, line = run_full("procedural", "--out", out)
+    assert (status, line) == (1, f"error: [Errno 27] File too large: '{out}'")
+    assert os.listdir(out.parent) == []
+    text = test_builders.lafan_text(0)
+    head, rows = text.split("Frame Time", 1)
+    rows = rows.split("\r\n", 1)
+    text = head.replace("Frames: 5", "Frames: 1000") + "Frame Time" + rows[0] + "\r\n"
+    raw = test_builders.put(
+        tmp_path / "raw", {"walk1_subject1.bvh": text + 200 * rows[1]}
+    )
+    status, line = run_full("lafan1", "--manual-dir", raw, "--out", out)
+    assert status == 1 and "\n" not in line
+    assert line.startswith(f"error: cannot write {out.parent}/tfds/lafan1/1.0.0: ")
+    assert not [path for path in out.parent.rglob("*") if path.is_file()]

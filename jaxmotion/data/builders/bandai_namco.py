@@ -101,7 +101,7 @@ def _read_lists(folder: Path, number: str, stem: str) -> dict[str, list[str]]:
     lists = {
         PurePosixPath(path.replace("\\", "/")).name: [
             line.strip().removeprefix(f"dataset-{number}_")
-            for line in data.decode().splitlines()
+            for line in base.read_text(path, data).splitlines()
             if line.strip()
         ]
         for path, data in base.read_files(folder, ("_label.txt",), stem=stem)
@@ -133,7 +133,7 @@ def read_labels(path: str, data: bytes, names: dict[str, list[str]]) -> dict[str
             if not 0 <= int(ids[field]) < len(names[field]):
                 raise ValueError(f"{field} {ids[field]} is not in the label list")
             labels[field] = names[field][int(ids[field])]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(
             f"{path}: expected ids of content and style ({error})"
         ) from None

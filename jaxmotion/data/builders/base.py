@@ -7,15 +7,15 @@ centred, turned or put on the floor.
 """
 
 import os
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import jax.numpy as jnp
 import numpy as np
 import tensorflow_datasets as tfds
 from jaxtyping import Float
 
+from jaxmotion import files
 from jaxmotion.data.clips import Clips, clips_from_motions
 from jaxmotion.motion.skeleton import Motion, Skeleton
 
@@ -79,7 +79,18 @@ class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
         )
 
     def _split_generators(self, dl_manager):
-        return {"train": self._generate_examples(Path(dl_manager.manual_dir))}
+        examples = self._generate_examples(Path(dl_manager.manual_dir))
+        return {"train": _unique(examples)}
+
+
+def _unique(examples: Iterator[tuple[str, dict]]) -> Iterator[tuple[str, dict]]:
+    """The examples; raises when a name comes for the second time."""
+    names = set()
+    for name, features in examples:
+        if name in names:
+            raise ValueError(f"two clips have the name {name!r}, expected one")
+        names.add(name)
+        yield name, features
 
 
 def motion_from_matrices(
@@ -134,8 +145,19 @@ def example(
     return name, features
 
 
+def _claim(places: dict[str, str], name: str, path: str, unique: bool) -> None:
+    """Raises if another file has that name."""
+    if unique and name in places:
+        raise ValueError(f"two files are named {name!r}: {places[name]} and {path}")
+    places[name] = path
+
+
 def read_files(
-    manual_dir: str | os.PathLike, suffixes: tuple[str, ...], *, stem: str = ""
+    manual_dir: str | os.PathLike,
+    suffixes: tuple[str, ...],
+    *,
+    stem: str = "",
+    unique: bool = True,
 ) -> Iterator[tuple[str, bytes]]:
     """Files of a folder or, where it has none of the kind, of the zips in it.
 
@@ -144,13 +166,14 @@ def read_files(
       suffixes: Wanted ends of file names, lower case.
       stem: Only files below a folder of that name (in the path or inside the zip), or
         in a zip named so.
+      unique: Whether files are told apart by their names alone, without folders.
 
     Yields:
       Path (for zips "archive.zip/member") and content, sorted by path.
 
     Raises:
       FileNotFoundError: if the folder is missing or has no such file.
-      ValueError: if a zip is damaged; names it.
+      ValueError: if a zip cannot be unpacked, or two files have one name; names them.
     """
     folder = Path(manual_dir)
     if not folder.is_dir():
@@ -162,21 +185,23 @@ def read_files(
         and path.is_file()
         and (not stem or stem in path.resolve().parts)
     ]
+    places: dict[str, str] = {}
     if loose:
+        for path in loose:
+            _claim(places, path.name, str(path), unique)
         for path in loose:
             yield str(path), path.read_bytes()
         return
-    archives = [path for path in sorted(folder.rglob("*.zip")) if stem in path.name]
     found = False
-    for path in archives:
-        try:
-            with zipfile.ZipFile(path) as archive:
-                for member in sorted(archive.namelist()):
-                    if member.lower().endswith(suffixes):
-                        found = True
-                        yield f"{path}/{member}", archive.read(member)
-        except zipfile.BadZipFile as error:
-            raise ValueError(f"{path}: damaged zip ({error})") from None
+    for path in sorted(folder.rglob("*.zip")):
+        if stem not in path.name:
+            continue
+        members = files.read_members(path, lambda name: name.lower().endswith(suffixes))
+        for member, data in members:
+            found = True
+            name = PurePosixPath(member.replace("\\", "/")).name
+            _claim(places, name, f"{path}/{member}", unique)
+            yield f"{path}/{member}", data
     if not found:
         raise FileNotFoundError(
             f"{str(folder)!r} has neither files *{', *'.join(suffixes)} nor a zip with "
@@ -202,6 +227,7 @@ def prepare(
 
     Raises:
       FileNotFoundError: if the folder or its files are missing.
+      OSError: if the builder's folder cannot be written, as on a full disk.
       ValueError: if a file is malformed; names it.
     """
     folder = Path(manual_dir)
@@ -216,8 +242,24 @@ def prepare(
     config = tfds.download.DownloadConfig(
         manual_dir=os.fspath(manual_dir), download_mode=mode
     )
-    builder.download_and_prepare(download_config=config)
+    try:
+        builder.download_and_prepare(download_config=config)
+    except RuntimeError as error:  # as the writer of array_record says it
+        line = str(error).splitlines()[0]
+        raise OSError(f"cannot write {builder.data_path}: {line}") from error
     return builder
+
+
+def read_text(path: str, data: bytes) -> str:
+    """Content of a text file.
+
+    Raises:
+      ValueError: if it is no UTF-8; names the file.
+    """
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not UTF-8 text (byte {error.start})") from None
 
 
 def _word(value) -> str:

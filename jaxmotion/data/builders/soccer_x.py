@@ -69,12 +69,12 @@ class SoccerX(ball_base.BallBuilder):
 
     def _generate_examples(self, folder: Path) -> Iterator[tuple[str, dict]]:
         skeleton = None
-        for path, data in base.read_files(folder, (_SKELETON,)):
+        for path, data in base.read_files(folder, (_SKELETON,), unique=False):
             if skeleton is not None:
                 raise ValueError(f"{path}: a second {_SKELETON}, expected one")
             skeleton = read_skeleton(path, data)
         found = False
-        for path, data in base.read_files(folder, (".npz",)):
+        for path, data in base.read_files(folder, (".npz",), unique=False):
             if not path.endswith(_SKELETON):
                 found = True
                 yield read_sequence(path, data, skeleton)

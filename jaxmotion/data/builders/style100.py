@@ -65,7 +65,7 @@ class Style100(base.MotionBuilder):
         tables = {
             PurePosixPath(path.replace("\\", "/")).name: (
                 path,
-                data.decode("utf-8-sig"),
+                base.read_text(path, data),
             )
             for path, data in base.read_files(folder, (".csv",))
         }
