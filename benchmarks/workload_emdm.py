@@ -45,7 +45,7 @@ def program(
             norm="pre",
         )
     params = emdm.init(jax.random.key(0), config)["generator"]
-    vectors = jax.nn.one_hot(jnp.arange(batch) % 12, 12)
+    vectors = emdm.action_vectors(jnp.arange(batch) % 12, 12)
     conditions = emdm.make_condition(vectors, config=config)
     at_once = chunk if chunk and batch >= 16 else batch
 

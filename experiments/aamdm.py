@@ -15,6 +15,8 @@ from typing import Annotated, Literal
 import jax
 import tyro
 from baselines import rows, tables
+from reports import aamdm as paper
+from reports import results, verdicts
 
 from jaxmotion.learning import loop
 from jaxmotion.motion import skeleton
@@ -208,9 +210,11 @@ def evaluate(args: Evaluate) -> None:
     loop.check_writable(out)
     run = aamdm_runs.load_run(args.run)
     table, report = tables.evaluate(run, args, out)
+    here = results.Measured(path=out / "metrics.json", rows=table, about=report)
+    report["claims"] = verdicts.lines(paper.TABLES, {paper.RUN: here})
     note = "div and fid are of joint positions in the character's axes: no recogniser."
     artifacts.write_table(out, table, report, (note,))
-    for line in report["orderings"]:
+    for line in report["claims"]:
         print(line)
 
 

@@ -94,6 +94,7 @@ def test_scripts_and_options_that_the_text_names():
     assert camdm.Config(num_joints=22, num_labels=8).num_steps == 8
     assert (default.guidance_scale, released.guidance_scale) == (0.7, 0.5)
     assert (default.guided_plans, released.guided_plans) == (1, 2)
+    assert (default.guide_start, released.guide_start) == (False, True)
     assert (default.reuse, released.reuse) == (15, 23)
     assert (default.replan_on_change, released.replan_on_change) == (True, False)
     assert (default.bias_position, released.bias_position) == (0.7, 0.4)

@@ -1,4 +1,4 @@
-"""AAMDM's tables 1 and 2, measured, and which orderings of the paper hold here."""
+"""AAMDM's tables 1 and 2, measured."""
 
 import json
 from pathlib import Path
@@ -151,43 +151,6 @@ def long_rollouts(
     return found
 
 
-def orderings(found: dict[str, Row]) -> list[str]:
-    """Which orderings of the paper's tables hold here."""
-
-    def value(row: str, column: str) -> float:
-        cell = found.get(row, {}).get(column)
-        return float("nan") if cell is None else cell.value
-
-    fid = {name: value(name, "fid") for name in rows.ALL}
-    ratio = value("aamdm", "fps") / value("amdm200", "fps")
-    diverged = value("polish0_draft3", "diverged_unbounded")
-    checks = {
-        "FID of AMDM200 < AAMDM < AMDM5": (
-            fid["amdm200"] < fid["aamdm"] < fid["amdm5"],
-            f"{fid['amdm200']:.3g}, {fid['aamdm']:.3g}, {fid['amdm5']:.3g}",
-        ),
-        "FID of AAMDM below LMM's and MVAE's": (
-            fid["aamdm"] < fid["lmm"] and fid["aamdm"] < fid["mvae"],
-            f"{fid['aamdm']:.3g}, {fid['lmm']:.3g}, {fid['mvae']:.3g}",
-        ),
-        "AAMDM at least 25 times as fast as AMDM200": (ratio >= 25, f"{ratio:.1f}"),
-        "no polishing steps diverge": (diverged > 0, f"{diverged:.0f} rollouts"),
-        "more polishing, lower FID (1, 2, 10)": (
-            fid["polish10_draft3"] < fid["aamdm"] < fid["polish1_draft3"],
-            f"{fid['polish1_draft3']:.3g}, {fid['aamdm']:.3g}, "
-            f"{fid['polish10_draft3']:.3g}",
-        ),
-        "FID without the embedding is the worst": (
-            fid["full_pose"] > np.nanmax([fid[k] for k in (*rows.TABLE_2, "aamdm")]),
-            f"{fid['full_pose']:.3g}",
-        ),
-    }
-    return [
-        f"{'reproduced' if holds else 'NOT reproduced'}: {claim} ({shown})"
-        for claim, (holds, shown) in checks.items()
-    ]
-
-
 def evaluate(
     run: aamdm_runs.Run, args: Any, out: Path
 ) -> tuple[dict[str, Row], dict[str, Any]]:
@@ -201,7 +164,6 @@ def evaluate(
     report = {
         "arguments": camdm_runs.arguments_json(args),
         "source": run.source,
-        "orderings": orderings(found),
         **provenance.provenance(),
     }
     if args.long_minutes and "aamdm" in steppers:

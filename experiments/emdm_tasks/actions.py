@@ -77,7 +77,7 @@ def make_judge(args: Any) -> Judge:
 
     conditional = run.config["task"] == "action"
     conditions = emdm.Condition(
-        vector=jax.nn.one_hot(wanted, number if conditional else 0),
+        vector=emdm.action_vectors(wanted, number if conditional else 0),
         keep=jnp.ones(wanted.shape, bool),
         mask=jnp.ones((*wanted.shape, run.train.frames), bool),
     )

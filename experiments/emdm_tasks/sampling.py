@@ -62,7 +62,7 @@ def _from_actions(args: Any, out: Path) -> None:
                 f"unknown action {action!r}: expected one of {', '.join(run.actions)}"
             )
     numbers = jnp.asarray([run.actions.index(a) for a in args.action], jnp.int32)
-    vectors = jax.nn.one_hot(numbers, len(run.actions))
+    vectors = emdm.action_vectors(numbers, len(run.actions))
     if not args.action:
         vectors = jnp.zeros((1, 0))
     motions = emdm_motion.to_motion(_generate(args, vectors, 1.0), run.representation)

@@ -13,7 +13,7 @@ RUN = Source(
 _NOTE = (
     "LaFAN1 in both; here its walks and runs, small networks, trainings of minutes. "
     "Rollouts are kept within the bounds of the data, but in the column of those that "
-    "diverge. The lines `orderings` in metrics.json compare values without intervals."
+    "diverge."
 )
 _FEATURES = "of joint positions; the paper does not say of what"
 DIV = Column(name="DIV", here="div", better="real", note=_FEATURES)

@@ -222,5 +222,24 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     return Decision(verdict="reproduced")
 
 
+def lines(tables: tuple[Table, ...], found: Found) -> list[str]:
+    """What became of every claim of some tables, one line each.
+
+    Args:
+      tables: The tables.
+      found: All that was measured.
+
+    Returns:
+      Verdict, claim, and what the verdict rests on.
+    """
+    shown = []
+    for table in tables:
+        for claim in table.claims:
+            made = decide(table, claim, found)
+            reason = f" ({made.reason})" if made.reason else ""
+            shown.append(f"{made.verdict}: {claim.words}{reason}")
+    return shown
+
+
 def _pairs(pairs: list[tuple[str, str]]) -> str:
     return "; ".join(f"{first} and {second}" for first, second in pairs)

@@ -106,7 +106,7 @@ def _load(job: Job, point: Point) -> emdm.Sample:
 def write_motion(job: Job, run: emdm_action.ActionRun, point: Point, out: Path) -> None:
     """One motion of the first action."""
     condition = emdm.Condition(
-        vector=jax.nn.one_hot(0, len(run.actions)),
+        vector=emdm.action_vectors(jnp.zeros((), int), len(run.actions)),
         keep=jax.numpy.ones((), bool),
         mask=jax.numpy.ones(run.train.frames, bool),
     )

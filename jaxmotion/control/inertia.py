@@ -111,73 +111,6 @@ def decay(
     )
 
 
-@jax.jit
-def inertialize_position(
-    previous: Float[Array, "*batch n"],
-    current: Float[Array, "*batch n"],
-    target: Float[Array, "*batch n"],
-    *,
-    remaining: Scalar,
-    dt: Scalar,
-) -> Float[Array, "*batch n"]:
-    """One tick of recursive inertialisation of positions.
-
-    Exactly as released: the target counts as standing still, only the part of the
-    displayed velocity along the difference is kept, and that velocity is a backward
-    difference, so that the offset fades later than (1), solved once, would have it.
-
-    Args:
-      previous: Displayed one tick before `current`.
-      current: Displayed last.
-      target: What to display next without inertialisation.
-      remaining: Seconds until the difference must be gone; at most zero: the target.
-      dt: Seconds a tick.
-
-    Returns:
-      What to display next.
-
-    Source: released code of CAMDM; Bollo 2018.
-    """
-    difference = current - target
-    length, unit, along, _ = _along_and_across(difference, (current - previous) / dt)
-    return target + unit * quintic(length, along, dt, duration=remaining)
-
-
-@jax.jit
-def inertialize_rotation(
-    previous: Float[Array, "*batch 3 3"],
-    current: Float[Array, "*batch 3 3"],
-    target: Float[Array, "*batch 3 3"],
-    *,
-    remaining: Scalar,
-    dt: Scalar,
-) -> Float[Array, "*batch 3 3"]:
-    """One tick of recursive inertialisation of rotations.
-
-    As `inertialize_position`, for the angle about the axis of the difference.
-
-    Args:
-      previous: Displayed one tick before `current`, rotation matrices.
-      current: Displayed last.
-      target: What to display next without inertialisation.
-      remaining: Seconds until the difference must be gone; at most zero: the target.
-      dt: Seconds a tick.
-
-    Returns:
-      What to display next.
-
-    Source: released code of CAMDM; Bollo 2018.
-    """
-    inverse = jnp.swapaxes(target, -1, -2)
-    now = rotation_vector.from_matrix(current @ inverse)
-    before = rotation_vector.nearest(
-        rotation_vector.from_matrix(previous @ inverse), now
-    )
-    length, unit, along, _ = _along_and_across(now, (now - before) / dt)
-    offset = unit * quintic(length, along, dt, duration=remaining)
-    return rotation_vector.to_matrix(offset) @ target
-
-
 def _position_seam(past: Array, chunk: Array, fps: float) -> tuple[Array, Array]:
     """Offset of the last displayed frame to the chunk, and its velocity."""
     step = chunk[..., 1, :] - chunk[..., 0, :]
@@ -221,8 +154,10 @@ def inertialize(
     Raises:
       ValueError: if either has fewer than two frames, or their fps differ.
 
-    Source: Bollo 2018; Chen et al. 2024 (CAMDM), released code. Differs: one offset
-      a chunk, of continuous velocity, instead of one a tick.
+    Source: Bollo 2018; Chen et al. 2024 (CAMDM), released code. Differs: one offset per
+      chunk, of continuous velocity. There it is solved anew in every tick for a target
+      that counts as standing still, so it fades later; only the velocity along the
+      difference is kept; and rotations that differ by less than 2 mrad jump.
     """
     for name, motion in (("past", past), ("chunk", chunk)):
         if motion.root_position.shape[-2] < 2:

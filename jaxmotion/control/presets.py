@@ -76,7 +76,7 @@ def preset_commands(
 
     Raises:
       ValueError: if there is no such preset (names those there are), the length is not
-        that of a tick at least, or the speed is negative.
+        that of a tick at least, or the speed or the label is negative.
     """
     if name not in PRESETS:
         raise ValueError(f"unknown preset {name!r}: there are {', '.join(PRESETS)}")
@@ -85,6 +85,8 @@ def preset_commands(
             f"{seconds} s at {fps} ticks a second and {speed} m/s: expected a tick or "
             "more, and a speed that is not negative"
         )
+    if label < 0:
+        raise ValueError(f"label is {label}, expected 0 or more")
     table = np.array(PRESETS[name]())
     ticks = round(seconds * fps)
     ends = np.cumsum(table[:, 0])

@@ -51,7 +51,9 @@ def confidence_interval(
       samples: For example one value a seed or a clip.
       level: Probability that the interval holds the mean, in (0, 1).
       method: Student's "t", right for few samples of a Gaussian; or "normal", the
-        1.96 of the literature on text to motion.
+        1.96 of the literature on text to motion. Both take the deviation with n - 1
+        (ddof=1); the released scripts of text to motion divide by n (NumPy's default),
+        so their half widths are sqrt(1 - 1 / n) of "normal": 2.5 % less for n = 20.
 
     Returns:
       Mean, and mean minus and plus the half width.

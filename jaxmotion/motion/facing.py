@@ -1,7 +1,10 @@
 """Which way a pose faces on the ground.
 
 CAMDM takes the facing from the hips alone: with across = left hip - right hip in the
-world, forward = across x up. Only the chain from the root to the hips is needed.
+world, forward = across x up. Only the chain from the root to the hips is needed. So
+are its training data made; its Unity run-time takes the forward axis of the root joint
+instead, which differed from the hips by 0.5 degrees on average where the two were
+compared (95th percentile 1.8, at most 7.4).
 """
 
 import jax

@@ -26,6 +26,25 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 
+def known_labels(
+    labels: Int[Array, "*batch"], number: int, *, what: str = "labels"
+) -> Int[Array, "*batch"]:
+    """Labels, refused or clipped where they are not in 0..number - 1.
+
+    A concrete label out of range is refused; a traced one, whose value is not known, is
+    taken for the nearest. (JAX's own gather would make NaN of it.)
+
+    Raises:
+      ValueError: names the range, `what`, and the labels found.
+    """
+    if not isinstance(labels, jax.core.Tracer):
+        found = np.asarray(labels)
+        low, high = found.min(), found.max()
+        if low < 0 or high >= number:
+            raise ValueError(f"{what} are in {low}..{high}, expected 0..{number - 1}")
+    return jnp.clip(labels, 0, number - 1)
+
+
 def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
     """Table of sinusoidal position codes: sine on even channels, cosine on odd.
 

@@ -153,6 +153,20 @@ def style_speeds(clips: Clips, *, field: str) -> Float[Array, " labels"]:
     return jnp.asarray([np.median(x) if x.size else 0.0 for x in found], jnp.float32)
 
 
+def check_labels(labels: np.ndarray | Array, model: Model) -> None:
+    """Raises unless labels are styles of a model; compiled code cannot.
+
+    Raises:
+      ValueError: names the range and the labels found.
+    """
+    found, last = np.asarray(labels), len(model.labels) - 1
+    if found.size and (found.min() < 0 or found.max() > last):
+        raise ValueError(
+            f"labels are in {found.min()}..{found.max()}, expected 0..{last} "
+            f"({', '.join(model.labels)})"
+        )
+
+
 def start_states(
     clips: Clips, model: Model, labels: np.ndarray, *, field: str, seed: int
 ) -> camdm_control.CharacterState:
@@ -171,13 +185,15 @@ def start_states(
       States, batch axis first.
 
     Raises:
-      ValueError: if a style has no clip that is long enough; names it.
+      ValueError: if a label is none of the model's, or a style has no clip that is long
+        enough; names it.
     """
     past = model.config.past
     index = windows.window_index(clips, past, short="skip")
     owner = np.asarray(clips.labels[field])[np.asarray(index.clips)]
     generator = np.random.default_rng(seed)
     starts = []
+    check_labels(labels, model)
     for label in labels:
         known = np.flatnonzero(owner == label)
         if known.size == 0:
@@ -244,8 +260,9 @@ def steered_rollouts(
       Frames [characters, ticks, ...].
 
     Raises:
-      ValueError: if the chunk is not positive.
+      ValueError: if the chunk is not positive, or a label is none of the model's.
     """
+    check_labels(commands.label, model)
     number = commands.label.shape[0]
     if chunk is not None:
         if chunk < 1:

@@ -116,7 +116,7 @@ def make_task(
         motions = emdm_data.sample_motions(key_motion, data, actions)
         return emdm_loss.Batch(
             x_0=emdm_motion.to_features(motions, representation),
-            vector=jax.nn.one_hot(actions, number),
+            vector=emdm.action_vectors(actions, number),
             mask=jnp.ones((size, data.frames), bool),
         )
 

@@ -6,11 +6,13 @@ and the autoencoder's loss, which looks at poses in their own channels and, thro
 forward kinematics F, in the character's axes:
 
     L_val = |y' - y| + |F(y') - F(y)|,  L_vel = the same of frame differences a second,
-    L_reg = |z|.
+    L_reg = |z|^2 + |z| + the differences of z.
 
 Source: Li et al. 2024 (AAMDM), section 3.1, eq. 1-4. Norms, weights and normalisation
 are those of Learned Motion Matching (Holden et al. 2020, released code), since the
-paper gives none.
+paper gives none. So are terms that its equations do not have: differences of local
+positions and rotations beside eq. 2's of F, and the latent's |z| and differences beside
+eq. 3's square.
 """
 
 import dataclasses

@@ -158,7 +158,8 @@ def replan(
     """
     frame = plan_frame(bones, state.past, config=config)
     wanted = wanted_trajectory(bones, state, command, config=config, control=control)
-    left = jnp.where(is_new_style(state, command), control.guided_plans, state.guided)
+    is_new = is_new_style(state, command, control=control)
+    left = jnp.where(is_new, control.guided_plans, state.guided)
     condition = camdm.Condition(
         past=camdm.to_features(features.to_frame(state.past, frame), config=config),
         trajectory=trajectory.to_local(wanted, frame),
@@ -218,7 +219,7 @@ def advance(
         planned=state.cursor == 0,
     )
     # A style that changes while the old plan still plays arms the next plans.
-    armed = is_new_style(state, command) & (state.cursor > 0)
+    armed = is_new_style(state, command, control=control) & (state.cursor > 0)
     return dataclasses.replace(
         state,
         past=past,

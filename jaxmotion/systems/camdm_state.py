@@ -27,6 +27,8 @@ class Control:
       guidance_scale: Of the past after a change of style (paper 0.7, code 0.5).
       guided_plans: Plans that are guided after a change of style (paper: "when the
         style label has just changed", so 1; code 2).
+      guide_start: The first plans after the start are guided as those after a change of
+        style are (released code: its counter starts full).
       half_life: Of the springs of velocity and facing, seconds (orangeduck 0.27).
       bias_position: Exponent of the blend of positions (released scene 0.7, code
         0.4).
@@ -43,6 +45,7 @@ class Control:
     reuse: int = 15
     guidance_scale: float = 0.7
     guided_plans: int = 1
+    guide_start: bool = False
     half_life: float = 0.27
     bias_position: float = 0.7
     bias_facing: float = 2.2
@@ -57,6 +60,7 @@ RELEASED = Control(
     reuse=23,
     guidance_scale=0.5,
     guided_plans=2,
+    guide_start=True,
     bias_position=0.4,
 )
 
@@ -167,17 +171,12 @@ def _changed(state: CharacterState, command: trajectory.Command) -> Bool[Array, 
     )
 
 
-def is_new_style(state: CharacterState, command: trajectory.Command) -> Bool[Array, ""]:
-    """Whether a command changes the style (the first one does not).
-
-    Args:
-      state: The character's state.
-      command: What the user wants now.
-
-    Returns:
-      A truth value.
-    """
-    return (state.command.label != command.label) & (state.command.label >= 0)
+def is_new_style(
+    state: CharacterState, command: trajectory.Command, *, control: Control
+) -> Bool[Array, ""]:
+    """Whether a command changes the style; the first one does with `guide_start`."""
+    started = (state.command.label >= 0) | control.guide_start
+    return (state.command.label != command.label) & started
 
 
 def urgency(
@@ -196,6 +195,8 @@ def urgency(
     need = (state.command.label < 0) | (state.cursor >= control.apply)
     if control.replan_on_change:
         need = need | _changed(state, command)
-    new_style = is_new_style(state, command) & (control.guided_plans > 0)
+    new_style = is_new_style(state, command, control=control) & (
+        control.guided_plans > 0
+    )
     guided = need & (new_style | (state.guided > 0))
     return need.astype(jnp.int32) + guided.astype(jnp.int32)

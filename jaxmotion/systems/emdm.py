@@ -24,12 +24,12 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.diffusion.schedule import Schedule
+from jaxmotion.networks import blocks, sequence_discriminator
 from jaxmotion.networks import generator as _generator
-from jaxmotion.networks import sequence_discriminator
 from jaxmotion.typing import Denoiser, Key, Params
 
 
@@ -144,6 +144,19 @@ class Condition:
     vector: Float[Array, "*batch condition"]
     keep: Bool[Array, "*batch"]
     mask: Bool[Array, "*batch frames"]
+
+
+def action_vectors(
+    actions: Int[Array, "*batch"], number: int
+) -> Float[Array, "*batch {number}"]:
+    """One-hot vectors of actions; in compiled code an unknown one is the nearest.
+
+    Raises:
+      ValueError: outside compiled code, if an action is not in 0..number - 1.
+    """
+    if number:
+        actions = blocks.known_labels(actions, number, what="actions")
+    return jax.nn.one_hot(actions, number)
 
 
 def make_condition(

@@ -90,47 +90,6 @@ def test_decay_is_the_same_in_every_coordinate_system():
     np.testing.assert_allclose(turned, given @ turn.T, atol=1e-5)
 
 
-# --- tick by tick ----------------------------------------------------------------
-
-
-def test_ticks_towards_a_moving_target_are_those_of_the_release():
-    # The oracle is the released recursion, with numbers along one line and one axis.
-    dt, duration = 1 / 30, 0.2
-    axis = np.array([0.6, 0.0, 0.8])
-    goals = 0.3 + 0.4 * np.arange(8) * dt
-    want = [1.2, 1.25]
-    for i, goal in enumerate(goals):
-        x, v = want[-1] - goal, (want[-1] - want[-2]) / dt
-        want.append(goal + oracle.quintic(x, v, dt, duration - i * dt))
-
-    def turn(angle):
-        return Rotation.from_rotvec(axis * angle).as_matrix().astype(np.float32)
-
-    p = [jnp.asarray(axis * s, jnp.float32) for s in want[:2]]
-    r = [jnp.asarray(turn(s)) for s in want[:2]]
-    for i, goal in enumerate(goals):
-        time = {"remaining": duration - i * dt, "dt": dt}
-        target = jnp.asarray(axis * goal, jnp.float32)
-        p.append(inertia.inertialize_position(*p[-2:], target, **time))
-        r.append(inertia.inertialize_rotation(*r[-2:], jnp.asarray(turn(goal)), **time))
-    np.testing.assert_allclose(np.stack(p) @ axis, want, atol=1e-5)
-    np.testing.assert_allclose(np.stack(r), [turn(s) for s in want], atol=1e-5)
-    np.testing.assert_allclose(want[-2:], goals[-2:], atol=1e-9)
-
-
-def test_tick_with_no_time_left_shows_the_target():
-    target = jnp.array([1.0, 2.0, 3.0])
-    got = inertia.inertialize_position(
-        jnp.zeros(3), jnp.ones(3), target, remaining=0.0, dt=1 / 30
-    )
-    np.testing.assert_array_equal(got, target)
-    turn = rotation.matrix_from_yaw(jnp.float32(2.0))
-    got = inertia.inertialize_rotation(
-        jnp.eye(3), jnp.eye(3), turn, remaining=-0.1, dt=1 / 30
-    )
-    np.testing.assert_allclose(got, turn, atol=1e-6)
-
-
 # --- chunks ----------------------------------------------------------------------
 
 

@@ -77,6 +77,7 @@ def test_stop_and_go_stands_two_seconds_of_five():
         (dict(seconds=float("nan")), "nan s"),
         (dict(fps=-30.0), "-30.0 ticks"),
         (dict(speed=-1.0), "-1.0 m/s"),
+        (dict(label=-1), "label is -1"),
     ],
 )
 def test_bad_arguments_are_named(bad, message):

@@ -185,6 +185,35 @@ def test_a_claim_comes_out_each_way(decide):
     assert decide(dict(a=near(2.0), b=near(1.0))).verdict == "not reproduced"
 
 
+def test_claims_in_lines_say_what_was_not_run(load):
+    """No row, all rows as the paper prints them, and one whose value is not finite."""
+    paper, results = load("reports.aamdm"), load("reports.results")
+    verdicts = load("reports.verdicts")
+
+    def shown(rows):
+        made = results.Measured(path=Path("here"), rows=rows, about={})
+        return verdicts.lines(paper.TABLES, {paper.RUN: made if rows else None})
+
+    claims = sum(len(table.claims) for table in paper.TABLES)
+    assert len(shown({})) == claims
+    assert all(line.startswith("not run: ") for line in shown({}))
+    rows = {}
+    for table in paper.TABLES:
+        for row in table.rows:
+            for column, value in zip(table.columns, row.paper, strict=True):
+                # As if times were exact, and most diverged without polishing.
+                if column.kind == "count":
+                    value = 9.0 if row.name == "0 + 3" else 0.0
+                elif value is None:
+                    continue
+                made = Cell(value=value, low=value, high=value, samples=16)
+                rows.setdefault(row.here, {})[column.here] = made
+    assert all(line.startswith("reproduced: ") for line in shown(rows))
+    rows["amdm200"]["fid"] = Cell(value=math.nan)
+    found = shown(rows)[0]
+    assert found.startswith("not decided: FID of AMDM200") and "nan" not in found
+
+
 def test_what_is_not_finite_or_has_no_interval_decides_nothing(decide):
     rows = dict(a=near(1.0), b=near(2.0))
     assert decide(rows | dict(c=cell(None))).verdict == "not decided"

@@ -135,6 +135,20 @@ def test_every_argument_matters(name):
 
 
 @pytest.mark.parametrize("name", ["transformer", "mlp", "single token"])
+def test_unknown_labels_are_refused_or_when_compiled_the_nearest(name):
+    *args, _, keep = arguments(2)
+    with_labels = lambda *labels: (*args, jnp.array(labels), keep)  # noqa: E731
+    for labels in ((0, 3), (-1, 2)):
+        found = forward(name)(*with_labels(*labels))
+        nearest = forward(name)(*with_labels(*np.clip(labels, 0, 2)))
+        np.testing.assert_array_equal(found, nearest)
+        assert np.isfinite(found).all()
+        message = f"labels are in {min(labels)}..{max(labels)}, expected 0..2"
+        with pytest.raises(ValueError, match=message):
+            KINDS[name].apply(parameters(name), *with_labels(*labels))
+
+
+@pytest.mark.parametrize("name", ["transformer", "mlp", "single token"])
 def test_a_dropped_past_is_a_past_of_zeros(name):
     *args, _ = arguments()
     dropped = forward(name)(*args, jnp.zeros((), bool))

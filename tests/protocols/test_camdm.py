@@ -169,6 +169,22 @@ def test_a_chunk_that_does_not_divide_is_made_smaller(run):
         steered(0)
 
 
+@pytest.mark.parametrize("label", [-1, 2])
+def test_a_style_that_the_model_has_not_is_refused(run, label):
+    message = rf"labels are in {min(label, 0)}..{max(label, 1)}, expected 0..1 \("
+    labels = np.array([0, 1, label])
+    with pytest.raises(ValueError, match=message):
+        protocol.start_states(run.train, run.model, labels, field="style", seed=0)
+    both, speeds = labels[:2], np.ones(2)
+    good = protocol.preset_batch("forward", both, speeds, seconds=1.0, fps=30.0)
+    bad = dataclasses.replace(good, label=good.label.at[0, 3].set(label))
+    states = protocol.start_states(run.train, run.model, both, field="style", seed=0)
+    with pytest.raises(ValueError, match=message):
+        protocol.steered_rollouts(
+            run.params, jax.random.key(0), states, bad, model=run.model
+        )
+
+
 def test_the_walker_as_a_rollout_goes_where_its_command_says():
     frames = samples.walking(LABELS[:2], seconds=6.0)
     motion = skeleton.Motion(

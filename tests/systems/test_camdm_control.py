@@ -150,6 +150,20 @@ def test_guidance_only_in_the_first_plans_after_a_style_change(
         assert set(heights(frames, other)) <= {-1.0, 1.0}
 
 
+def test_a_released_character_starts_with_guided_plans(bones, use):
+    """Two of them; the first style is then no change of style without the option."""
+    use(scale_as_height)
+    released = camdm_control.RELEASED
+    assert released.guide_start and released.guided_plans == 2
+    for start, ticks in ((True, range(10)), (False, ())):
+        control = dataclasses.replace(
+            released, apply=5, reuse=6, seam=0.0, guide_start=start
+        )
+        frames = roll(bones, commands_of(*steady(1, 15)), control)[1]
+        want = [np.float32(0.5) if i in ticks else -1 for i in range(15)]
+        assert heights(frames, 0) == want
+
+
 def test_a_second_change_guides_again(bones, use):
     use(scale_as_height)
     velocity, facing, label = steady(1, 20)

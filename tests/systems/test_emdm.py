@@ -268,6 +268,18 @@ def test_conditions_have_lengths():
     assert whole.mask.shape == (3, 6) and whole.mask.all()
 
 
+def test_unknown_actions_are_refused_or_when_compiled_the_nearest():
+    make = jax.jit(emdm.action_vectors, static_argnums=1)
+    found = make(jnp.array([-1, 0, 3, 4]), 4)
+    np.testing.assert_array_equal(found, np.eye(4)[[0, 0, 3, 3]])
+    np.testing.assert_array_equal(emdm.action_vectors(jnp.arange(4), 4), np.eye(4))
+    for action in (-1, 4):
+        with pytest.raises(ValueError, match=f"actions are in .*{action}.*0..3"):
+            emdm.action_vectors(jnp.array([2, action]), 4)
+    # Motions from nothing.
+    assert emdm.action_vectors(jnp.arange(3), 0).shape == (3, 0)
+
+
 @pytest.mark.parametrize(
     ("width", "lengths", "message"),
     [
