@@ -6,6 +6,7 @@ from pathlib import Path
 
 import emdm as script
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxmotion.motion import skeleton
