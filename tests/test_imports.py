@@ -14,7 +14,8 @@ MAY_IMPORT = {
     "files.py": set(),
     "diffusion": {"typing"},
     "motion": {"typing"},
-    "networks": {"typing"},
+    # files: published weights (networks/weight_files.py).
+    "networks": {"typing", "files"},
     "evaluation": {"typing", "motion"},
     # networks: the recogniser is trained and used in learning/recognition.py.
     "learning": {"typing", "files", "motion", "networks"},
@@ -23,7 +24,15 @@ MAY_IMPORT = {
     # Sentences to vectors: tokenizers, weights from a folder, and their network.
     "text": {"typing", "files", "networks"},
     # learning.checkpoint: a model is loaded as a value (systems/camdm_model.py).
-    "systems": {"typing", "diffusion", "motion", "networks", "control", "learning"},
+    "systems": {
+        "typing",
+        "files",
+        "diffusion",
+        "motion",
+        "networks",
+        "control",
+        "learning",
+    },
     # What an experiment measures and leaves behind: a method, its data, its pictures.
     "protocols": {
         "typing",
@@ -54,9 +63,7 @@ DOORS = {
     "PIL": ("jaxmotion/viz/",),
     "tqdm": ("jaxmotion/learning/loop.py", "experiments/", "benchmarks/"),
     "tyro": ("experiments/", "benchmarks/"),
-    # Published weights of PyTorch, read without running code (weights_only).
-    "torch": ("benchmarks/", "jaxmotion/learning/published.py"),
-    "safetensors": ("jaxmotion/text/", "jaxmotion/learning/published.py"),
+    "torch": ("benchmarks/",),
     "tokenizers": ("jaxmotion/text/",),
     "wordllama": ("jaxmotion/text/",),
 }

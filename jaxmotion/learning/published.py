@@ -1,31 +1,27 @@
-"""The published text-motion evaluator: PyTorch's weights as Flax parameters.
+"""Published evaluators: their weights as parameters, and what they read.
 
-A layer of PyTorch is transposed: `weight` [out, in] becomes `kernel` [in, out], that of
-a convolution [out, in, width] becomes [width, in, out]. A GRU keeps its gates r, z, n
-one below the other; the two biases of r and of z are added, those of n stay apart,
-because one of them is inside the product with r (see networks/matching.py).
-
-Source: released code and weights of Guo et al. 2022 (T2M).
+Source: released code and weights of Guo et al. 2022 (T2M), Guo et al. 2020
+(Action2Motion, as released with EMDM), and Chen et al. 2024 (CAMDM).
 """
 
 import os
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion.learning.action_recognition import ActionRecognizerConfig
 from jaxmotion.learning.matching import TAGS, WORD_SIZE, MatcherConfig
+from jaxmotion.networks.torch_layers import Layers
+from jaxmotion.networks.weight_files import Stored, arrays, read_weights
 from jaxmotion.typing import Params
 
 _MODULES = ("movement_encoder", "motion_encoder", "text_encoder")
-Weights = dict[str, np.ndarray]
 
 
 def load_matcher(
     path: str | os.PathLike, *, config: MatcherConfig | None = None
 ) -> Params:
-    """Reads published weights of the evaluator; runs no code from the file.
+    """Reads published weights of the text-motion evaluator; runs no code of the file.
 
     Means and deviations of the features are files of their own there.
 
@@ -40,150 +36,148 @@ def load_matcher(
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ImportError: if the package that reads such files is missing.
+      ValueError: if the file is damaged or foreign, or arrays are missing, unknown or
+        of another shape; names them all.
+    """
+    path, c = os.fspath(path), config or MatcherConfig()
+    weights = arrays(read_weights(path))
+    if not path.endswith(".safetensors"):  # with optimizers and counters beside them
+        kept = {x: y for x, y in weights.items() if x.split(".")[0] in _MODULES}
+        found = {x.split(".")[0] for x in kept}
+        if found != set(_MODULES):
+            raise ValueError(
+                f"{path} should have {', '.join(_MODULES)}, found {sorted(found)}"
+            )
+        weights = kept
+    layers = Layers(path, weights, what="the evaluator")
+    width = c.movement_width
+    params = {
+        "movement": {
+            "convolution_1": layers.convolution(
+                "movement_encoder.main.0", c.num_features, width, 4
+            ),
+            "convolution_2": layers.convolution(
+                "movement_encoder.main.3", width, width, 4
+            ),
+            "out": layers.linear("movement_encoder.out_net", width, width),
+        },
+        "motion": _sequence(layers, "motion_encoder", width, c.motion_width, c),
+        "text": {
+            "tags": layers.linear("text_encoder.pos_emb", len(TAGS), WORD_SIZE),
+            "sequence": _sequence(layers, "text_encoder", WORD_SIZE, c.text_width, c),
+        },
+    }
+    return layers.finish(params)
+
+
+def _sequence(
+    layers: Layers, name: str, channels: int, width: int, config: MatcherConfig
+) -> dict[str, Any]:
+    """A `SequenceEncoder`."""
+    return {
+        "input": layers.linear(f"{name}.input_emb", channels, width),
+        "start": layers.take(f"{name}.hidden", 2, 1, width)[:, 0],
+        "forward": layers.gru(f"{name}.gru", "l0", width, width),
+        "backward": layers.gru(f"{name}.gru", "l0_reverse", width, width),
+        "hidden": layers.linear(f"{name}.output_net.0", 2 * width, width),
+        "norm": layers.norm(f"{name}.output_net.1", width),
+        "out": layers.linear(f"{name}.output_net.3", width, config.embedding),
+    }
+
+
+def _state(content: dict[str, Any], field: str) -> dict[str, Stored]:
+    """Arrays of a state dict, which may be under a field or be the whole file."""
+    inner = content.get(field)
+    return arrays(inner if isinstance(inner, dict) else content)
+
+
+def load_action_recognizer(
+    path: str | os.PathLike,
+) -> tuple[Params, ActionRecognizerConfig]:
+    """Reads the published action recognizer (humanact12_gru.tar); runs no code.
+
+    What it looks at is in `action_recognition.released_input`.
+
+    Args:
+      path: A file of PyTorch with its state dict, perhaps under "model".
+
+    Returns:
+      Parameters of `ActionRecognizer`, and its size.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
       ValueError: if the file is damaged or foreign, or arrays are missing, unknown or
         of another shape; names them all.
     """
     path = os.fspath(path)
-    if not os.path.exists(path):
-        raise FileNotFoundError(f"no weights file {path!r}")
-    read = _read_safetensors if path.endswith(".safetensors") else _read_torch
-    weights = read(path)
-    _check(path, weights, _shapes(config or MatcherConfig()))
+    what = "the action recognizer"
+    layers = Layers(path, _state(read_weights(path), "model"), what=what)
+    gates, channels = layers.shape("recurrent.weight_ih_l0", 2)
+    features, hidden = layers.shape("linear1.weight", 2)
+    classes, _ = layers.shape("linear2.weight", 2)
+    if channels % 3:
+        raise ValueError(f"{path} does not fit {what}; {channels} inputs, not x, y, z")
     params = {
-        "movement": {
-            "convolution_1": _linear(weights, "movement_encoder.main.0"),
-            "convolution_2": _linear(weights, "movement_encoder.main.3"),
-            "out": _linear(weights, "movement_encoder.out_net"),
-        },
-        "motion": _sequence(weights, "motion_encoder"),
-        "text": {
-            "tags": _linear(weights, "text_encoder.pos_emb"),
-            "sequence": _sequence(weights, "text_encoder"),
-        },
+        "lower": layers.gru("recurrent", "l0", channels, hidden),
+        "upper": layers.gru("recurrent", "l1", hidden, hidden),
+        "feature": layers.linear("linear1", hidden, features),
+        "out": layers.linear("linear2", features, classes),
     }
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
-
-
-def _read_torch(path: str) -> Weights:
-    """Arrays of a file of PyTorch, named as in safetensors."""
-    try:
-        import torch
-    except ImportError:
-        raise ImportError(
-            f'{path} needs PyTorch to read: pip install "jaxmotion[parity]"'
-        ) from None
-    try:
-        file = torch.load(path, weights_only=True, map_location="cpu")
-    except Exception as error:  # PyTorch has no kind of its own for this
-        raise _unreadable(path, error) from error
-    found = sorted(map(str, file)) if isinstance(file, dict) else type(file).__name__
-    if not isinstance(file, dict) or not set(_MODULES) <= set(file):
-        raise ValueError(f"{path} should have {', '.join(_MODULES)}, found {found}")
-    return {
-        f"{module}.{name}": tensor.float().numpy()
-        for module in _MODULES
-        for name, tensor in file[module].items()
-    }
-
-
-def _read_safetensors(path: str) -> Weights:
-    try:
-        from safetensors import numpy as safetensors
-    except ImportError:
-        raise ImportError(
-            f'{path} needs safetensors to read: pip install "jaxmotion[text]"'
-        ) from None
-    try:
-        return safetensors.load_file(path)
-    except Exception as error:  # an extension's error, not exported everywhere
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: str, error: Exception) -> ValueError:
-    return ValueError(
-        f"{path}: not a file of weights alone, or a damaged one "
-        f"({type(error).__name__})"
+    config = ActionRecognizerConfig(
+        num_classes=classes,
+        num_joints=channels // 3,
+        num_features=features,
+        hidden=hidden,
     )
+    return layers.finish(params), config
 
 
-def _shapes(config: MatcherConfig) -> dict[str, tuple[int, ...]]:
-    """Shape of each array of a published file."""
-    c = config
-    shapes = {}
+def load_style_classifier(
+    path: str | os.PathLike, *, frames: int = 60
+) -> tuple[Params, tuple[str, ...]]:
+    """Reads CAMDM's style classifier (100style_position_classifier.pth); runs no code.
 
-    def layer(name: str, *weight: int) -> None:
-        shapes[f"{name}.weight"] = weight
-        shapes[f"{name}.bias"] = weight[:1]
+    Args:
+      path: A file of PyTorch with its state dict under "state_dict", and "class_names".
+      frames: Frames of a window.
 
-    def sequence(name: str, channels: int, width: int) -> None:
-        shapes[f"{name}.hidden"] = (2, 1, width)
-        layer(f"{name}.input_emb", width, channels)
-        for direction in ("l0", "l0_reverse"):
-            for kind in ("ih", "hh"):
-                shapes[f"{name}.gru.weight_{kind}_{direction}"] = (3 * width, width)
-                shapes[f"{name}.gru.bias_{kind}_{direction}"] = (3 * width,)
-        layer(f"{name}.output_net.0", width, 2 * width)
-        layer(f"{name}.output_net.1", width)
-        layer(f"{name}.output_net.3", c.embedding, width)
+    Returns:
+      Parameters of `networks.recognizer.StyleClassifier`, and the names of the styles.
 
-    layer("movement_encoder.main.0", c.movement_width, c.num_features, 4)
-    layer("movement_encoder.main.3", c.movement_width, c.movement_width, 4)
-    layer("movement_encoder.out_net", c.movement_width, c.movement_width)
-    sequence("motion_encoder", c.movement_width, c.motion_width)
-    sequence("text_encoder", WORD_SIZE, c.text_width)
-    layer("text_encoder.pos_emb", WORD_SIZE, len(TAGS))
-    return shapes
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if the file is damaged or foreign, or arrays are missing, unknown or
+        of another shape; names them all.
+    """
+    path = os.fspath(path)
+    content = read_weights(path)
+    layers = Layers(path, _state(content, "state_dict"), what="the style classifier")
+    _, channels, _ = layers.shape("conv1.weight", 3)
+    classes, _ = layers.shape("fc3.weight", 2)
+    first, second, hidden, features = 64, 128, 1024, 512
+    names = content.get("class_names")
+    if not isinstance(names, list) or len(names) != classes:
+        raise ValueError(
+            f"{path}: field 'class_names' should list the names of {classes} styles"
+        )
 
+    def block(i: int, inputs: int, outputs: int) -> dict[str, Any]:
+        return {
+            "main": layers.convolution(f"conv{i}", inputs, outputs, 3),
+            "norm": layers.batch_norm(f"bn{i}", outputs),
+            "side": layers.convolution(f"residual1x1_{i}", inputs, outputs, 1),
+        }
 
-def _check(path: str, weights: Weights, shapes: dict[str, tuple[int, ...]]) -> None:
-    missing = sorted(set(shapes) - set(weights))
-    unknown = sorted(set(weights) - set(shapes))
-    differ = [
-        f"{name} {weights[name].shape} instead of {shape}"
-        for name, shape in sorted(shapes.items())
-        if name in weights and weights[name].shape != shape
-    ]
-    kinds = {"missing": missing, "unknown": unknown, "of another shape": differ}
-    told = [f"{kind}: {', '.join(names)}" for kind, names in kinds.items() if names]
-    if told:
-        raise ValueError(f"{path} does not fit the evaluator; " + "; ".join(told))
-
-
-def _linear(weights: Weights, name: str) -> dict[str, Any]:
-    """A linear layer or a convolution: the axes of its weight in reverse order."""
-    return {"kernel": weights[f"{name}.weight"].T, "bias": weights[f"{name}.bias"]}
-
-
-def _gru(weights: Weights, name: str, direction: str) -> dict[str, Any]:
-    """One direction of a GRU."""
-
-    def gates(array: str) -> list[np.ndarray]:
-        return np.split(weights[f"{name}.gru.{array}_{direction}"], 3)
-
-    cell = {}
-    for gate, w_i, w_h, b_i, b_h in zip(
-        "rzn",
-        *map(gates, ("weight_ih", "weight_hh", "bias_ih", "bias_hh")),
-        strict=True,
-    ):
-        apart = gate == "n"
-        cell[f"i{gate}"] = {"kernel": w_i.T, "bias": b_i if apart else b_i + b_h}
-        cell[f"h{gate}"] = {"kernel": w_h.T} | ({"bias": b_h} if apart else {})
-    return {"cell": cell}
-
-
-def _sequence(weights: Weights, name: str) -> dict[str, Any]:
-    """A `SequenceEncoder`."""
-    return {
-        "input": _linear(weights, f"{name}.input_emb"),
-        "start": weights[f"{name}.hidden"][:, 0],
-        "forward": _gru(weights, name, "l0"),
-        "backward": _gru(weights, name, "l0_reverse"),
-        "hidden": _linear(weights, f"{name}.output_net.0"),
-        "norm": {
-            "scale": weights[f"{name}.output_net.1.weight"],
-            "bias": weights[f"{name}.output_net.1.bias"],
-        },
-        "out": _linear(weights, f"{name}.output_net.3"),
+    fc1 = layers.linear("fc1", second * frames, hidden)
+    # PyTorch flattens [channels, frames], we [frames, channels].
+    kernel = fc1["kernel"].reshape(second, frames, hidden).swapaxes(0, 1)
+    params = {
+        "convolution_1": block(1, channels, first),
+        "convolution_2": block(2, first, second),
+        "hidden": {"kernel": kernel.reshape(-1, hidden), "bias": fc1["bias"]},
+        "hidden_norm": layers.batch_norm("bn3", hidden),
+        "feature": layers.linear("fc2", hidden, features),
+        "feature_norm": layers.batch_norm("bn4", features),
+        "out": layers.linear("fc3", features, classes),
     }
+    return layers.finish(params), tuple(map(str, names))

@@ -3,15 +3,44 @@
 Two residual convolutions over time, then three linear layers; the 512 activations
 before the last are the features. Differs from the released one: layer and group norms
 stand in for batch norms, so that a prediction does not depend on its batch and the
-network has no state beside its parameters.
+network has no state beside its parameters. `StyleClassifier` is the released one after
+its training, for published weights.
 
 Source: released feature extractor of CAMDM (Chen et al. 2024).
 """
 
 import flax.linen as nn
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmotion.networks.convolution import convolve
+
+
+class InferenceBatchNorm(nn.Module):
+    """Batch norm whose statistics are parameters, as training left them.
+
+    Attributes:
+      channels: Channels, the last axis.
+    """
+
+    channels: int
+
+    def setup(self):
+        """Makes the four vectors."""
+        zeros, ones = nn.initializers.zeros, nn.initializers.ones
+        shape = (self.channels,)
+        self.mean = self.param("mean", zeros, shape)
+        self.variance = self.param("variance", ones, shape)
+        self.scale = self.param("scale", ones, shape)
+        self.bias = self.param("bias", zeros, shape)
+
+    def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Standardizes each channel, then scales and shifts it."""
+        factor = self.scale * jax.lax.rsqrt(self.variance + 1e-5)
+        shift = self.bias - self.mean * factor
+        factor, shift = (jnp.broadcast_to(v, x.shape) for v in (factor, shift))
+        return x * factor + shift
 
 
 class ResidualConvolution(nn.Module):
@@ -19,14 +48,18 @@ class ResidualConvolution(nn.Module):
 
     Attributes:
       channels: Output channels.
+      frozen: Batch norm in inference mode in place of group norm.
     """
 
     channels: int
+    frozen: bool = False
 
     def setup(self):
         """Makes the two convolutions and the norm."""
         self.main = nn.Conv(self.channels, (3,), conv_general_dilated=convolve)
-        self.norm = nn.GroupNorm(8)
+        self.norm = (
+            InferenceBatchNorm(self.channels) if self.frozen else nn.GroupNorm(8)
+        )
         self.side = nn.Conv(self.channels, (1,), conv_general_dilated=convolve)
 
     def __call__(
@@ -50,22 +83,29 @@ class Recognizer(nn.Module):
       num_classes: Classes.
       num_features: Width of the feature layer.
       dropout: Rate after the convolutions.
+      frozen: Batch norms in inference mode in place of layer and group norms.
     """
 
     num_classes: int
     num_features: int = 512
     dropout: float = 0.5
+    frozen: bool = False
 
     def setup(self):
         """Makes the layers."""
-        self.convolution_1 = ResidualConvolution(64)
-        self.convolution_2 = ResidualConvolution(128)
+        self.convolution_1 = ResidualConvolution(64, self.frozen)
+        self.convolution_2 = ResidualConvolution(128, self.frozen)
         self.hidden = nn.Dense(1024)
-        self.hidden_norm = nn.LayerNorm(epsilon=1e-5)
+        self.hidden_norm = self._norm(1024)
         self.feature = nn.Dense(self.num_features)
-        self.feature_norm = nn.LayerNorm(epsilon=1e-5)
+        self.feature_norm = self._norm(self.num_features)
         self.out = nn.Dense(self.num_classes)
         self.drop = nn.Dropout(self.dropout)
+
+    def _norm(self, channels: int) -> nn.Module:
+        if self.frozen:
+            return InferenceBatchNorm(channels)
+        return nn.LayerNorm(epsilon=1e-5)
 
     def __call__(
         self, x: Float[Array, "batch frames channels"], *, train: bool = False
@@ -85,3 +125,9 @@ class Recognizer(nn.Module):
         x = nn.leaky_relu(self.hidden_norm(self.hidden(x)))
         features = nn.leaky_relu(self.feature_norm(self.feature(x)))
         return features, self.out(features)
+
+
+class StyleClassifier(Recognizer):
+    """The released recognizer; its input is `learning.recognition.released_input`."""
+
+    frozen: bool = True

@@ -1,9 +1,11 @@
 """CLIP's text tower from a local folder in the layout of the Hugging Face hub.
 
-The folder holds model.safetensors, config.json and tokenizer.json; the image tower in
-the weights, if any, is not read. Nothing is downloaded.
+The folder holds model.safetensors, config.json and tokenizer.json, or in place of the
+first two OpenAI's own file, such as ViT-B-32.pt. The image tower in the weights, if
+any, is not read, and no code of theirs is run. Nothing is downloaded.
 
-Source: layout of the released ViT-B/32 on the hub (openai/clip-vit-base-patch32).
+Source: layout of the released ViT-B/32 on the hub (openai/clip-vit-base-patch32), and
+of OpenAI's TorchScript archives.
 """
 
 import dataclasses
@@ -21,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.networks.clip import EPSILON, ClipText
+from jaxmotion.networks.weight_files import Stored, arrays, read_weights
 from jaxmotion.text import files
 from jaxmotion.typing import Params
 
@@ -60,6 +63,21 @@ _IN_LAYER = {
     "norm_1": "layer_norm1",
     "norm_2": "layer_norm2",
 }
+# What OpenAI's file calls those.
+_OPENAI = {
+    "token_embedding.weight": "text_model.embeddings.token_embedding.weight",
+    "positional_embedding": "text_model.embeddings.position_embedding.weight",
+    "ln_final.weight": "text_model.final_layer_norm.weight",
+    "ln_final.bias": "text_model.final_layer_norm.bias",
+}
+_OPENAI_IN_LAYER = {
+    "attn.out_proj": "self_attn.out_proj",
+    "mlp.c_fc": "mlp.fc1",
+    "mlp.c_proj": "mlp.fc2",
+    "ln_1": "layer_norm1",
+    "ln_2": "layer_norm2",
+}
+_OPENAI_HEAD = 64  # channels of a head
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,34 +101,43 @@ def load_clip(folder: str | os.PathLike) -> ClipModel:
     """Reads a text tower.
 
     Args:
-      folder: With model.safetensors, config.json and tokenizer.json. Sizes that the
-        config does not name are those of ViT-B/32, as on the hub.
+      folder: With model.safetensors, config.json and tokenizer.json, or with one .pt
+        file of OpenAI's and tokenizer.json. Sizes that the config does not name are
+        those of ViT-B/32, as on the hub.
 
     Returns:
       The model.
 
     Raises:
       FileNotFoundError: if a file is missing; names all that are.
-      ModuleNotFoundError: if `tokenizers` or `safetensors` is not installed.
+      ModuleNotFoundError: if `tokenizers` is not installed.
       ValueError: if a file is damaged or does not fit the others; names its fields or
         keys (five at most), what was expected and what was found.
     """
     folder = Path(folder)
-    names = ("config.json", "tokenizer.json", "model.safetensors")
+    names = ["config.json", "tokenizer.json", "model.safetensors"]
+    originals = sorted(folder.glob("*.pt"))
+    if not (folder / names[2]).is_file() and len(originals) == 1:
+        names = [names[1], originals[0].name]
     absent = [name for name in names if not (folder / name).is_file()]
     if absent:
         raise FileNotFoundError(f"{folder} has no {', '.join(absent)}")
-    config, vocabulary, weights = (folder / name for name in names)
-    network, config_end = _read_config(config)
+    *config, vocabulary, weights = (folder / name for name in names)
+    if config:
+        network, config_end = _read_config(config[0])
+        stored = arrays(read_weights(weights))
+    else:
+        network, stored = _read_openai(weights)
+        config_end = None
     tokenizer = files.read_tokenizer(vocabulary)
     end = _check_tokenizer(vocabulary, tokenizer, network)
     if config_end not in (None, _OLD_END, end):
         raise ValueError(
-            f"{config}: eos_token_id is {config_end}, but {END} is {end} in "
+            f"{config[0]}: eos_token_id is {config_end}, but {END} is {end} in "
             f"{vocabulary.name}"
         )
     network = network.clone(end_of_text=end)
-    params = _read_weights(weights, network)
+    params = _take_weights(weights, stored, network)
     digest = zlib.crc32(vocabulary.read_bytes())
     for leaf in jax.tree.leaves(params):
         digest = zlib.crc32(np.asarray(leaf), digest)
@@ -184,31 +211,76 @@ def _keys(network: ClipText) -> Iterator[tuple[tuple, str, tuple[int, ...], bool
         yield (*modules, kind), key, shape, transposed
 
 
-def _read_weights(path: Path, network: ClipText) -> Params:
+def _read_openai(path: Path) -> tuple[ClipText, dict[str, Stored]]:
+    """The network that an archive of OpenAI's has, its arrays named as on the hub."""
+    named: dict[str, Stored] = {}
+    found = arrays(read_weights(path))
+    for name, stored in found.items():
+        prefix, _, rest = name.partition("transformer.resblocks.")
+        if name in _OPENAI:
+            named[_OPENAI[name]] = stored
+        elif name == "text_projection":
+            named["text_projection.weight"] = _part(stored, slice(None), turned=True)
+        elif not prefix and rest:
+            layer, _, inner = rest.partition(".")
+            stem = f"text_model.encoder.layers.{layer}"
+            module, _, kind = inner.rpartition(".")
+            if inner.startswith("attn.in_proj_"):  # the three one below the other
+                rows = stored.shape[0] // 3
+                for i, letter in enumerate("qkv"):
+                    key = (
+                        f"self_attn.{letter}_proj.{inner.removeprefix('attn.in_proj_')}"
+                    )
+                    part = slice(i * rows, (i + 1) * rows)
+                    named[f"{stem}.{key}"] = _part(stored, part)
+            elif module in _OPENAI_IN_LAYER:
+                named[f"{stem}.{_OPENAI_IN_LAYER[module]}.{kind}"] = stored
+    sizes = {}
+    for key, axes in (
+        ("token_embedding.weight", ("vocabulary", "width")),
+        ("positional_embedding", ("context", "width")),
+        ("text_projection", ("width", "dimensions")),
+        ("transformer.resblocks.0.mlp.c_fc.weight", ("hidden", "width")),
+    ):
+        shape = found[key].shape if key in found else ()
+        if len(shape) != 2 or 0 in shape:
+            raise ValueError(
+                f"{path}: {key} should have two axes, found "
+                f"{shape if key in found else 'nothing'}"
+            )
+        sizes |= dict(zip(axes, shape, strict=True))
+    layers = {key.split(".")[3] for key in named if ".layers." in key}
+    heads = sizes["width"] // _OPENAI_HEAD
+    if heads * _OPENAI_HEAD != sizes["width"]:
+        raise ValueError(
+            f"{path}: {sizes['width']} channels are no multiple of {_OPENAI_HEAD}"
+        )
+    return ClipText(**sizes, depth=len(layers), heads=heads), named
+
+
+def _part(stored: Stored, rows: slice, *, turned: bool = False) -> Stored:
+    """Some rows of an array, or its transpose."""
+    shape = (len(range(stored.shape[0])[rows]), *stored.shape[1:])
+    if turned:
+        return Stored(shape[::-1], lambda: stored.read()[rows].T)
+    return Stored(shape, lambda: stored.read()[rows])
+
+
+def _take_weights(path: Path, stored: dict[str, Stored], network: ClipText) -> Params:
     """Parameters of the network, float32."""
-    safetensors = files.require("safetensors")
-    try:
-        # Not "numpy", which has no bfloat16 in older versions.
-        file = safetensors.safe_open(path, framework="flax")
-    except safetensors.SafetensorError as error:
-        raise ValueError(f"{path}: not safetensors, or damaged ({error})") from None
     params, wrong = {}, []
-    with file:
-        stored = set(file.keys())
-        for modules, key, shape, transposed in _keys(network):
-            if key not in stored:
-                wrong.append(f"{key} is missing")
-                continue
-            found = tuple(file.get_slice(key).get_shape())
-            if found != shape:
-                wrong.append(f"{key} has shape {found}, expected {shape}")
-            if wrong:
-                continue
-            leaf = jnp.asarray(file.get_tensor(key), jnp.float32)
-            at = params
-            for name in modules[:-1]:
-                at = at.setdefault(name, {})
-            at[modules[-1]] = leaf.T if transposed else leaf
+    for modules, key, shape, transposed in _keys(network):
+        if key not in stored:
+            wrong.append(f"{key} is missing")
+        elif stored[key].shape != shape:
+            wrong.append(f"{key} has shape {stored[key].shape}, expected {shape}")
+        if wrong:
+            continue
+        leaf = jnp.asarray(stored[key].read(), jnp.float32)
+        at = params
+        for name in modules[:-1]:
+            at = at.setdefault(name, {})
+        at[modules[-1]] = leaf.T if transposed else leaf
     if wrong:
         more = "; ..." if len(wrong) > 5 else ""
         raise ValueError(

@@ -7,9 +7,11 @@ import pytest
 from safetensors import numpy as safetensors
 
 from jaxmotion.learning import matching, published
+from jaxmotion.networks.recognizer import StyleClassifier
 
 torch = pytest.importorskip("torch")
 from tests.reference import matching_torch  # noqa: E402
+from tests.reference import published_torch as peers  # noqa: E402
 
 CONFIG = matching.MatcherConfig(
     num_features=7, movement_width=8, motion_width=6, text_width=5, embedding=4
@@ -130,6 +132,80 @@ class Code:
 
 
 def test_code_in_a_file_is_not_run(state, tmp_path, capsys):
-    with pytest.raises(ValueError, match="not a file of weights alone"):
-        published.load_matcher(save(state | {"epoch": Code()}, tmp_path), config=CONFIG)
+    path = save(state | {"epoch": Code()}, tmp_path)
+    torch.load(path, weights_only=False)
+    assert capsys.readouterr().out == "run\n"
+    published.load_matcher(path, config=CONFIG)
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("old_format", [False, True])
+def test_the_action_recognizer_is_pytorchs(tmp_path, old_format):
+    peer = peers.randomize(peers.ActionRecognizer(), 4)
+    path = tmp_path / "humanact12_gru.tar"
+    torch.save(
+        {"model": peer.state_dict(), "epoch": 8},
+        path,
+        _use_new_zipfile_serialization=not old_format,
+    )
+    params, config = published.load_action_recognizer(path)
+    assert (config.num_classes, config.num_joints) == (12, 24)
+    generator = np.random.default_rng(0)
+    x = generator.normal(size=(3, 20, 72)).astype(np.float32)
+    state = generator.normal(size=(3, 2, 128)).astype(np.float32)
+    given = jnp.asarray(x), jnp.asarray(state)
+    ours = config.network.apply({"params": params}, *given)
+    with torch.inference_mode():
+        theirs = peer(
+            torch.from_numpy(x.swapaxes(0, 1)), torch.from_numpy(state.swapaxes(0, 1))
+        )
+    for found, wanted in zip(ours, theirs, strict=True):
+        assert wanted.std() > 0.1
+        np.testing.assert_allclose(found, wanted.numpy(), atol=1e-5)
+
+
+def style_classifier(path, **changes):
+    peer = peers.randomize(peers.StyleClassifier(classes=5), 6)
+    with torch.inference_mode():  # one step of training, for statistics that fit
+        for module in peer.modules():
+            if isinstance(module, torch.nn.BatchNorm1d):
+                module.reset_running_stats()
+                module.momentum = None
+        normal = torch.Generator().manual_seed(1)
+        peer.train()(torch.randn((64, 45, 60), generator=normal))
+        peer.eval()
+    names = ["Angry", "Old", "Proud", "Stiff", "Zombie"]
+    content = {"state_dict": peer.state_dict(), "in_feat": 45, "class_names": names}
+    torch.save(content | changes, path)
+    return peer
+
+
+def test_the_style_classifier_is_pytorchs(tmp_path):
+    path = tmp_path / "100style_position_classifier.pth"
+    peer = style_classifier(path)
+    params, names = published.load_style_classifier(path)
+    assert names == ("Angry", "Old", "Proud", "Stiff", "Zombie")
+    x = np.random.default_rng(0).normal(size=(3, 60, 45)).astype(np.float32)
+    ours = StyleClassifier(5).apply({"params": params}, jnp.asarray(x))
+    with torch.inference_mode():
+        theirs = peer.double()(torch.from_numpy(x.swapaxes(1, 2)).double())
+    for found, wanted in zip(ours, theirs, strict=True):
+        assert wanted.std() > 0.1
+        np.testing.assert_allclose(found, wanted.numpy(), atol=1e-5)
+    like = jax.eval_shape(StyleClassifier(5).init, jax.random.key(0), jnp.asarray(x))
+    shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)  # noqa: E731
+    assert shapes(params) == shapes(like["params"])
+
+
+def test_recognizers_that_do_not_fit_are_named(tmp_path):
+    path = tmp_path / "weights.pth"
+    style_classifier(path, class_names=["Old"])
+    with pytest.raises(ValueError, match="'class_names' should list .* 5 styles"):
+        published.load_style_classifier(path)
+    with pytest.raises(ValueError, match="recurrent.weight_ih_l0 should have 2 axes"):
+        published.load_action_recognizer(path)
+    state = peers.StyleClassifier(classes=5).state_dict()
+    del state["bn3.running_var"]
+    style_classifier(path, state_dict=state)
+    with pytest.raises(ValueError, match="style classifier; missing: bn3.running_var$"):
+        published.load_style_classifier(path)

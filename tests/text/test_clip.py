@@ -1,6 +1,7 @@
 """The text tower from a folder: numbers by a float64 oracle, and what is refused."""
 
 import json
+from copy import deepcopy
 
 import jax.numpy as jnp
 import numpy as np
@@ -101,7 +102,7 @@ def test_missing_files_are_named_together(written):
 def test_damaged_files_are_named(written):
     folder, _ = written
     (folder / "model.safetensors").write_bytes(b"not weights at all")
-    with pytest.raises(ValueError, match="model.safetensors: not safetensors"):
+    with pytest.raises(ValueError, match="model.safetensors: no safetensors"):
         clip.load_clip(folder)
     (folder / "config.json").write_text("{")
     with pytest.raises(ValueError, match="config.json: not JSON"):
@@ -194,3 +195,58 @@ def test_fingerprint_changes_with_weights_and_tokenizer(written):
         file.write("\n")
     prints.add(clip.load_clip(folder).fingerprint)
     assert len(prints) == 3
+
+
+SIZES = dict(width=64, depth=2, context=24, dimensions=7)
+
+
+@pytest.fixture(scope="module")
+def openai():
+    torch = pytest.importorskip("torch")
+    from tests.reference import published_torch as peers
+
+    vocabulary = samples.tokenizer().get_vocab_size()
+    return torch, peers.randomize(peers.ClipText(vocabulary, **SIZES), 2)
+
+
+def archive(openai, folder, precision="float32"):
+    """As OpenAI publishes it: code and weights in one, which PyTorch would run."""
+    torch, peer = openai
+    samples.tokenizer().save(str(folder / "tokenizer.json"))
+    ids = torch.tensor([[0, 1, samples.tokenizer().token_to_id(samples.END)]])
+    copy = deepcopy(peer).to(getattr(torch, precision))
+    traced = torch.jit.trace(copy.eval(), (ids,), check_trace=False)
+    traced.save(str(folder / "ViT-tiny.pt"))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("precision", ["float32", "float16"])
+def test_openais_archive_encodes_as_pytorch_does(openai, tmp_path, precision):
+    archive(openai, tmp_path, precision)
+    model = clip.load_clip(tmp_path)
+    found = clip.encode(model, TEXTS)
+    torch, peer = openai
+    if precision == "float16":  # computed in float32, as ours are
+        peer = deepcopy(peer).half().float()
+    wanted = []
+    for text in TEXTS:
+        ids = clip.tokenize(model, [text])
+        with torch.inference_mode():
+            wanted.append(peer(torch.from_numpy(np.array(ids)).long()).numpy()[0])
+    assert np.std(wanted) > 0.1
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_archives_are_named(openai, tmp_path):
+    archive(openai, tmp_path)
+    path = tmp_path / "ViT-tiny.pt"
+    whole = path.read_bytes()
+    for stop in (0, 100, len(whole) // 2, len(whole) - 30):
+        path.write_bytes(whole[:stop])
+        with pytest.raises(ValueError, match="ViT-tiny.pt: no PyTorch's file"):
+            clip.load_clip(tmp_path)
+    torch, peer = openai
+    torch.save({"positional_embedding": torch.zeros(3, 4)}, path)
+    with pytest.raises(ValueError, match="token_embedding.weight .* found nothing"):
+        clip.load_clip(tmp_path)
