@@ -7,8 +7,6 @@ Source: released code and weights of Guo et al. 2022 (T2M), Guo et al. 2020
 import os
 from typing import Any
 
-import numpy as np
-
 from jaxmotion.learning.action_recognition import ActionRecognizerConfig
 from jaxmotion.learning.matching import TAGS, WORD_SIZE, MatcherConfig
 from jaxmotion.networks.torch_layers import Layers

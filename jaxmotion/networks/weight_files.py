@@ -64,7 +64,7 @@ class Stored:
 
     Attributes:
       shape: Its shape.
-      read: Reads it; may raise ValueError if the file is damaged.
+      read: Reads it; raises ValueError if the file is damaged.
     """
 
     shape: tuple[int, ...]
@@ -121,7 +121,7 @@ def read_weights(path: str | os.PathLike) -> dict[str, Any]:
     else:
         read, what = _read_archive, "PyTorch's"
     try:
-        content = _plain(read(path))
+        content = _plain(read(path), path)
     # Damaged bytes make unpickler, zipfile and NumPy raise almost anything.
     except Exception as error:
         said = str(error).splitlines() or [type(error).__name__]
@@ -153,8 +153,10 @@ def arrays(content: dict[str, Any]) -> dict[str, Stored]:
     return found
 
 
-def _plain(value: Any, above: tuple[int, ...] = ()) -> Any:
+def _plain(value: Any, path: str, name: str = "", above: tuple[int, ...] = ()) -> Any:
     """Records with named attributes as dictionaries; a cycle ends in None."""
+    if isinstance(value, Stored):
+        return Stored(value.shape, lambda: _read(value, path, name))
     if isinstance(value, Record) and isinstance(value.state, dict):
         value = value.state
     if not isinstance(value, dict):
@@ -162,7 +164,14 @@ def _plain(value: Any, above: tuple[int, ...] = ()) -> Any:
     if id(value) in above:
         return None
     above = (*above, id(value))
-    return {str(key): _plain(x, above) for key, x in value.items()}
+    return {str(key): _plain(x, path, str(key), above) for key, x in value.items()}
+
+
+def _read(stored: Stored, path: str, name: str) -> np.ndarray:
+    try:
+        return stored.read()
+    except Exception as error:
+        raise ValueError(f"{path}: {name} is damaged ({error})") from error
 
 
 def _decoded(data: bytes, kind: str) -> np.ndarray:

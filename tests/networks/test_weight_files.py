@@ -117,8 +117,7 @@ def test_a_flipped_bit_of_an_archive_is_found(torch, tmp_path):
     data = bytearray(path.read_bytes())
     data[data.index(np.float32(1.25).tobytes() * 8)] ^= 1
     path.write_bytes(data)
-    with pytest.raises(zipfile.BadZipFile, match="CRC"):
-        found_in(path)
+    refused(path, r"weights.pt: x is damaged \(Bad CRC-32")
 
 
 def rezip(path, change, compression=zipfile.ZIP_STORED):
