@@ -100,9 +100,8 @@ class _OneVectorCondition(nn.Module):
           The context of `denoise`.
         """
         del train
-        known = blocks.known_labels(label, self.num_labels)
         flat = flatten_condition(past, path, facing, keep_past)
-        x = jnp.concatenate([flat, self.embed_label(known)], axis=-1)
+        x = jnp.concatenate([flat, self.embed_label(label)], axis=-1)
         return FlatContext(
             condition=self.out_condition(nn.silu(self.embed_condition(x))),
             steps=self.embed_time(self.num_steps),

@@ -233,8 +233,8 @@ class TimeEmbedding(nn.Module):
 class LabelEmbedding(nn.Module):
     """A learned row for each label; `nn.Embed` cannot look up one label of one.
 
-    Labels out of range take the nearest row, so that a compiled program never makes
-    NaN of them; they are refused where they come in.
+    Labels out of range are refused, or in a compiled program take the nearest row
+    (`known_labels`).
 
     Attributes:
       num_labels: Rows.
@@ -250,7 +250,8 @@ class LabelEmbedding(nn.Module):
         self.embedding = self.param("embedding", nn.initializers.normal(1.0), shape)
 
     def __call__(self, label: Int[Array, "*batch"]) -> Float[Array, "*batch width"]:
-        return jnp.take(self.embedding, label, axis=0, mode="clip")
+        known = known_labels(label, self.num_labels)
+        return jnp.take(self.embedding, known, axis=0, mode="clip")
 
 
 class EncoderLayer(nn.Module):

@@ -81,14 +81,13 @@ class TrajectoryGenerator(nn.Module):
           Predicted path x_0.
         """
         n, batch = self.frames_per_token, x_t.shape[:-2]
-        known = blocks.known_labels(label, self.num_labels)
         time = jnp.broadcast_to(
             self.embed_time(self.num_steps)[t], (*batch, self.width)
         )
         tokens = jnp.concatenate(
             [
                 time[..., None, :],
-                self.embed_label(known)[..., None, :],
+                self.embed_label(label)[..., None, :],
                 self.embed_target(target)[..., None, :],
                 self.embed_past(blocks.fold_frames(past, n)),
                 self.embed_noisy(blocks.fold_frames(x_t, n)),

@@ -139,10 +139,9 @@ class CamdmTransformer(nn.Module):
         """
         n = self.frames_per_token
         kept = jnp.where(keep_past[..., None, None], past, 0.0)
-        known = blocks.known_labels(label, self.num_labels)
         tokens = jnp.concatenate(
             [
-                self.embed_label(known)[..., None, :],
+                self.embed_label(label)[..., None, :],
                 self.embed_path(blocks.fold_frames(path, n)),
                 self.embed_facing(blocks.fold_frames(facing, n)),
                 self.embed_past(blocks.fold_frames(kept, n)),

@@ -236,14 +236,6 @@ def test_the_trapezoid_is_flat_over_own_frames_and_no_margin_is_no_change():
     np.testing.assert_array_equal(blocks.unfold_frames(x, 4), x.reshape(8, 3))
 
 
-def test_a_label_out_of_range_takes_the_nearest():
-    table = blocks.LabelEmbedding(3, 2)
-    rows, variables = table.init_with_output(jax.random.key(0), jnp.array([0, 2]))
-    found = table.apply(variables, jnp.array([-1, 7]))
-    np.testing.assert_array_equal(found, rows)
-    assert np.isfinite(found).all()
-
-
 def test_positions_are_sines_and_cosines():
     table = blocks.sinusoidal_positions(5000, 8)
     for position in (0, 1, 4999):

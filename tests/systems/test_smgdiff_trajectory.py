@@ -1,5 +1,6 @@
 """SMGDiff's trajectory generator: what it learns from, and the paths it makes."""
 
+import dataclasses
 import functools
 
 import jax
@@ -51,6 +52,18 @@ def test_the_wish_is_the_mean_velocity_of_what_happened():
     np.testing.assert_allclose(
         path.position[-1], np.asarray(found.velocity) * 12 / 30, atol=1e-5
     )
+
+
+@pytest.mark.parametrize("label", [-1, 2])
+def test_an_unknown_skill_is_refused_or_when_compiled_the_nearest(params, label):
+    generate = smgdiff_trajectory.generator(params, config=CONFIG)
+    ask = lambda skill: dataclasses.replace(wish(), label=jnp.int32(skill))  # noqa: E731
+    run = jax.jit(lambda wanted: generate(jax.random.key(0), wanted).position)
+    found = run(ask(label))
+    assert np.isfinite(found).all()
+    np.testing.assert_array_equal(found, run(ask(np.clip(label, 0, 1))))
+    with pytest.raises(ValueError, match=f"labels are in {label}..{label}, expected 0"):
+        generate(jax.random.key(0), ask(label))
 
 
 def test_a_straight_path_reaches_its_target():
