@@ -56,12 +56,19 @@ def group_means(
     return jnp.asarray(summed[used] / total[used], jnp.float32)
 
 
-def cell(samples: Float[Array, " samples"], *, scale: float = 1.0) -> Cell:
+def cell(
+    samples: Float[Array, " samples"],
+    *,
+    scale: float = 1.0,
+    bounds: tuple[float, float] = (-math.inf, math.inf),
+) -> Cell:
     """Mean of independent samples with its 95 % interval (Student's t).
 
     Args:
       samples: One a clip or rollout.
       scale: Factor for the unit of the table.
+      bounds: Of what the mean can be, before scaling, such as 0 and 1 of a proportion;
+        the interval is cut to them.
 
     Returns:
       The cell; without an interval for a single sample, not a number for none.
@@ -71,10 +78,9 @@ def cell(samples: Float[Array, " samples"], *, scale: float = 1.0) -> Cell:
         return Cell(value=math.nan, samples=0)
     if count < 2:
         return Cell(value=float(samples[0]) * scale, samples=count)
-    estimate, low, high = (
-        float(x) * scale for x in statistics.confidence_interval(samples)
-    )
-    return Cell(value=estimate, low=low, high=high, samples=count)
+    estimate, *ends = (float(x) for x in statistics.confidence_interval(samples))
+    low, high = (scale * min(max(end, bounds[0]), bounds[1]) for end in ends)
+    return Cell(value=scale * estimate, low=low, high=high, samples=count)
 
 
 def to_json(rows: dict[str, dict[str, Cell]]) -> dict[str, Any]:

@@ -152,8 +152,10 @@ def free_row(
     return row | {
         "div": table.cell(jnp.stack(spread)),
         "fid": table.cell(jnp.stack(distance)),
-        "ffr_mann": table.cell(contact.skating_frame_ratio(feet, fps)),
-        "ffr_gmd": table.cell(contact.skate_ratio(feet, fps)),
+        "ffr_mann": table.cell(
+            contact.skating_frame_ratio(feet, fps), bounds=(0.0, 1.0)
+        ),
+        "ffr_gmd": table.cell(contact.skate_ratio(feet, fps), bounds=(0.0, 1.0)),
         "speed_m/s": table.cell(speed),
         "acceleration_m/s2": table.cell(smoothness.acceleration(positions, fps)),
         "jerk_m/s3": table.cell(smoothness.jerk(positions, fps)),

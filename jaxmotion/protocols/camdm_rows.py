@@ -65,11 +65,12 @@ def metric_row(
     row = {}
     if hits is not None:
         means = table.group_means(hits, found.group)
-        row["style_accuracy_%"] = table.cell(means, scale=100.0)
+        row["style_accuracy_%"] = table.cell(means, scale=100.0, bounds=(0.0, 1.0))
     for column, (name, weights, scale) in _COLUMNS.items():
         weight = None if weights is None else values[weights]
         means = table.group_means(values[name], found.group, weight)
-        row[column] = table.cell(means, scale=scale)
+        bounds = (0.0, 1.0) if name == "skate_ratio" else (-np.inf, np.inf)
+        row[column] = table.cell(means, scale=scale, bounds=bounds)
     return row
 
 

@@ -198,11 +198,11 @@ def transition_row(
         jnp.asarray(found), jnp.asarray(centres, jnp.float32), limit=changes.limit
     )
 
-    def cell(values: Array) -> table.Cell:
-        return table.cell(table.group_means(values, changes.replication))
+    def cell(values: Array, **options) -> table.Cell:
+        return table.cell(table.group_means(values, changes.replication), **options)
 
     row = {
-        "success_%": cell(100.0 * done.succeeded),
+        "success_%": cell(1.0 * done.succeeded, scale=100.0, bounds=(0.0, 1.0)),
         "transition_s": cell(done.seconds),
         "transition_frames": cell(fps * done.seconds),
     }
@@ -275,4 +275,6 @@ def clip_accuracy(run: Run, recognizer: Recognized) -> table.Cell:
     """
     real = protocol.data_windows(run.held_out, stride=STRIDE, field=run.field)
     _, hits = camdm_styles.recognized(run.model.bones, real, recognizer)
-    return table.cell(table.group_means(hits, real.group), scale=100.0)
+    return table.cell(
+        table.group_means(hits, real.group), scale=100.0, bounds=(0.0, 1.0)
+    )

@@ -48,6 +48,17 @@ def test_a_cell_is_the_mean_with_students_interval():
     assert found.samples == 5
 
 
+def test_intervals_of_proportions_stay_within_them():
+    # Student's interval of 0.9, 1 and 1 runs from 0.82 to 1.11.
+    high = jnp.array([0.9, 1.0, 1.0])
+    free = table.cell(high, scale=100.0)
+    assert free.high == pytest.approx(111.009, abs=1e-2)
+    found = table.cell(high, scale=100.0, bounds=(0.0, 1.0))
+    assert (found.low, found.high, found.value) == (free.low, 100.0, free.value)
+    low = table.cell(1.0 - high, scale=100.0, bounds=(0.0, 1.0))
+    assert low.low == 0.0 and low.high == pytest.approx(100.0 - free.low, abs=1e-3)
+
+
 def test_one_sample_has_no_interval_and_none_has_no_value():
     assert table.cell(jnp.array([2.0])) == table.Cell(value=2.0)
     nothing = table.cell(jnp.zeros(0))

@@ -35,3 +35,11 @@ def test_time_is_that_of_a_call_by_its_parts_and_keys_are_new(monkeypatch):
     assert found.value == pytest.approx(5.0)
     assert (found.low, found.high) == pytest.approx((4.0, 6.0))
     assert cells.milliseconds(run, seconds=1.0, least=1).samples > 1
+
+
+def test_intervals_of_proportions_stay_within_them():
+    scores = [{"skill accuracy": jnp.float32(x), "fid": x} for x in (0.9, 1.0, 1.0)]
+    scores = [{k: jnp.float32(v) for k, v in one.items()} for one in scores]
+    row = cells.row(scores)
+    assert row["skill accuracy"].high == 1.0
+    assert row["fid"].high == pytest.approx(1.11, abs=1e-2)
