@@ -8,7 +8,7 @@ import io
 import os
 import stat
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -127,7 +127,11 @@ def _one_line(name: str | os.PathLike, problem: str) -> Iterator[None]:
 
 
 def read_arrays(
-    file: str | os.PathLike | io.BytesIO, *, name: str, what: str
+    file: str | os.PathLike | io.BytesIO,
+    *,
+    name: str,
+    what: str,
+    only: Collection[str] | None = None,
 ) -> dict[str, np.ndarray]:
     """All arrays of an npz file without pickles.
 
@@ -135,6 +139,7 @@ def read_arrays(
       file: Its path, or its content.
       name: Its path, for messages.
       what: What it holds, for messages.
+      only: Fields to read, of those that are there; None for all.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -155,7 +160,29 @@ def read_arrays(
             raise ValueError(f"expected an npz archive, the file {found}")
         content = np.load(opened, allow_pickle=False)
         _check_sizes(content.zip.infolist(), size)
-        return {field: _array(content, field) for field in content.files}
+        wanted = [field for field in content.files if only is None or field in only]
+        return {field: _array(content, field) for field in wanted}
+
+
+def read_array(path: str | os.PathLike, *, what: str) -> np.ndarray:
+    """The array of floating-point numbers in an npy file, as float32.
+
+    Raises:
+      OSError: if it cannot be read.
+      ValueError: if it is damaged or holds something else; names it.
+    """
+    with (
+        open_regular(path) as file,
+        _one_line(path, f"not a {what} file, or a damaged one"),
+    ):
+        if file.read(6) != b"\x93NUMPY":
+            raise ValueError("expected an npy file")
+        file.seek(0)
+        array = np.lib.format.read_array(file, allow_pickle=False)
+        if array.dtype.kind != "f":
+            raise ValueError(f"expected floating-point numbers, found {array.dtype}")
+        with np.errstate(over="ignore"):  # becomes infinite, which users refuse
+            return array.astype(np.float32)
 
 
 def _array(content: np.lib.npyio.NpzFile, field: str) -> np.ndarray:

@@ -17,6 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxmotion import files
+
 
 def read_array(path: Path) -> Float[np.ndarray, "..."]:
     """An array of numbers in an npy file, as float32.
@@ -25,14 +27,11 @@ def read_array(path: Path) -> Float[np.ndarray, "..."]:
       ValueError: if it is missing, damaged or of other contents; names it.
     """
     try:
-        array = np.load(path, allow_pickle=False)
-        if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
-            raise ValueError("not an array of floating-point numbers")
+        return files.read_array(path, what="feature")
     except FileNotFoundError:
         raise ValueError(f"{path}: no such file") from None
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: not a feature file, or damaged ({error})") from None
-    return array.astype(np.float32)
+    except OSError as error:
+        raise ValueError(f"{path}: not a feature file ({error})") from None
 
 
 class Caption(NamedTuple):

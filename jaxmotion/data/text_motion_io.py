@@ -1,10 +1,10 @@
 """Motions with captions on disk: one npz file."""
 
 import os
-import zipfile
 
 import numpy as np
 
+from jaxmotion import files
 from jaxmotion.data import clips_io, npz
 from jaxmotion.data.text_motion import TextMotions, check_statistics
 
@@ -149,8 +149,9 @@ def is_text_motions(path: str | os.PathLike) -> bool:
     Raises:
       OSError: if it cannot be read.
     """
+    name = os.fspath(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return "format" in file and str(file["format"]) == _FORMAT
-    except (ValueError, EOFError, zipfile.BadZipFile):
+        fields = files.read_arrays(path, name=name, what="motion", only=("format",))
+    except ValueError:
         return False
+    return str(fields.get("format")) == _FORMAT

@@ -9,8 +9,6 @@ import dataclasses
 import functools
 import json
 import os
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxmotion import files
 from jaxmotion.text import clip, hashing, wordllama
 
 _FORMAT = "jaxmotion-text-vectors"
@@ -219,40 +218,23 @@ def _write_cache(path: str, encoder: TextEncoder, known: dict[str, np.ndarray]) 
     header = {"format": _FORMAT, "version": _VERSION, "encoder": encoder.name}
     # Texts as JSON: NumPy's strings all take the room of the longest.
     text = json.dumps(header | {"texts": list(known)}).encode()
-    os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
-    temporary = f"{path}.{os.getpid()}.partial"
-    try:
-        with open(temporary, "wb") as file:
-            np.savez(
-                file,
-                header=np.frombuffer(text, np.uint8),
-                vectors=np.stack(list(known.values())),
-            )
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        if os.path.exists(temporary):
-            os.remove(temporary)
+    with files.replacing(path) as file:
+        np.savez(
+            file,
+            header=np.frombuffer(text, np.uint8),
+            vectors=np.stack(list(known.values())),
+        )
 
 
 def _read_cache(path: str, encoder: TextEncoder) -> dict[str, np.ndarray]:
     """Texts and vectors of a cache; checks every field."""
+    fields = files.read_arrays(path, name=path, what="text vector")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            header, vectors = json.loads(file["header"].tobytes()), file["vectors"]
+        header, vectors = json.loads(fields["header"].tobytes()), fields["vectors"]
         found = {key: header[key] for key in ("format", "version", "encoder", "texts")}
-    except (
-        AttributeError,  # an array, not an archive
-        EOFError,
-        KeyError,
-        TypeError,
-        ValueError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(
-            f"{path}: not a cache of text vectors, or a damaged one ({error})"
+            f"{path}: not a text vector file, or a damaged one ({error})"
         ) from None
     wanted = {"format": _FORMAT, "version": _VERSION, "encoder": encoder.name}
     for key, value in wanted.items():

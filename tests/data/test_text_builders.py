@@ -133,15 +133,15 @@ BAD = {
     ),
     "integers": (
         save("new_joint_vecs/000001.npy", np.zeros((50, 263), int)),
-        "000001.npy: not a feature file, or damaged .not an array of floating",
+        "000001.npy: not a feature file, or a damaged one .expected floating",
     ),
     "objects": (
         save("new_joint_vecs/000001.npy", np.array([{}], dtype=object)),
-        "000001.npy: not a feature file, or damaged",
+        "000001.npy: not a feature file, or a damaged",
     ),
     "damaged": (
         write("new_joint_vecs/000001.npy", "x"),
-        "000001.npy: not a feature file, or damaged",
+        "000001.npy: not a feature file, or a damaged",
     ),
     "no features": (
         remove("new_joint_vecs/M000001.npy"),

@@ -275,7 +275,7 @@ def test_bad_statistics_are_named(tmp_path):
         0 * mean, std
     )
     (tmp_path / "mean.npy").write_text("mean")
-    with pytest.raises(ValueError, match="mean.npy: not a feature file, or damaged"):
+    with pytest.raises(ValueError, match="mean.npy: not a feature file, or a damaged"):
         protocol.read_statistics(tmp_path, WIDTH)
 
 

@@ -144,7 +144,7 @@ def test_an_interrupted_write_leaves_the_old_cache(cached, monkeypatch):
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(encoder.os, "fsync", stop)
+    monkeypatch.setattr(os, "fsync", stop)
     with pytest.raises(KeyboardInterrupt):
         encoder.encode_unique(Counting().encoder, TEXTS, cache=cached)
     assert cached.read_bytes() == before
@@ -158,17 +158,17 @@ def test_damaged_and_foreign_caches_are_named(cached):
     whole = cached.read_bytes()
     for cut in (0, 10, len(whole) // 2, len(whole) - 30):
         cached.write_bytes(whole[:cut])
-        with pytest.raises(ValueError, match="texts.npz: not a cache of text vectors"):
+        with pytest.raises(ValueError, match="texts.npz: not a text vector file"):
             read()
     with open(cached, "wb") as file:
         np.save(file, np.zeros(3))
-    with pytest.raises(ValueError, match="texts.npz: not a cache of text vectors"):
+    with pytest.raises(ValueError, match="texts.npz: not a text vector file"):
         read()
     np.savez(cached, weights=np.zeros(3))
-    with pytest.raises(ValueError, match="texts.npz: not a cache.*header"):
+    with pytest.raises(ValueError, match="texts.npz: not a text vector.*header"):
         read()
     np.savez(cached, header=np.array([{}], object), vectors=np.zeros(3))  # a pickle
-    with pytest.raises(ValueError, match="texts.npz: not a cache of text vectors"):
+    with pytest.raises(ValueError, match="texts.npz: not a text vector file"):
         read()
 
 
@@ -177,7 +177,7 @@ def test_damaged_and_foreign_caches_are_named(cached):
     [
         ({"encoder": "other"}, "'encoder' should be 'counting', found 'other'"),
         ({"version": 2}, "field 'version' should be 1, found 2"),
-        ({"drop": "texts"}, "not a cache of text vectors.*texts"),
+        ({"drop": "texts"}, "not a text vector file.*texts"),
         ({"texts": "he runs"}, "field 'texts' should be a list of texts"),
         ({"texts": ["he runs", 3]}, "field 'texts' should be a list of texts"),
         ({"texts": ["he runs"] * 2}, "field 'texts' has a text twice"),
