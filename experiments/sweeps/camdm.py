@@ -13,12 +13,15 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.data import windows
+from jaxmotion.evaluation import camdm_release as released
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.motion import skeleton
 from jaxmotion.protocols import camdm as protocol
 from jaxmotion.protocols import (
     camdm_distances,
     camdm_evaluation,
+    camdm_release,
     camdm_rows,
     camdm_runs,
     camdm_styles,
@@ -117,6 +120,7 @@ class Judge:
     Attributes:
       recognizer: Of styles.
       reference: Features of the training windows.
+      styles: The same by style, one window behind the other.
       height: Below it a foot joint should not move, metres.
       root: Median height of the root, metres.
       count: Windows of each Fréchet distance.
@@ -125,6 +129,7 @@ class Judge:
 
     recognizer: camdm_styles.Recognized
     reference: np.ndarray
+    styles: released.Groups
     height: float
     root: float
     count: int
@@ -153,6 +158,7 @@ def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
     judge = Judge(
         recognizer=recognizer,
         reference=reference,
+        styles=camdm_release.style_features(bones, run.train, recognizer, field=field),
         height=height,
         root=float(np.median(np.asarray(real.motion.root_position)[..., 1])),
         count=min(made, len(feature), int(own.sum()), int((~own).sum())),
@@ -164,11 +170,25 @@ def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
         seed=job.seed,
         repeats=job.replications,
     )
+    whole = camdm_release.of_clips(run.held_out, field=field)
     return judge, {
         GROUND_TRUTH: distances(feature, reference)
-        | camdm_rows.metric_row(bones, real, hits, height=height),
+        | camdm_rows.metric_row(bones, real, hits, height=height)
+        | _released(judge, bones, whole),
         NOISE_FLOOR: distances(reference[own], reference[~own]),
     }
+
+
+def _released(
+    judge: Judge,
+    bones: skeleton.Skeleton,
+    whole: camdm_release.Recordings,
+    group: np.ndarray | None = None,
+) -> Row:
+    """Columns of the released evaluation."""
+    values = camdm_release.metrics(bones, whole)
+    fid = camdm_release.distances(bones, whole, judge.recognizer, judge.styles)
+    return camdm_release.row(values | {"fid": fid}, group)
 
 
 def _fid(job: Job, judge: Judge, features: np.ndarray, owner: np.ndarray) -> Cell:
@@ -210,6 +230,9 @@ def score(job: Job, judge: Judge, run: camdm_runs.Run) -> Row:
     row = {"fid": _fid(job, judge, features, owner)}
     row |= camdm_distances.unbiased_cells(features, judge.reference, seed=job.seed)
     row |= camdm_rows.metric_row(bones, grouped, hits, height=judge.height)
+    whole = camdm_release.of_rollouts(frames, commands, fps=fps)
+    replication = np.arange(judge.labels.size) % job.replications
+    row |= _released(judge, bones, whole, replication)
     row["diversity_m2"] = camdm_rows.repeat_diversity(
         bones, made, repeats=job.replications
     )

@@ -147,51 +147,38 @@ def frechet_distance(a: Moments, b: Moments) -> Float[Array, ""]:
 
 
 @jax.jit
-def frechet_distance_camdm_release(a: Moments, b: Moments) -> Float[Array, ""]:
-    """Fréchet distance divided by the number of features, as CAMDM's code prints it.
+def frechet_distance_of_rows(
+    a: Float[Array, "rows features"],
+    count_a: Int[Array, ""],
+    b: Float[Array, "others features"],
+    count_b: Int[Array, ""],
+) -> Float[Array, ""]:
+    """Squared Fréchet distance of the Gaussians fitted to two sets of few rows.
+
+    With centred rows X and Y divided by the root of their number less one, the last
+    trace of (1) is the sum of the singular values of X Y^T: no covariance is formed,
+    so that singular ones lose nothing.
 
     Args:
-      a: Moments of one set.
-      b: Moments of the other.
+      a: Rows from `count_a` on are padding.
+      count_a: Rows that count.
+      b: Likewise.
+      count_b: Likewise.
 
     Returns:
-      Distance a feature.
-
-    Source: released code of CAMDM (which divides by 512, its feature size).
-    """
-    return frechet_distance(a, b) / a.mean.shape[0]
-
-
-@jax.jit
-def frechet_by_group(
-    features: Float[Array, "samples features"],
-    groups: Int[Array, " samples"],
-    references: Moments,
-) -> Float[Array, " groups"]:
-    """Fréchet distance of each group of rows to a reference of its own.
-
-    CAMDM's paper scores every style against the training data of that style and takes
-    the mean over styles: groups are styles. Its code takes clips as groups, each
-    against its style, and divides by the number of features. Groups of few rows are
-    biased upwards, so that the second is larger: see `frechet_bias`.
-
-    Args:
-      features: One row a sample.
-      groups: Group of each row, from 0; rows of other numbers are left out.
-      references: Of each group, stacked along a first axis.
-
-    Returns:
-      One distance a group, in squared units of the features; NaN for a group of fewer
-      than two rows.
-
-    Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 1; released eval_motion_FID.
+      Distance, in squared units of the features, not negative; NaN where fewer than
+      two rows count.
     """
 
-    def of_one(x: tuple[Array, Moments]) -> Array:
-        group, reference = x
-        found = masked_moments(features, groups == group)
-        distance = frechet_distance(found, reference)
-        return jnp.where(found.count > 1, distance, jnp.nan)
+    def centred(x: Array, count: Array) -> tuple[Array, Array]:
+        own = (jnp.arange(len(x)) < count)[:, None]
+        mean = jnp.mean(x, axis=0, where=own)
+        spread = jnp.where(own, x - mean[None], 0.0)
+        return mean, spread / jnp.sqrt(jnp.maximum(count - 1, 1).astype(x.dtype))
 
-    number = references.mean.shape[0]
-    return jax.lax.map(of_one, (jnp.arange(number), references))
+    (m_a, x), (m_b, y) = centred(a, count_a), centred(b, count_b)
+    product = jnp.matmul(x, y.T, precision="highest")
+    cross = jnp.sum(jnp.linalg.svd(product, compute_uv=False))
+    spread = jnp.sum(x * x) + jnp.sum(y * y) - 2.0 * cross
+    distance = jnp.sum((m_a - m_b) ** 2) + jnp.maximum(spread, 0.0)
+    return jnp.where((count_a > 1) & (count_b > 1), distance, jnp.nan)

@@ -34,8 +34,7 @@ def locomotion_metrics(
 
     Returns:
       trajectory_error and orientation_error in radians; slide_speed in metres a second
-      over slide_seconds of low feet; skate_ratio; acceleration, m/s^2; jerk, m/s^3;
-      and the released code's variants under names that end in camdm_release.
+      over slide_seconds of low feet; skate_ratio; acceleration, m/s^2; jerk, m/s^3.
     """
     fps = motion.fps
     positions = skeleton.joint_positions(bones, motion)
@@ -53,16 +52,6 @@ def locomotion_metrics(
         "skate_ratio": contact.skate_ratio(feet, fps, max_height=contact_height),
         "acceleration": smoothness.acceleration(positions, fps),
         "jerk": smoothness.jerk(positions, fps),
-        "slide_camdm_release": contact.foot_slide_camdm_release(
-            feet, positions[..., 0, :], max_height=contact_height
-        ),
-        "coherence_camdm_release": smoothness.coherence_camdm_release(positions),
-        "trajectory_camdm_release": alignment.trajectory_error_camdm_release(
-            wanted_velocity, path
-        ),
-        "orientation_camdm_release": alignment.orientation_error_camdm_release(
-            wanted_facing, facing
-        ),
     }
 
 

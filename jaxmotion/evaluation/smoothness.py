@@ -37,7 +37,7 @@ def acceleration(
       ValueError: if there are fewer than three frames.
 
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 3, in its usual meaning (the
-      paper's unit is that of a speed; see `coherence_camdm_release`).
+      paper's unit is that of a speed; see `camdm_release.coherence`).
     """
     return _mean_derivative(positions, fps, 2)
 
@@ -63,31 +63,3 @@ def jerk(
     Source: Flash and Hogan 1985, who make its square least.
     """
     return _mean_derivative(positions, fps, 3)
-
-
-@jax.jit
-def coherence_camdm_release(
-    positions: Float[Array, "*batch frames joints 3"],
-) -> Float[Array, "*batch"]:
-    """What CAMDM's code prints as acceleration: a ratio of speeds.
-
-    Mean step of all joints divided by the mean horizontal step of joint 0, or by 1 if
-    that stands still. No second difference is taken.
-
-    Args:
-      positions: World positions of the joints, metres; joint 0 is the root.
-
-    Returns:
-      Ratio without unit, near 1 for walking.
-
-    Raises:
-      ValueError: if there are fewer than two frames.
-
-    Source: released code of CAMDM, cal_metric_cohenrence.
-    """
-    if positions.shape[-3] < 2:
-        raise ValueError("1 frame or none, expected at least 2 to have a step")
-    step = jnp.diff(positions, axis=-3)
-    root = jnp.mean(jnp.linalg.norm(step[..., 0, ::2], axis=-1), axis=-1)
-    mean = jnp.mean(jnp.linalg.norm(step, axis=-1), axis=(-2, -1))
-    return mean / jnp.where(root == 0, 1.0, root)

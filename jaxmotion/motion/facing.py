@@ -4,7 +4,8 @@ CAMDM takes the facing from the hips alone: with across = left hip - right hip i
 world, forward = across x up. Only the chain from the root to the hips is needed. So
 are its training data made; its Unity run-time takes the forward axis of the root joint
 instead, which differed from the hips by 0.5 degrees on average where the two were
-compared (95th percentile 1.8, at most 7.4).
+compared (95th percentile 1.8, at most 7.4); its evaluation takes hips and shoulders
+(`body_facing`).
 """
 
 import jax
@@ -20,6 +21,13 @@ _HIPS = (
     ("upperlegl", "upperlegr"),  # Bandai Namco Research
     ("lefthip", "righthip"),  # 100STYLE, SMPL
     ("lhip", "rhip"),  # BallPlay-M
+)
+# Inner joints of the shoulders, likewise. Where there are collars, these are they.
+_SHOULDERS = (
+    ("leftcollar", "rightcollar"),  # 100STYLE, SMPL
+    ("lthorax", "rthorax"),  # BallPlay-M
+    ("leftshoulder", "rightshoulder"),  # Mixamo, LaFAN1, CMU
+    ("shoulderl", "shoulderr"),  # Bandai Namco Research
 )
 
 
@@ -64,6 +72,15 @@ def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
     )
 
 
+def shoulder_joints(skeleton: Skeleton) -> tuple[int, int] | None:
+    """Left and right inner shoulder joint (collar), found by name; None for none."""
+    plain = plain_names(skeleton)
+    for left, right in _SHOULDERS:
+        if left in plain and right in plain:
+            return plain.index(left), plain.index(right)
+    return None
+
+
 @jax.jit
 def facing_from_across(across: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
     """Facing of a body from the vector that points from its right to its left.
@@ -105,3 +122,33 @@ def hip_facing(
         from_root(skeleton, joint_rotation, left)
         - from_root(skeleton, joint_rotation, right)
     )
+
+
+def body_facing(
+    skeleton: Skeleton, positions: Float[Array, "*batch joints 3"]
+) -> Float[Array, "*batch 2"]:
+    """Facing of poses from hips and shoulders alike, as CAMDM's evaluation has it.
+
+    Args:
+      skeleton: The bones.
+      positions: World positions of its joints.
+
+    Returns:
+      Unit directions (x, z), world.
+
+    Raises:
+      ValueError: if hips or shoulders are not found by name.
+
+    Source: Chen et al. 2024 (CAMDM), released code.
+    """
+    shoulders = shoulder_joints(skeleton)
+    if shoulders is None:
+        raise ValueError(
+            "no shoulder joints: expected LeftCollar, LeftShoulder, Shoulder_L or "
+            f"L_Thorax among the joint names {', '.join(skeleton.names)}"
+        )
+    across = 0.0
+    for left, right in (hip_joints(skeleton), shoulders):
+        gap = positions[..., left, :] - positions[..., right, :]
+        across += gap / jnp.linalg.norm(gap, axis=-1, keepdims=True)
+    return facing_from_across(across)

@@ -6,7 +6,7 @@ through the same windows of 60 frames, and the Fréchet distances are taken of e
 numbers of windows against the same reference.
 
 Source: Chen et al. 2024 (CAMDM), section 4.1 and table 1; what its release computes
-instead is in the columns whose names end in camdm_release.
+instead is in the columns of `protocols.camdm_release`.
 """
 
 import dataclasses

@@ -12,7 +12,13 @@ from jaxtyping import Array, Float
 from jaxmotion.evaluation import table
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.protocols import camdm as protocol
-from jaxmotion.protocols import camdm_rows, camdm_styles, evaluators, provenance
+from jaxmotion.protocols import (
+    camdm_release,
+    camdm_rows,
+    camdm_styles,
+    evaluators,
+    provenance,
+)
 from jaxmotion.protocols.camdm_runs import Run
 from jaxmotion.typing import Key
 
@@ -138,6 +144,14 @@ def evaluate_run(
     rows, report = camdm_rows.evaluation_table(
         model.bones, real, dense, made, frames, judge, repeats=repeats
     )
+    styles = camdm_release.style_features(model.bones, run.train, judge, field=field)
+    for name, whole in (
+        (camdm_rows.TRUTH, camdm_release.of_clips(run.held_out, field=field)),
+        (camdm_rows.ROLLOUTS, camdm_release.of_rollouts(frames, commands, fps=fps)),
+    ):
+        values = camdm_release.metrics(model.bones, whole)
+        fid = camdm_release.distances(model.bones, whole, judge, styles)
+        rows[name] |= camdm_release.row(values | {"fid": fid})
     return rows, report | {
         "source": model.source,
         "evaluator": evaluators.describe(

@@ -19,6 +19,7 @@ from jaxmotion.protocols.camdm import Windows
 from jaxmotion.protocols.camdm_styles import Recognized, in_batches, recognized
 from jaxmotion.systems import camdm_control
 
+TRUTH, ROLLOUTS = "held-out (ground truth)", "rollouts"
 _DEGREES = 180.0 / np.pi
 # Column: metric, metric that weights its windows, factor.
 _COLUMNS = {
@@ -28,10 +29,6 @@ _COLUMNS = {
     "skate_ratio": ("skate_ratio", None, 1.0),
     "acceleration_m/s2": ("acceleration", None, 1.0),
     "jerk_m/s3": ("jerk", None, 1.0),
-    "slide_camdm_release": ("slide_camdm_release", None, 1.0),
-    "coherence_camdm_release": ("coherence_camdm_release", None, 1.0),
-    "trajectory_camdm_release_deg": ("trajectory_camdm_release", None, _DEGREES),
-    "orientation_camdm_release_deg": ("orientation_camdm_release", None, _DEGREES),
 }
 
 
@@ -190,17 +187,17 @@ def evaluation_table(
     count = min(len(real_feature), len(made_feature), int(own.sum()), int((~own).sum()))
     distances = functools.partial(camdm_distances.frechet_cells, count=count, seed=seed)
     rows = {
-        "held-out (ground truth)": metric_row(bones, real, real_hits, height=height)
+        TRUTH: metric_row(bones, real, real_hits, height=height)
         | distances(real_feature, reference),
         "training half vs half (noise floor)": distances(
             reference[own], reference[~own]
         ),
-        "rollouts": metric_row(bones, made, made_hits, height=height)
+        ROLLOUTS: metric_row(bones, made, made_hits, height=height)
         | distances(made_feature, reference),
     }
     if repeats > 1:
         found = repeat_diversity(bones, made, repeats=repeats)
-        rows["rollouts"]["diversity_m2"] = found
+        rows[ROLLOUTS]["diversity_m2"] = found
     root = float(np.median(np.asarray(real.motion.root_position)[..., 1]))
     return rows, {
         "contact_height_m": height,

@@ -21,7 +21,12 @@ from jaxmotion.evaluation import table
 from jaxmotion.evaluation.transitions import transition
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.protocols import camdm as protocol
-from jaxmotion.protocols import camdm_evaluation, camdm_rows, camdm_styles
+from jaxmotion.protocols import (
+    camdm_evaluation,
+    camdm_release,
+    camdm_rows,
+    camdm_styles,
+)
 from jaxmotion.protocols.camdm_runs import Run
 from jaxmotion.protocols.camdm_styles import Recognized
 from jaxmotion.systems import camdm_control
@@ -31,12 +36,7 @@ STRIDE = 3
 HALF = protocol.WINDOW // 2
 # Seconds behind the command whose motion is measured; the paper's 120 frames.
 MEASURED = 4.0
-MOTION = (
-    "foot_slide_m/s",
-    "jerk_m/s3",
-    "slide_camdm_release",
-    "coherence_camdm_release",
-)
+MOTION = ("foot_slide_m/s", "jerk_m/s3")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -190,7 +190,8 @@ def transition_row(
 
     Returns:
       Success in per cent; duration in seconds and frames, failures counted as the
-      limit; and of the four seconds behind the command what `metric_row` measures.
+      limit; of the four seconds behind the command what `metric_row` measures; and of
+      the whole rollout slide and coherence of CAMDM's release.
     """
     bones, fps = run.model.bones, run.model.config.fps
     found, centres = find_changes(bones, frames, changes, recognizer, fps=fps)
@@ -212,7 +213,11 @@ def transition_row(
     owner = changes.replication[np.asarray(made.group)]
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
     motion = camdm_rows.metric_row(bones, grouped, None, height=height)
-    return row | {name: motion[name] for name in MOTION}
+    row |= {name: motion[name] for name in MOTION}
+    # Of its changes of style the release measures neither direction nor facing.
+    whole = camdm_release.of_rollouts(frames, changes.commands, fps=fps)
+    values = camdm_release.metrics(bones, dataclasses.replace(whole, command=None))
+    return row | camdm_release.row(values, changes.replication)
 
 
 def evaluate_transitions(

@@ -39,46 +39,14 @@ def test_trajectory_error_of_a_character_at_rest_uses_nothing():
     np.testing.assert_array_equal(got, (0.0, 0.0))
 
 
-def test_left_and_right_cancel_only_in_the_release():
+def test_left_and_right_do_not_cancel():
     wanted = directions(np.zeros(10))
     facing = directions([0.5, -0.5] * 5)
     np.testing.assert_allclose(
         alignment.orientation_error(wanted, facing), 0.5, atol=1e-6
     )
-    np.testing.assert_allclose(
-        alignment.orientation_error_camdm_release(wanted, facing), 0.0, atol=1e-6
-    )
-
-
-def test_release_does_not_wrap():
-    # Polar angles pi - 0.1 and -(pi - 0.1): 0.2 apart, but 2 pi - 0.2 by subtraction.
-    polar = np.array([[np.pi - 0.1], [-np.pi + 0.1]])
-    a, b = (
-        jnp.asarray(np.stack([np.cos(p), np.sin(p)], -1), jnp.float32) for p in polar
-    )
-    np.testing.assert_allclose(alignment.orientation_error(a, b), 0.2, atol=1e-5)
-    np.testing.assert_allclose(
-        alignment.orientation_error_camdm_release(a, b), 2 * np.pi - 0.2, atol=1e-5
-    )
-
-
-def test_released_trajectory_error_is_the_mean_signed_difference():
-    rng = np.random.default_rng(0)
-    wanted, position = (rng.normal(size=(3, 12, 2)).astype(np.float32) for _ in "ab")
-    step = np.diff(position.astype(float), axis=1)
-    polar = np.arctan2(wanted[:, :-1, 1], wanted[:, :-1, 0]) - np.arctan2(
-        step[..., 1], step[..., 0]
-    )
-    got = alignment.trajectory_error_camdm_release(
-        jnp.asarray(wanted), jnp.asarray(position)
-    )
-    np.testing.assert_allclose(got, np.abs(polar.mean(-1)), atol=1e-5)
 
 
 def test_one_frame_is_refused():
-    for call in (
-        lambda p: alignment.trajectory_error(p, p, 30.0),
-        lambda p: alignment.trajectory_error_camdm_release(p, p),
-    ):
-        with pytest.raises(ValueError, match="expected at least 2"):
-            call(jnp.zeros((1, 2)))
+    with pytest.raises(ValueError, match="expected at least 2"):
+        alignment.trajectory_error(jnp.zeros((1, 2)), jnp.zeros((1, 2)), 30.0)

@@ -102,24 +102,6 @@ def test_skating_frames_are_those_of_the_definition():
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_released_foot_slide_is_that_of_the_definition():
-    feet, root = clip(1)
-    want = oracle.foot_slide_release(feet.astype(float), root.astype(float), 0.01)
-    got = contact.foot_slide_camdm_release(jnp.asarray(feet), jnp.asarray(root))
-    np.testing.assert_allclose(got, want, rtol=1e-5)
-
-
-def test_released_foot_slide_is_a_ratio():
-    feet, root = clip(2)
-    got = contact.foot_slide_camdm_release(jnp.asarray(feet), jnp.asarray(root))
-    slow = contact.foot_slide_camdm_release(jnp.asarray(feet), jnp.asarray(root) / 10)
-    np.testing.assert_allclose(slow, 10 * got, rtol=1e-4)
-    still = contact.foot_slide_camdm_release(jnp.asarray(feet), 0 * jnp.asarray(root))
-    assert np.isfinite(still)
-    high = jnp.asarray(feet) + jnp.array([0, 1.0, 0]).reshape(1, 1, 3)
-    assert contact.foot_slide_camdm_release(high, jnp.asarray(root)) == 0.0
-
-
 def test_one_frame_is_refused():
     for measure in (contact.slide_distance, contact.skating_frame_ratio):
         with pytest.raises(ValueError, match="expected at least 2"):

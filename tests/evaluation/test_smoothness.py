@@ -28,19 +28,6 @@ def test_means_are_over_frames_and_joints_but_not_clips():
     )
 
 
-def test_released_coherence_is_a_ratio_of_speeds():
-    t = np.arange(10)[:, None, None]
-    # The root walks 3 a frame and rises, the other joint moves 6 a frame.
-    steps = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 6.0]])
-    got = smoothness.coherence_camdm_release(jnp.asarray(t * steps, jnp.float32))
-    np.testing.assert_allclose(got, (5 + 6) / 2 / 3, rtol=1e-6)
-    steps[0] = 0
-    got = smoothness.coherence_camdm_release(jnp.asarray(t * steps, jnp.float32))
-    np.testing.assert_allclose(got, 3.0, rtol=1e-6)
-
-
 def test_too_few_frames_are_refused():
     with pytest.raises(ValueError, match="3 frames, expected at least 4"):
         smoothness.jerk(jnp.zeros((3, 1, 3)), 30.0)
-    with pytest.raises(ValueError, match="expected at least 2"):
-        smoothness.coherence_camdm_release(jnp.zeros((1, 1, 3)))

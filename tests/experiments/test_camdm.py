@@ -13,6 +13,7 @@ from PIL import Image
 
 from jaxmotion.data import bvh_text, clips_io
 from jaxmotion.learning import checkpoint
+from jaxmotion.protocols import camdm_release
 from tests.protocols import samples
 
 ROOT = Path(__file__).parents[2]
@@ -105,6 +106,17 @@ def check_evaluation(folder, rollouts):
         "training half vs half (noise floor)",
         "rollouts",
     }
+    released = {
+        row: {name for name in cells if "camdm_release" in name}
+        for row, cells in found["rows"].items()
+    }
+    every = {column for column, _ in camdm_release.COLUMNS.values()}
+    assert released["rollouts"] == every
+    # Of clips that nobody steered there is no error of direction or facing.
+    steered = {name for name in every if name.endswith("_deg")}
+    assert released["held-out (ground truth)"] == every - steered
+    for name in every:
+        assert found["rows"]["rollouts"][name]["samples"] == rollouts
     assert found["health"]["rollouts"] == rollouts
     assert set(found["speeds"]) == set(samples.STYLES)
     assert found["arguments"]["preset"] == "forward"

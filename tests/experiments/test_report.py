@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.protocols import camdm_release
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "report.py"
 
@@ -229,12 +230,21 @@ def test_rows_of_two_judges_are_not_compared(decide):
     assert decide(rows, pairs=pairs, judges=(one, one)).verdict == "reproduced"
 
 
+def test_beside_the_values_of_camdm_stands_what_its_release_computes(load):
+    tables = load("reports.camdm").TABLES
+    released = {column for column, _ in camdm_release.COLUMNS.values()}
+    names = {"FID", "Ft. Slid.", "Accel.", "Traj. Err.", "Orient. Err."}
+    found = {x.name: x.here for table in tables for x in table.columns}
+    assert {found[name] for name in names} == released
+    assert not {found[name] for name in set(found) - names} & released
+
+
 # --- a report -----------------------------------------------------------------------
 
 SWEEP = {
     f"T = {steps}": {
         "p50 ms": near(float(steps)),
-        "fid": near(fid),
+        "fid_camdm_release": near(fid),
         "slide_camdm_release": near(0.5),
     }
     for steps, fid in ((2, 5.0), (4, 4.0), (8, 3.0), (16, 2.0), (32, None))

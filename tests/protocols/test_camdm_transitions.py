@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from jaxmotion.learning import recognition
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.protocols import camdm_styles
 from jaxmotion.protocols import camdm_transitions as transitions
 from jaxmotion.systems.camdm_control import Control
 from tests.protocols import samples
+from tests.reference import metrics as oracle
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
@@ -91,6 +93,21 @@ def test_planted_changes_are_found_at_their_time(changes):
     assert frames_there.value == pytest.approx(30 * np.mean(seconds), abs=1e-3)
     assert set(transitions.MOTION) < set(row)
     assert row["foot_slide_m/s"].value >= 0
+    # What CAMDM's release measures of changes of style, of the whole rollout.
+    bones = samples.run().model.bones
+    wanted = []
+    for i in range(4):
+        motion = Motion(
+            root_position=frames.root_position[i],
+            joint_rotation=frames.joint_rotation[i],
+        )
+        joints = joint_positions(bones, motion)
+        wanted.append(oracle.camdm_release(bones.names, joints))
+    released = {name: row[f"{name}_camdm_release"] for name in wanted[0]}
+    for name, cell in released.items():
+        mean = np.mean([x[name] for x in wanted])
+        assert cell.value == pytest.approx(mean, rel=1e-5) and cell.samples == 2
+    assert not [name for name in row if name.startswith(("fid", "trajectory"))]
 
 
 @pytest.mark.usefixtures("sees_height")
