@@ -1,10 +1,11 @@
-"""CAMDM on prepared clips: train, evaluate, roll out.
+"""CAMDM on prepared clips: train, evaluate, roll out; its authors' weights too.
 
 Examples:
   python experiments/prepare_data.py bandai_namco/2 --manual-dir ../shared/data/bandai_namco --out data/bandai2.npz
   python experiments/camdm.py train --data data/bandai2.npz --out runs/camdm
   python experiments/camdm.py evaluate --run runs/camdm
   python experiments/camdm.py rollout --run runs/camdm --style elderly --seconds 20
+  python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --out camdm_released.npz
 """  # noqa: E501
 
 import dataclasses
@@ -27,7 +28,7 @@ from jaxmotion.protocols import (
     evaluators,
     script,
 )
-from jaxmotion.systems import camdm_model
+from jaxmotion.systems import camdm_model, camdm_published
 
 Steering = Literal["forward", "strafe", "stop_and_go"]
 
@@ -191,7 +192,8 @@ class Evaluate:
     Attributes:
       run: Run folder of `train`.
       data: Clips; None for those that the run was trained on.
-      out: Folder for metrics.json and table.md; None for <run>/evaluation.
+      out: Folder for metrics.json and table.md; None for <run>/evaluation
+        (beside an exported file).
       rollouts: Characters; spread evenly over the styles.
       seconds: Length of each rollout, seconds; 4 at least.
       preset: Commands.
@@ -232,7 +234,7 @@ class Rollout:
       seconds: Length, seconds.
       preset: Commands.
       speed: Metres a second; None for the style's own median speed.
-      out: Folder; None for <run>/rollout.
+      out: Folder; None for <run>/rollout (beside an exported file).
       seed: Of the start pose and the noise.
     """
 
@@ -251,7 +253,7 @@ def evaluate(args: Evaluate) -> None:
     """Writes the table."""
     evaluator = None if args.evaluator is None else evaluators.load(args.evaluator)
     run = camdm_runs.load_run(args.run, args.data, args.contents)
-    out = args.out or args.run / "evaluation"
+    out = args.out or _beside(args.run) / "evaluation"
     loop.check_writable(out)
     rows, report = camdm_evaluation.evaluate_run(
         run,
@@ -273,7 +275,7 @@ def evaluate(args: Evaluate) -> None:
 def rollout(args: Rollout) -> None:
     """Writes rollout.bvh, rollout.gif and rollout.html."""
     run = camdm_runs.load_run(args.run, args.data)
-    out = args.out or args.run / "rollout"
+    out = args.out or _beside(args.run) / "rollout"
     loop.check_writable(out)
     motion, velocity = camdm_evaluation.steer_one(
         run,
@@ -312,11 +314,60 @@ def export(args: Export) -> None:
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
 
 
+@dataclasses.dataclass(frozen=True)
+class Import:
+    """Write the authors' weights as one npz file; no code of theirs is run.
+
+    What other commands and serve.py take as --run is then this file.
+
+    Example: python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --labels 100style_conditions.json --out camdm_released.npz
+
+    Attributes:
+      weights: Their checkpoint (.pt) or one of their ONNX files.
+      skeleton: A BVH file of the skeleton that it was trained on; fingers and eyes are
+        left out.
+      labels: JSON with the styles' names as "styles"; None for 100style_conditions.json
+        beside the weights.
+      data: Clips from prepare_data.py to start from and compare with, where a command
+        is given no others.
+      scale: Metres per unit of the BVH file.
+      out: File to write; parameters are stored as float32.
+    """  # noqa: E501
+
+    weights: Path
+    skeleton: Path
+    labels: Path | None = None
+    data: Path = Path("data/style100.npz")
+    scale: float = 0.01
+    out: Path = Path("camdm_released.npz")
+
+
+def import_weights(args: Import) -> None:
+    """Writes the file."""
+    bones = camdm_runs.released_skeleton(args.skeleton, scale=args.scale)
+    labels = args.labels and camdm_published.read_styles(args.labels)
+    model, params = camdm_published.load(args.weights, bones=bones, labels=labels)
+    # Which clips to use, as `train` would note it.
+    clips = camdm_runs.arguments_json(Train(data=args.data, contents=()))
+    config = camdm_model.to_json(model) | {"experiment": clips}
+    checkpoint.export_params(args.out, params, config, dtype=np.float32)
+    print(
+        f"wrote {args.out}: {len(model.labels)} styles, {bones.num_joints} joints, "
+        f"{model.config.num_steps} steps; {model.source}"
+    )
+
+
+def _beside(run: Path) -> Path:
+    """Where what is made with a run folder, or with an exported file, goes."""
+    return run.with_suffix("") if run.is_file() else run
+
+
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
 )
 
 
@@ -324,7 +375,7 @@ def main() -> None:
     """Parses the command line and runs the command."""
     args = tyro.cli(Command, description=__doc__)
     run = {Train: train, Evaluate: evaluate, Rollout: rollout, Export: export}
-    run[type(args)](args)
+    (run | {Import: import_weights})[type(args)](args)
 
 
 if __name__ == "__main__":

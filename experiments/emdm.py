@@ -21,6 +21,7 @@ from emdm_tasks import evaluation, sampling, setup
 from jaxmotion.learning import loop
 from jaxmotion.learning.matching import Padding
 from jaxmotion.protocols import emdm_rows, emdm_runs, emdm_text, script, stages
+from jaxmotion.systems import emdm as emdm_system
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,10 +215,53 @@ def sample(args: Sample) -> None:
     sampling.sample(args, out)
 
 
+@dataclasses.dataclass(frozen=True)
+class Import:
+    """Put the authors' weights into a run folder of texts; no code of theirs is run.
+
+    The folder comes of `train` without rows (see the example), with HumanML3D or KIT-ML
+    as prepare_data.py leaves them. Then evaluate and sample as ever.
+
+    Example: python experiments/emdm.py train --task text --data data/humanml3d.npz --encoder clip --frames 196 --out runs/emdm_released --rows
+    python experiments/emdm.py import --weights humanml.pth --run runs/emdm_released
+
+    Attributes:
+      weights: Their checkpoint (.pth), with the generator's moving average.
+      run: The run folder.
+      heads: Attention heads; the file does not say.
+      diffusion_steps: Steps T of the diffusion; the file does not say.
+    """  # noqa: E501
+
+    weights: Path
+    run: Path
+    heads: int = 32
+    diffusion_steps: int = 10
+
+
+def import_weights(args: Import) -> None:
+    """Writes the row's checkpoint."""
+    run = emdm_text.load_run(args.run)
+    if (form := run.config["text_form"]) != "released":
+        raise ValueError(
+            f"{args.run}: field 'text_form' is {form!r}, expected 'released': CLIP's "
+            "vectors are what the weights know"
+        )
+    base, frames = emdm_system.Config(features=1), run.config["frames"]
+    task = emdm_text.make_task(run, base, frames=frames)
+    config = emdm_runs.import_row(
+        args.run, task, args.weights, heads=args.heads, num_steps=args.diffusion_steps
+    )
+    print(
+        f"wrote row 'emdm' of {args.run}: {config.depth} layers of {config.width} "
+        f"channels, {config.num_steps} steps"
+    )
+
+
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Sample, tyro.conf.subcommand("sample")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
 )
 
 
@@ -225,7 +269,7 @@ def main() -> None:
     """Parses the command line and runs the command."""
     args = tyro.cli(Command, description=__doc__)
     run = {Train: train, Evaluate: evaluate, Sample: sample}
-    run[type(args)](args)
+    (run | {Import: import_weights})[type(args)](args)
 
 
 if __name__ == "__main__":

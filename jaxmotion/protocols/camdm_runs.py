@@ -4,8 +4,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from jaxmotion.data import clips_io, selection
+from jaxmotion.data import bvh, bvh_text, clips_io, selection
 from jaxmotion.data.clips import Clips
+from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems import camdm_model
 from jaxmotion.typing import Params
 
@@ -83,6 +84,24 @@ def split_data(
     if held_out_clips:
         return selection.split_by_name(clips, held_out_clips)
     return selection.split_clips(clips, fraction=held_out, seed=0, field=label)
+
+
+def released_skeleton(path: Path, *, scale: float) -> Skeleton:
+    """The skeleton of a BVH file as CAMDM's preprocessing leaves it.
+
+    Args:
+      path: The file; fingers and eyes are dropped.
+      scale: Metres per unit of the file.
+
+    Raises:
+      OSError: if it cannot be read.
+      BvhError: if it is malformed or has no toes.
+    """
+    from jaxmotion.data.builders import style100
+
+    content = style100.without_fingers(bvh_text.read_bvh(path))
+    skeleton, _ = bvh.motion_from_bvh(content, scale=scale)
+    return dataclasses.replace(skeleton, feet=style100.toes(skeleton, str(path)))
 
 
 def check_clips(model: camdm_model.Model, clips: Clips, field: str) -> None:

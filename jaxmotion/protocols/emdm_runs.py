@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmotion.learning import adversarial, training
+from jaxmotion.learning import adversarial, checkpoint, training
 from jaxmotion.protocols import stages
 from jaxmotion.protocols.emdm_rows import (
     SAMPLERS,
@@ -25,7 +25,7 @@ from jaxmotion.protocols.emdm_rows import (
     row_config,
 )
 from jaxmotion.protocols.stages import Budget
-from jaxmotion.systems import emdm, emdm_loss
+from jaxmotion.systems import emdm, emdm_loss, emdm_published
 from jaxmotion.systems.emdm import Config
 from jaxmotion.typing import Key, Params
 
@@ -143,6 +143,49 @@ def train_row(
         config=_config_json(config) | task.describe,
         show=show,
     )
+
+
+def import_row(
+    folder: Path, task: Task, weights: Path, *, heads: int, num_steps: int
+) -> Config:
+    """Puts the authors' weights into a run folder, as its row "emdm".
+
+    Args:
+      folder: The run folder.
+      task: Its data; only what it is conditioned on and how it looks counts.
+      weights: As of `emdm_published.load`; so are heads and steps.
+
+    Returns:
+      The configuration.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if the row exists, or the file is damaged or does not fit the run;
+        names what differs.
+    """
+    row, base = "emdm", task.base
+    place = folder / row / "checkpoints"
+    if checkpoint.latest_step(place) is not None:
+        raise ValueError(f"{folder}: row {row!r} exists; use another folder")
+    config, params = emdm_published.load(
+        weights, frames=base.frames, num_steps=num_steps, heads=heads
+    )
+    for field in ("condition", "condition_size", "features"):
+        expected, found = getattr(base, field), getattr(config, field)
+        if expected != found:
+            raise ValueError(
+                f"{weights} does not fit {folder}: field {field!r} is {found!r}, the "
+                f"run's {expected!r}"
+            )
+    checkpoint.save(
+        place,
+        0,
+        {"generator": {"ema_params": params["generator"]}},
+        {"system": "emdm", "stage": row, "weights": weights.name}
+        | _config_json(config)
+        | task.describe,
+    )
+    return config
 
 
 def load_row(folder: Path, row: str) -> tuple[Params, Config]:

@@ -1,5 +1,6 @@
 """experiments/camdm.py: train, evaluate and roll out on clips that the tests make."""
 
+import argparse
 import functools
 import json
 import re
@@ -7,13 +8,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.data import bvh_text, clips_io
+from jaxmotion.data import bvh, bvh_text, clips_io, windows
 from jaxmotion.learning import checkpoint
 from jaxmotion.protocols import camdm_release
+from jaxmotion.systems import camdm_model, camdm_published
 from tests.protocols import samples
 
 ROOT = Path(__file__).parents[2]
@@ -143,6 +147,77 @@ def test_an_evaluation_writes_its_table(call, trained):
         "--chunk 2"
     )
     check_evaluation(trained / "evaluation", 2)
+
+
+@pytest.fixture(scope="module")
+def released(call, data, tmp_path_factory):
+    """The authors' checkpoint of the walker's skeleton, and what becomes of it."""
+    torch = pytest.importorskip("torch")
+    from tests.reference import published_torch as peers
+
+    folder = tmp_path_factory.mktemp("released")
+    clips = samples.clips()
+    motion = windows.cut(clips, jnp.array(0), 3)
+    content = bvh.bvh_from_motion(clips.skeleton, motion)
+    bvh_text.write_bvh(folder / "skeleton.bvh", content)
+    peer = peers.Camdm(clips.skeleton.num_joints, len(samples.STYLES))
+    content = {"state_dict": peers.randomize(peer, 0).state_dict()}
+    torch.save(content | {"config": argparse.Namespace(name="x")}, folder / "best.pt")
+    styles = folder / "styles.json"
+    styles.write_text(json.dumps({"styles": samples.STYLES}))
+    call(
+        f"import --weights {folder}/best.pt --skeleton {folder}/skeleton.bvh "
+        f"--labels {styles} --data {data} --out {folder}/released.npz"
+    )
+    return folder
+
+
+@pytest.mark.usefixtures("quick_compile")
+def test_released_weights_become_a_model_that_rolls_out(call, released):
+    model, params, _ = camdm_model.load(released / "released.npz")
+    assert model.config.num_steps == 4 and model.config.norm == "post"
+    assert model.labels == samples.STYLES
+    assert model.bones.feet == samples.clips().skeleton.feet
+    direct, again = camdm_published.load(
+        released / "best.pt", bones=model.bones, labels=model.labels
+    )
+    assert direct.config == model.config
+    jax.tree.map(np.testing.assert_array_equal, params, again)
+    call(f"rollout --run {released}/released.npz --style zombie --seconds 1")
+    folder = released / "released" / "rollout"
+    assert bvh_text.read_bvh(folder / "rollout.bvh").values.shape[0] == 30
+
+
+@pytest.mark.usefixtures("quick_compile")
+@pytest.mark.slow
+def test_released_weights_are_evaluated(call, released):
+    call(
+        f"evaluate --run {released}/released.npz --rollouts 2 --seconds 4 "
+        "--recognizer-steps 2 --chunk 2"
+    )
+    folder = released / "released" / "evaluation"
+    assert json.loads((folder / "metrics.json").read_text())["rows"]["rollouts"]
+
+
+@pytest.mark.parametrize(
+    "option, message",
+    [
+        ("--skeleton {data}", "clips.npz"),
+        ("--weights {data}", "clips.npz: no PyTorch's file"),
+        ("--weights {folder}/gone.pt", "no weights file .*gone.pt"),
+        ("--labels {folder}/gone.json", "gone.json"),
+        ("--labels {folder}/skeleton.bvh", "skeleton.bvh: not JSON"),
+    ],
+)
+def test_bad_weights_leave_nothing_behind(call, data, released, option, message):
+    out = released / "bad.npz"
+    with pytest.raises((ValueError, OSError), match=message) as caught:
+        call(
+            f"import --weights {released}/best.pt --skeleton {released}/skeleton.bvh "
+            f"--labels {released}/styles.json --out {out} "
+            + option.format(data=data, folder=released)
+        )
+    assert "\n" not in str(caught.value) and not out.exists()
 
 
 BAD = [

@@ -3,14 +3,18 @@
 import dataclasses
 import functools
 import json
+import string
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxmotion.data import bvh_text, clips_io, procedural
+from jaxmotion.protocols import emdm_runs
+from jaxmotion.systems import emdm_published
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "experiments" / "emdm.py"
@@ -230,3 +234,54 @@ def test_bad_input_is_one_clear_error(call, line, actions, texts, data, tmp_path
 def test_help_says_what_every_option_does(help_of, command):
     text = help_of("emdm", command)
     assert "Example:" in text and "--seed" in text
+
+
+@pytest.fixture(scope="module")
+def released(call, data, tmp_path_factory):
+    """The authors' checkpoint beside a run folder of texts with data alone."""
+    torch = pytest.importorskip("torch")
+    from tests.reference import published_torch as peers
+    from tests.text import samples
+
+    folder = tmp_path_factory.mktemp("released")
+    (folder / "clip").mkdir()
+    with pytest.MonkeyPatch.context() as patch:  # a tokenizer of all letters
+        patch.setattr(samples, "_byte_pairs", samples._byte_pairs.__wrapped__)
+        letters = " ".join(f"{x} {x}{x}" for x in string.ascii_lowercase)
+        patch.setattr(samples, "SENTENCES", (*samples.SENTENCES, letters))
+        samples.folder(folder / "clip")
+    call(
+        f"train --task text --data {data} --out {folder}/run --held-out 0.3 "
+        f"--encoder {folder}/clip --unseen walk/elderly --frames 40 --rows"
+    )
+    size = samples.SIZES["dimensions"]
+    peer = peers.randomize(peers.EmdmGenerator("text", size, 263), 0)
+    torch.save({"netG_dict": peer.state_dict(), "epoch": 3}, folder / "t2m.pth")
+    return folder
+
+
+def test_released_weights_become_a_row(call, released, tmp_path):
+    line = f"import --weights {released}/t2m.pth --run {released}/run"
+    with pytest.raises(ValueError, match="32 heads do not divide width 16"):
+        call(line)
+    assert not (released / "run" / "emdm").exists()
+    call(f"{line} --heads 4")
+    params, config = emdm_runs.load_row(released / "run", "emdm")
+    assert (config.frames, config.num_steps, config.latent) == (40, 10, 5)
+    wanted = emdm_published.load(released / "t2m.pth", frames=40, heads=4)
+    assert config == wanted[0]
+    jax.tree.map(np.testing.assert_array_equal, params, wanted[1]["generator"])
+    run = f"sample --run {released}/run --out {tmp_path}"
+    call(f"{run} --text", "a person turns left")
+    motion = bvh_text.read_bvh(tmp_path / "a_person_turns_left.bvh")
+    assert motion.values.shape[0] == 40
+    with pytest.raises(ValueError, match="row 'emdm' exists"):
+        call(f"{line} --heads 4")
+
+
+def test_weights_of_another_task_are_refused(call, released, texts, actions):
+    weights = f"import --weights {released}/t2m.pth --heads 4 --run"
+    with pytest.raises(ValueError, match="'text_form' is 'unit', expected 'released'"):
+        call(f"{weights} {texts}")
+    with pytest.raises(ValueError, match="'task' is 'action', expected 'text'"):
+        call(f"{weights} {actions}")

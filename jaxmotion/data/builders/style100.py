@@ -90,7 +90,7 @@ class Style100(base.MotionBuilder):
                 continue
             content = cut_clip(bvh.read_bvh(data, name=path), cuts[style, action])
             skeleton, motion = bvh.motion_from_bvh(content)
-            feet = _feet(skeleton, path)
+            feet = toes(skeleton, path)
             skeleton = dataclasses.replace(skeleton, feet=feet)
             labels = {"style": style, "action": action}
             yield base.example(name, skeleton, motion, labels)
@@ -110,8 +110,12 @@ def _plan(skeleton: Skeleton) -> mirror.MirrorPlan:
     return mirror.mirror_plan(skeleton, tolerance=0.02)
 
 
-def _feet(skeleton: Skeleton, path: str) -> tuple[int, ...]:
-    """The outermost pair of toe joints."""
+def toes(skeleton: Skeleton, path: str) -> tuple[int, ...]:
+    """The outermost pair of toe joints, left before right.
+
+    Raises:
+      BvhError: if there is none; names the file.
+    """
     plain = plain_names(skeleton)
     for pair in _FEET:
         if set(pair) <= set(plain):
@@ -150,6 +154,11 @@ def cut_clip(content: bvh.Bvh, cut: tuple[int, int]) -> bvh.Bvh:
     content = dataclasses.replace(
         content, values=values[start:stop], frame_time=1.0 / 30.0
     )
+    return without_fingers(content)
+
+
+def without_fingers(content: bvh.Bvh) -> bvh.Bvh:
+    """The recording without fingers and eyes, as CAMDM's preprocessing leaves it."""
     dropped = [
         name
         for name in content.names[1:]
