@@ -238,9 +238,13 @@ def rollout(args: Rollout) -> None:
         joint_rotation=frames.joint_rotation[0],
         fps=run.train.fps,
     )
-    title = f"{args.row}{'' if args.steered else ', not steered'} ({run.source})"
     artifacts.write_rollout(
-        out, run.bones, motion, frames.desired_velocity[0], title=title
+        out,
+        run.bones,
+        motion,
+        frames.desired_velocity[0],
+        title=f"{args.row}{'' if args.steered else ', not steered'}",
+        caption=run.source,
     )
 
 

@@ -287,8 +287,9 @@ def rollout(args: Rollout) -> None:
         seed=args.seed,
     )
     title = " to ".join(filter(None, (args.style, args.to_style)))
-    title = f"{title} ({run.model.source})"
-    artifacts.write_rollout(out, run.model.bones, motion, velocity, title=title)
+    artifacts.write_rollout(
+        out, run.model.bones, motion, velocity, title=title, caption=run.model.source
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -195,6 +195,7 @@ def main() -> None:
         motion,
         first.desired_velocity,
         title=f"procedural walker: {', '.join(args.styles)}",
+        caption=procedural.SOURCE,
     )
     seconds = time.perf_counter() - start
     report = {"losses": losses, "seconds": seconds, "jax": jax.__version__}

@@ -77,7 +77,8 @@ def _from_actions(args: Any, out: Path) -> None:
             run.clips.skeleton,
             motion,
             None,
-            title=f"{title}, {args.row} ({run.clips.source})",
+            title=f"{title}, {args.row}",
+            caption=run.clips.source,
             name=_file_name(title),
         )
 
@@ -93,5 +94,11 @@ def _from_texts(args: Any, out: Path) -> None:
             positions[i], run.motions.fps
         )
         artifacts.write_rollout(
-            out, bones, motion, None, title=text, name=_file_name(text)
+            out,
+            bones,
+            motion,
+            None,
+            title=text,
+            caption=run.motions.source,
+            name=_file_name(text),
         )

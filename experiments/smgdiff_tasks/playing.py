@@ -108,7 +108,8 @@ def play(args: Any, run: Run, out: Path) -> None:
         bones,
         scene.motion,
         steered.velocity,
-        title=f"{', '.join(args.skills or model.labels)} ({model.source})",
+        title=", ".join(args.skills or model.labels),
+        caption=model.source,
         ball=artifacts.Ball(
             position=np.asarray(scene.ball),
             touch=touch,

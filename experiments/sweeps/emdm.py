@@ -119,8 +119,10 @@ def write_motion(job: Job, run: emdm_action.ActionRun, point: Point, out: Path) 
         joint_rotation=motion.joint_rotation,
         fps=run.clips.fps,
     )
-    title = f"{run.actions[0]}, {point.row} ({run.clips.source})"
-    artifacts.write_rollout(out, run.clips.skeleton, motion, None, title=title)
+    title = f"{run.actions[0]}, {point.row}"
+    artifacts.write_rollout(
+        out, run.clips.skeleton, motion, None, title=title, caption=run.clips.source
+    )
 
 
 def bench(job: Job) -> Bench:

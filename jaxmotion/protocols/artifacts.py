@@ -38,6 +38,7 @@ def write_rollout(
     desired_velocity: Float[Array, "frames 2"] | None,
     *,
     title: str,
+    caption: str = "",
     name: str = "rollout",
     ball: Ball | None = None,
 ) -> None:
@@ -50,6 +51,7 @@ def write_rollout(
       desired_velocity: What was commanded, metres a second; its integral is drawn as
         the commanded path. None if nothing was.
       title: Of the pictures.
+      caption: Below them: the source of the data and its licence.
       name: Of the files, without their ends.
       ball: What the person plays with; None for nothing.
 
@@ -67,9 +69,8 @@ def write_rollout(
     if desired_velocity is not None:
         path = presets.integrate_path(desired_velocity, fps)
         commanded = np.asarray(path) + walked[0]
-    shown = dict(
-        fps=fps, names=bones.names, commanded=commanded, walked=walked, title=title
-    )
+    shown = dict(fps=fps, names=bones.names, commanded=commanded, walked=walked)
+    shown |= dict(title=title, caption=caption)
     gif, page = dict(shown), dict(shown)
     if ball is not None:
         _write_ball(folder / f"{name}_ball.csv", ball, fps)

@@ -1,1 +1,1 @@
-"""Pictures: stick figures, animations, plots; the only package with matplotlib."""
+"""Pictures: animated bodies, plots; the only package with matplotlib."""

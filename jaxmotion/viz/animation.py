@@ -1,128 +1,312 @@
-"""Animated GIF of a stick figure with the commanded and the walked path."""
+"""Animated GIF of a body on the ground, with the commanded and the walked path."""
 
 import dataclasses
 import functools
-import io
-import textwrap
-from collections.abc import Callable
 from pathlib import Path
 
+import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from matplotlib.patches import Circle
-from PIL import Image
+from PIL import Image, ImageColor, ImageDraw, ImageFilter, ImageFont
 
+from jaxmotion.viz import body as bodies
+from jaxmotion.viz import camera as cameras
 from jaxmotion.viz import figure as drawing
+from jaxmotion.viz import raster
 
+_GROUND, _TILE, _INK, _FAINT = "#f6f8fa", "#dde4ec", "#20262e", "#707884"
 _PATH_COLORS = (drawing.COMMANDED, drawing.WALKED)
+_TOUCH, _BALL = "#2fae4a", "#e8e4da"
+_SHADOW = 0.3
+# Trunk, head and feet are of many capsules: metres over which their light is smoothed.
+_SOFT = {
+    bodies.MIDDLE: 0.07,
+    bodies.SKIN: 0.02,
+    bodies.LEFT_DARK: 0.02,
+    bodies.RIGHT_DARK: 0.02,
+}
+_TONES = 4
+_MARK = 0.05  # radius of the mark of a joint in contact, metres
+# Drawn so many times larger in both directions, then averaged.
+_FINE = 2
 
 
-def _grid(centre: np.ndarray, size: float) -> np.ndarray:
-    """Segments of a metre grid on the ground around a point, [n, 2, 3]."""
-    low, high = np.floor(centre - size), np.ceil(centre + size)
-    xs = np.arange(low[0], high[0] + 1)
-    zs = np.arange(low[1], high[1] + 1)
-    along_z = [[(x, 0, zs[0]), (x, 0, zs[-1])] for x in xs]
-    along_x = [[(xs[0], 0, z), (xs[-1], 0, z)] for z in zs]
-    return np.array(along_z + along_x, float)
+def _rgb(color: str) -> np.ndarray:
+    return np.array(ImageColor.getrgb(color), float)
+
+
+def _mix(a: str, b: str, part: float) -> tuple[int, int, int]:
+    return tuple(np.round(_rgb(a) * (1 - part) + _rgb(b) * part).astype(int).tolist())
+
+
+@functools.cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    folder = Path(matplotlib.get_data_path()) / "fonts" / "ttf"
+    return ImageFont.truetype(str(folder / "DejaVuSans.ttf"), size)
+
+
+def fit_text(text: str, width: int, *, size: int, least: int) -> tuple[str, int]:
+    """One line that is at most so wide: shrunk, and if that is not enough elided.
+
+    Args:
+      width: Pixels.
+      size: Of the font, pixels, where there is room.
+      least: The smallest size.
+
+    Returns:
+      What to write, and its size.
+    """
+    text = " ".join(text.split())
+    for smaller in range(size, least - 1, -1):
+        if _font(smaller).getlength(text) <= width:
+            return text, smaller
+    for keep in range(len(text) - 1, 0, -1):
+        cut = text[:keep].rstrip() + "…"
+        if _font(least).getlength(cut) <= width:
+            return cut, least
+    return "", least
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Page:
+    """Size, texts as (text, font size, upper left corner, colour), and room left."""
+
+    width: int
+    height: int
+    texts: tuple[tuple[str, int, tuple[int, int], str], ...]
+    keys: tuple[tuple[tuple[int, int, int, int], str], ...]
+    box: tuple[int, int, int, int]
+
+
+def _page(
+    title: str, caption: str, lines: list[tuple[str, str]], width: int, height: int
+) -> _Page:
+    """Title above, caption below, and above that what the lines' colours mean."""
+    margin = max(width // 60, 3)
+    room = width - 2 * margin
+    texts, keys = [], []
+    title, size = fit_text(
+        title, room, size=max(height // 22, 8), least=max(height // 36, 7)
+    )
+    top = margin
+    if title:
+        left = (width - _font(size).getlength(title)) / 2
+        texts.append((title, size, (round(left), margin), _INK))
+        top += round(1.4 * size)
+    small = max(height // 34, 7)
+    caption, size = fit_text(caption, room, size=small, least=max(small - 3, 6))
+    bottom = height - margin
+    if caption:
+        bottom -= round(1.3 * size)
+        texts.append((caption, size, (margin, bottom), _FAINT))
+    x, y = margin, bottom - round(1.5 * small)
+    for label, color in lines:
+        keys.append(((x, y + small // 2, x + small, y + small // 2 + 2), color))
+        texts.append((label, small, (x + small + small // 2, y), _FAINT))
+        x += round(2.5 * small + _font(small).getlength(label))
+    return _Page(
+        width=width,
+        height=height,
+        texts=tuple(texts),
+        keys=tuple(keys),
+        box=(2 * margin, top + margin, width - 2 * margin, bottom - margin),
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Scene:
-    """What is drawn; bones and paths are in world coordinates."""
+    """What is drawn; capsules and paths are in world coordinates."""
 
-    view: Callable[[np.ndarray], np.ndarray]
-    positions: np.ndarray
-    parents: list[int]
-    colors: list[str]
-    paths: list[tuple[np.ndarray, str, str]]
+    page: _Page
+    camera: cameras.Camera
+    body: bodies.Body
+    paths: tuple[tuple[np.ndarray, str], ...]
     contacts: tuple[tuple[int, ...], np.ndarray] | None
     ball: np.ndarray | None
     radius: float
 
+    @property
+    def colors(self) -> list[str]:
+        """What has shades."""
+        found = {*self.body.colors}
+        found |= set() if self.contacts is None else {_TOUCH}
+        return sorted(found | (set() if self.ball is None else {_BALL}))
 
-def _draw(axes: Axes, scene: _Scene, frame: int) -> None:
-    """One frame; the camera follows the root on the ground."""
-    view, pose = scene.view, scene.positions[frame]
-    centre = pose[0, [0, 2]]
-    axes.clear()
-    axes.set_axis_off()
-    grid = view(_grid(centre, 3.0))
-    axes.add_collection(LineCollection(grid, colors="#dddddd", linewidths=0.8))
-    for line, color, label in scene.paths:
-        axes.plot(*view(line).T, color=color, lw=0.8, alpha=0.35)
-        axes.plot(*view(line[: frame + 1]).T, color=color, lw=2, label=label)
-    bones = np.stack([view(pose[scene.parents]), view(pose[1:])], axis=1)
-    axes.add_collection(
-        LineCollection(bones, colors=scene.colors, linewidths=2.5, capstyle="round")
+    @property
+    def reach(self) -> float:
+        """How far around the target the ground is drawn, metres."""
+        return 0.85 * self.camera.distance
+
+
+def _fade(scene: _Scene, points: np.ndarray, frame: int) -> np.ndarray:
+    """1 near the target, 0 where the ground is no longer drawn."""
+    target = scene.camera.targets[frame]
+    far = np.linalg.norm((points - target)[..., [0, 2]], axis=-1) / scene.reach
+    return np.clip((1.0 - far) / 0.6, 0.0, 1.0)
+
+
+def tiles(centre: np.ndarray, reach: float) -> np.ndarray:
+    """Every other square metre of the ground around a point: corners [n, 4, 3]."""
+    low, high = np.floor(centre - reach), np.ceil(centre + reach)
+    x, z = np.meshgrid(
+        np.arange(low[0], high[0]), np.arange(low[2], high[2]), indexing="ij"
     )
-    if scene.ball is not None:
-        place = view(scene.ball[frame])
-        axes.add_patch(
-            Circle(place, scene.radius, fc="#f2f2f2", ec="#222222", zorder=3)
-        )
+    corner = np.stack([x, 0 * x, z], axis=-1)[(x + z) % 2 == 0]
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]], float)
+    return corner[:, None] + square
+
+
+def _draw_tiles(pen: ImageDraw.ImageDraw, scene: _Scene, frame: int) -> None:
+    """A chequered ground that fades into the distance."""
+    corners = tiles(scene.camera.targets[frame], scene.reach)
+    level = np.round(_TONES * _fade(scene, corners.mean(axis=1), frame)).astype(int)
+    pixels, _, near = scene.camera.project(corners, frame)
+    ahead = near.max(axis=1) < 0.98 * scene.camera.distance  # not behind the camera
+    shapes = pixels.reshape(-1, 8).tolist()
+    for shape, tone in zip(shapes, (level * ahead).tolist(), strict=True):
+        if tone:
+            pen.polygon(shape, fill=_mix(_GROUND, _TILE, tone / _TONES))
+
+
+def _draw_lines(
+    pen: ImageDraw.ImageDraw,
+    scene: _Scene,
+    frame: int,
+    points: np.ndarray,
+    color: str,
+    *,
+    strength: float,
+    width: int,
+) -> None:
+    """Lines [..., n, 3] on the ground that fade with their distance."""
+    fade = _fade(scene, 0.5 * (points[..., 1:, :] + points[..., :-1, :]), frame)
+    levels = np.ceil(4 * fade).astype(int)
+    pixels = _FINE * scene.camera.project(points, frame)[0]
+    ends = np.concatenate([pixels[..., :-1, :], pixels[..., 1:, :]], axis=-1)
+    ramp = [_mix(_GROUND, color, strength * level / 4) for level in range(5)]
+    # Pale ones first: where lines cross, the strong one is seen.
+    for level in range(1, 5):
+        for end in ends[levels == level].tolist():
+            pen.line(end, fill=ramp[level], width=width)
+
+
+def _capsules(scene: _Scene, frame: int) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Ends [S, 2, 3] and radii [S, 2] of body, marks and ball, metres, and colours."""
+    ends, radii = [scene.body.points[frame, scene.body.ends]], [scene.body.radii]
+    colors = list(scene.body.colors)
     if scene.contacts is not None:
         feet, down = scene.contacts
-        axes.scatter(
-            *view(pose[list(feet)][down[frame]]).T, color="#2ca02c", s=25, zorder=4
-        )
-    middle = view(np.array([centre[0], 0.85, centre[1]]))
-    axes.set_xlim(middle[0] - 1.5, middle[0] + 1.5)
-    axes.set_ylim(middle[1] - 1.5, middle[1] + 1.5)
-    if scene.paths:
-        axes.legend(loc="lower left", fontsize=7, framealpha=0.9)
+        marks = scene.body.points[frame, np.array(feet)[down[frame]]]
+        ends.append(np.stack([marks, marks], axis=1))
+        radii.append(np.full((len(marks), 2), _MARK))
+        colors += [_TOUCH] * len(marks)
+    if scene.ball is not None:
+        ends.append(scene.ball[[frame, frame]][None])
+        radii.append(np.full((1, 2), scene.radius))
+        colors.append(_BALL)
+    return np.concatenate(ends), np.concatenate(radii), colors
 
 
-def _picture(title: str, size: int) -> tuple[Figure, Axes]:
-    """A square figure whose title is wrapped, and shrunk if that is not enough."""
-    picture = Figure(figsize=(size / 100, size / 100), dpi=100)
-    FigureCanvasAgg(picture)
-    text = picture.text(
-        0.5,
-        0.99,
-        textwrap.fill(title, max(size // 6, 1)),
-        fontsize=8,
-        ha="center",
-        va="top",
-        parse_math=False,
+def _draw_shadow(scene: _Scene, frame: int, picture: Image.Image) -> None:
+    """What the light casts on the ground, soft."""
+    ends, radii, _ = _capsules(scene, frame)
+    light = scene.camera.axes.T @ raster.LIGHT
+    ground = (ends - ends[..., 1:2] / light[1] * light)[..., [0, 2]]
+    along = ground[:, 1] - ground[:, 0]
+    angles = np.arctan2(along[:, 1], along[:, 0])[:, None]
+    angles = angles + np.linspace(-0.5, 0.5, 7) * np.pi
+    arc = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    far = ground[:, 1, None] + radii[:, 1, None, None] * arc
+    near = ground[:, 0, None] - radii[:, 0, None, None] * arc
+    rims = np.concatenate([far, near], axis=1)
+    points = np.stack([rims[..., 0], 0 * rims[..., 0], rims[..., 1]], axis=-1)
+    pixels = scene.camera.project(points, frame)[0]
+    mask = Image.new("L", picture.size)
+    pen = ImageDraw.Draw(mask)
+    for polygon in pixels.reshape(len(pixels), -1).tolist():
+        pen.polygon(polygon, fill=round(255 * _SHADOW))
+    mask = mask.filter(ImageFilter.GaussianBlur(picture.height / 120))
+    # Few steps: a shadow of many would cost more bytes than the body.
+    picture.paste(_INK, mask=mask.point([16 * round(v / 16) for v in range(256)]))
+
+
+def _draw_body(scene: _Scene, frame: int, picture: Image.Image) -> None:
+    """Body, marks of touching joints, and ball."""
+    ends, radii, colors = _capsules(scene, frame)
+    number = {color: i for i, color in enumerate(scene.colors)}
+    pixels, scale, near = scene.camera.project(ends, frame)
+    usual = scene.camera.focal / scene.camera.distance
+    seen = raster.capsules(
+        _FINE * np.concatenate([pixels, near[..., None] * usual], axis=-1),
+        _FINE * radii * scale,
+        np.array([number[color] for color in colors]),
+        width=picture.width,
+        height=picture.height,
+        soft={number[c]: _FINE * m * usual for c, m in _SOFT.items() if c in number},
     )
-    # Widths of small letters are whole pixels: one shrinking may not be enough.
-    for _ in range(8):
-        box = text.get_window_extent()
-        room = min(0.96 * size / max(box.width, 1), 0.25 * size / max(box.height, 1))
-        if room >= 1.0:
-            break
-        text.set_fontsize(0.98 * room * text.get_fontsize())
-    top = text.get_window_extent().y0 / size if title else 1.0
-    return picture, picture.add_axes((0, 0, 1, top - 0.01))
+    shades = [raster.shades(_rgb(color)) for color in scene.colors]
+    table = np.round(np.concatenate([np.zeros((1, 3)), *shades])).astype(np.uint8)
+    mask = Image.fromarray(np.where(seen > 0, 255, 0).astype(np.uint8))
+    picture.paste(Image.fromarray(table[seen]), mask=mask)
 
 
-def _draw_all(scene: _Scene, frames: range, title: str, size: int) -> list[Image.Image]:
-    """Pictures of 64 colours."""
-    picture, axes = _picture(title, size)
-    images = []
-    for frame in frames:
-        _draw(axes, scene, frame)
-        buffer = io.BytesIO()
-        picture.savefig(buffer, format="rgba")
-        whole = picture.canvas.get_width_height()
-        image = Image.frombytes("RGBA", whole, buffer.getvalue())
-        images.append(image.convert("RGB").quantize(64))
-    return images
+def _draw(scene: _Scene, frame: int) -> Image.Image:
+    """One frame."""
+    page = scene.page
+    picture = Image.new("RGB", (page.width, page.height), _GROUND)
+    _draw_tiles(ImageDraw.Draw(picture), scene, frame)
+    _draw_shadow(scene, frame, picture)
+    fine = (_FINE * page.width, _FINE * page.height)
+    picture = picture.resize(fine, Image.Resampling.NEAREST)
+    pen = ImageDraw.Draw(picture)
+    for line, color in scene.paths:
+        if color == drawing.COMMANDED:  # what is still to come of it
+            rest = line[frame:]
+            _draw_lines(pen, scene, frame, rest, color, strength=0.6, width=_FINE)
+        _draw_lines(
+            pen, scene, frame, line[: frame + 1], color, strength=1.0, width=2 * _FINE
+        )
+    _draw_body(scene, frame, picture)
+    picture = picture.reduce(_FINE)
+    pen = ImageDraw.Draw(picture)
+    for key, color in page.keys:
+        pen.rectangle(key, fill=color)
+    for text, size, place, color in page.texts:
+        halo = dict(stroke_width=2, stroke_fill=_GROUND)
+        pen.text(place, text, fill=color, font=_font(size), **halo)
+    return picture
 
 
-def _lines(
-    ground: dict[str, np.ndarray | None],
-) -> list[tuple[np.ndarray, str, str]]:
-    """Paths in the world with colour and label, of those that are given."""
-    return [
-        (drawing.on_ground(line), color, name)
-        for (name, line), color in zip(ground.items(), _PATH_COLORS, strict=True)
-        if line is not None
-    ]
+def _palette(scene: _Scene) -> np.ndarray:
+    """The colours of a GIF [n, 3]; each with what lies between it and the ground."""
+    ramps = [(_TILE, _TONES), (_INK, 6), (_FAINT, 2)]
+    ramps += [(color, 4) for _, color in scene.paths]
+    found = [_mix(_GROUND, _GROUND, 0.0)]
+    found += [_mix(_GROUND, c, i / n) for c, n in ramps for i in range(1, n + 1)]
+    found += [_mix(_GROUND, _INK, _SHADOW * i / 4) for i in range(1, 5)]
+    for color in scene.colors:
+        table = raster.shades(_rgb(color))
+        found += [*table, 0.5 * (table[1] + _rgb(_GROUND))]
+    return np.round(np.array(found))
+
+
+class _Quantizer:
+    """Nearest colours of a palette, not dithered, looked up by 6 bits per channel."""
+
+    def __init__(self, palette: np.ndarray):
+        self.palette = palette.astype(np.uint8)
+        steps = np.arange(64) * 4.0 + 2.0
+        self.table = np.zeros((64, 64, 64), np.uint8)
+        square = (palette**2).sum(axis=1)
+        cells = np.stack(np.meshgrid([0.0], steps, steps, indexing="ij"), axis=-1)
+        for i, red in enumerate(steps):
+            distance = square - 2 * (cells[0] + [red, 0.0, 0.0]) @ palette.T
+            self.table[i] = distance.argmin(axis=-1)
+
+    def __call__(self, picture: Image.Image) -> Image.Image:
+        r, g, b = np.moveaxis(np.asarray(picture) >> 2, -1, 0)
+        image = Image.fromarray(self.table[r, g, b], "P")
+        image.putpalette(self.palette.ravel().tolist())
+        return image
 
 
 def _durations(number: int, seconds: float) -> list[int]:
@@ -159,10 +343,11 @@ def save_gif(
     ball: np.ndarray | None = None,
     radius: float = 0.11,
     title: str = "",
-    every: int = 2,
-    azimuth: float = 35.0,
-    elevation: float = 20.0,
-    size: int = 360,
+    caption: str = "",
+    every: int | None = None,
+    azimuth: float | None = None,
+    elevation: float = 16.0,
+    size: int | tuple[int, int] = (480, 360),
 ) -> None:
     """Writes an animated GIF whose camera follows the character.
 
@@ -171,20 +356,23 @@ def save_gif(
     Args:
       path: File to write.
       positions: [F, J, 3] world positions, metres, y up.
-      parents: Parent of each joint.
-      fps: Frames a second of the motion.
-      names: Joint names, to colour left and right; None for grey.
+      fps: Of the motion.
+      names: Joint names, to find the head and colour left and right; None for guesses
+        and grey.
       commanded: [F, 2] commanded path (x, z), or None.
       walked: [F, 2] walked path, or None.
-      feet: Foot joints to mark while they are in contact.
+      feet: Joints to mark while they are in contact.
       contact: [F, feet] bool, or None.
       ball: [F, 3] world position of a ball's centre, or None.
       radius: Of the ball, metres.
-      title: Above the picture.
-      every: Draw every so many frames; the speed stays true.
-      azimuth: Of the camera, degrees about +y.
+      title: Above the picture, in one line: shrunk, then elided.
+      caption: Below it, small: the source of the data and its licence.
+      every: Draw every so many frames; the speed stays true. None for at most 20
+        pictures per second.
+      azimuth: Of the camera, degrees about +y. None for one towards which the
+        character comes, all in all.
       elevation: Of the camera, degrees.
-      size: Pixels of a side.
+      size: Width and height, or the side of a square, pixels.
 
     Raises:
       ValueError: if an array has a wrong shape or is not finite (names it), or `every`
@@ -194,23 +382,39 @@ def save_gif(
     ground = {"commanded": commanded, "walked": walked}
     positions = drawing.check_motion(positions, parents, fps=fps, paths=ground)
     marks = _contacts(contact, feet, len(positions))
-    if every < 1 or size < 64:
+    every = max(int(np.ceil(fps / 20.0)), 1) if every is None else every
+    width, height = (size, size) if isinstance(size, int) else size
+    if every < 1 or min(width, height) < 64:
         raise ValueError(
             f"every {every}, size {size}: expected every >= 1 and size >= 64 pixels"
         )
     ball = drawing.check_ball(ball, len(positions))
     path = drawing.check_writable(path)
+    shown = [
+        (name, color, drawing.on_ground(line))
+        for (name, line), color in zip(ground.items(), _PATH_COLORS, strict=True)
+        if line is not None
+    ]
+    page = _page(title, caption, [line[:2] for line in shown], width, height)
+    body = bodies.build(positions, parents, names)
+    way = positions[-1, 0] - positions[0, 0]
+    if azimuth is None:
+        moved = np.hypot(way[0], way[2]) > 0.3
+        azimuth = 35.0 + (np.rad2deg(np.arctan2(way[0], way[2])) if moved else 0.0)
     scene = _Scene(
-        view=functools.partial(drawing.project, azimuth=azimuth, elevation=elevation),
-        positions=positions,
-        parents=list(parents[1:]),
-        colors=drawing.bone_colors(names, len(parents))[1:],
-        paths=_lines(ground),
+        page=page,
+        camera=cameras.follow(
+            body, fps=fps, azimuth=azimuth, elevation=elevation, box=page.box
+        ),
+        body=body,
+        paths=tuple((line, color) for _, color, line in shown),
         contacts=marks,
         ball=ball,
         radius=radius,
     )
-    images = _draw_all(scene, range(0, len(positions), every), title, size)
+    quantize = _Quantizer(_palette(scene))
+    frames = range(0, len(positions), every)
+    images = [quantize(_draw(scene, frame)) for frame in frames]
     times = _durations(len(images), every / fps)
     images[0].save(
         path, save_all=True, append_images=images[1:], duration=times, loop=0

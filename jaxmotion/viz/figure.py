@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-LEFT, RIGHT, MIDDLE = "#1f77b4", "#d62728", "#333333"
+LEFT, RIGHT, MIDDLE = "#2878c8", "#d63a3a", "#6b7480"
 COMMANDED, WALKED = "#2ca02c", "#ff7f0e"
 
 
@@ -107,47 +107,19 @@ def check_ball(ball: np.ndarray | None, frames: int) -> np.ndarray | None:
     return ball
 
 
-def bone_colors(names: tuple[str, ...] | None, number: int) -> list[str]:
-    """Blue for the left side, red for the right, grey for the rest.
+def view_axes(*, azimuth: float, elevation: float) -> np.ndarray:
+    """Right, up and towards the viewer of a view in the world, rows of [3, 3].
 
     Args:
-      names: Joint names; None to draw all grey.
-      number: Joints.
-
-    Returns:
-      One colour a joint, for the bone that ends at it.
-    """
-    if names is None:
-        return [MIDDLE] * number
-    plain = [name.lower() for name in names]
-
-    def color(name: str) -> str:
-        if "left" in name or name.endswith("_l") or name.startswith("l_"):
-            return LEFT
-        if "right" in name or name.endswith("_r") or name.startswith("r_"):
-            return RIGHT
-        return MIDDLE
-
-    return [color(name) for name in plain]
-
-
-def project(points: np.ndarray, *, azimuth: float, elevation: float) -> np.ndarray:
-    """Orthographic view of world points.
-
-    Args:
-      points: [..., 3] metres, y up.
       azimuth: Degrees about +y; 0 looks along -z (a character that faces +z walks
         towards the viewer).
       elevation: Degrees above the ground.
-
-    Returns:
-      [..., 2] right and up on the picture, metres.
     """
     a, e = np.deg2rad([azimuth, elevation])
-    x, y, z = np.moveaxis(points, -1, 0)
-    right = x * np.cos(a) - z * np.sin(a)
-    depth = x * np.sin(a) + z * np.cos(a)
-    return np.stack([right, y * np.cos(e) - depth * np.sin(e)], axis=-1)
+    right = [np.cos(a), 0.0, -np.sin(a)]
+    up = [-np.sin(e) * np.sin(a), np.cos(e), -np.sin(e) * np.cos(a)]
+    towards = [np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)]
+    return np.array([right, up, towards])
 
 
 def on_ground(path: np.ndarray) -> np.ndarray:

@@ -152,7 +152,7 @@ def test_the_table_has_a_line_for_each_row(evaluated):
 
 @pytest.mark.parametrize(
     ("options", "title"),
-    [("", "aamdm ("), ("--row lmm --no-steered", "lmm, not steered (")],
+    [("", "aamdm</h1>"), ("--row lmm --no-steered", "lmm, not steered</h1>")],
 )
 def test_a_rollout_is_written_as_bvh_gif_and_page(
     call, trained, tmp_path, options, title

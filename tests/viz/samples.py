@@ -1,6 +1,12 @@
-"""A figure of four joints that walks in a circle."""
+"""Figures that walk in a circle: one of four joints, and a person."""
 
+import jax.numpy as jnp
 import numpy as np
+
+from jaxmotion.data import procedural, walker
+from jaxmotion.data.gaits import GAITS
+from jaxmotion.motion import skeleton
+from jaxmotion.motion.trajectory import Command
 
 PARENTS = (-1, 0, 1, 0)
 NAMES = ("Hips", "Spine", "LeftHand", "RightFoot")
@@ -22,3 +28,20 @@ def circle(frames=12, radius=1.0):
     swing = np.sin(9 * angle)[:, None, None] * np.array([[0, 0, 0.3]])
     positions = root[:, None] + bones + swing * (np.arange(4) == 3)[:, None]
     return positions, root[:, ::2]
+
+
+def person(seconds=4.0, speed=1.4, turn=1.2):
+    """The generated walker on a curve of so many radians per second: positions, bones.
+
+    A negative turn goes to the right; the motion begins at rest.
+    """
+    angle = turn * np.arange(int(seconds * FPS)) / FPS
+    facing = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+    commands = Command(
+        velocity=jnp.asarray(speed * facing, jnp.float32),
+        facing=jnp.asarray(facing, jnp.float32),
+        label=jnp.zeros(len(angle), jnp.int32),
+    )
+    made = procedural.walk(commands, next(iter(GAITS.values())), fps=FPS)
+    bones = walker.walker_skeleton()
+    return np.asarray(skeleton.joint_positions(bones, made.motion), float), bones

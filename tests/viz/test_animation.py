@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.viz import animation
+from jaxmotion.viz import animation, body, camera
 from tests.viz import samples
 
 
@@ -41,21 +41,23 @@ def test_count_size_and_duration_are_those_asked_for(tmp_path, every, fps):
 
 def test_the_picture_changes_with_the_motion(tmp_path):
     positions, _ = samples.circle()
-    save(tmp_path / "a.gif", positions)
+    save(tmp_path / "a.gif", positions, walked=None)
     pictures, _, _ = frames(tmp_path / "a.gif")
     steps = np.mean(np.any(np.diff(pictures, axis=0) != 0, axis=-1), axis=(1, 2))
     assert steps.min() > 0.002
     raised = positions.copy()
     raised[:, 2, 1] += 0.5  # only the left hand, which is blue
-    save(tmp_path / "b.gif", raised)
+    save(tmp_path / "b.gif", raised, walked=None)
     other, _, _ = frames(tmp_path / "b.gif")
     blue = lambda x: (x[..., 2] > x[..., 0] + 60) & (x[..., 2] > 120)  # noqa: E731
-    red = lambda x: (x[..., 0] > x[..., 2] + 90) & (x[..., 1] < 90)  # noqa: E731
-    rows = [np.argwhere(blue(x[0]))[:, 0].mean() for x in (pictures, other)]
-    assert rows[1] < rows[0] - 5, "higher on the picture"
-    legs = [np.argwhere(red(x[0])) for x in (pictures, other)]
-    assert len(legs[0]) > 10
-    assert abs(legs[0].mean(0) - legs[1].mean(0)).max() < 3
+    red = lambda x: (x[..., 0] > x[..., 2] + 80) & (x[..., 1] < 110)  # noqa: E731
+
+    def reach(picture):
+        """Of the hand over the foot, in lengths of the leg."""
+        hand, leg = (np.argwhere(mask(picture))[:, 0] for mask in (blue, red))
+        return (leg.max() - hand.min()) / np.ptp(leg)
+
+    assert reach(other[0]) > reach(pictures[0]) + 0.3, "higher on the picture"
 
 
 def test_paths_and_contacts_are_drawn(tmp_path):
@@ -77,17 +79,122 @@ def test_paths_and_contacts_are_drawn(tmp_path):
     assert np.all((counts["feet"] > 5) == contact[::2, 0])
 
 
-@pytest.mark.parametrize("size", [100, 333, 360])
-def test_a_long_title_stays_on_the_picture(tmp_path, size):
-    words = "a title that is much longer than any picture could be wide " * 3
-    for title in (words, "W" * 150, "unbroken_$math_^" * 6):
-        save(tmp_path / "a.gif", samples.circle(2)[0], title=title, size=size)
-        pictures, _, _ = frames(tmp_path / "a.gif")
-        assert pictures.shape[1:3] == (size, size)
-        dark = pictures[0].sum(axis=-1) < 600
-        top = dark[: size // 4]
-        assert top.sum() > 50
-        assert not top[:, :1].any() and not top[:, -1:].any() and not dark[0].any()
+LONG = ("a title much longer than any picture is wide " * 5)[:200]
+
+
+@pytest.mark.parametrize("size", [100, 333, (480, 360)])
+def test_a_long_title_stays_in_one_line_on_the_picture(tmp_path, size):
+    positions, bones = samples.person(seconds=0.1)
+    for title in (LONG, "W" * 200, "unbroken_$math_^" * 13, "two\nlines " * 20):
+        animation.save_gif(
+            tmp_path / "a.gif",
+            positions,
+            bones.parents,
+            fps=samples.FPS,
+            title=title,
+            size=size,
+        )
+        picture = frames(tmp_path / "a.gif")[0][0]
+        height, width = picture.shape[:2]
+        ink = picture.sum(axis=-1) < 350
+        ink[height // 12 :, width // 3 : -(width // 3)] = False  # the body
+        rows = np.flatnonzero(ink[: height // 4].any(axis=1))
+        assert rows[0] > 0 and len(rows) > 2
+        assert np.ptp(rows) < height / 16 + 4, "one line"
+        assert not ink[: rows[-1] + 1, :2].any() and not ink[: rows[-1] + 1, -2:].any()
+
+
+def test_text_is_shrunk_before_it_is_elided():
+    short, size = animation.fit_text("a walk", 300, size=16, least=9)
+    assert (short, size) == ("a walk", 16)
+    middle, size = animation.fit_text(LONG[:39], 240, size=16, least=9)
+    assert middle == LONG[:39] and 9 <= size < 16
+    cut, size = animation.fit_text(LONG, 240, size=16, least=9)
+    assert size == 9 and cut.endswith("…") and LONG.startswith(cut[:-1])
+    assert len(cut) > 30, "as much as there is room for"
+
+
+@pytest.mark.parametrize("turn, elevation", [(0.0, 16.0), (1.2, 16.0), (-2.5, 40.0)])
+def test_the_whole_body_is_in_the_picture_in_all_frames(turn, elevation):
+    positions, bones = samples.person(turn=turn)
+    made = body.build(positions, bones.parents, bones.names)
+    box = (16, 40, 464, 330)
+    view = camera.follow(
+        made, fps=samples.FPS, azimuth=35.0, elevation=elevation, box=box
+    )
+    now = np.arange(len(positions))[:, None]
+    places = np.concatenate([made.points[:, made.ends.ravel()], positions], axis=1)
+    radii = np.concatenate([made.radii.ravel(), np.zeros(positions.shape[1])])
+    pixels, scale, _ = view.project(places, now)
+    low, high = pixels - (radii * scale)[..., None], pixels + (radii * scale)[..., None]
+    assert np.all(low >= [box[:2]]) and np.all(high <= [box[2:]])
+    # And no farther than that needs: somewhere it touches the box.
+    gap = min((low - box[:2]).min(), (box[2:] - high).min())
+    assert gap < 8
+    # Smoothly: the camera is shaken much less than the root is.
+    jerk = lambda x: np.abs(np.diff(x[:, [0, 2]], 3, axis=0)).max()  # noqa: E731
+    assert jerk(view.targets) < 0.3 * jerk(positions[:, 0])
+    # And it stays with it.
+    assert np.linalg.norm(view.targets - positions[:, 0], axis=-1).max() < 0.4
+
+
+def test_a_mean_over_time_keeps_a_straight_line():
+    line = np.arange(50.0)[:, None] * [1.0, -2.0]
+    np.testing.assert_allclose(camera.smooth(line, 6.0), line, atol=1e-9)
+    np.testing.assert_allclose(camera.smooth(line[:1], 6.0), line[:1])
+
+
+def test_the_ground_moves_under_the_character_and_stands_in_the_world(tmp_path):
+    positions, bones = samples.person(seconds=3.0, turn=0.0)
+    paths = {}
+    for name, still in (("walk", False), ("still", True)):
+        shown = np.repeat(positions[:1], len(positions), 0) if still else positions
+        path = tmp_path / f"{name}.gif"
+        animation.save_gif(path, shown, bones.parents, fps=samples.FPS)
+        paths[name] = frames(path)[0][:, 250:, :100]  # beside the body
+    assert len(paths["still"]) == 1, "equal pictures are one"
+    changed = np.any(np.diff(paths["walk"], axis=0), axis=-1).mean(axis=(1, 2))
+    assert changed[5:].min() > 0.005
+    # Tiles have whole metres as corners wherever the camera is.
+    for centre in ([0.3, 0.9, 7.7], [-2.2, 0.9, 0.1]):
+        corners = animation.tiles(np.array(centre), 2.0)
+        np.testing.assert_array_equal(corners, np.round(corners))
+        assert np.all(corners[:, 0, [0, 2]].sum(axis=-1) % 2 == 0)
+        assert np.all(np.abs(corners.mean(axis=1) - centre)[:, [0, 2]] < 3)
+
+
+def test_eight_seconds_are_small_and_at_most_20_pictures_a_second(tmp_path):
+    positions, bones = samples.person(seconds=8.0)
+    walked = positions[:, 0, ::2]
+    animation.save_gif(
+        tmp_path / "a.gif",
+        positions,
+        bones.parents,
+        fps=samples.FPS,
+        names=bones.names,
+        walked=walked,
+        commanded=walked + 0.1,
+        title="a walk",
+        caption="data (licence)",
+    )
+    assert (tmp_path / "a.gif").stat().st_size < 1_500_000
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.size == (480, 360)
+        assert 12 <= image.n_frames / 8.0 <= 20
+
+
+def test_a_caption_is_below_and_the_title_above(tmp_path):
+    positions, bones = samples.person(seconds=0.1)
+    place = {}
+    for name in ("title", "caption"):
+        text = {name: "data and its licence " * 2}
+        path = tmp_path / "a.gif"
+        animation.save_gif(
+            path, positions, bones.parents, fps=samples.FPS, size=240, **text
+        )
+        ink = frames(tmp_path / "a.gif")[0][0][:, :70].sum(axis=-1) < 450
+        place[name] = [bool(part.any()) for part in (ink[:24], ink[-16:])]
+    assert place == {"title": [True, False], "caption": [False, True]}
 
 
 def test_a_single_frame_is_a_picture(tmp_path):

@@ -9,39 +9,27 @@ from jaxmotion.viz import figure
 from tests.viz import samples
 
 
-def test_left_is_blue_and_right_is_red():
-    names = ("Hips", "LeftArm", "r_foot", "RightLeg", "hand_l", "Head")
-    found = figure.bone_colors(names, 6)
-    left, right, middle = figure.LEFT, figure.RIGHT, figure.MIDDLE
-    assert found == [middle, left, middle, right, left, middle] or found == [
-        middle,
-        left,
-        right,
-        right,
-        left,
-        middle,
-    ]
-    assert figure.bone_colors(None, 3) == [middle] * 3
-
-
-def test_the_view_is_an_orthographic_projection():
-    # A camera's own axes: right, up and towards the viewer are orthonormal.
+def test_the_axes_of_a_view():
+    # Right, up and towards the viewer are orthonormal, and right-handed.
     for azimuth, elevation in [(0.0, 0.0), (35.0, 20.0), (200.0, 70.0)]:
-        axes = figure.project(np.eye(3), azimuth=azimuth, elevation=elevation)
-        np.testing.assert_allclose(axes.T @ axes, np.eye(2), atol=1e-12)
-    # Straight ahead: +x to the right, +y up; from above what is nearer is lower.
-    flat = figure.project(np.eye(3), azimuth=0.0, elevation=0.0)
-    np.testing.assert_allclose(flat, [[1, 0], [0, 1], [0, 0]], atol=1e-12)
-    above = figure.project(np.eye(3), azimuth=0.0, elevation=90.0)
-    np.testing.assert_allclose(above, [[1, 0], [0, 0], [0, -1]], atol=1e-12)
+        axes = figure.view_axes(azimuth=azimuth, elevation=elevation)
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(axes) > 0
+    # Straight ahead along -z; from above what is nearer is lower.
+    flat = figure.view_axes(azimuth=0.0, elevation=0.0)
+    np.testing.assert_allclose(flat, np.eye(3), atol=1e-12)
+    above = figure.view_axes(azimuth=0.0, elevation=90.0)
+    np.testing.assert_allclose(above @ [0, 0, 1], [0, -1, 0], atol=1e-12)
+    np.testing.assert_allclose(above @ [0, 1, 0], [0, 0, 1], atol=1e-12)
     # A camera turned by 90 degrees about +y stands on the +x axis.
-    side = figure.project(np.eye(3), azimuth=90.0, elevation=0.0)
-    np.testing.assert_allclose(side, [[0, 0], [0, 1], [-1, 0]], atol=1e-12)
+    side = figure.view_axes(azimuth=90.0, elevation=0.0)
+    np.testing.assert_allclose(side @ [1, 0, 0], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(side @ [0, 0, 1], [-1, 0, 0], atol=1e-12)
 
 
 def test_a_character_that_faces_the_viewer_has_its_left_on_the_right():
     left = np.array([0.3, 1.0, 0.0])  # facing +z, y up: left is +x
-    assert figure.project(left, azimuth=0.0, elevation=10.0)[0] > 0
+    assert (figure.view_axes(azimuth=0.0, elevation=10.0) @ left)[0] > 0
 
 
 def test_a_file_below_a_file_cannot_be_written(tmp_path):

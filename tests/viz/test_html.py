@@ -7,6 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 
+from jaxmotion.viz import body
 from jaxmotion.viz import html as page
 from tests.viz import samples
 
@@ -54,9 +55,10 @@ def test_the_page_holds_the_positions_to_a_millimetre(tmp_path):
     np.testing.assert_allclose(data["positions"], positions, atol=5.001e-4)
     np.testing.assert_allclose(data["walked"], walked, atol=5.001e-4)
     np.testing.assert_allclose(data["commanded"], walked + 0.5, atol=5.001e-4)
-    assert data["parents"] == list(samples.PARENTS)
+    # Three bones: grey, blue and red.
+    assert [shape[:2] for shape in data["shapes"]] == [[0, 1], [1, 2], [0, 3]]
     assert data["fps"] == samples.FPS
-    assert len(set(data["colors"])) == 3
+    assert len({shape[4] for shape in data["shapes"]}) == 3
     longest = max(len(x) for x in re.findall(r"\.\d+", json.dumps(data["positions"])))
     assert longest <= 4, "three decimals"
 
@@ -64,7 +66,7 @@ def test_the_page_holds_the_positions_to_a_millimetre(tmp_path):
 def test_without_paths_there_are_none(tmp_path):
     data = data_of(save(tmp_path / "a.html", walked=None, commanded=None, names=None))
     assert data["walked"] is None and data["commanded"] is None
-    assert len(set(data["colors"])) == 1
+    assert len({shape[4] for shape in data["shapes"]} - {body.SKIN}) == 1
 
 
 @pytest.mark.parametrize(
@@ -72,13 +74,14 @@ def test_without_paths_there_are_none(tmp_path):
     [
         "</title><script>alert(1)</script>",
         '"><img src=x onerror="alert(1)">',
-        "__DATA__ __TITLE__ \\1 & <b>",
+        "__DATA__ __TITLE__ __CAPTION__ \\1 & <b>",
         "Schritt – ñ 歩く",
     ],
 )
 def test_a_title_is_text_whatever_it_says(tmp_path, title):
-    text = save(tmp_path / "a.html", title=title)
+    text = save(tmp_path / "a.html", title=title, caption=title)
     reader = Reader(text)
+    assert reader.texts["p"] == title
     assert reader.texts["title"] == title
     assert reader.texts["h1"] == title
     assert [tag for tag, _ in reader.tags].count("script") == 1
@@ -104,12 +107,17 @@ def test_the_script_is_javascript(tmp_path):
 
 
 BROWSER = """
-const lines = [];
-const drawn = {beginPath() {}, clearRect() {}, stroke() { lines.push(this.points); },
-  moveTo(x, y) { this.points = [[x, y]]; }, lineTo(x, y) { this.points.push([x, y]); }};
+const drawn = [];
+let points = [];
+const fake = {
+  beginPath() { points = []; }, closePath() {}, clearRect() { drawn.length = 0; },
+  moveTo(x, y) { points.push([x, y]); }, lineTo(x, y) { points.push([x, y]); },
+  arc(x, y, r) { points.push([x, y, r]); },
+  fill() { drawn.push([this.fillStyle, points]); },
+  stroke() { drawn.push([this.strokeStyle, points]); }};
 const parts = {};
 globalThis.document = {getElementById(id) { return parts[id] ??= {
-  clientWidth: 320, clientHeight: 320, getContext() { return drawn; }}; }};
+  clientWidth: 320, clientHeight: 320, getContext() { return fake; }}; }};
 globalThis.window = globalThis;
 let next; globalThis.requestAnimationFrame = f => { next = f; };
 globalThis.performance = {now: () => 0};
@@ -121,19 +129,28 @@ def test_the_script_draws_every_bone_and_both_paths(tmp_path):
     if node is None:
         pytest.skip("node is not installed")
     script = tmp_path / "a.js"
-    play = "next(0); next(100); console.log(JSON.stringify([lines, parts.time.value]));"
+    play = "next(0); next(100); console.log(JSON.stringify([drawn, parts.time.value]));"
     source = Reader(save(tmp_path / "a.html")).texts["script"]
     script.write_text(BROWSER + source + play)
     done = subprocess.run([node, script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    lines, shown = json.loads(done.stdout)
+    drawn, shown = json.loads(done.stdout)
     assert shown == 3, "frame 3 after 0.1 s at 30 fps"
-    # Twice: 22 lines of the grid, two paths twice each, three bones.
-    assert len(lines) == 2 * (22 + 4 + 3)
-    bones = np.array(lines[-3:])
-    # Bones keep their lengths' order on the picture: up the page is smaller y.
-    assert bones[0, 1, 1] < bones[0, 0, 1] and bones[2, 1, 1] > bones[2, 0, 1]
-    assert np.isfinite(bones).all()
+    of = lambda color: [points for found, points in drawn if found == color]  # noqa: E731
+    assert len(of("#dde4ec")) == 50, "every other of a hundred tiles"
+    for path in ("#2ca02c", "#ff7f0e"):
+        assert len(of(path)) == 1 and len(of(path)[0]) == 4, "what is walked so far"
+        assert len(of(path + "55")) == 1
+    bones = {
+        color: np.array(of(color)[0]) for color in (body.MIDDLE, body.LEFT, body.RIGHT)
+    }
+    assert all(bone.shape == (2, 3) for bone in bones.values())
+    # Ends and radius; up the page is smaller y.
+    spine, foot = bones[body.MIDDLE], bones[body.RIGHT]
+    assert spine[1, 1] < spine[0, 1] and foot[1, 1] > foot[0, 1]
+    assert all(
+        np.isfinite(bone).all() and bone[:, 2].min() > 0 for bone in bones.values()
+    )
 
 
 def test_a_path_below_a_file_is_an_error_that_names_it(tmp_path):
