@@ -122,7 +122,8 @@ def _one_line(name: str | os.PathLike, problem: str) -> Iterator[None]:
         yield
     except Exception as error:
         kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        words = " ".join(str(error).split()) or "truncated"
+        # Some messages quote damaged bytes at length.
+        words = " ".join(str(error).split())[:300] or "truncated"
         raise ValueError(f"{os.fspath(name)}: {problem} ({kind}{words})") from None
 
 

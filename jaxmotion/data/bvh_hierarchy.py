@@ -25,6 +25,11 @@ def number(word: str) -> float:
     return float(word)
 
 
+def quote(word: str) -> str:
+    """A word of a file, for a message of one short line."""
+    return repr(word if len(word) <= 40 else f"{word[:40]}...")
+
+
 class Hierarchy:
     """Reads the tokens of a HIERARCHY block into lists, one entry a joint."""
 
@@ -58,7 +63,7 @@ class Hierarchy:
         """Next token must be that keyword."""
         found = self.take(repr(word))
         if found.upper() != word.upper():
-            self.fail(f"expected {word!r}, found {found!r}")
+            self.fail(f"expected {quote(word)}, found {quote(found)}")
 
     def numbers(self, what: str) -> tuple[float, float, float]:
         """Next three tokens as finite numbers."""
@@ -68,9 +73,9 @@ class Hierarchy:
             try:
                 values.append(number(word))
             except ValueError:
-                self.fail(f"{what} needs three numbers, found {word!r}")
+                self.fail(f"{what} needs three numbers, found {quote(word)}")
             if not np.isfinite(values[-1]):
-                self.fail(f"{what} is not finite: {word!r}")
+                self.fail(f"{what} is not finite: {quote(word)}")
         return values[0], values[1], values[2]
 
     def joint_name(self) -> str:
@@ -81,12 +86,14 @@ class Hierarchy:
             self.fail("a joint has no name")
         while (word := self.take("'{'")) != "{":
             if self.tokens[self.at - 1][1] != line:
-                self.fail(f"expected '{{' after joint {words[0]!r}, found {word!r}")
+                self.fail(
+                    f"expected '{{' after joint {quote(words[0])}, found {quote(word)}"
+                )
             words.append(word)
         name = " ".join(words)
         if name in self.names:
             self.at -= 1  # the line of the name, not of the brace
-            self.fail(f"joint name {name!r} is used twice")
+            self.fail(f"joint name {quote(name)} is used twice")
         return name
 
     def channel_list(self) -> tuple[str, ...]:
@@ -94,15 +101,15 @@ class Hierarchy:
         word = self.take("the number of channels")
         # One ASCII digit: isdigit() takes superscripts, and int() refuses 5,000 digits.
         if word not in tuple("0123456"):
-            self.fail(f"CHANNELS needs a number in 0..6, found {word[:40]!r}")
+            self.fail(f"CHANNELS needs a number in 0..6, found {quote(word)}")
         found: list[str] = []
         for _ in range(int(word)):
             channel = self.take("a channel name")
             if channel.lower() not in _CANONICAL:
                 known = ", ".join(CHANNELS)
-                self.fail(f"unknown channel {channel!r}, expected one of {known}")
+                self.fail(f"unknown channel {quote(channel)}, expected one of {known}")
             if _CANONICAL[channel.lower()] in found:
-                self.fail(f"channel {channel!r} occurs twice in one joint")
+                self.fail(f"channel {quote(channel)} occurs twice in one joint")
             found.append(_CANONICAL[channel.lower()])
         return tuple(found)
 
@@ -142,13 +149,13 @@ class Hierarchy:
                     self.end_site(joint)
                 case "}":
                     if self.offsets[joint] is None:
-                        self.fail(f"joint {self.names[joint]!r} has no OFFSET")
+                        self.fail(f"joint {quote(self.names[joint])} has no OFFSET")
                     joint = self.parents[joint]
                 case _:
                     self.fail(
                         "expected OFFSET, CHANNELS, JOINT, End Site or '}', "
-                        f"found {word!r}"
+                        f"found {quote(word)}"
                     )
         if self.at < len(self.tokens):
             word = self.take("nothing")
-            self.fail(f"expected MOTION after the root, found {word!r}")
+            self.fail(f"expected MOTION after the root, found {quote(word)}")

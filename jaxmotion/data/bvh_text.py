@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmotion import files
-from jaxmotion.data.bvh_hierarchy import BvhError, Hierarchy, number
+from jaxmotion.data.bvh_hierarchy import BvhError, Hierarchy, number, quote
 
 _MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.IGNORECASE | re.MULTILINE)
 _FRAMES = re.compile(r"\s*Frames\s*:?\s*(\S+)\s*", re.IGNORECASE)
@@ -82,7 +82,7 @@ def _header_number(lines: list[str], at: int, pattern, name: str, what: str):
     if not (np.isfinite(value) and value > 0):
         raise BvhError(
             f"{name}, line {at + 1}: expected '{what} <positive number>', "
-            f"found {lines[at].strip()!r:.80}"
+            f"found {quote(lines[at].strip())}"
         )
     return value, at + 1
 

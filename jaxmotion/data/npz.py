@@ -57,6 +57,8 @@ def read_npz(
         )
     found_version = fields.get("version")
     if found_version is None or found_version.ndim or found_version != version:
+        if found_version is not None and found_version.ndim:
+            found_version = f"of shape {found_version.shape}"
         raise ValueError(
             f"{path}: version {found_version} of the {what} format, expected "
             f"{version}; prepare the data again"

@@ -79,7 +79,7 @@ BAD = {
     "superscript": (samples.BVH.replace("6 X", "\u00b2 X"), "line 5: CHANNELS needs"),
     "5,000 digits": (
         samples.BVH.replace("6 X", "6" * 5000 + " X"),
-        "line 5: CHANNELS needs a number in 0..6, found '6{40}'$",
+        "line 5: CHANNELS needs a number in 0..6, found '6{40}...'$",
     ),
     "channel number": (samples.BVH.replace("6 X", "x X"), "line 5.*found 'x'"),
     "joint twice": (
