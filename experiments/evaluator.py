@@ -9,10 +9,11 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from emdm_tasks import setup
@@ -28,7 +29,7 @@ from jaxmotion.protocols import (
     script,
     smgdiff_data,
 )
-from jaxmotion.protocols.evaluators import Evaluator, Kind
+from jaxmotion.protocols.evaluators import Evaluator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Train:
       seed: Of parameters, batches and windows.
     """  # noqa: E501
 
-    kind: Kind = "style"
+    kind: Literal["style", "action", "ball"] = "style"
     data: tuple[Path, ...] = (Path("data/bandai2.npz"),)
     label: str | None = None
     out: Path = Path("evaluators/bandai2_style.npz")
@@ -191,21 +192,51 @@ def show(args: Show) -> None:
     value = evaluators.to_json(evaluators.load(args.file))
     lines = {"fingerprint": value.pop("fingerprint"), "file": args.file} | value
     lines["accuracy"] = f"{100 * value['accuracy']:.1f} % of held-out clips' windows"
+    if math.isnan(value["accuracy"]):
+        lines["accuracy"] = "not known"
     for name, found in lines.items():
         shown = ", ".join(found) if isinstance(found, list) else found
         print(f"{name}: {shown}")
 
 
+@dataclasses.dataclass(frozen=True)
+class Import:
+    """Write the style classifier released with CAMDM as an evaluator; runs no code of it.
+
+    It judges CAMDM's motions of 100STYLE, of its skeleton or Mixamo's.
+
+    Example: python experiments/evaluator.py import --weights 100style_position_classifier.pth --out evaluators/camdm_release.npz
+
+    Attributes:
+      weights: Its file.
+      out: File to write.
+      overwrite: Replace the file if it exists.
+    """  # noqa: E501
+
+    weights: Path
+    out: Path = Path("evaluators/camdm_release.npz")
+    overwrite: bool = False
+
+
+def import_weights(args: Import) -> None:
+    """Writes the file."""
+    if args.out.exists() and not args.overwrite:
+        raise FileExistsError(f"{args.out} exists; --overwrite replaces it")
+    evaluators.save(args.out, evaluators.released_style(args.weights))
+    show(Show(file=args.out))
+
+
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Show, tyro.conf.subcommand("show")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
 )
 
 
 def main() -> None:
     """Parses the command line and runs the command."""
     args = tyro.cli(Command, description=__doc__)
-    {Train: train, Show: show}[type(args)](args)
+    {Train: train, Show: show, Import: import_weights}[type(args)](args)
 
 
 if __name__ == "__main__":

@@ -69,6 +69,25 @@ def action_recognizer_input(
     return positions.reshape(*positions.shape[:-2], -1)
 
 
+def released_input(
+    bones: skeleton.Skeleton, motion: skeleton.Motion
+) -> Float[Array, "*batch frames channels"]:
+    """Joint positions as the published recognizer looks at them: from the first root.
+
+    Nothing is turned. There the joints are those of SMPL with its mean shape.
+
+    Args:
+      bones: The skeleton.
+      motion: Frames of it.
+
+    Returns:
+      Metres; three channels a joint.
+    """
+    positions = skeleton.joint_positions(bones, motion)
+    positions = positions - positions[..., :1, :1, :]
+    return positions.reshape(*positions.shape[:-2], -1)
+
+
 def _initial_state(key: Key, batch: int, config: ActionRecognizerConfig) -> Array:
     return config.state_scale * jax.random.normal(key, (batch, 2, config.hidden))
 

@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.learning import training
 from jaxmotion.motion import rotation, skeleton, trajectory
-from jaxmotion.networks.recognizer import Recognizer
+from jaxmotion.motion.facing import body_facing, plain_names
+from jaxmotion.networks.recognizer import Recognizer, StyleClassifier
 from jaxmotion.typing import Key, Params
 
 
@@ -31,6 +32,94 @@ class RecognizerConfig:
     num_classes: int
     num_joints: int
     frames: int = 60
+
+    @property
+    def network(self) -> Recognizer:
+        """The module of this size."""
+        return Recognizer(self.num_classes)
+
+    def read(
+        self, bones: skeleton.Skeleton, motion: skeleton.Motion
+    ) -> Float[Array, "*batch frames channels"]:
+        """What the network looks at."""
+        return recognizer_input(bones, motion)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReleasedConfig(RecognizerConfig):
+    """Size of the released classifier: 15 joints, and windows of 60 frames."""
+
+    num_joints: int = 15
+
+    @property
+    def network(self) -> StyleClassifier:
+        """The module of this size."""
+        return StyleClassifier(self.num_classes)
+
+    def read(
+        self, bones: skeleton.Skeleton, motion: skeleton.Motion
+    ) -> Float[Array, "*batch frames channels"]:
+        """What the network looks at."""
+        return released_input(bones, motion)
+
+
+# The joints of the released classifier as `plain_names` has them, of Mixamo's skeleton
+# and of 100STYLE's own.
+_RELEASED_NAMES = tuple(
+    ("hips", "neck", "head")
+    + tuple(f"{side}{part}" for side in ("right", "left") for part in arm)
+    + tuple(f"{side}{part}" for side in ("right", "left") for part in leg)
+    for arm, leg in (
+        (("collar", "shoulder", "elbow"), ("hip", "knee", "ankle")),
+        (("shoulder", "arm", "forearm"), ("upleg", "leg", "foot")),
+    )
+)
+RELEASED_JOINTS = _RELEASED_NAMES[1]
+
+
+def released_joints(bones: skeleton.Skeleton) -> tuple[int, ...]:
+    """The joints that the released classifier looks at, in its order.
+
+    Raises:
+      ValueError: if the skeleton has neither Mixamo's nor 100STYLE's names.
+    """
+    plain = plain_names(bones)
+    for names in _RELEASED_NAMES:
+        if set(names) <= set(plain):
+            return tuple(plain.index(name) for name in names)
+    raise ValueError(
+        f"the released classifier needs the joints {', '.join(RELEASED_JOINTS)}, or "
+        f"{', '.join(_RELEASED_NAMES[0])}; the skeleton has {', '.join(bones.names)}"
+    )
+
+
+def released_input(
+    bones: skeleton.Skeleton, motion: skeleton.Motion
+) -> Float[Array, "*batch frames channels"]:
+    """What the released classifier looks at.
+
+    Positions of 15 joints relative to the root, each frame turned so that hips and
+    shoulders face +x.
+
+    Args:
+      bones: The skeleton.
+      motion: Frames of it, at 30 a second.
+
+    Returns:
+      Metres; three channels a joint.
+
+    Raises:
+      ValueError: as of `released_joints`.
+
+    Source: released feature extractor of CAMDM (Chen et al. 2024).
+    """
+    joints = jnp.asarray(released_joints(bones))
+    positions = skeleton.joint_positions(bones, motion)
+    turn = rotation.matrix_from_facing(body_facing(bones, positions))
+    local = positions[..., joints, :] - positions[..., :1, :]
+    x, y, z = jnp.moveaxis(jnp.einsum("...ji,...kj->...ki", turn, local), -1, 0)
+    local = jnp.stack([z, y, -x], axis=-1)  # from facing +z
+    return local.reshape(*local.shape[:-2], -1)
 
 
 def recognizer_input(
@@ -87,7 +176,7 @@ def init_recognizer(key: Key, config: RecognizerConfig) -> Params:
       Parameters of `Recognizer`.
     """
     x = jnp.zeros((1, config.frames, 3 * config.num_joints))
-    return Recognizer(config.num_classes).init(key, x)["params"]
+    return config.network.init(key, x)["params"]
 
 
 def recognizer_loss(
@@ -109,7 +198,7 @@ def recognizer_loss(
       The loss, and the accuracy.
     """
     x, labels = batch
-    _, logits = Recognizer(config.num_classes).apply(
+    _, logits = config.network.apply(
         {"params": params}, x, train=True, rngs={"dropout": key}
     )
     return cross_entropy(logits, labels)
@@ -131,7 +220,7 @@ def recognize(
     Returns:
       Features (for Fréchet distances), and logits.
     """
-    return Recognizer(config.num_classes).apply({"params": params}, x)
+    return config.network.apply({"params": params}, x)
 
 
 def train_recognizer(

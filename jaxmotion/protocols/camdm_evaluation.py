@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmotion.evaluation import table
+from jaxmotion.learning import recognition
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.protocols import camdm as protocol
 from jaxmotion.protocols import (
@@ -181,16 +182,27 @@ def recognizer(
     Raises:
       ValueError: if the evaluator does not fit the run; names the field.
     """
+    model = run.model
+    kind, labels, joints = "style", model.labels, model.bones.names
+    classes: tuple[int, ...] = ()
+    if evaluator is not None and evaluator.kind == "style_release":
+        recognition.released_joints(model.bones)  # raises unless it has them
+        kind, joints = evaluator.kind, evaluator.joints
+        if set(labels) <= set(evaluator.labels):  # a run may have fewer styles
+            classes = tuple(evaluator.labels.index(name) for name in labels)
+            labels = evaluator.labels
     frozen = evaluators.params_for(
         evaluator,
-        kind="style",
-        labels=run.model.labels,
-        joints=run.model.bones.names,
-        fps=run.model.config.fps,
+        kind=kind,
+        labels=labels,
+        joints=joints,
+        fps=model.config.fps,
         frames=protocol.WINDOW,
     )
     if frozen is not None:
-        return camdm_styles.Recognized(params=frozen, config=evaluator.config)
+        return camdm_styles.Recognized(
+            params=frozen, config=evaluator.config, classes=classes
+        )
     print(f"training the style recogniser for {num_steps} steps", flush=True)
     return camdm_styles.fit_recognizer(
         key, run.train, field=run.field, num_steps=num_steps

@@ -46,10 +46,12 @@ class Recognized:
     Attributes:
       params: Its parameters.
       config: Its size.
+      classes: Its class of each label; none if they are the same.
     """
 
     params: Params
     config: recognition.RecognizerConfig
+    classes: tuple[int, ...] = ()
 
 
 def fit_recognizer(
@@ -95,7 +97,10 @@ def recognized(
       Features [windows, 512], and hits [windows] (0 or 1).
     """
     run = functools.partial(_recognize, recognizer.params, bones, recognizer.config)
-    return in_batches(run, (found.motion, found.label))
+    label = found.label
+    if recognizer.classes:
+        label = jnp.asarray(recognizer.classes)[label]
+    return in_batches(run, (found.motion, label))
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -106,6 +111,6 @@ def _recognize(
     x: tuple[skeleton.Motion, Array],
 ) -> tuple[Array, Array]:
     motion, label = x
-    given = recognition.recognizer_input(bones, motion)
+    given = config.read(bones, motion)
     feature, logits = recognition.recognize(params, given, config=config)
     return feature, (jnp.argmax(logits, axis=-1) == label).astype(jnp.float32)

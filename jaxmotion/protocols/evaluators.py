@@ -14,11 +14,16 @@ import numpy as np
 
 from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.data.clips import Clips
-from jaxmotion.learning import action_recognition, checkpoint, recognition
+from jaxmotion.learning import (
+    action_recognition,
+    checkpoint,
+    published,
+    recognition,
+)
 from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.typing import Params
 
-Kind = Literal["style", "action", "ball"]
+Kind = Literal["style", "action", "ball", "style_release"]
 Config = recognition.RecognizerConfig | action_recognition.ActionRecognizerConfig
 
 _FORMAT = "jaxmotion-evaluator"
@@ -46,7 +51,8 @@ class Evaluator:
 
     Attributes:
       kind: "style" (CAMDM's recogniser, of windows of a label), "action" (EMDM's GRU),
-        or "ball" (SMGDiff's, of skills with a ball).
+        "ball" (SMGDiff's, of skills with a ball), or "style_release" (the classifier
+        released with CAMDM).
       params: Of the recogniser.
       field: Label field of the clips that the classes are from.
       labels: Names of the classes, in their order.
@@ -57,7 +63,7 @@ class Evaluator:
       clips: Fingerprint of the training clips.
       seed: Of parameters and batches.
       updates: Of its training.
-      accuracy: On clips that it was not trained on, in [0, 1].
+      accuracy: On clips that it was not trained on, in [0, 1]; NaN if nobody said.
       path: Its file; None for one that was not loaded.
     """
 
@@ -83,11 +89,40 @@ class Evaluator:
             return action_recognition.ActionRecognizerConfig(
                 num_classes=classes, num_joints=joints
             )
+        if self.kind == "style_release":
+            return recognition.ReleasedConfig(num_classes=classes)
         return recognition.RecognizerConfig(
             num_classes=classes,
             num_joints=joints + (self.kind == "ball"),
             frames=self.frames,
         )
+
+
+def released_style(path: Path) -> Evaluator:
+    """The style classifier released with CAMDM.
+
+    Args:
+      path: Its file, 100style_position_classifier.pth.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: as of `published.load_style_classifier`.
+    """
+    params, labels = published.load_style_classifier(path)
+    return Evaluator(
+        kind="style_release",
+        params=params,
+        field="style",
+        labels=labels,
+        joints=recognition.RELEASED_JOINTS,
+        fps=30.0,
+        frames=60,
+        source="100STYLE (CC BY 4.0); weights released with CAMDM",
+        clips="unknown",
+        seed=0,
+        updates=0,
+        accuracy=float("nan"),
+    )
 
 
 def to_json(evaluator: Evaluator) -> dict[str, Any]:

@@ -1,16 +1,21 @@
 """experiments/evaluator.py: frozen evaluators, and their use by the three systems."""
 
+import dataclasses
+import functools
 import json
 import re
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from jaxmotion.data import clips_io
 from jaxmotion.data.ball_clips import save_ball_clips
+from jaxmotion.learning import recognition
 from jaxmotion.learning.fingerprint import fingerprint
-from jaxmotion.protocols import evaluators
+from jaxmotion.protocols import camdm as protocol
+from jaxmotion.protocols import camdm_evaluation, camdm_styles, evaluators
 from tests import ball_walker, tiny
 from tests.protocols import samples
 
@@ -210,3 +215,41 @@ def test_emdm_is_judged_alike_twice(invoke, data, tmp_path):
     report = json.loads((tmp_path / "a" / "metrics.json").read_text())
     assert "trained on tests, 0 updates" in report["evaluator"]["recognizer"]
     assert np.isfinite(report["rows"]["emdm"]["FID"]["value"])
+
+
+def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
+    """Four styles known, two of them the run's; against PyTorch on the same input."""
+    torch = pytest.importorskip("torch")
+    from tests.reference import published_torch as peers
+
+    weights, out = tmp_path / "classifier.pth", tmp_path / "released.npz"
+    peer = peers.randomize(peers.StyleClassifier(classes=4), 2)
+    names = ["angry", "neutral", "old", "zombie"]
+    torch.save({"state_dict": peer.state_dict(), "class_names": names}, weights)
+    invoke("evaluator", f"import --weights {weights} --out {out}")
+    fields = shown(capsys.readouterr().out)
+    assert fields["kind"] == "style_release" and fields["accuracy"] == "not known"
+    with pytest.raises(FileExistsError, match="--overwrite replaces it"):
+        invoke("evaluator", f"import --weights {weights} --out {out}")
+
+    run, evaluator = samples.run(), evaluators.load(out)
+    get = functools.partial(camdm_evaluation.recognizer, jax.random.key(0))
+    judge = get(run, evaluator, num_steps=1)
+    windows = protocol.data_windows(run.train, stride=60, field="style")
+    bones = run.model.bones
+    features, hits = camdm_styles.recognized(bones, windows, judge)
+    x = np.array(recognition.released_input(bones, windows.motion))
+    with torch.inference_mode():
+        wanted, logits = peer(torch.from_numpy(x.swapaxes(1, 2)))
+    assert wanted.std() > 0.1
+    np.testing.assert_allclose(features, wanted.numpy(), atol=1e-5 * wanted.abs().max())
+    classes = np.array([1, 3])[np.asarray(windows.label)]
+    np.testing.assert_array_equal(hits, logits.argmax(-1).numpy() == classes)
+
+    other = dataclasses.replace(evaluator, labels=("a", "neutral", "b", "c"))
+    with pytest.raises(ValueError, match="field 'labels' is .* expected"):
+        get(run, other, num_steps=1)
+    lame = dataclasses.replace(bones, names=("Hip", *bones.names[1:]))
+    model = dataclasses.replace(run.model, bones=lame)
+    with pytest.raises(ValueError, match="released classifier needs the joints hips"):
+        get(dataclasses.replace(run, model=model), evaluator, num_steps=1)

@@ -154,3 +154,12 @@ def test_it_learns_to_tell_two_actions(bones):
         params, jax.random.key(1), held_out, config=CONFIG
     )
     assert np.mean(logits.argmax(-1) == labels) > 0.8
+
+
+def test_the_released_input_is_not_turned_and_begins_at_the_root(bones):
+    motion = tiny.walk(9, turn=1.0, start=0.5)
+    positions = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
+    centred = positions - positions[:, :1]
+    path = positions[:, :1] - positions[0, 0]
+    found = action_recognition.released_input(bones, motion)
+    np.testing.assert_allclose(found, (centred + path).reshape(9, -1), atol=1e-6)

@@ -90,3 +90,66 @@ def test_it_learns_to_tell_two_styles(windows_of_styles):
     found, logits = recognition.recognize(params, x[1::2], config=CONFIG)
     assert found.shape == (x[1::2].shape[0], 512)
     assert np.mean(logits.argmax(-1) == labels[1::2]) > 0.7
+
+
+def skeleton_with(names, rng):
+    """A chain from the root to each joint."""
+    return skeleton.Skeleton(
+        offsets=jnp.asarray(rng.normal(size=(len(names), 3)), jnp.float32),
+        parents=(-1, *(0,) * (len(names) - 1)),
+        names=tuple(names),
+        feet=(1, 2),
+    )
+
+
+MIXAMO = (
+    "Hips Spine Neck Head LeftShoulder LeftArm LeftForeArm LeftHand RightShoulder "
+    "RightArm RightForeArm RightUpLeg RightLeg RightFoot LeftUpLeg LeftLeg LeftFoot"
+)
+STYLE = (
+    "Hips Chest LeftCollar LeftShoulder LeftElbow RightCollar RightShoulder RightElbow "
+    "Neck Head RightHip RightKnee RightAnkle LeftHip LeftKnee LeftAnkle"
+)
+ORDER = {
+    MIXAMO: "Hips Neck Head RightShoulder RightArm RightForeArm LeftShoulder LeftArm "
+    "LeftForeArm RightUpLeg RightLeg RightFoot LeftUpLeg LeftLeg LeftFoot",
+    STYLE: "Hips Neck Head RightCollar RightShoulder RightElbow LeftCollar "
+    "LeftShoulder LeftElbow RightHip RightKnee RightAnkle LeftHip LeftKnee LeftAnkle",
+}
+ACROSS = {
+    MIXAMO: ("LeftShoulder", "RightShoulder", "LeftUpLeg", "RightUpLeg"),
+    STYLE: ("LeftCollar", "RightCollar", "LeftHip", "RightHip"),
+}
+
+
+@pytest.mark.parametrize("names", [MIXAMO, STYLE])
+def test_the_released_input_is_that_of_the_released_scripts(names):
+    """Float64: across = shoulders + hips, each of length 1; facing +x; no root."""
+    rng = np.random.default_rng(0)
+    joints = names.split()
+    bones = skeleton_with([f"rig:{name}" for name in joints], rng)
+    motion = skeleton.Motion(
+        root_position=jnp.asarray(rng.normal(size=(6, 3)), jnp.float32),
+        joint_rotation=jnp.asarray(rng.normal(size=(6, len(joints), 6)), jnp.float32),
+        fps=30.0,
+    )
+    positions = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
+    at = lambda name: positions[:, joints.index(name)]  # noqa: E731
+    left_top, right_top, left_hip, right_hip = map(at, ACROSS[names])
+    across = np.zeros((6, 3))
+    for left, right in ((left_top, right_top), (left_hip, right_hip)):
+        across += (left - right) / np.linalg.norm(left - right, axis=-1)[:, None]
+    forward = np.cross(across, [0.0, 1.0, 0.0])
+    angle = np.arctan2(forward[:, 2], forward[:, 0])
+    local = np.stack([at(x) - at("Hips") for x in ORDER[names].split()], axis=1)
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    x, y, z = np.moveaxis(local, -1, 0)
+    wanted = np.stack([c * x + s * z, y, c * z - s * x], axis=-1).reshape(6, 45)
+    found = recognition.released_input(bones, motion)
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
+
+
+def test_the_released_input_names_the_joints_that_it_needs():
+    bones = skeleton_with(["Hips", "LeftUpLeg", "RightUpLeg"], np.random.default_rng(0))
+    with pytest.raises(ValueError, match="needs the joints hips, neck, .* has Hips, "):
+        recognition.released_joints(bones)
