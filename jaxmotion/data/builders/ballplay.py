@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation
 from jaxmotion import files
 from jaxmotion.data import npz
 from jaxmotion.data.builders import ball_base, base, chains
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.skeleton import MAX_METRES, Skeleton
 
 RADIUS = 0.112
 OTHER = "other"
@@ -161,10 +161,14 @@ def read_fields(path: str, data: bytes) -> dict[str, np.ndarray]:
                 f"{path}: field {field!r} has shape {fields[field].shape}, expected "
                 f"{shape}"
             )
-        finite = np.isfinite(fields[field]) if field in _FRAMES else np.array([True])
-        if not finite.all():
-            frame = int(np.argwhere(~finite)[0, 0])
-            raise ValueError(f"{path}: field {field!r} of frame {frame} is not finite")
+        if field not in _FRAMES:
+            continue
+        inside = np.abs(fields[field].astype(np.float64)) <= MAX_METRES
+        if not inside.all():
+            frame = int(np.argwhere(~inside)[0, 0])
+            raise ValueError(
+                f"{path}: field {field!r} of frame {frame} is not within {MAX_METRES:g}"
+            )
     _check_clips(path, fields, num_frames)
     return {
         field: array.astype(np.float64) if array.dtype.kind == "f" else array
@@ -182,9 +186,13 @@ def _check_clips(path: str, fields: dict[str, np.ndarray], num_frames: int) -> N
         )
     found = fields["body_name"].tolist()
     if tuple(found) != NAMES:
+        pairs = itertools.zip_longest(NAMES, found)
+        joint, (expected, name) = next(
+            (i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1]
+        )
         raise ValueError(
-            f"{path}: field 'body_name' should list {len(NAMES)} joints, "
-            f"{', '.join(NAMES)}; found {len(found)}, {', '.join(found)}"
+            f"{path}: field 'body_name' should list {len(NAMES)} joints, found "
+            f"{len(found)}: joint {joint} should be {expected!r}, found {name!r}"
         )
     if fields["fps"] != _FPS:
         raise ValueError(f"{path}: field 'fps' is {fields['fps']}, expected {_FPS:g}")

@@ -42,7 +42,7 @@ from jaxmotion import files
 from jaxmotion.data import npz
 from jaxmotion.data.builders import ball_base, base, chains, smpl
 from jaxmotion.motion.ball import ball_accelerations
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.skeleton import MAX_METRES, Skeleton
 
 SKILLS = ("dribble", "trick", "shoot", "stand", "celebrate", "off_ball")
 RADIUS = 0.11
@@ -97,9 +97,12 @@ def _arrays(
                 f"{path}: field {field!r} has shape {found.shape}, expected "
                 f"({expected})"
             )
-        if not np.isfinite(found).all():
-            row = int(np.argwhere(~np.isfinite(found))[0, 0])
-            raise ValueError(f"{path}: field {field!r} is not finite in row {row}")
+        inside = np.abs(found.astype(np.float64)) <= MAX_METRES
+        if not inside.all():
+            row = int(np.argwhere(~inside)[0, 0])
+            raise ValueError(
+                f"{path}: field {field!r} is not within {MAX_METRES:g} in row {row}"
+            )
     return fields
 
 
@@ -202,7 +205,12 @@ def _check_sequence(path: str, fields: dict[str, np.ndarray]) -> int:
     for field in ("fps", "up"):
         if field not in fields:
             raise ValueError(f"{path}: field {field!r} is missing")
-    if fields["fps"].ndim or fields["fps"] not in (30, 240):
+        if fields[field].ndim:
+            raise ValueError(
+                f"{path}: field {field!r} has shape {fields[field].shape}, expected "
+                "one value"
+            )
+    if fields["fps"] not in (30, 240):
         raise ValueError(f"{path}: field 'fps' is {fields['fps']}, expected 240 or 30")
     if str(fields["up"]) not in ("y", "z"):
         raise ValueError(f"{path}: field 'up' is {fields['up']}, expected 'y' or 'z'")
