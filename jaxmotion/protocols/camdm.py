@@ -199,15 +199,56 @@ def start_states(
         if known.size == 0:
             raise ValueError(f"no clip of style {model.labels[label]!r} to start from")
         starts.append(int(index.starts[generator.choice(known)]))
+    cut = jax.vmap(lambda start: windows.cut(clips, start, past))
+    return _states_at_origin(model, cut(jnp.asarray(starts)))
 
-    def state(start: Array) -> camdm_control.CharacterState:
-        motion = windows.cut(clips, start, past)
-        path = trajectory.root_trajectory(model.bones, motion)
-        frame = trajectory.PlanarFrame(origin=path.position[-1], facing=path.facing[-1])
-        local = features.to_frame(motion, frame)
+
+def own_states(
+    model: Model, labels: np.ndarray, *, seed: int = 0
+) -> camdm_control.CharacterState:
+    """States of characters that start with the model's own poses of their style.
+
+    Args:
+      model: A model with `starts`.
+      labels: Style of each character.
+      seed: Of the choice of poses.
+
+    Returns:
+      States, batch axis first.
+
+    Raises:
+      ValueError: if the model has no poses of its own, or no such style.
+    """
+    if model.starts is None:
+        raise ValueError("the model has no poses to start from: give clips")
+    labels = np.asarray(labels)
+    if labels.size and not (0 <= labels.min() <= labels.max() < len(model.labels)):
+        raise ValueError(
+            f"labels of {labels.min()} to {labels.max()}, expected 0 to "
+            f"{len(model.labels) - 1}"
+        )
+    number = model.starts.root_position.shape[1]
+    which = np.random.default_rng(seed).integers(number, size=labels.shape)
+    return _states_at_origin(
+        model, jax.tree.map(lambda x: x[labels, which], model.starts)
+    )
+
+
+def at_origin(model: Model, motion: skeleton.Motion) -> skeleton.Motion:
+    """A motion moved so that its last pose stands at the origin and faces +z."""
+    path = trajectory.root_trajectory(model.bones, motion)
+    frame = trajectory.PlanarFrame(origin=path.position[-1], facing=path.facing[-1])
+    return features.to_frame(motion, frame)
+
+
+def _states_at_origin(
+    model: Model, motions: skeleton.Motion
+) -> camdm_control.CharacterState:
+    def state(motion: skeleton.Motion) -> camdm_control.CharacterState:
+        local = at_origin(model, motion)
         return camdm_control.init_state(model.bones, local, config=model.config)
 
-    return jax.jit(jax.vmap(state))(jnp.asarray(starts))
+    return jax.jit(jax.vmap(state))(motions)
 
 
 def preset_batch(

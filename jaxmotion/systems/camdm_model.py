@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from jaxmotion.learning import checkpoint
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.systems import camdm, model_json
 from jaxmotion.typing import Params
 
@@ -25,12 +27,16 @@ class Model:
       bones: The skeleton that it was trained on.
       labels: Names of the styles.
       source: The data, and its licence.
+      starts: Poses to start from, [labels, number, past, ...], at the origin facing +z;
+        None where characters start from clips. A shipped model has its own, which it
+        made itself.
     """
 
     config: camdm.Config
     bones: Skeleton
     labels: tuple[str, ...]
     source: str
+    starts: Motion | None = None
 
     def label(self, name: str) -> int:
         """Number of a style.
@@ -60,13 +66,46 @@ def to_json(model: Model) -> dict[str, Any]:
     Returns:
       A JSON object.
     """
-    return {
+    value = {
         "system": "camdm",
         "config": dataclasses.asdict(model.config),
         "skeleton": model_json.skeleton_to_json(model.bones),
         "labels": list(model.labels),
         "source": model.source,
     }
+    if model.starts is not None:
+        value["starts"] = {
+            name: np.asarray(getattr(model.starts, name), np.float64).round(5).tolist()
+            for name in ("root_position", "joint_rotation")
+        }
+    return value
+
+
+def _starts_from_json(value: Any, config: camdm.Config, where: str) -> Motion | None:
+    if value is None:
+        return None
+    try:
+        root, joints = (
+            np.asarray(value[name], np.float32)
+            for name in ("root_position", "joint_rotation")
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{where}: field 'starts' is wrong: {error}") from None
+    number = root.shape[1] if root.ndim > 1 else 0
+    lead = (config.num_labels, number, config.past)
+    expected = ((*lead, 3), (*lead, config.num_joints, 6))
+    if number < 1 or (root.shape, joints.shape) != expected:
+        raise ValueError(
+            f"{where}: field 'starts' has shapes {root.shape} and {joints.shape}, "
+            f"expected {expected[0]} and {expected[1]} of at least one start per label"
+        )
+    if not (np.isfinite(root).all() and np.isfinite(joints).all()):
+        raise ValueError(f"{where}: field 'starts' has numbers that are not finite")
+    return Motion(
+        root_position=jnp.asarray(root),
+        joint_rotation=jnp.asarray(joints),
+        fps=config.fps,
+    )
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
@@ -114,7 +153,8 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
             raise ValueError(
                 f"{where}: field {name!r} has {found} entries, the config {expected}"
             )
-    return model
+    starts = _starts_from_json(value.get("starts"), config, where)
+    return dataclasses.replace(model, starts=starts)
 
 
 def _shapes(model: Model) -> Params:
