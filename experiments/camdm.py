@@ -19,16 +19,18 @@ import tyro
 
 from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import Clips
+from jaxmotion.evaluation import by_frame
 from jaxmotion.learning import checkpoint, loop
 from jaxmotion.protocols import (
     artifacts,
     camdm_evaluation,
     camdm_runs,
+    camdm_speeds,
     camdm_training,
     evaluators,
     script,
 )
-from jaxmotion.systems import camdm_model, camdm_published
+from jaxmotion.systems import camdm_control, camdm_model, camdm_published
 
 Steering = Literal["forward", "strafe", "stop_and_go"]
 
@@ -221,6 +223,36 @@ class Evaluate:
 
 
 @dataclasses.dataclass(frozen=True)
+class Speeds:
+    """Tell characters to walk straight on at several speeds, and measure each.
+
+    Example: python experiments/camdm.py speeds --run runs/locomotion --style neutral
+
+    Attributes:
+      run: Run folder of `train`.
+      data: Clips; None for those that the run was trained on.
+      out: Folder for metrics.json and table.md; None for <run>/speeds.
+      style: Style of all characters; None for the first.
+      speeds: Metres per second; 0 to stand.
+      rollouts: Characters per speed.
+      seconds: Length of each rollout, seconds.
+      follow: Half-life in which a character that left its course returns, seconds; 0
+        to steer by velocity alone.
+      seed: Of poses and noise.
+    """
+
+    run: Path = Path("runs/camdm")
+    data: Path | None = None
+    out: Path | None = None
+    style: str | None = None
+    speeds: tuple[float, ...] = (0.0, 0.8, 1.4, 2.5, 3.5)
+    rollouts: int = 16
+    seconds: float = 20.0
+    follow: float = 0.0
+    seed: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
 class Rollout:
     """Steer one character in one style; writes BVH, GIF and HTML.
 
@@ -270,6 +302,24 @@ def evaluate(args: Evaluate) -> None:
     notes = (evaluators.note(report["evaluator"]),)
     artifacts.write_table(out, rows, report, notes)
     print(report)
+
+
+def speeds(args: Speeds) -> None:
+    """Writes the table, and jerk and slide by frame of the plan below it."""
+    run = camdm_runs.load_run(args.run, args.data)
+    out = args.out or args.run / "speeds"
+    loop.check_writable(out)
+    rows, plans, report = camdm_speeds.speed_table(
+        run,
+        args.speeds,
+        style=args.style or run.model.labels[0],
+        rollouts=args.rollouts,
+        seconds=args.seconds,
+        control=camdm_control.Control(follow=args.follow),
+        seed=args.seed,
+    )
+    report = {"arguments": camdm_runs.arguments_json(args)} | report
+    artifacts.write_table(out, rows, report, (by_frame.to_markdown(plans),))
 
 
 def rollout(args: Rollout) -> None:
@@ -366,6 +416,7 @@ def _beside(run: Path) -> Path:
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Speeds, tyro.conf.subcommand("speeds")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]
@@ -375,8 +426,15 @@ Command = (
 def main() -> None:
     """Parses the command line and runs the command."""
     args = tyro.cli(Command, description=__doc__)
-    run = {Train: train, Evaluate: evaluate, Rollout: rollout, Export: export}
-    (run | {Import: import_weights})[type(args)](args)
+    run = {
+        Train: train,
+        Evaluate: evaluate,
+        Speeds: speeds,
+        Rollout: rollout,
+        Export: export,
+        Import: import_weights,
+    }
+    run[type(args)](args)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import locomotion
 from jaxmotion.motion import features, rotation, skeleton, trajectory
-from jaxmotion.systems import camdm_control, camdm_loss
+from jaxmotion.systems import camdm, camdm_control, camdm_loss
 from jaxmotion.systems.camdm_model import Model
 from jaxmotion.typing import Key, Params
 
@@ -309,8 +309,30 @@ def steered_rollouts(
         if chunk < 1:
             raise ValueError(f"chunks of {chunk} characters, expected 1 or more")
         chunk = max(size for size in range(1, chunk + 1) if number % size == 0)
-    driver = camdm_control.controller(
-        params, model.bones, config=model.config, control=control
+    return _rollouts(
+        params,
+        key,
+        states,
+        commands,
+        model.bones,
+        config=model.config,
+        control=control,
+        chunk=chunk,
     )
-    run = functools.partial(rollout.rollout, driver, chunk=chunk)
-    return jax.jit(run)(key, states, commands)[1]
+
+
+# One program per method and shape, also over calls: everything else is an argument.
+@functools.partial(jax.jit, static_argnames=("config", "control", "chunk"))
+def _rollouts(
+    params: Params,
+    key: Key,
+    states: camdm_control.CharacterState,
+    commands: trajectory.Command,
+    bones: skeleton.Skeleton,
+    *,
+    config: camdm.Config,
+    control: camdm_control.Control | None,
+    chunk: int | None,
+) -> camdm_control.Frame:
+    driver = camdm_control.controller(params, bones, config=config, control=control)
+    return rollout.rollout(driver, key, states, commands, chunk=chunk)[1]
