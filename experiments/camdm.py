@@ -351,15 +351,22 @@ class Export:
     Attributes:
       run: Run folder of `train`.
       out: File to write; parameters are stored as float16.
+      starts: Poses per style that the model itself stands in, stored with it, so that
+        characters start without any recording; 0 for none.
     """
 
     run: Path = Path("runs/camdm")
     out: Path = Path("camdm.npz")
+    starts: int = 0
 
 
 def export(args: Export) -> None:
     """Writes the file."""
     model, params, _ = camdm_model.load(args.run)
+    if args.starts:
+        run = camdm_runs.load_run(args.run)
+        starts = camdm_evaluation.own_starts(run, number=args.starts)
+        model = dataclasses.replace(model, starts=starts)
     config = camdm_model.to_json(model) | {"experiment": {"label": "style"}}
     checkpoint.export_params(args.out, params, config)
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")

@@ -1,13 +1,17 @@
-"""From nothing to a steered character in a few minutes, without any data.
+"""From nothing to a steered character in half a minute, without data or training.
 
-Makes clips of the procedural walker in its eight styles and in a ninth, "swagger", that
-the small model shipped with the package has never seen; teaches it the ninth in a
-minute; steers a character that changes from one style to the other; and measures it
-beside the data.
+Steers the shipped model of a real person's locomotion along a course (stand, walk,
+turn, jog, run, stop, crouch) and writes what it does as GIF, HTML and BVH.
+
+With --train it shows the whole path instead: clips of a procedural walker in its eight
+styles and in a ninth, "swagger", that the small model shipped for it has never seen;
+the ninth is taught in a minute; a character changes from one style to the other, and is
+measured beside the data.
 
 Examples:
   python experiments/quickstart.py
-  python experiments/quickstart.py --from-scratch --out runs/scratch
+  python experiments/quickstart.py --train
+  python experiments/quickstart.py --train --from-scratch --out runs/scratch
 """
 
 import dataclasses
@@ -22,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from jaxmotion.control import presets
 from jaxmotion.data import procedural, selection, windows
 from jaxmotion.data.gaits import GAITS, Gait
 from jaxmotion.learning import loop, training
@@ -30,7 +35,18 @@ from jaxmotion.protocols import artifacts, camdm_rows, camdm_training, script
 from jaxmotion.protocols import camdm as protocol
 from jaxmotion.systems import camdm, camdm_control, camdm_loss, camdm_model
 
-SHIPPED = Path(camdm_model.__file__).parents[1] / "assets" / "walker.npz"
+ASSETS = Path(camdm_model.__file__).parents[1] / "assets"
+SHIPPED, WALKER = ASSETS / "locomotion.npz", ASSETS / "walker.npz"
+# Seconds, direction of travel and facing (degrees from +z towards +x), m/s, style.
+COURSE = (
+    (1.5, 0, 0, 0.0, "neutral"),
+    (3.0, 0, 0, 1.4, "neutral"),
+    (2.5, 90, 90, 1.4, "neutral"),
+    (3.0, 45, 45, 2.5, "neutral"),
+    (2.5, 0, 0, 3.5, "neutral"),
+    (2.0, 0, 0, 0.0, "neutral"),
+    (3.5, -90, -90, 0.9, "crouch"),
+)
 NEW_STYLE = "swagger"
 SWAGGER = Gait(
     max_speed=1.2,
@@ -48,11 +64,14 @@ SIZE = camdm_training.PRESETS["small"] | dict(width=128, hidden=512)
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Train on the procedural walker, steer it, measure it.
+    """Steer the shipped model; or train on the procedural walker, steer it, measure it.
 
     Attributes:
-      out: Folder for rollout.bvh, rollout.gif, rollout.html, metrics.json and
-        checkpoints.
+      out: Folder for rollout.bvh, rollout.gif, rollout.html and metrics.json; of a
+        training also checkpoints.
+      characters: Rollouts to measure.
+      seed: Of everything random.
+      train: Teach the procedural walker a style first; the options below are its own.
       from_scratch: Start from random parameters and train for 4000 steps (about 12
         minutes on two cores) instead of starting from the shipped model.
       steps: Optimiser steps, rounded down to fifties; None for 400, or 4000 from
@@ -61,19 +80,66 @@ class Config:
       minutes: Minutes of walking to generate.
       seconds: Length of the rollout, seconds.
       styles: Styles of the rollout, one after the other.
-      characters: Rollouts to measure.
-      seed: Of everything random.
     """
 
     out: Path = Path("runs/quickstart")
+    characters: int = 16
+    seed: int = 0
+    train: bool = False
     from_scratch: bool = False
     steps: int | None = None
     batch: int = 32
     minutes: float = 12.0
     seconds: float = 16.0
     styles: tuple[str, ...] = ("neutral", NEW_STYLE)
-    characters: int = 16
-    seed: int = 0
+
+
+def first_motion(frames, fps) -> skeleton.Motion:
+    """Motion of the first character."""
+    return skeleton.Motion(
+        root_position=frames.root_position[0],
+        joint_rotation=frames.joint_rotation[0],
+        fps=fps,
+    )
+
+
+def steer_shipped(args: Config):
+    """Steers the shipped model along the course; writes files and metrics."""
+    model, params, _ = camdm_model.load(SHIPPED)
+    fps = model.config.fps
+    print(f"{SHIPPED.stem}: {model.source}; compiling, about 15 s", flush=True)
+    course = presets.segment_commands(
+        [(*part[:4], model.label(part[4])) for part in COURSE],
+        seconds=sum(part[0] for part in COURSE),
+        fps=fps,
+    )
+    many = args.characters
+    commands = jax.tree.map(lambda x: jnp.repeat(x[None], many, axis=0), course)
+    labels = np.zeros(many, int)
+    frames = protocol.steered_rollouts(
+        params,
+        jax.random.key(args.seed),
+        protocol.own_states(model, labels, seed=args.seed),
+        commands,
+        model=model,
+        control=camdm_control.Control(follow=1.0),
+        chunk=4,
+    )
+    made = protocol.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=0)
+    standing = jax.tree.map(lambda x: x[0], model.starts)
+    toes = skeleton.joint_positions(model.bones, standing)[..., model.bones.feet, 1]
+    row = camdm_rows.metric_row(
+        model.bones, made, None, height=float(toes.min()) + 0.01
+    )
+    title = "walk, turn, jog, run, stop, crouch"
+    artifacts.write_rollout(
+        args.out,
+        model.bones,
+        first_motion(frames, fps),
+        frames.desired_velocity[0],
+        title=f"{title} ({model.source})",
+    )
+    return {"rollouts": row}, {"source": model.source, "course": COURSE}
 
 
 def start_model(args: Config, clips, key):
@@ -81,7 +147,7 @@ def start_model(args: Config, clips, key):
     if args.from_scratch:
         model = camdm_training.make_model(clips, field="style", **SIZE)
         return model, camdm.init(key, model.config)
-    model, params, _ = camdm_model.load(SHIPPED)
+    model, params, _ = camdm_model.load(WALKER)
     config = dataclasses.replace(model.config, num_labels=model.config.num_labels + 1)
     table = params["embed_label"]["embedding"]
     table = jnp.concatenate([table, table.mean(axis=0, keepdims=True)])
@@ -157,14 +223,11 @@ def steer(args: Config, clips, model, params, key):
     return jax.block_until_ready(frames), labels
 
 
-def main() -> None:
-    """Runs the quickstart."""
-    args = tyro.cli(Config, description=__doc__)
-    loop.check_writable(args.out)
+def train_walker(args: Config):
+    """Teaches the walker a style; returns the table's rows and what belongs beside."""
     if (args.out / "losses.jsonl").exists():  # an earlier quickstart's
         shutil.rmtree(args.out / "checkpoints", ignore_errors=True)
         (args.out / "losses.jsonl").unlink()
-    start = time.perf_counter()
     key_init, key_train, key_roll = jax.random.split(jax.random.key(args.seed), 3)
     gaits = {**GAITS, NEW_STYLE: SWAGGER}
     clips = procedural.make_clips(seed=args.seed + 1, minutes=args.minutes, gaits=gaits)
@@ -174,31 +237,33 @@ def main() -> None:
     print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f}")
     frames, labels = steer(args, clips, model, params, key_roll)
 
-    made = protocol.rollout_windows(
-        frames, jnp.asarray(labels), fps=model.config.fps, skip=30
-    )
+    fps = model.config.fps
+    made = protocol.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=30)
     real = protocol.data_windows(clips, stride=protocol.WINDOW, field="style")
     height = procedural.TOE_HEIGHT + 0.01
     rows = {
         "data": camdm_rows.metric_row(model.bones, real, None, height=height),
         "rollouts": camdm_rows.metric_row(model.bones, made, None, height=height),
     }
-    first = jax.tree.map(lambda x: x[0], frames)
-    motion = skeleton.Motion(
-        root_position=first.root_position,
-        joint_rotation=first.joint_rotation,
-        fps=model.config.fps,
-    )
     artifacts.write_rollout(
         args.out,
         model.bones,
-        motion,
-        first.desired_velocity,
+        first_motion(frames, fps),
+        frames.desired_velocity[0],
         title=f"procedural walker: {', '.join(args.styles)}",
         caption=procedural.SOURCE,
     )
-    seconds = time.perf_counter() - start
-    report = {"losses": losses, "seconds": seconds, "jax": jax.__version__}
+    return rows, {"losses": losses}
+
+
+def main() -> None:
+    """Runs the quickstart."""
+    args = tyro.cli(Config, description=__doc__)
+    loop.check_writable(args.out)
+    begun = time.perf_counter()
+    rows, report = train_walker(args) if args.train else steer_shipped(args)
+    seconds = time.perf_counter() - begun
+    report |= {"seconds": seconds, "jax": jax.__version__}
     artifacts.write_table(args.out, rows, report)
     print(f"done in {seconds:.0f} s: see {args.out}")
 

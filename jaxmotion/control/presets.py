@@ -14,6 +14,8 @@ trigger re-plans whenever the command changes.
 Source: ours, after the preset of CAMDM's release (Chen et al. 2024).
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -93,15 +95,36 @@ def preset_commands(
         )
     if label < 0:
         raise ValueError(f"label is {label}, expected 0 or more")
-    table = np.array(PRESETS[name]())
+    cycle = [(*segment[:3], segment[3] * speed, label) for segment in PRESETS[name]()]
+    return segment_commands(cycle, seconds=seconds, fps=fps)
+
+
+def segment_commands(
+    segments: Sequence[tuple[float, float, float, float, int]],
+    *,
+    seconds: float,
+    fps: float,
+) -> Command:
+    """Commands of segments, one per tick; they begin again at their end.
+
+    Args:
+      segments: Seconds, direction of travel and facing in degrees from +z towards +x,
+        speed in m/s, label.
+      seconds: Length of the result.
+      fps: Ticks per second.
+
+    Returns:
+      Commands [ticks, ...].
+    """
+    table = np.array(segments)
     ticks = round(seconds * fps)
     ends = np.cumsum(table[:, 0])
     time = np.arange(ticks) / fps % ends[-1]
     row = table[np.searchsorted(ends, time, side="right")]
     return Command(
-        velocity=jnp.asarray(_unit(row[:, 1]) * row[:, 3:] * speed, dtype=jnp.float32),
+        velocity=jnp.asarray(_unit(row[:, 1]) * row[:, 3:4], dtype=jnp.float32),
         facing=jnp.asarray(_unit(row[:, 2]), dtype=jnp.float32),
-        label=jnp.full(ticks, label, jnp.int32),
+        label=jnp.asarray(row[:, 4], jnp.int32),
     )
 
 

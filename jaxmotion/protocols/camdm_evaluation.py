@@ -98,6 +98,51 @@ def steer_one(
     return motion, frames.desired_velocity[0]
 
 
+def own_starts(run: Run, *, number: int, seed: int = 0) -> skeleton.Motion:
+    """Poses that the model itself stands in: a start without any recorded frame.
+
+    Characters of each style stand still for twelve seconds; of sixteen the calmest are
+    taken.
+
+    Args:
+      run: The run.
+      number: Starts per style, 1 to 16.
+      seed: Of the recorded poses that the rollouts begin with, and the noise.
+
+    Returns:
+      `Model.starts`.
+
+    Raises:
+      ValueError: if a style has no clip to begin with.
+    """
+    model, many = run.model, 16
+    if not 1 <= number <= many:
+        raise ValueError(f"starts is {number}, expected 1 to {many}")
+    found = []
+    for label in range(len(model.labels)):
+        labels = np.full(many, label)
+        commands = protocol.preset_batch(
+            "straight", labels, np.zeros(many), seconds=12.0, fps=model.config.fps
+        )
+        states = protocol.start_states(
+            run.train, model, labels, field=run.field, seed=seed
+        )
+        frames = protocol.steered_rollouts(
+            run.params, jax.random.key(seed), states, commands, model=model, chunk=4
+        )
+        past = skeleton.Motion(
+            root_position=frames.root_position[:, -model.config.past :],
+            joint_rotation=frames.joint_rotation[:, -model.config.past :],
+            fps=model.config.fps,
+        )
+        positions = skeleton.joint_positions(model.bones, past)
+        unrest = jnp.mean(jnp.abs(jnp.diff(positions, axis=1)), axis=(1, 2, 3))
+        calmest = jnp.argsort(unrest)[:number]
+        motions = jax.tree.map(lambda x, i=calmest: x[i], past)
+        found.append(jax.vmap(lambda m: protocol.at_origin(model, m))(motions))
+    return jax.tree.map(lambda *x: jnp.stack(x), *found)
+
+
 def evaluate_run(
     run: Run,
     *,
