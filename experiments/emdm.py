@@ -55,6 +55,8 @@ class Train:
       hidden: Channels of the feed-forward layers.
       dropout: Rate (paper: 0.1; short trainings do without).
       frames_per_token: Frames of one token (paper: 1).
+      token_margin: Frames that neighboring output tokens share, on either side of each
+        (paper: 0); their values are cross-faded, so motion does not jump at borders.
       mask_frames: Hide what follows a motion's end, and average losses over all frames
         of a batch (ours); --no-mask-frames is the released form (see emdm.Config).
       discriminator_width: Channels of the discriminator's first layers.
@@ -93,6 +95,7 @@ class Train:
     hidden: int = 384
     dropout: float = 0.0
     frames_per_token: int = 4
+    token_margin: int = 3
     mask_frames: bool = True
     discriminator_width: int = 128
     recon: float | None = None

@@ -46,6 +46,8 @@ class Train:
       preset: "small" for a CPU or a short run, or "paper".
       width: Channels of the motion model's tokens; None for the preset's.
       depth: Its layers; None for the preset's.
+      token_margin: Frames that its neighboring output tokens share; None for the
+        preset's.
       held_out: Part of the recordings kept for evaluation.
       steps: Updates of a motion model.
       draft_steps: Updates before these in which displacements hardly count.
@@ -61,6 +63,7 @@ class Train:
     preset: Literal["small", "paper"] = "small"
     width: int | None = None
     depth: int | None = None
+    token_margin: int | None = None
     held_out: float = 0.1
     steps: int = 3000
     draft_steps: int = 3500
@@ -164,6 +167,8 @@ def sizes_of(args: Train) -> dict[str, Any]:
         sizes |= {"width": args.width, "hidden": 4 * args.width}
     if args.depth:
         sizes |= {"depth": args.depth}
+    if args.token_margin is not None:
+        sizes |= {"token_margin": args.token_margin}
     return sizes
 
 
@@ -230,11 +235,11 @@ def evaluate(args: Evaluate) -> None:
         ),
     }
     if "schedules" in args.tables:
-        rows = tables.schedules(args, run, setting)
-        tables.write(out, "schedules", rows, args, run, found)
+        rows, places = tables.schedules(args, run, setting)
+        tables.write(out, "schedules", rows, args, run, found, places)
     if "steps" in args.tables:
-        rows = tables.steps(args, run, setting)
-        tables.write(out, "steps", rows, args, run, found)
+        rows, places = tables.steps(args, run, setting)
+        tables.write(out, "steps", rows, args, run, found, places)
     if "paths" in args.tables:
         rows, more = tables.paths(args, run, setting)
         tables.write(out, "paths", rows, args, run, found | more)

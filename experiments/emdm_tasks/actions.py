@@ -8,6 +8,7 @@ from jaxtyping import Array
 
 from emdm_tasks.judge import Judge
 from emdm_tasks.scores import ORDER
+from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.motion import skeleton
 from jaxmotion.protocols import cells, emdm_action, emdm_runs, evaluators
@@ -97,8 +98,21 @@ def make_judge(args: Any) -> Judge:
             }
         return found
 
+    def places(key: Array, many, frames_per_token: int) -> by_frame.ByFrame:
+        positions = positions_of(many(key, conditions, scale))
+        at = jnp.arange(positions.shape[1]) % frames_per_token
+        return by_frame.by_frame(
+            positions,
+            run.clips.skeleton.feet,
+            jnp.broadcast_to(at, positions.shape[:2]),
+            run.clips.fps,
+            num_places=frames_per_token,
+            contact_height=ground + 0.05,
+        )
+
     scale = emdm_runs.guidance_scale(args.scale, default=1.0)
     return Judge(
+        by_frame=places,
         real={
             "real (training clips)": score_real(keys_real[0], run.train),
             "real (held-out clips)": score_real(keys_real[1], run.held_out),

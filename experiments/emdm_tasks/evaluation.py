@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from emdm_tasks import actions, texts
 from emdm_tasks.scores import ORDER
+from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.protocols import (
     artifacts,
@@ -78,6 +79,7 @@ def evaluate(args: Any, out: Path) -> None:
     kind = texts if value["task"] == "text" else actions
     judge = kind.make_judge(args)
     found: dict[str, dict[str, Cell]] = dict(judge.real)
+    places: dict[str, by_frame.ByFrame] = {}
     for row in rows:
         begun = time.perf_counter()
         params, config = emdm_runs.load_row(args.run, row)
@@ -92,6 +94,8 @@ def evaluate(args: Any, out: Path) -> None:
             "ms a frame": _milliseconds(sample, judge.one, scale, config.frames),
             "network calls": Cell(value=float(number)),
         }
+        if judge.by_frame is not None:
+            places[row] = judge.by_frame(keys[0], many, config.frames_per_token)
         seconds = time.perf_counter() - begun
         print(f"{row}: {count} x {judge.samples}, {seconds:.0f} s", flush=True)
     report = {
@@ -100,4 +104,7 @@ def evaluate(args: Any, out: Path) -> None:
         "evaluator": judge.describe,
     } | provenance.provenance()
     notes = (evaluators.note(judge.describe), *judge.notes)
+    if places:
+        report["by_frame_of_the_token"] = by_frame.to_json(places)
+        notes += (by_frame.to_markdown(places),)
     artifacts.write_table(out, found, report, notes)

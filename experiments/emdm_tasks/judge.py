@@ -6,6 +6,7 @@ from typing import Any
 
 from jaxtyping import Array
 
+from jaxmotion.evaluation.by_frame import ByFrame
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.systems import emdm
 
@@ -22,6 +23,8 @@ class Judge:
       samples: Motions of a replication.
       describe: JSON that says what the evaluator is.
       notes: Lines below the table.
+      by_frame: `(key, many) -> jerk and slide by place in a token`; None where motions
+        have no joints in the world.
     """
 
     real: dict[str, dict[str, Cell]]
@@ -31,3 +34,4 @@ class Judge:
     samples: int
     describe: dict[str, Any]
     notes: tuple[str, ...] = ()
+    by_frame: Callable[[Array, Callable[..., Array], int], ByFrame] | None = None

@@ -38,6 +38,7 @@ def base_config(args: Any, recon: float) -> emdm.Config:
         hidden=args.hidden,
         dropout=args.dropout,
         frames_per_token=args.frames_per_token,
+        token_margin=args.token_margin if args.frames_per_token > 1 else 0,
         norm="pre",
         mask_frames=args.mask_frames,
         discriminator_width=args.discriminator_width,

@@ -5,9 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.motion import skeleton
 from jaxmotion.protocols import (
     artifacts,
     cells,
@@ -25,6 +28,7 @@ from jaxmotion.systems.smgdiff_guidance import SCHEDULES, UNGUIDED, Guidance, Pl
 from jaxmotion.systems.smgdiff_model import Model
 
 Rows = dict[str, dict[str, Cell]]
+Places = dict[str, by_frame.ByFrame]
 
 _ORDER = (
     "FID",
@@ -82,14 +86,25 @@ def _milliseconds(plan: Plan, setting: Setting) -> Cell:
 
 def _plan_row(
     run: Run, setting: Setting, steps: int, guided: Guidance, chunk: int
-) -> dict[str, Cell]:
+) -> tuple[dict[str, Cell], by_frame.ByFrame]:
     model, params = smgdiff_runs.load_stage(run, f"motion_{steps}")
     plan = smgdiff_guidance.planner(
         params, config=model.config, representation=model.representation, guided=guided
     )
     many = smgdiff_evaluation.plan_many(plan, model, chunk=chunk)
     found = _row(smgdiff_evaluation.score_plans(setting, many))
-    return found | {"ms a plan": _milliseconds(plan, setting)}
+    scenes = many(jax.random.key(setting.seed), setting.known.condition)
+    positions = skeleton.joint_positions(model.representation.bones, scenes.motion)
+    at = jnp.arange(model.config.future) % model.config.frames_per_token
+    places = by_frame.by_frame(
+        positions,
+        model.representation.bones.feet,
+        jnp.broadcast_to(at, positions.shape[:2]),
+        model.config.fps,
+        num_places=model.config.frames_per_token,
+        contact_height=smgdiff_evaluation.limits(run.train, model).foot_height,
+    )
+    return found | {"ms a plan": _milliseconds(plan, setting)}, places
 
 
 def real_rows(run: Run, setting: Setting) -> Rows:
@@ -113,7 +128,7 @@ def real_rows(run: Run, setting: Setting) -> Rows:
     }
 
 
-def schedules(args: Any, run: Run, setting: Setting) -> Rows:
+def schedules(args: Any, run: Run, setting: Setting) -> tuple[Rows, Places]:
     """Table 4: where in the chain guidance acts.
 
     Args:
@@ -122,17 +137,19 @@ def schedules(args: Any, run: Run, setting: Setting) -> Rows:
       setting: Of the table.
 
     Returns:
-      The rows.
+      The rows, and jerk and slide by place in a token.
     """
-    rows = real_rows(run, setting)
+    rows, places = real_rows(run, setting), {}
     for name in args.schedules:
         guided = guidance_of(args, name)
-        rows[name] = _plan_row(run, setting, args.steps, guided, args.chunk)
+        rows[name], places[name] = _plan_row(
+            run, setting, args.steps, guided, args.chunk
+        )
         print(f"{name}: done", flush=True)
-    return rows
+    return rows, places
 
 
-def steps(args: Any, run: Run, setting: Setting) -> Rows:
+def steps(args: Any, run: Run, setting: Setting) -> tuple[Rows, Places]:
     """Table 3: models of other step counts, unguided.
 
     Args:
@@ -141,21 +158,22 @@ def steps(args: Any, run: Run, setting: Setting) -> Rows:
       setting: Of the table.
 
     Returns:
-      The rows.
+      The rows, and jerk and slide by place in a token.
 
     Raises:
       ValueError: if no such model was trained.
     """
-    rows = real_rows(run, setting)
+    rows, places = real_rows(run, setting), {}
     trained = sorted(
         int(folder.name.removeprefix("motion_"))
         for folder in run.folder.glob("motion_*")
         if folder.name.removeprefix("motion_").isdecimal()
     )
     for number in trained:
-        rows[f"{number} steps"] = _plan_row(run, setting, number, UNGUIDED, args.chunk)
-        print(f"{number} steps: done", flush=True)
-    return rows
+        name = f"{number} steps"
+        rows[name], places[name] = _plan_row(run, setting, number, UNGUIDED, args.chunk)
+        print(f"{name}: done", flush=True)
+    return rows, places
 
 
 def _generators(run: Run) -> dict[str, tuple[Model, Any]]:
@@ -217,7 +235,15 @@ def paths(args: Any, run: Run, setting: Setting) -> tuple[Rows, dict[str, Any]]:
     return rows, {"noise of the paths": shares}
 
 
-def write(out: Path, name: str, rows: Rows, args: Any, run: Run, more: dict) -> None:
+def write(
+    out: Path,
+    name: str,
+    rows: Rows,
+    args: Any,
+    run: Run,
+    more: dict,
+    places: Places | None = None,
+) -> None:
     """Writes one table into a folder of its own.
 
     Args:
@@ -227,9 +253,13 @@ def write(out: Path, name: str, rows: Rows, args: Any, run: Run, more: dict) -> 
       args: Of the command line.
       run: The run.
       more: What belongs beside the table; "evaluator" says who judged.
+      places: Jerk and slide by place in a token, for a second table below.
     """
     folder = out / name
     folder.mkdir(parents=True, exist_ok=True)
     report = {"arguments": arguments_json(args), "source": run.model.source} | more
     notes = (evaluators.note(more["evaluator"]),)
+    if places:
+        report["by_frame_of_the_token"] = by_frame.to_json(places)
+        notes += (by_frame.to_markdown(places),)
     artifacts.write_table(folder, rows, report | provenance.provenance(), notes)

@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.evaluation import contact
-from jaxmotion.motion import skeleton
 from jaxmotion.motion.spring import Scalar
 
 
@@ -35,9 +35,10 @@ def frames_since(planned: Bool[Array, "*batch frames"]) -> Int[Array, "*batch fr
 
 
 def by_frame(
-    bones: skeleton.Skeleton,
-    motion: skeleton.Motion,
+    positions: Float[Array, "*batch frames joints 3"],
+    feet: tuple[int, ...],
     place: Int[Array, "*batch frames"],
+    fps: Scalar,
     *,
     num_places: int,
     contact_height: Scalar,
@@ -48,21 +49,21 @@ def by_frame(
     jerk of frames 5, 6 and 7 (as 1 : 2 : 1) and in the slide of frame 5.
 
     Args:
-      bones: The skeleton; sliding is that of its feet.
-      motion: World.
+      positions: World, metres.
+      feet: Joints whose sliding counts.
       place: Of each frame, in 0..num_places-1; others are left out.
+      fps: Frames per second.
       num_places: Length of the result.
       contact_height: A foot joint below this height should not move, metres.
 
     Returns:
       Means over the batch and time.
     """
-    positions = skeleton.joint_positions(bones, motion)
-    feet = positions[..., jnp.array(bones.feet), :]
-    jerk = jnp.diff(positions, n=3, axis=-3) * motion.fps**3
+    toes = positions[..., jnp.array(feet), :]
+    jerk = jnp.diff(positions, n=3, axis=-3) * fps**3
     jerk = jnp.mean(jnp.linalg.norm(jerk, axis=-1), axis=-1)
-    low = feet[..., :-1, :, 1] < contact_height
-    slide = jnp.where(low, contact.foot_steps(feet) * motion.fps, 0.0)
+    low = toes[..., :-1, :, 1] < contact_height
+    slide = jnp.where(low, contact.foot_steps(toes) * fps, 0.0)
 
     def sums(values: Array, first: int) -> Array:
         at = jax.nn.one_hot(place[..., first:], num_places)
@@ -77,6 +78,13 @@ def by_frame(
         slide=divide(sums(jnp.sum(slide, axis=-1), 1), sums(times.astype(float), 1)),
         frames=sums(every, 0).astype(jnp.int32),
     )
+
+
+def to_json(rows: dict[str, ByFrame]) -> dict[str, dict[str, list[float]]]:
+    return {
+        name: {k: np.asarray(v).tolist() for k, v in row._asdict().items()}
+        for name, row in rows.items()
+    }
 
 
 def to_markdown(rows: dict[str, ByFrame]) -> str:

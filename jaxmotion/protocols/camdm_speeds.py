@@ -149,9 +149,10 @@ def speed_table(
             fps=fps,
         )
         plans[f"told {speed:g} m/s"] = by_frame.by_frame(
-            model.bones,
-            motion,
+            skeleton.joint_positions(model.bones, motion),
+            model.bones.feet,
             by_frame.frames_since(frames.planned)[:, SKIP:],
+            fps,
             num_places=(control or camdm_control.Control()).apply,
             contact_height=height,
         )
@@ -161,10 +162,7 @@ def speed_table(
         "rollouts": rollouts,
         "seconds": seconds,
         "contact_height_m": height,
-        "by_frame_of_the_plan": {
-            name: {k: np.asarray(v).tolist() for k, v in found._asdict().items()}
-            for name, found in plans.items()
-        },
+        "by_frame_of_the_plan": by_frame.to_json(plans),
         **provenance.provenance(),
     }
     return rows, plans, report

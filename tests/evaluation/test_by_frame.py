@@ -33,7 +33,12 @@ def test_a_jump_at_a_border_shows_in_three_frames(bones):
         motion, root_position=motion.root_position.at[:, 0].add(hops)
     )
     found = by_frame.by_frame(
-        bones, motion, jnp.arange(40) % 10, num_places=10, contact_height=1.0
+        skeleton.joint_positions(bones, motion),
+        bones.feet,
+        jnp.arange(40) % 10,
+        30.0,
+        num_places=10,
+        contact_height=1.0,
     )
     jerk = np.zeros(10)
     jerk[5:8] = np.array([1, 2, 1]) * 0.01 * 30**3
@@ -48,7 +53,12 @@ def test_the_mean_over_places_is_the_metric(bones):
     motion = tiny.walk(33, turn=0.5)
     positions = skeleton.joint_positions(bones, motion)
     found = by_frame.by_frame(
-        bones, motion, jnp.zeros(33, jnp.int32), num_places=2, contact_height=0.0
+        positions,
+        bones.feet,
+        jnp.zeros(33, jnp.int32),
+        30.0,
+        num_places=2,
+        contact_height=0.0,
     )
     np.testing.assert_allclose(
         found.jerk[0], smoothness.jerk(positions, 30.0), rtol=1e-5
