@@ -39,13 +39,13 @@ ASSETS = Path(camdm_model.__file__).parents[1] / "assets"
 SHIPPED, WALKER = ASSETS / "locomotion.npz", ASSETS / "walker.npz"
 # Seconds, direction of travel and facing (degrees from +z towards +x), m/s, style.
 COURSE = (
-    (1.5, 0, 0, 0.0, "neutral"),
-    (3.0, 0, 0, 1.4, "neutral"),
-    (2.5, 90, 90, 1.4, "neutral"),
-    (3.0, 45, 45, 2.5, "neutral"),
-    (2.5, 0, 0, 3.5, "neutral"),
+    (1.0, 0, 0, 0.0, "neutral"),
+    (2.5, 0, 0, 1.4, "neutral"),
+    (2.0, 90, 90, 1.4, "neutral"),
+    (2.0, 45, 45, 2.5, "neutral"),
+    (2.0, 0, 0, 3.5, "neutral"),
     (2.0, 0, 0, 0.0, "neutral"),
-    (3.5, -90, -90, 0.9, "crouch"),
+    (2.5, -90, -90, 0.9, "crouch"),
 )
 NEW_STYLE = "swagger"
 SWAGGER = Gait(
@@ -131,13 +131,13 @@ def steer_shipped(args: Config):
     row = camdm_rows.metric_row(
         model.bones, made, None, height=float(toes.min()) + 0.01
     )
-    title = "walk, turn, jog, run, stop, crouch"
     artifacts.write_rollout(
         args.out,
         model.bones,
         first_motion(frames, fps),
         frames.desired_velocity[0],
-        title=f"{title} ({model.source})",
+        title="stand, walk, turn, jog, run, stop, crouch",
+        caption=f"locomotion, trained on {model.source}",
     )
     return {"rollouts": row}, {"source": model.source, "course": COURSE}
 

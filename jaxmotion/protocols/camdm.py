@@ -221,12 +221,8 @@ def own_states(
     """
     if model.starts is None:
         raise ValueError("the model has no poses to start from: give clips")
+    check_labels(labels, model)
     labels = np.asarray(labels)
-    if labels.size and not (0 <= labels.min() <= labels.max() < len(model.labels)):
-        raise ValueError(
-            f"labels of {labels.min()} to {labels.max()}, expected 0 to "
-            f"{len(model.labels) - 1}"
-        )
     number = model.starts.root_position.shape[1]
     which = np.random.default_rng(seed).integers(number, size=labels.shape)
     return _states_at_origin(

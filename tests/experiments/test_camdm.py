@@ -16,6 +16,7 @@ from PIL import Image
 
 from jaxmotion.data import bvh, bvh_text, clips_io, windows
 from jaxmotion.learning import checkpoint
+from jaxmotion.motion import trajectory
 from jaxmotion.protocols import camdm_release
 from jaxmotion.systems import camdm_model, camdm_published
 from tests.protocols import samples
@@ -147,6 +148,39 @@ def test_an_evaluation_writes_its_table(call, trained):
         "--chunk 2"
     )
     check_evaluation(trained / "evaluation", 2)
+
+
+@pytest.mark.usefixtures("quick_compile")
+@pytest.mark.slow
+def test_speeds_are_measured_beside_data_and_by_frame_of_the_plan(call, trained):
+    call(f"speeds --run {trained} --speeds 0 1 --rollouts 2 --seconds 6")
+    found = json.loads((trained / "speeds" / "metrics.json").read_text())
+    assert [name for name in found["rows"] if name.startswith("told")] == [
+        "told 0 m/s",
+        "told 1 m/s",
+    ]
+    assert found["rows"]["told 0 m/s"]["creep_cm"]["samples"] == 2
+    data = found["rows"]["training, about 1 m/s"]
+    assert data["windows"]["value"] > 0
+    assert 0.8 < data["speed_m/s"]["value"] < 1.2
+    places = found["by_frame_of_the_plan"]["told 1 m/s"]
+    assert len(places["jerk"]) == 15 and min(places["frames"]) > 0
+    text = (trained / "speeds" / "table.md").read_text()
+    assert "| told 1 m/s, jerk m/s³ |" in text
+
+
+@pytest.mark.usefixtures("quick_compile")
+@pytest.mark.slow
+def test_an_export_has_poses_of_the_models_own(call, trained, tmp_path):
+    call(f"export --run {trained} --out {tmp_path / 'model.npz'} --starts 2")
+    model, _, _ = camdm_model.load(tmp_path / "model.npz")
+    lead = (len(model.labels), 2, model.config.past)
+    assert model.starts.root_position.shape == (*lead, 3)
+    path = trajectory.root_trajectory(
+        model.bones, jax.tree.map(lambda x: x[1, 1], model.starts)
+    )
+    np.testing.assert_allclose(path.position[-1], 0.0, atol=1e-4)
+    np.testing.assert_allclose(path.facing[-1], [0.0, 1.0], atol=1e-4)
 
 
 @pytest.fixture(scope="module")

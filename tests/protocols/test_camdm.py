@@ -1,5 +1,7 @@
+import copy
 import dataclasses
 import functools
+import json
 
 import jax
 import jax.numpy as jnp
@@ -7,8 +9,10 @@ import numpy as np
 import pytest
 
 from jaxmotion.control import presets
+from jaxmotion.data import windows
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.protocols import camdm as protocol
+from jaxmotion.systems import camdm_model
 from tests.protocols import samples
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -119,6 +123,40 @@ def test_characters_start_at_the_origin_facing_ahead_in_poses_of_the_data(run):
     assert np.all(past.root_position[..., 1] <= heights.max() + 1e-6)
 
 
+def test_characters_start_in_poses_of_the_models_own(run):
+    """Through JSON, as an exported model has them."""
+    past = run.model.config.past
+    starts = jax.vmap(jax.vmap(lambda start: windows.cut(run.train, start, past)))(
+        jnp.array([[0, 20], [50, 70]])
+    )
+    value = camdm_model.to_json(dataclasses.replace(run.model, starts=starts))
+    model = camdm_model.from_json(json.loads(json.dumps(value)), where="here")
+    states = protocol.own_states(model, LABELS, seed=1)
+    path = trajectory.root_trajectory(model.bones, states.past)
+    np.testing.assert_allclose(path.position[:, -1], 0.0, atol=1e-5)
+    np.testing.assert_allclose(path.facing[:, -1, 1], 1.0, atol=1e-5)
+    # Rotations below the root tell whose pose it is.
+    own = np.asarray(starts.joint_rotation)[..., 1:, :]
+    for label, pose in zip(LABELS, states.past.joint_rotation[:, :, 1:], strict=True):
+        assert min(np.abs(pose - known).max() for known in own[label]) < 1e-4
+    with pytest.raises(ValueError, match="labels are in 0..2, expected 0..1"):
+        protocol.own_states(model, np.array([0, 2]))
+    with pytest.raises(ValueError, match="no poses to start from: give clips"):
+        protocol.own_states(run.model, LABELS)
+    for change, message in (
+        (lambda v: v["starts"]["root_position"].pop(), "'starts' has shapes"),
+        (lambda v: v["starts"].pop("joint_rotation"), "'starts' is wrong"),
+        (
+            lambda v: v["starts"]["root_position"][0][0][0].__setitem__(0, np.nan),
+            "'starts' has numbers that are not finite",
+        ),
+    ):
+        bad = copy.deepcopy(value)
+        change(bad)
+        with pytest.raises(ValueError, match=f"here: field {message}"):
+            camdm_model.from_json(bad, where="here")
+
+
 def test_presets_are_stacked_at_each_ones_speed():
     speeds = np.array([0.5, 1.0, 1.5, 0.0])
     found = protocol.preset_batch("strafe", LABELS, speeds, seconds=4.0, fps=30.0)
@@ -159,6 +197,22 @@ def test_rollouts_show_a_frame_a_tick_from_where_they_start(run):
     gap = np.asarray(frames.desired_velocity) - np.array([0.0, 1.0])
     gap = np.linalg.norm(gap, axis=-1)
     assert gap[:, -1].max() < 0.1 < 0.5 < gap[:, 0].min()
+
+
+def test_a_second_call_compiles_nothing(run):
+    """Other commands, start poses and keys of the same shapes."""
+    steered(None)
+    counted = protocol._rollouts._cache_size()
+    states = protocol.start_states(
+        run.held_out, run.model, LABELS, field="style", seed=9
+    )
+    commands = protocol.preset_batch(
+        "strafe", LABELS, np.full(4, 0.5), seconds=1.2, fps=30.0
+    )
+    protocol.steered_rollouts(
+        run.params, jax.random.key(7), states, commands, model=run.model
+    )
+    assert protocol._rollouts._cache_size() == counted
 
 
 def test_a_chunk_that_does_not_divide_is_made_smaller(run):
