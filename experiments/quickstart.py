@@ -35,8 +35,6 @@ from jaxmotion.protocols import artifacts, camdm_rows, camdm_training, script
 from jaxmotion.protocols import camdm as protocol
 from jaxmotion.systems import camdm, camdm_control, camdm_loss, camdm_model
 
-ASSETS = Path(camdm_model.__file__).parents[1] / "assets"
-SHIPPED, WALKER = ASSETS / "locomotion.npz", ASSETS / "walker.npz"
 # Seconds, direction of travel and facing (degrees from +z towards +x), m/s, style.
 COURSE = (
     (1.0, 0, 0, 0.0, "neutral"),
@@ -105,9 +103,9 @@ def first_motion(frames, fps) -> skeleton.Motion:
 
 def steer_shipped(args: Config):
     """Steers the shipped model along the course; writes files and metrics."""
-    model, params, _ = camdm_model.load(SHIPPED)
+    model, params, _ = camdm_model.load("locomotion")
     fps = model.config.fps
-    print(f"{SHIPPED.stem}: {model.source}; compiling, about 15 s", flush=True)
+    print(f"locomotion: {model.source}; compiling, about 15 s", flush=True)
     course = presets.segment_commands(
         [(*part[:4], model.label(part[4])) for part in COURSE],
         seconds=sum(part[0] for part in COURSE),
@@ -147,7 +145,7 @@ def start_model(args: Config, clips, key):
     if args.from_scratch:
         model = camdm_training.make_model(clips, field="style", **SIZE)
         return model, camdm.init(key, model.config)
-    model, params, _ = camdm_model.load(WALKER)
+    model, params, _ = camdm_model.load("walker")
     config = dataclasses.replace(model.config, num_labels=model.config.num_labels + 1)
     table = params["embed_label"]["embedding"]
     table = jnp.concatenate([table, table.mean(axis=0, keepdims=True)])

@@ -33,7 +33,7 @@ SCRIPTS = [words for words in commands() if words[0] == "python"]
 def test_programs_run_as_they_stand(tmp_path):
     """In a process and a folder of their own, one after the other."""
     programs = blocks("python")
-    assert len(programs) == 3
+    assert len(programs) == 4
     # Whether they run is the question: unoptimised programs compile in a third.
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),

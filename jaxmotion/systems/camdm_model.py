@@ -161,12 +161,19 @@ def _shapes(model: Model) -> Params:
     return jax.eval_shape(lambda: camdm.init(jax.random.key(0), model.config))
 
 
+# Models that come with the package, by name; each has a card beside it.
+SHIPPED = {
+    path.stem: path
+    for path in sorted((Path(__file__).parents[1] / "assets").glob("*.npz"))
+}
+
+
 def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
     """Model and averaged parameters (EMA) of a run folder or an exported file.
 
     Args:
-      folder: Run folder that `experiments/camdm.py train` made, or an npz file that
-        `checkpoint.export_params` wrote.
+      folder: Name of a shipped model ("locomotion"), run folder that
+        `experiments/camdm.py train` made, or npz file that `camdm.py export` wrote.
 
     Returns:
       The model, its parameters, and the whole JSON that was stored with it.
@@ -176,6 +183,8 @@ def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
       ValueError: if its JSON is not that of a CAMDM model.
     """
     path = Path(folder)
+    if not path.exists():
+        path = SHIPPED.get(str(folder), path)
     if path.is_file():
         _, value = checkpoint.import_params(path)
         model = from_json(value, where=str(path))

@@ -31,19 +31,20 @@ def test_a_person_stands_walks_runs_and_crouches(tmp_path):
     hips = np.asarray(motion.root_position)
     frames = round(30 * sum(part[0] for part in found["course"]))
     assert hips.shape == (frames, 3)
-    second = lambda a, b: slice(round(30 * a), round(30 * b))  # noqa: E731
-    along = lambda a, b: (
-        np.linalg.norm(  # noqa: E731
-            hips[round(30 * b), ::2] - hips[round(30 * a), ::2]
-        )
-        / (b - a)
-    )
+
+    def along(start, end):
+        """Speed between two moments, m/s."""
+        way = hips[round(30 * end), ::2] - hips[round(30 * start), ::2]
+        return np.linalg.norm(way) / (end - start)
+
+    def height(start, end):
+        return hips[round(30 * start) : round(30 * end), 1].mean()
+
     assert along(0.1, 0.9) < 0.2  # stands
     assert 1.1 < along(2.0, 3.4) < 1.7  # walks at 1.4 m/s
     assert along(8.0, 9.4) > 2.3  # runs
     assert along(10.8, 11.4) < 0.5  # has stopped
-    crouched = hips[second(12.8, 13.9), 1].mean()
-    assert crouched < hips[second(2.0, 3.4), 1].mean() - 0.1
+    assert height(12.8, 13.9) < height(2.0, 3.4) - 0.1  # crouches
     toes = np.asarray(skeleton.joint_positions(bones, motion))[:, :, 1].min()
     assert -0.06 < toes < 0.06
     with Image.open(tmp_path / "rollout.gif") as image:
