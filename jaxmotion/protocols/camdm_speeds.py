@@ -17,7 +17,7 @@ from jaxmotion.protocols import camdm as protocol
 from jaxmotion.protocols import camdm_rows, provenance
 from jaxmotion.protocols.camdm_runs import Run
 from jaxmotion.protocols.camdm_styles import in_batches
-from jaxmotion.systems import camdm_control, camdm_loss
+from jaxmotion.systems import camdm_control
 
 # Ticks to leave out at the start: characters begin with other speeds.
 SKIP = 90
@@ -29,20 +29,21 @@ def _row(
     run: Run, found: protocol.Windows, *, height: float, rest: float
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Metrics of windows and their clip or rollout."""
-    matrix = camdm_loss.smoothing_matrices(protocol.WINDOW, (10.0,))[0]
+    # Over half a second, so that the sway of the hips does not count.
+    half = round(0.5 * run.model.config.fps)
     feet = jnp.array(run.model.bones.feet)
 
     @jax.jit
     def measure(x: protocol.Windows) -> dict[str, jax.Array]:
         positions = skeleton.joint_positions(run.model.bones, x.motion)
-        path = locomotion.smooth(positions[..., 0, ::2], matrix)
-        speed = jnp.linalg.norm(jnp.diff(path, axis=-2), axis=-1) * x.motion.fps
+        path = positions[..., 0, ::2]
+        way = jnp.linalg.norm(path[..., half:, :] - path[..., :-half, :], axis=-1)
         metrics = locomotion.locomotion_metrics(
             run.model.bones, x.motion, x.velocity, x.facing, contact_height=height
         )
         names = ("slide_speed", "slide_seconds", "skate_ratio", "jerk")
         return {name: metrics[name] for name in names} | {
-            "speed": jnp.mean(speed, axis=-1),
+            "speed": jnp.mean(way, axis=-1) * x.motion.fps / half,
             "sink": rest - jnp.min(positions[..., feet, 1], axis=(-2, -1)),
         }
 

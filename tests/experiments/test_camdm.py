@@ -17,7 +17,7 @@ from PIL import Image
 from jaxmotion.data import bvh, bvh_text, clips_io, windows
 from jaxmotion.learning import checkpoint
 from jaxmotion.motion import trajectory
-from jaxmotion.protocols import camdm_release
+from jaxmotion.protocols import camdm_release, camdm_runs
 from jaxmotion.systems import camdm_model, camdm_published
 from tests.protocols import samples
 
@@ -148,6 +148,22 @@ def test_an_evaluation_writes_its_table(call, trained):
         "--chunk 2"
     )
     check_evaluation(trained / "evaluation", 2)
+
+
+@pytest.mark.usefixtures("quick_compile")
+@pytest.mark.slow
+def test_one_style_trains_with_clips_held_out_by_name(call, data, tmp_path):
+    names = clips_io.load_clips(data).clip_names
+    held_out = [name for name in names if "neutral" in name][:2]
+    call(
+        f"train --data {data} --out {tmp_path} {SIZES} --steps 2 --labels neutral "
+        f"--held-out-clips {' '.join(held_out)}"
+    )
+    model, _, _ = camdm_model.load(tmp_path)
+    assert model.labels == ("neutral",)
+    run = camdm_runs.load_run(tmp_path)
+    assert list(run.held_out.clip_names) == held_out
+    call(f"rollout --run {tmp_path} --style neutral --seconds 1")
 
 
 @pytest.mark.usefixtures("quick_compile")
