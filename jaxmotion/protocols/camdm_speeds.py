@@ -60,14 +60,14 @@ def _cells(values: dict[str, np.ndarray], groups: np.ndarray) -> dict[str, table
     }
     if groups.size == 0:
         return {c: table.cell(jnp.zeros(0)) for c in columns} | {
-            "windows": table.Cell(value=0, samples=0)
+            "windows": table.Cell(value=0.0, samples=0)
         }
     row = {}
     for column, (name, weights, scale) in columns.items():
         weight = None if weights is None else values[weights]
         means = table.group_means(values[name], groups, weight)
         row[column] = table.cell(means, scale=scale)
-    return row | {"windows": table.Cell(value=groups.size, samples=groups.size)}
+    return row | {"windows": table.Cell(value=float(groups.size), samples=groups.size)}
 
 
 def speed_table(
