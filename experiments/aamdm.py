@@ -61,6 +61,7 @@ class Train:
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
       seed: Of everything random.
+      override: Go on with these settings where a stage began with others.
     """
 
     data: Path = Path("data/lafan1.npz")
@@ -82,6 +83,7 @@ class Train:
     schedule: Literal["cosine", "vp"] = "cosine"
     previous_noise: float = 0.05
     seed: int = 0
+    override: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,7 +173,11 @@ def train(args: Train) -> None:
 
     def budget(steps: int, **more) -> aamdm_stages.Budget:
         return aamdm_stages.Budget(
-            steps=steps, batch=args.batch, seed=args.seed, **more
+            steps=steps,
+            batch=args.batch,
+            seed=args.seed,
+            override=args.override,
+            **more,
         )
 
     adversarial = budget(args.generator_steps, optimizer="radam", learning_rate=2e-4)
@@ -209,6 +215,7 @@ def evaluate(args: Evaluate) -> None:
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
     run = aamdm_runs.load_run(args.run)
+    script.announce("compiling the rollouts of each row", 40)
     table, report = tables.evaluate(run, args, out)
     here = results.Measured(path=out / "metrics.json", rows=table, about=report)
     report["claims"] = verdicts.lines(paper.TABLES, {paper.RUN: here})
@@ -231,6 +238,7 @@ def rollout(args: Rollout) -> None:
     given = aamdm_evaluation.commands(
         run, 1, ticks, preset=args.preset, speed=args.speed
     )
+    script.announce("compiling the rollout", 40)
     roll = aamdm_evaluation.roller(run, space, step, steered=args.steered)
     _, frames = roll(jax.random.key(args.seed), states, given)
     motion = skeleton.Motion(
@@ -257,7 +265,7 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = tyro.cli(Command, description=__doc__)
+    args = script.check(tyro.cli(Command, description=__doc__))
     run = {Train: train, Evaluate: evaluate, Rollout: rollout}
     run[type(args)](args)
 

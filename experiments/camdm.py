@@ -17,6 +17,7 @@ import jax
 import numpy as np
 import tyro
 
+from jaxmotion import files
 from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import by_frame
@@ -29,6 +30,7 @@ from jaxmotion.protocols import (
     camdm_training,
     evaluators,
     script,
+    stages,
 )
 from jaxmotion.systems import camdm_control, camdm_model, camdm_published
 
@@ -73,6 +75,7 @@ class Train:
       diffusion_steps: Steps T of the diffusion.
       devices: Split each batch over so many devices; 1 for no mesh.
       seed: Of everything random.
+      override: Go on with these settings where the run began with others.
     """
 
     data: Path = Path("data/bandai2.npz")
@@ -102,6 +105,11 @@ class Train:
     diffusion_steps: int = 8
     devices: int = 1
     seed: int = 0
+    override: bool = False
+
+
+# Options that do not change what is trained, or whose effect the clips show.
+FREE = ("data", "out", "chunk", "save_every", "devices", "override")
 
 
 def with_preset(args: Train) -> Train:
@@ -117,9 +125,9 @@ def model_of(args: Train, clips: Clips) -> camdm_model.Model:
         "num_steps": args.diffusion_steps,
         "network": args.network,
     }
-    if args.width:
+    if args.width is not None:
         sizes |= {"width": args.width, "hidden": 4 * args.width}
-    if args.depth:
+    if args.depth is not None:
         sizes |= {"depth": args.depth}
     if args.token_margin is not None:
         sizes |= {"token_margin": args.token_margin}
@@ -144,6 +152,18 @@ def train(args: Train) -> None:
     model, params = model_of(args, clips), None
     if args.init:
         model, params = camdm_training.continued(model, args.init)
+    made_by = camdm_runs.arguments_json(args) | {
+        "clips": evaluators.clips_fingerprint(clips, args.label)
+    }
+    config = camdm_model.to_json(model) | {"experiment": made_by}
+    if checkpoint.latest_step(args.out / "checkpoints") is not None:
+        stages.check_resumed(
+            args.out,
+            checkpoint.load_config(args.out / "checkpoints").get("experiment", {}),
+            {name: value for name, value in made_by.items() if name not in FREE},
+            steps=args.steps,
+            override=args.override,
+        )
     run, state, key, data = camdm_training.start(
         clips,
         model,
@@ -161,10 +181,7 @@ def train(args: Train) -> None:
         seed=args.seed,
         params=params,
     )
-    config = camdm_model.to_json(model) | {
-        "experiment": camdm_runs.arguments_json(args)
-    }
-    (args.out / "config.json").write_text(json.dumps(config, indent=1))
+    files.write_text(args.out / "config.json", json.dumps(config, indent=1))
     lengths = np.diff(np.asarray(clips.offsets))
     short = int(np.sum(lengths < model.config.window))
     parameters = sum(x.size for x in jax.tree.leaves(state.params))
@@ -287,6 +304,7 @@ def evaluate(args: Evaluate) -> None:
     run = camdm_runs.load_run(args.run, args.data, args.contents)
     out = args.out or _beside(args.run) / "evaluation"
     loop.check_writable(out)
+    script.announce("compiling the rollouts", 40)
     rows, report = camdm_evaluation.evaluate_run(
         run,
         preset=args.preset,
@@ -327,6 +345,7 @@ def rollout(args: Rollout) -> None:
     run = camdm_runs.load_run(args.run, args.data)
     out = args.out or _beside(args.run) / "rollout"
     loop.check_writable(out)
+    script.announce("compiling the rollout", 40)
     motion, velocity = camdm_evaluation.steer_one(
         run,
         args.style,
@@ -432,7 +451,7 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = tyro.cli(Command, description=__doc__)
+    args = script.check(tyro.cli(Command, description=__doc__))
     run = {
         Train: train,
         Evaluate: evaluate,

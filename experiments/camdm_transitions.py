@@ -83,6 +83,7 @@ def measure(args: Config) -> None:
     run = camdm_runs.load_run(args.run, args.data, args.contents)
     out = args.out or args.run / "transitions"
     loop.check_writable(out)
+    script.announce("compiling the rollouts of each row", 40)
     changes = camdm_transitions.make_changes(
         run,
         preset=args.preset,
@@ -123,7 +124,7 @@ def measure(args: Config) -> None:
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    measure(tyro.cli(Config, description=__doc__))
+    measure(script.check(tyro.cli(Config, description=__doc__)))
 
 
 if __name__ == "__main__":

@@ -130,7 +130,7 @@ def describe(data: BallClips) -> None:
 
 def main() -> None:
     """Reads, synthesises, writes."""
-    config = tyro.cli(Config, description=__doc__)
+    config = script.check(tyro.cli(Config, description=__doc__))
     loop.check_writable(config.out.parent)
     if config.out.exists() and not config.overwrite:
         raise FileExistsError(f"{config.out} exists; --overwrite replaces it")

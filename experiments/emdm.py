@@ -67,6 +67,7 @@ class Train:
       ddpm_rate: Of diffusion models (Muon).
       discriminator_rate: Of the discriminator (Adam, beta 0.5 and 0.9).
       seed: Of everything random.
+      override: Go on with these settings where a row began with others.
     """
 
     task: emdm_runs.TaskName = "action"
@@ -104,6 +105,7 @@ class Train:
     ddpm_rate: float = 2e-3
     discriminator_rate: float = 5e-4
     seed: int = 0
+    override: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,6 +197,7 @@ def train(args: Train) -> None:
             batch=args.batch,
             learning_rate=args.learning_rate if latent else args.ddpm_rate,
             seed=args.seed,
+            override=args.override,
         )
         judge = dataclasses.replace(
             budget, optimizer="adam", learning_rate=args.discriminator_rate
@@ -208,6 +211,7 @@ def evaluate(args: Evaluate) -> None:
     emdm_rows.check_rows(args.rows)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
+    script.announce("compiling the evaluator and the sampler of each row", 40)
     evaluation.evaluate(args, out)
 
 
@@ -215,6 +219,7 @@ def sample(args: Sample) -> None:
     """Writes one motion for each action or sentence."""
     out = args.out or args.run / "samples"
     loop.check_writable(out)
+    script.announce("compiling the sampler", 40)
     sampling.sample(args, out)
 
 
@@ -270,7 +275,7 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = tyro.cli(Command, description=__doc__)
+    args = script.check(tyro.cli(Command, description=__doc__))
     run = {Train: train, Evaluate: evaluate, Sample: sample}
     (run | {Import: import_weights})[type(args)](args)
 

@@ -103,7 +103,7 @@ def train_style(args: Train) -> Evaluator:
     train, held_out = camdm_runs.split_data(
         one_file(args), contents, field, args.held_out
     )
-    steps = args.updates or 1500
+    steps = 1500 if args.updates is None else args.updates
     return evaluator_training.train_style(
         train, held_out, field=field, num_steps=steps, seed=args.seed
     )
@@ -126,7 +126,7 @@ def train_action(args: Train) -> Evaluator:
     train, held_out = (
         emdm_data.action_arrays(part, field=field, frames=frames) for part in parts
     )
-    steps = args.updates or 1500
+    steps = 1500 if args.updates is None else args.updates
     return evaluator_training.train_action(
         train, held_out, field=field, num_steps=steps, seed=args.seed
     )
@@ -144,7 +144,7 @@ def train_ball(args: Train) -> Evaluator:
         train,
         held_out,
         frames=45 if args.frames is None else args.frames,
-        num_steps=args.updates or 800,
+        num_steps=800 if args.updates is None else args.updates,
         seed=args.seed,
     )
 
@@ -164,10 +164,6 @@ def check(args: Train) -> None:
         for name in options:
             if name not in own and getattr(args, name) is not None:
                 raise ValueError(f"option --{name} is not for kind {args.kind!r}")
-    for name, least in (("updates", 1), ("frames", 2), ("least", 1), ("fps", 1)):
-        value = getattr(args, name)
-        if value is not None and value < least:
-            raise ValueError(f"{name} is {value}, expected at least {least}")
     if args.out.exists() and not args.overwrite:
         raise FileExistsError(f"{args.out} exists; --overwrite replaces it")
 
@@ -235,7 +231,7 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = tyro.cli(Command, description=__doc__)
+    args = script.check(tyro.cli(Command, description=__doc__))
     {Train: train, Show: show, Import: import_weights}[type(args)](args)
 
 

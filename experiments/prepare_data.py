@@ -313,7 +313,7 @@ def prepare(config: Config) -> None:
 
 def main() -> None:
     """Parses the command line and prepares the data."""
-    prepare(tyro.cli(Config, description=__doc__))
+    prepare(script.check(tyro.cli(Config, description=__doc__)))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ Examples:
 
 import dataclasses
 import functools
-import json
 import shutil
 import time
 from pathlib import Path
@@ -57,6 +56,8 @@ SWAGGER = Gait(
     arm_out=0.5,
     elbow=0.6,
 )
+# Optimiser steps of a row of losses.
+CHUNK = 50
 SIZE = camdm_training.PRESETS["small"] | dict(width=128, hidden=512)
 
 
@@ -154,9 +155,18 @@ def start_model(args: Config, clips, key):
     return dataclasses.replace(model, config=config, labels=labels), params
 
 
+def steps_of(args: Config) -> int:
+    """Optimiser steps; whole chunks."""
+    default = 4000 if args.from_scratch else 400
+    steps = default if args.steps is None else args.steps
+    if steps < CHUNK:
+        raise ValueError(f"--steps is {steps}, expected at least {CHUNK}")
+    return steps // CHUNK * CHUNK
+
+
 def train(args: Config, clips, model, params, key):
     """Trains on the clips; returns the averaged parameters and the losses."""
-    steps = args.steps or (4000 if args.from_scratch else 400)
+    steps = steps_of(args)
     optimizer = training.muon_cosine(
         learning_rate=1e-3 if args.from_scratch else 3e-4,
         num_steps=steps,
@@ -181,23 +191,22 @@ def train(args: Config, clips, model, params, key):
         camdm_loss.loss, bones=model.bones, config=model.config
     )
     update = training.make_update(objective, optimizer, ema_decay=0.995)
-    chunk = 50
     state = loop.train(
-        training.train_chunk(update, sample_batch, num_steps=chunk),
+        training.train_chunk(update, sample_batch, num_steps=CHUNK),
         training.init_train_state(params, optimizer),
         key,
         data,
         loop=loop.Loop(
-            num_steps=steps // chunk * chunk,
-            chunk=chunk,
-            save_every=max(steps // chunk // 2, 1) * chunk,
+            num_steps=steps,
+            chunk=CHUNK,
+            save_every=max(steps // CHUNK // 2, 1) * CHUNK,
             folder=args.out,
             config=camdm_model.to_json(model) | {"experiment": {"label": "style"}},
             show=("loss", "data", "foot"),
         ),
     )
-    lines = (args.out / "losses.jsonl").read_text().splitlines()
-    return state.ema_params, [json.loads(line)["loss"] for line in lines]
+    rows = loop.read_losses(args.out / "losses.jsonl")
+    return state.ema_params, [row["loss"] for row in rows]
 
 
 def steer(args: Config, clips, model, params, key):
@@ -233,6 +242,7 @@ def train_walker(args: Config):
     model, params = start_model(args, clips, key_init)
     params, losses = train(args, clips, model, params, key_train)
     print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f}")
+    script.announce("compiling the rollouts", 40)
     frames, labels = steer(args, clips, model, params, key_roll)
 
     fps = model.config.fps
@@ -256,7 +266,8 @@ def train_walker(args: Config):
 
 def main() -> None:
     """Runs the quickstart."""
-    args = tyro.cli(Config, description=__doc__)
+    args = script.check(tyro.cli(Config, description=__doc__))
+    steps_of(args)
     loop.check_writable(args.out)
     begun = time.perf_counter()
     rows, report = train_walker(args) if args.train else steer_shipped(args)

@@ -106,7 +106,7 @@ def report(args: Config) -> None:
 
 def main() -> None:
     """Parses the command line and writes the report."""
-    report(tyro.cli(Config, description=__doc__))
+    report(script.check(tyro.cli(Config, description=__doc__)))
 
 
 if __name__ == "__main__":

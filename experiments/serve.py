@@ -11,6 +11,7 @@ import dataclasses
 import gc
 import ipaddress
 import signal
+import socket
 import sys
 import time
 from pathlib import Path
@@ -61,6 +62,25 @@ def is_local(host: str) -> bool:
     return host == "localhost"
 
 
+def check_address(host: str, port: int) -> None:
+    """Raises if an address cannot be listened on; before minutes of compiling.
+
+    Raises:
+      OSError: names the address.
+    """
+    try:
+        found = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
+        for family, kind, number, _, address in found:
+            with socket.socket(family, kind, number) as probe:
+                if sys.platform != "win32":
+                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+    except OSError as error:
+        raise OSError(f"cannot listen on {host}:{port}: {error.strerror}") from error
+
+
 async def listen(args: Config, characters: simulation.Simulation) -> None:
     """Serves until SIGINT or SIGTERM.
 
@@ -88,8 +108,7 @@ def serve(args: Config) -> None:
       OSError: if the run cannot be read or the address not be listened on.
       ValueError: if the run cannot be served.
     """
-    if args.max_clients < 1:
-        raise ValueError(f"--max-clients is {args.max_clients}, expected 1 or more")
+    script.check(args)
     if not is_local(args.host):
         print(
             f"warning: {args.host} may be reached from other machines, and there is no "
@@ -97,8 +116,10 @@ def serve(args: Config) -> None:
             file=sys.stderr,
             flush=True,
         )
+    check_address(args.host, args.port)
     characters = runs.load(args.run, args.data)
     begin = time.perf_counter()
+    script.announce("compiling all that a tick may need", 60)
     simulation.warm(characters)
     seconds = time.perf_counter() - begin
     print(

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from smgdiff_tasks import playing, tables
 
+from jaxmotion import files
 from jaxmotion.data.ball_clips import load_ball_clips
 from jaxmotion.learning import loop
 from jaxmotion.protocols import (
@@ -55,6 +56,7 @@ class Train:
       batch: Windows an update.
       learning_rate: Peak of Muon's rate; cosine to a twentieth.
       seed: Of everything random.
+      override: Go on with these settings where a stage began with others.
     """  # noqa: E501
 
     data: Path = Path("data/dribble.npz")
@@ -71,6 +73,7 @@ class Train:
     batch: int = 48
     learning_rate: float = 2e-3
     seed: int = 0
+    override: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,12 +163,16 @@ class Rollout:
     seed: int = 0
 
 
+# What of a training's options decides the model and its clips, for all stages.
+MADE = ("preset", "width", "depth", "held_out")
+
+
 def sizes_of(args: Train) -> dict[str, Any]:
     """Sizes of the motion model that the arguments describe."""
     sizes = dict(smgdiff_training.PRESETS[args.preset])
-    if args.width:
+    if args.width is not None:
         sizes |= {"width": args.width, "hidden": 4 * args.width}
-    if args.depth:
+    if args.depth is not None:
         sizes |= {"depth": args.depth}
     if args.token_margin is not None:
         sizes |= {"token_margin": args.token_margin}
@@ -177,7 +184,11 @@ def train(args: Train) -> None:
     for stage in args.stages:
         smgdiff_runs.check_stage_name(stage)
     loop.check_writable(args.out)
+    arguments = args.out / "arguments.json"
+    how = {name: getattr(args, name) for name in MADE}
     if (args.out / "config.json").exists():
+        found = files.read_object(arguments, what="expected what `train` writes")
+        stages.check_made(args.out, found, [args.data], how)
         run = smgdiff_runs.load_run(args.out)
     else:
         data = load_ball_clips(args.data)
@@ -186,8 +197,10 @@ def train(args: Train) -> None:
         run = smgdiff_runs.Run(
             folder=args.out, model=model, train=kept, held_out=held_out
         )
+        prints = stages.made_from([args.data])["fingerprints"]
+        value = arguments_json(args) | {"fingerprints": prints}
+        files.write_text(arguments, json.dumps(value))
         smgdiff_runs.write_run(run)
-        (args.out / "arguments.json").write_text(json.dumps(arguments_json(args)))
     clips = run.train.clips
     print(
         f"{clips.num_clips} clips, {clips.num_frames / clips.fps / 60:.1f} minutes, of "
@@ -201,6 +214,7 @@ def train(args: Train) -> None:
             batch=args.batch,
             learning_rate=args.learning_rate,
             seed=args.seed,
+            override=args.override,
         )
         smgdiff_training.train_stage(
             run, stage, budget=budget, draft_steps=args.draft_steps
@@ -216,6 +230,7 @@ def evaluate(args: Evaluate) -> None:
     run = smgdiff_runs.load_run(args.run)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
+    script.announce("compiling the recogniser and each row's plans", 40)
     setting = smgdiff_evaluation.make_setting(
         run.train,
         run.held_out,
@@ -251,6 +266,7 @@ def rollout(args: Rollout) -> None:
     run = smgdiff_runs.load_run(args.run)
     out = args.out or args.run / "rollout"
     loop.check_writable(out)
+    script.announce("compiling the rollout", 40)
     playing.play(args, run, out)
 
 
@@ -263,7 +279,7 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = tyro.cli(Command, description=__doc__)
+    args = script.check(tyro.cli(Command, description=__doc__))
     run = {Train: train, Evaluate: evaluate, Rollout: rollout}
     run[type(args)](args)
 

@@ -22,6 +22,7 @@ import numpy as np
 import tyro
 from baselines import amdm, lmm, mvae
 
+from jaxmotion import files
 from jaxmotion.evaluation import modes
 from jaxmotion.learning import adversarial, loop, training
 from jaxmotion.protocols import script
@@ -141,8 +142,9 @@ def roll(step, key, start, length: int):
 
 def main() -> None:
     """Trains, rolls out, scores and plots."""
-    args = tyro.cli(Config, description=__doc__)
+    args = script.check(tyro.cli(Config, description=__doc__))
     loop.check_writable(args.out)
+    script.announce("compiling each model's training", 40)
     began = time.perf_counter()
     key, key_start, key_roll, key_data = jax.random.split(jax.random.key(args.seed), 4)
     sizes = dict(features=2, width=args.width)
@@ -184,7 +186,7 @@ def main() -> None:
         "jax": jax.__version__,
         "platform": jax.devices()[0].platform,
     }
-    (args.out / "scores.json").write_text(json.dumps(report, indent=1))
+    files.write_text(args.out / "scores.json", json.dumps(report, indent=1))
     scatter.write_scatter(
         args.out / "squ9.png",
         {name: x.reshape(-1, 2) for name, x in points.items()},

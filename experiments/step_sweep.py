@@ -131,7 +131,7 @@ def make_job(args: Config) -> tuple[Job, Path]:
 def main() -> None:
     """Parses the command line and runs the sweep."""
     numbers = [budgets.describe(name, x.amounts) for name, x in SYSTEMS.items()]
-    args = tyro.cli(Config, description="\n\n".join([__doc__, *numbers]))
+    args = script.check(tyro.cli(Config, description="\n\n".join([__doc__, *numbers])))
     job, out = make_job(args)
     shown = arguments_json(args) | {
         "data": [str(file) for file in job.data],

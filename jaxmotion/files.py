@@ -5,6 +5,7 @@ Nothing that is read here runs code, waits for a pipe, or unpacks without a limi
 
 import contextlib
 import io
+import json
 import os
 import stat
 import zipfile
@@ -69,6 +70,42 @@ def replacing(path: str | os.PathLike) -> Iterator[BinaryIO]:
     finally:
         if os.path.exists(temporary):
             os.remove(temporary)
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Writes a text file, whole or not at all.
+
+    Raises:
+      OSError: if it cannot be written; names it.
+    """
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def read_object(path: str | os.PathLike, *, what: str) -> dict[str, Any]:
+    """JSON object of a file.
+
+    Args:
+      path: The file.
+      what: What it is, or who writes it, for messages.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      OSError: if it cannot be read.
+      ValueError: if it is no JSON, or not an object; names it.
+    """
+    try:
+        value = json.loads(read_bytes(path))
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{os.fspath(path)}: no such file: {what}") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{os.fspath(path)}: not JSON ({error}): {what}") from None
+    if not isinstance(value, dict):
+        raise ValueError(
+            f"{os.fspath(path)}: a JSON {type(value).__name__}, expected an object: "
+            f"{what}"
+        )
+    return value
 
 
 def _check_sizes(members: list[zipfile.ZipInfo], archive_bytes: int) -> None:

@@ -149,6 +149,8 @@ def train_baseline(
         stage=name,
         budget=budget,
         config={"config": dataclasses.asdict(config), "source": run.source},
+        source=run.frames,
+        settings={"previous_noise": sizes.previous_noise},
     )
 
 

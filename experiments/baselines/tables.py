@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from baselines import rows
+from jaxmotion import files
 from jaxmotion.evaluation import table
 from jaxmotion.learning import checkpoint
 from jaxmotion.protocols import (
@@ -160,7 +161,7 @@ def evaluate(
     found = data_rows(run, reference, args)
     for name, (step, space) in steppers.items():
         found[name] = measure(name, run, space, step, reference, args)
-        (out / "rows.json").write_text(json.dumps(table.to_json(found), indent=1))
+        files.write_text(out / "rows.json", json.dumps(table.to_json(found), indent=1))
     report = {
         "arguments": camdm_runs.arguments_json(args),
         "source": run.source,

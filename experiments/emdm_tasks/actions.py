@@ -53,7 +53,7 @@ def make_judge(args: Any) -> Judge:
             "actions"
         )
     frozen = None if args.evaluator is None else evaluators.load(args.evaluator)
-    steps = args.evaluator_steps or 1500
+    steps = 1500 if args.evaluator_steps is None else args.evaluator_steps
     recognizer = protocol.load_recognizer(
         run, num_steps=steps, seed=0, evaluator=frozen
     )

@@ -11,6 +11,7 @@ from jaxmotion.protocols import (
     emdm_data,
     emdm_runs,
     emdm_text,
+    stages,
 )
 from jaxmotion.systems import emdm
 
@@ -47,17 +48,11 @@ def base_config(args: Any, recon: float) -> emdm.Config:
     )
 
 
-def _same(folder: Path, made: dict[str, Any]) -> bool:
+def _same(folder: Path, paths: tuple[Path, ...], made: dict[str, Any]) -> bool:
     """Whether the folder has data made so; an error if it has other data."""
     if not (folder / "config.json").exists():
         return False
-    value = emdm_runs.read_config(folder)
-    found = {key: value.get(key) for key in made}
-    if found != made:
-        raise ValueError(
-            f"{folder}: its data were made with {found}, expected {made}; use another "
-            "folder"
-        )
+    stages.check_made(folder, emdm_runs.read_config(folder), paths, made)
     return True
 
 
@@ -102,20 +97,20 @@ def _prepare_actions(args: Any) -> emdm_runs.Task:
     merge = merges(args.merge)
     made = dict(
         task=args.task,
-        data=[str(path) for path in args.data],
         field=args.field,
         merge=merge,
         least=args.least,
-        fps=args.fps or 15.0,
-        frames=args.frames or 60,
+        fps=15.0 if args.fps is None else args.fps,
+        frames=60 if args.frames is None else args.frames,
         held_out=args.held_out,
     )
-    if not _same(args.out, made):
+    if not _same(args.out, args.data, made):
         clips, left_out = emdm_data.prepare_clips(
             args.data, field=args.field, merge=merge, least=args.least, fps=made["fps"]
         )
         clips_io.save_clips(args.out / "data.npz", clips)
-        emdm_runs.write_config(args.out, made | {"left_out": list(left_out)})
+        made |= stages.made_from(args.data) | {"left_out": list(left_out)}
+        emdm_runs.write_config(args.out, made)
     run = emdm_action.load_run(args.out)
     print(
         f"{run.clips.num_clips} clips of {len(run.actions)} actions: "
@@ -130,20 +125,19 @@ def _prepare_texts(args: Any) -> emdm_runs.Task:
     form = args.text_form or emdm_text.default_form(args.encoder)
     made = dict(
         task=args.task,
-        data=[str(path) for path in args.data],
         encoder=args.encoder,
         text_form=form,
         unseen=list(args.unseen),
-        fps=args.fps or 20.0,
-        frames=args.frames or 120,
+        fps=20.0 if args.fps is None else args.fps,
+        frames=120 if args.frames is None else args.frames,
         held_out=args.held_out,
     )
-    if not _same(args.out, made):
+    if not _same(args.out, args.data, made):
         # An encoder that is not there should be said before the features are made.
         emdm_text.make_encoder(args.encoder, form)
         motions = _text_motions(args, made["fps"])
         text_motion_io.save_text_motions(args.out / "data.npz", motions)
-        emdm_runs.write_config(args.out, made)
+        emdm_runs.write_config(args.out, made | stages.made_from(args.data))
     run = emdm_text.load_run(args.out)
     counts = {s: run.motions.clips_of(s).size for s in run.motions.split_names}
     print(

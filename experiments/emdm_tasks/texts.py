@@ -49,12 +49,11 @@ def make_judge(args: Any) -> Judge:
     frames, number = run.config["frames"], args.samples // 32 * 32
     if number < 64:
         raise ValueError(f"samples is {args.samples}, expected at least 64")
+    steps = 600 if args.evaluator_steps is None else args.evaluator_steps
     judge = (
         protocol.published_evaluator(run, args.matcher, glove=args.glove)
         if args.matcher
-        else protocol.train_evaluator(
-            run, frames=frames, num_steps=args.evaluator_steps or 600, seed=0
-        )
+        else protocol.train_evaluator(run, frames=frames, num_steps=steps, seed=0)
     )
     arrays = {
         split: text_arrays(run.motions, split=split, max_frames=frames)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxmotion import files
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.viz import dots
 from reports import aamdm, camdm, emdm_appendix, markdown, smgdiff, verdicts
@@ -219,7 +220,7 @@ def write(
             pictures[table.name] = picture_of(table)
             draw(out / pictures[table.name], table, found)
     whole = _json(decided, found, commands, made)
-    (out / "report.json").write_text(json.dumps(whole, indent=1))
+    files.write_text(out / "report.json", json.dumps(whole, indent=1))
     lines = _lines(decided, found, commands, pictures, made)
-    (out / "report.md").write_text("\n".join(lines) + "\n")
+    files.write_text(out / "report.md", "\n".join(lines) + "\n")
     return decided

@@ -1,8 +1,8 @@
 """The simulation of a run, by the system that its config names."""
 
-import json
 from pathlib import Path
 
+from jaxmotion import files
 from jaxmotion.learning import checkpoint
 from serving import camdm, smgdiff
 from serving.simulation import Simulation
@@ -27,7 +27,8 @@ def system_of(run: Path) -> str:
     if run.is_file():
         value = checkpoint.import_params(run)[1]
     else:
-        value = json.loads((run / "config.json").read_text())
+        what = "expected a run folder of `train`"
+        value = files.read_object(run / "config.json", what=what)
     system = value.get("system")
     if system not in SYSTEMS:
         raise ValueError(

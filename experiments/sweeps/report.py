@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxmotion import files
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.viz import pareto
@@ -41,10 +42,10 @@ def write(
     if left_out:
         notes.append(f"not in the plot, for want of a finite {quality}: {left_out}")
     whole = {"title": title} | report | {"notes": notes, "rows": table.to_json(rows)}
-    (out / "table.json").write_text(json.dumps(whole, indent=1))
+    files.write_text(out / "table.json", json.dumps(whole, indent=1))
     text = table.to_markdown(rows)
     below = "\n".join(f"- {note}" for note in notes)
-    (out / "table.md").write_text(f"# {title}\n\n{text}\n\n{below}\n")
+    files.write_text(out / "table.md", f"# {title}\n\n{text}\n\n{below}\n")
     _write_csv(out / "table.csv", rows, points)
     print(text)
 

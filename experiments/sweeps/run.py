@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from jaxmotion import files
 from jaxmotion.learning import loop
 from jaxmotion.protocols import evaluators, provenance
 from sweeps import budgets, latency, report
@@ -30,9 +31,9 @@ def check_models(name: str, system: System, job: Job) -> None:
         "seed": job.seed,
     } | budgets.training_part(system.amounts, job.budget)
     if not path.exists():
-        path.write_text(json.dumps(wanted, indent=1))
+        files.write_text(path, json.dumps(wanted, indent=1))
         return
-    found = json.loads(path.read_text())
+    found = files.read_object(path, what="expected what step_sweep.py writes")
     differ = [key for key in wanted | found if found.get(key) != wanted.get(key)]
     if differ:
         raise ValueError(

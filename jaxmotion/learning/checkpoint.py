@@ -6,8 +6,10 @@ is whole, so an interruption at any moment leaves the steps before it as they we
 is read is compared with its checksums, since the arrays' files have none of their own.
 """
 
+import errno
 import json
 import os
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -56,7 +58,18 @@ def save(
     Raises:
       OSError: if the folder cannot be written.
     """
-    with _manager(Path(folder), keep) as manager:
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    needed = sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(state))
+    free = shutil.disk_usage(folder).free
+    if free < needed:
+        raise OSError(
+            errno.ENOSPC,
+            f"disk full: step {step} needs {needed / 1e6:.1f} MB, {free / 1e6:.1f} MB "
+            "are free",
+            str(folder),
+        )
+    with _manager(folder, keep) as manager:
         manager.save(
             step,
             args=ocp.args.Composite(

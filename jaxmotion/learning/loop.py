@@ -8,6 +8,8 @@ import contextlib
 import dataclasses
 import json
 import signal
+import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,9 +20,13 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
+from jaxmotion import files
 from jaxmotion.learning import checkpoint
 from jaxmotion.learning.training import Info
 from jaxmotion.typing import Key
+
+# What a user waits for before the first step, on two CPU cores.
+COMPILING = "compiling the training step, about 40 s (once)"
 
 
 class TrainingDiverged(FloatingPointError):
@@ -33,8 +39,8 @@ class Loop:
 
     Attributes:
       num_steps: Updates of the whole run, a resumed part included.
-      chunk: Updates of one compiled call; divides num_steps.
-      save_every: Updates between checkpoints; a multiple of chunk.
+      chunk: Updates of one row of losses, and of a compiled call at most.
+      save_every: Updates between checkpoints.
       folder: Run folder: checkpoints in `checkpoints`, losses in `losses.jsonl`.
       config: JSON that rebuilds the model, stored with each checkpoint.
       show: Names of the values on the progress bar.
@@ -47,27 +53,38 @@ class Loop:
     config: dict[str, Any]
     show: tuple[str, ...] = ("loss",)
 
+    def __post_init__(self):
+        """Checks what would fail after the first chunk, which would be lost.
+
+        Raises:
+          ValueError: names the field.
+        """
+        for name in ("num_steps", "chunk", "save_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(
+                    f"{name} is {getattr(self, name)}, expected at least 1"
+                )
+
 
 def check_writable(folder: str | Path) -> None:
-    """Raises if a folder cannot be made or written; called before any work.
+    """Raises if a folder cannot be written, or not be made; called before any work.
 
-    Args:
-      folder: The folder; made if missing.
+    Leaves nothing behind: whoever writes first makes the folder.
 
     Raises:
       OSError: names the folder.
     """
-    folder = Path(folder)
+    there = Path(folder).absolute()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".writable"
-        probe.touch()
-        probe.unlink()
+        while not there.exists():
+            there = there.parent
+        with tempfile.TemporaryFile(dir=there):
+            pass
     except OSError as error:
         raise OSError(f"{folder}: cannot write here: {error}") from error
 
 
-def check_finite(info: Info, first_step: int, folder: Path) -> None:
+def check_finite(info: dict[str, Any], first_step: int, folder: Path) -> None:
     """Raises at the first loss that is not finite.
 
     Args:
@@ -115,16 +132,72 @@ def _held_interrupt() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
+def read_losses(path: Path) -> list[dict[str, Any]]:
+    """Rows of a `losses.jsonl`; without a last one that a kill tore.
+
+    Raises:
+      OSError: if it cannot be read.
+      ValueError: if a line is no row with a step; names the file and the line.
+    """
+    rows = []
+    for number, line in enumerate(
+        files.read_bytes(path).splitlines(keepends=True), start=1
+    ):
+        try:
+            row = json.loads(line)
+        except (ValueError, RecursionError):
+            if not line.endswith(b"\n"):
+                break
+            row = None
+        if not isinstance(row, dict) or not isinstance(row.get("step"), int):
+            raise ValueError(
+                f"{path}: line {number} is {line[:40]!r}, expected a JSON object with "
+                "a whole number as 'step'"
+            )
+        rows.append(row)
+    return rows
+
+
 def _forget_lost_steps(path: Path, done: int) -> None:
     """Drops rows behind the checkpoint that a run goes on from, and a torn last row."""
     if not path.exists():
         return
-    kept = []
-    for line in path.read_text().splitlines():
-        with contextlib.suppress(ValueError, KeyError):
-            if json.loads(line)["step"] <= done:
-                kept.append(line + "\n")
-    path.write_text("".join(kept))
+    kept = [json.dumps(row) + "\n" for row in read_losses(path) if row["step"] <= done]
+    files.write_text(path, "".join(kept))
+
+
+def _append(path: Path, row: dict[str, Any]) -> None:
+    try:
+        with open(path, "a") as log:
+            log.write(json.dumps(row) + "\n")
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _save(folder: Path, step: int, state: Any, config: dict[str, Any]) -> None:
+    try:
+        checkpoint.save(folder, step, state, config)
+    except Exception as error:  # a full disk is orbax's or tensorstore's to report
+        good = checkpoint.latest_step(folder)
+        raise OSError(
+            f"{folder}: cannot write step {step}: {' '.join(str(error).split())}; last "
+            f"good checkpoint: {'there is none' if good is None else f'step {good}'}"
+        ) from error
+
+
+class _Pieces:
+    """How many updates to run before the bar moves: what takes about a second."""
+
+    def __init__(self):
+        self.size = 1
+        self.first = True
+
+    def note(self, count: int, seconds: float) -> None:
+        """Takes in how long the last piece took."""
+        if not self.first:  # whose time is the compiler's
+            fitting = count / max(seconds, 1e-3)
+            self.size = int(np.clip(fitting, 1, 4 * self.size))
+        self.first = False
 
 
 def train(
@@ -141,7 +214,8 @@ def train(
     leaves the last checkpoint whole.
 
     Args:
-      run_chunk: From `train_chunk`, with `loop.chunk` steps.
+      run_chunk: From `train_chunk`, with `loop.chunk` steps; called for fewer of them
+        at a time where a chunk takes longer than about a second.
       state: New, or restored from `<folder>/checkpoints`; donated.
       key: The same for all parts of a run.
       data: Arrays on the device.
@@ -152,37 +226,57 @@ def train(
 
     Raises:
       TrainingDiverged: if a loss is not finite; nothing of that chunk is saved.
-      ValueError: if the chunk does not divide the steps that are left.
-      OSError: if the folder cannot be written.
+      ValueError: if more steps are done than asked for, or a line of `losses.jsonl`
+        is no row.
+      OSError: if the folder cannot be written; names the last good checkpoint.
       KeyboardInterrupt: after Ctrl-C, when the state is saved.
     """
     checkpoints = loop.folder / "checkpoints"
     check_writable(checkpoints)
     done = int(state.step)
-    if (loop.num_steps - done) % loop.chunk or loop.save_every % loop.chunk:
+    if done > loop.num_steps:
         raise ValueError(
-            f"steps left ({loop.num_steps - done}) and save_every "
-            f"({loop.save_every}) must be multiples of the chunk ({loop.chunk})"
+            f"{loop.folder}: has {done} steps, expected at most the {loop.num_steps} "
+            "to train"
         )
     losses = loop.folder / "losses.jsonl"
+    losses.parent.mkdir(parents=True, exist_ok=True)
     _forget_lost_steps(losses, done)
-    stop = False
+    if done >= loop.num_steps:
+        return state
+    stop, pieces = False, _Pieces()
+    began = time.perf_counter()
+    print(COMPILING, file=sys.stderr, flush=True)
     bar = tqdm(total=loop.num_steps, initial=done, unit="step", smoothing=0.1)
-    with bar, open(losses, "a", buffering=1) as log, _held_interrupt() as interrupts:
+    with bar, _held_interrupt() as interrupts:
         while done < loop.num_steps and not stop:
-            start = time.perf_counter()
-            state, info = jax.block_until_ready(run_chunk(state, key, data))
-            check_finite(info, done + 1, checkpoints)
-            done += loop.chunk
-            means = {name: float(np.mean(x)) for name, x in info.items()}
-            rate = loop.chunk / (time.perf_counter() - start)
-            row = {"step": done, **means, "steps_per_second": rate}
-            log.write(json.dumps(row) + "\n")
+            start, made, infos = time.perf_counter(), 0, []
+            # As long as whoever resumes here would make it.
+            to_save = loop.save_every - done % loop.save_every
+            length = min(loop.chunk, to_save, loop.num_steps - done)
+            while made < length:
+                before = time.perf_counter()
+                count = min(pieces.size, length - made)
+                state, info = jax.block_until_ready(run_chunk(state, key, data, count))
+                infos.append({name: np.asarray(x)[:count] for name, x in info.items()})
+                check_finite(infos[-1], done + made + 1, checkpoints)
+                made += count
+                bar.update(count)
+                if pieces.first:
+                    seconds = time.perf_counter() - began
+                    bar.write(f"first step after {seconds:.0f} s", file=sys.stderr)
+                pieces.note(count, time.perf_counter() - before)
+            done += length
+            means = {
+                name: float(np.mean(np.concatenate([x[name] for x in infos])))
+                for name in infos[0]
+            }
+            rate = length / (time.perf_counter() - start)
+            _append(losses, {"step": done, **means, "steps_per_second": rate})
             bar.set_postfix({name: f"{means[name]:.4f}" for name in loop.show})
-            bar.update(loop.chunk)
             stop = bool(interrupts)
             if done % loop.save_every == 0 or done >= loop.num_steps or stop:
-                checkpoint.save(checkpoints, done, state, loop.config)
+                _save(checkpoints, done, state, loop.config)
     if stop and done < loop.num_steps:
         raise KeyboardInterrupt(f"stopped at step {done}; saved in {checkpoints}")
     return state

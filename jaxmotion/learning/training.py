@@ -228,7 +228,7 @@ def train_chunk(
     *,
     num_steps: int,
     mesh: Mesh | None = None,
-) -> Callable[[Any, Key, Any], tuple[Any, Info]]:
+) -> Callable[..., tuple[Any, Info]]:
     """Many updates as one compiled program.
 
     Args:
@@ -241,11 +241,15 @@ def train_chunk(
         replicated (`replicate`). The result is that of one device up to rounding.
 
     Returns:
-      `run(state, key, data) -> (state, info)`, jitted; the given state is donated
-      (its buffers are gone afterwards). Each value of info has one row a step.
+      `run(state, key, data, count=None) -> (state, info)`, jitted; the given state is
+      donated (its buffers are gone afterwards). Each value of info has num_steps rows,
+      one a step. With a count (traced: no second compilation for another) only so many
+      updates are made, and the rows behind them are zero.
     """
 
-    def run(state: Any, key: Key, data: Any) -> tuple[Any, Info]:
+    def run(
+        state: Any, key: Key, data: Any, count: int | Array | None = None
+    ) -> tuple[Any, Info]:
         def one(state: Any, _) -> tuple[Any, Info]:
             key_batch, key_loss = jax.random.split(jax.random.fold_in(key, state.step))
             batch = sample_batch(key_batch, data)
@@ -254,7 +258,17 @@ def train_chunk(
                 batch = jax.lax.with_sharding_constraint(batch, split)
             return update(state, key_loss, batch)
 
-        return jax.lax.scan(one, state, None, length=num_steps)
+        if count is None:
+            return jax.lax.scan(one, state, None, length=num_steps)
+        row = jax.eval_shape(one, state, None)[1]
+        rows = jax.tree.map(lambda x: jnp.zeros((num_steps, *x.shape), x.dtype), row)
+
+        def write(i: Array, carry: tuple[Any, Info]) -> tuple[Any, Info]:
+            state, rows = carry
+            state, info = one(state, None)
+            return state, jax.tree.map(lambda x, y: x.at[i].set(y), rows, info)
+
+        return jax.lax.fori_loop(0, count, write, (state, rows))
 
     return jax.jit(run, donate_argnums=0)
 

@@ -11,7 +11,7 @@ from jaxmotion.learning import adversarial, training
 from jaxmotion.protocols import aamdm_stages
 from jaxmotion.protocols.aamdm_runs import Run, SpaceName
 from jaxmotion.protocols.aamdm_stages import Budget
-from jaxmotion.systems import aamdm, aamdm_loss, aamdm_space
+from jaxmotion.systems import aamdm, aamdm_loss, aamdm_space, model_json
 from jaxmotion.systems.aamdm import Transition
 from jaxmotion.systems.aamdm_space import Space
 from jaxmotion.typing import Params
@@ -76,6 +76,7 @@ def train_polisher(
         stage="polisher",
         budget=budget,
         config={"config": _shared(config), "space": name, "source": run.source},
+        source=run.frames,
         show=("loss", "value", "velocity"),
     )
     return state.ema_params
@@ -122,6 +123,7 @@ def train_generator(
         stage="generator",
         budget=budget,
         config={"config": _shared(config), "space": name, "source": run.source},
+        source=run.frames,
         show=("generator/loss", "discriminator/loss"),
     )
     return state.generator.ema_params
@@ -134,8 +136,9 @@ def _stored_config(folder: Path, *, drafts: int, polishes: int) -> aamdm.Config:
     try:
         stored = dict(value["config"])
         num_steps = stored.pop("num_steps")
-        config = aamdm.Config(**stored, drafts=drafts, polishes=polishes)
-    except (KeyError, TypeError) as error:
+        own = {"drafts": drafts, "polishes": polishes}
+        config = model_json.config_from_json(aamdm.Config, stored | own)
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{folder / stage}: field 'config' is wrong: {error}"
         ) from error

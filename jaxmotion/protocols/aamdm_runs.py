@@ -12,7 +12,6 @@ as two and two.
 import dataclasses
 import functools
 import json
-import os
 import zipfile
 from pathlib import Path
 from typing import Any, Literal
@@ -21,10 +20,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion import files
 from jaxmotion.data import clips_io, mirror, selection
 from jaxmotion.learning import checkpoint, training
 from jaxmotion.motion.skeleton import Skeleton
-from jaxmotion.protocols import aamdm_data, aamdm_stages
+from jaxmotion.protocols import aamdm_data, aamdm_stages, stages
 from jaxmotion.protocols.aamdm_data import PoseData
 from jaxmotion.protocols.aamdm_stages import Budget
 from jaxmotion.systems import (
@@ -58,6 +58,11 @@ class Run:
     held_out: PoseData
     source: str
     config: dict[str, Any]
+
+    @property
+    def frames(self) -> Path:
+        """File of the frames."""
+        return self.folder / "frames.npz"
 
     @property
     def embedding(self) -> aamdm_embedding.Config:
@@ -96,7 +101,6 @@ def prepare(
       ValueError: if the folder's frames were made otherwise, or the clips do not fit.
     """
     made = dict(
-        data=str(data),
         field=field,
         labels=list(labels),
         fps=fps,
@@ -105,13 +109,9 @@ def prepare(
     )
     if (folder / "config.json").exists():
         run = load_run(folder)
-        found = {k: run.config.get(k) for k in made}
-        if found != made:
-            raise ValueError(
-                f"{folder}: its frames were made with {found}, expected {made}; use "
-                "another folder"
-            )
+        stages.check_made(folder, run.config, [data], made)
         return run
+    source = stages.made_from([data])
     clips = clips_io.load_clips(data)
     if labels:
         clips = selection.select(clips, field, labels)
@@ -120,18 +120,15 @@ def prepare(
     frames, names = aamdm_data.pose_data(clips, fps=fps)
     skipped = sorted(set(clips.clip_names) - set(names))
     print(f"{len(names)} clips, {frames.num_frames} frames; too short: {skipped}")
-    folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / "frames.npz.partial"
-    with open(partial, "wb") as file:
+    with files.replacing(folder / "frames.npz") as file:
         np.savez(file, poses=frames.poses, paths=frames.paths, offsets=frames.offsets)
-    os.replace(partial, folder / "frames.npz")
     value = {
         "system": "aamdm",
         "skeleton": model_json.skeleton_to_json(clips.skeleton),
         "source": clips.source,
         "clips": list(names),
-    }
-    (folder / "config.json").write_text(json.dumps(value | made, indent=1))
+    } | source
+    files.write_text(folder / "config.json", json.dumps(value | made, indent=1))
     return load_run(folder)
 
 
@@ -149,7 +146,7 @@ def load_run(folder: Path) -> Run:
     """
     path = folder / "config.json"
     try:
-        value = json.loads(path.read_text())
+        value = files.read_object(path, what="expected a run folder of AAMDM")
         if value.get("system") != "aamdm":
             raise ValueError(
                 f"field 'system' is {value.get('system')!r}, expected 'aamdm'"
@@ -215,6 +212,7 @@ def train_autoencoder(run: Run, budget: Budget) -> Autoencoder:
         stage="autoencoder",
         budget=budget,
         config={"config": dataclasses.asdict(config), "source": run.source},
+        source=run.frames,
         show=("loss", "value", "change"),
     )
     return Autoencoder(params=state.ema_params, statistics=statistics, config=config)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxmotion import files
 from jaxmotion.control import presets
 from jaxmotion.data import bvh
 from jaxmotion.evaluation import table
@@ -45,7 +46,7 @@ def write_rollout(
     """Writes a motion as BVH, GIF and HTML, and a ball as CSV.
 
     Args:
-      folder: Where to; it must exist.
+      folder: Where to; made if missing.
       bones: The skeleton.
       motion: Frames of one character, world.
       desired_velocity: What was commanded, metres a second; its integral is drawn as
@@ -62,6 +63,7 @@ def write_rollout(
     from jaxmotion.viz import animation, html
 
     fps = motion.fps
+    folder.mkdir(parents=True, exist_ok=True)
     bvh.write_bvh(folder / f"{name}.bvh", bvh.bvh_from_motion(bones, motion))
     positions = np.asarray(skeleton.joint_positions(bones, motion))
     walked = positions[:, 0, ::2]
@@ -88,7 +90,7 @@ def _write_ball(path: Path, ball: Ball, fps: float) -> None:
     for frame, (place, touch) in enumerate(zip(ball.position, ball.touch, strict=True)):
         numbers = ",".join(f"{value:.4f}" for value in place)
         lines.append(f"{frame / fps:.4f},{numbers},{int(np.any(touch))}")
-    path.write_text("\n".join(lines) + "\n")
+    files.write_text(path, "\n".join(lines) + "\n")
 
 
 def write_table(
@@ -100,13 +102,13 @@ def write_table(
     """Writes metrics.json and table.md, and prints the table.
 
     Args:
-      folder: Where to; it must exist.
+      folder: Where to; made if missing.
       rows: The table.
       report: What belongs beside it: arguments, versions, hardware, bounds.
       notes: Lines below the table.
     """
     whole = report | {"rows": table.to_json(rows)}
-    (folder / "metrics.json").write_text(json.dumps(whole, indent=1))
+    files.write_text(folder / "metrics.json", json.dumps(whole, indent=1))
     text = "\n\n".join([table.to_markdown(rows), *notes])
-    (folder / "table.md").write_text(text + "\n")
+    files.write_text(folder / "table.md", text + "\n")
     print(text)

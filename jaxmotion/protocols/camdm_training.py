@@ -14,6 +14,7 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.learning import checkpoint, training
 from jaxmotion.motion import skeleton
+from jaxmotion.protocols import stages
 from jaxmotion.systems import camdm, camdm_loss
 from jaxmotion.systems.camdm_model import Model, load, to_json
 from jaxmotion.typing import Key, Params
@@ -136,14 +137,12 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
     found = dataclasses.replace(
         first, config=dataclasses.replace(first.config, **weights)
     )
-    expected = to_json(dataclasses.replace(model, config=wanted))
-    differ = [
-        k for k, v in to_json(found).items() if v != expected[k] and k != "source"
-    ]
+    expected = to_json(dataclasses.replace(model, config=wanted, source=first.source))
+    differ = stages.differences(to_json(found), expected)
     if differ:
         raise ValueError(
             f"{path}: expected a model with the skeleton, labels and config of the one "
-            f"to train, found another {', '.join(differ)}"
+            f"to train: {differ}"
         )
     return dataclasses.replace(found, source=model.source), params
 
@@ -226,6 +225,8 @@ def start(
         camdm_loss.loss, bones=model.bones, config=model.config
     )
     update = training.make_update(objective, transformation, ema_decay=ema)
+    if devices > jax.device_count():
+        raise ValueError(f"devices is {devices}, {jax.device_count()} are there")
     mesh = jax.make_mesh((devices,), ("data",)) if devices > 1 else None
 
     sample_batch = window_sampler(field=field, batch=batch)

@@ -125,6 +125,7 @@ def make_task(
         data=run.train,
         batch=batch,
         geometry=emdm_motion.geometry(representation, relative=base.geometry == "root"),
+        source=run.folder / "data.npz",
         describe={
             "task": base.condition,
             "actions": list(run.actions),

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxmotion import files
 from jaxmotion.learning import adversarial, checkpoint, training
 from jaxmotion.protocols import stages
 from jaxmotion.protocols.emdm_rows import (
@@ -25,7 +26,7 @@ from jaxmotion.protocols.emdm_rows import (
     row_config,
 )
 from jaxmotion.protocols.stages import Budget
-from jaxmotion.systems import emdm, emdm_loss, emdm_published
+from jaxmotion.systems import emdm, emdm_loss, emdm_published, model_json
 from jaxmotion.systems.emdm import Config
 from jaxmotion.typing import Key, Params
 
@@ -42,6 +43,7 @@ class Task:
       batch: `(key, data, size) -> Batch`.
       geometry: For the losses of joints; None if there are none.
       describe: JSON that says what the data are; stored with each checkpoint.
+      source: File of the data.
     """
 
     base: Config
@@ -49,6 +51,7 @@ class Task:
     batch: Callable[[Key, Any, int], emdm_loss.Batch]
     geometry: emdm_loss.Geometry | None
     describe: dict[str, Any]
+    source: Path
 
 
 def _config_json(config: Config) -> dict[str, Any]:
@@ -141,6 +144,10 @@ def train_row(
         stage=row,
         budget=generator,
         config=_config_json(config) | task.describe,
+        source=task.source,
+        settings={"discriminator_rate": discriminator.learning_rate}
+        if config.latent
+        else None,
         show=show,
     )
 
@@ -206,11 +213,9 @@ def load_row(folder: Path, row: str) -> tuple[Params, Config]:
     trained = SAMPLERS[row][0] if row in SAMPLERS else row
     value = stages.check_stage(folder / trained, trained, system="emdm")
     try:
-        config = Config(**value["config"])
-    except (KeyError, TypeError) as error:
-        raise ValueError(
-            f"{folder / trained}: field 'config' is not of this version: {error}"
-        ) from error
+        config = model_json.config_from_json(Config, value.get("config"))
+    except ValueError as error:
+        raise ValueError(f"{folder / trained}: field 'config': {error}") from error
     params = stages.load_params(
         folder / trained,
         trained,
@@ -284,7 +289,7 @@ def write_config(folder: Path, value: dict[str, Any]) -> None:
       value: A JSON object.
     """
     whole = {"system": "emdm"} | value
-    (folder / "config.json").write_text(json.dumps(whole, indent=1))
+    files.write_text(folder / "config.json", json.dumps(whole, indent=1))
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -297,16 +302,12 @@ def read_config(folder: Path) -> dict[str, Any]:
       The JSON object.
 
     Raises:
+      OSError: if it cannot be read.
       ValueError: if it is no run folder of EMDM; names the file and the field.
     """
     path = folder / "config.json"
-    try:
-        value = json.loads(path.read_text())
-        found = value.get("system")
-    except (OSError, AttributeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: no run folder of `experiments/emdm.py train`: {error}"
-        ) from error
+    what = "expected a run folder of `experiments/emdm.py train`"
+    found = (value := files.read_object(path, what=what)).get("system")
     if found != "emdm":
         raise ValueError(f"{path}: field 'system' is {found!r}, expected 'emdm'")
     if value.get("task") == "text":

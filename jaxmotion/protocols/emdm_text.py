@@ -193,6 +193,7 @@ def make_task(run: TextRun, base: emdm.Config, *, frames: int) -> emdm_runs.Task
         data=data,
         batch=batch,
         geometry=None,
+        source=run.folder / "data.npz",
         describe={
             "task": "text",
             "encoder": run.encoder.name,

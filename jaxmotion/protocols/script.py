@@ -1,9 +1,118 @@
-"""How a script ends: with one line for bad input, not with a traceback."""
+"""How a script starts and ends: options in range; one line for bad input."""
 
+import dataclasses
 import sys
 from collections.abc import Callable
+from typing import TypeVar
+
+from jax.errors import JaxRuntimeError
 
 from jaxmotion.learning.loop import TrainingDiverged
+
+Arguments = TypeVar("Arguments")
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Numbers that an option may have.
+
+    Attributes:
+      low: The least.
+      high: The largest.
+      without: Which of them are not allowed themselves.
+    """
+
+    low: float | int
+    high: float | int
+    without: tuple[int, ...] = ()
+
+    def __contains__(self, value: float | int) -> bool:
+        return self.low <= value <= self.high and value not in self.without
+
+    def __str__(self) -> str:
+        left = "(" if self.low in self.without else "["
+        right = ")" if self.high in self.without else "]"
+        return f"{left}{self.low:g}, {self.high:g}{right}"
+
+
+_COUNT, _UPDATES, _SIZE = Range(1, 10**6), Range(1, 10**9), Range(1, 2**16)
+_RATE, _FPS = Range(0, 1, (0,)), Range(0, 1000, (0,))
+_PART, _SPAN = Range(0, 1, (0, 1)), Range(0, 86400, (0,))
+
+# Numbers of all scripts' options, by name. An option has None for its default, so that
+# 0 is a number like others: allowed only where the help says what it means.
+LIMITS: dict[str, Range] = {
+    # Larger ones are not told apart: keys have 32 bits, and seeds are counted on.
+    "seed": Range(0, 2**31 - 1),
+    "port": Range(0, 65535),
+    "max_clients": Range(1, 1000),
+    "devices": Range(1, 10**4),
+    **dict.fromkeys(("held_out",), _PART),
+    **dict.fromkeys(("learning_rate", "ddpm_rate", "discriminator_rate"), _RATE),
+    **dict.fromkeys(("dropout", "ema"), Range(0, 1, (1,))),
+    **dict.fromkeys(("fps", "cut_fps"), _FPS),
+    **dict.fromkeys(("seconds", "minutes", "limit"), _SPAN),
+    **dict.fromkeys(("rate", "off_ball"), Range(0, 1)),
+    **dict.fromkeys(("last_sigma", "max_distance"), Range(0, 1000, (0,))),
+    **dict.fromkeys(("scale", "amdm_scale", "recon"), Range(0, 10**6)),
+    **dict.fromkeys(("max_norm", "previous_noise"), Range(0, 10**6)),
+    **dict.fromkeys(("speed", "speeds"), Range(0, 100)),
+    "follow": Range(0, 86400),
+    "min_acceleration": Range(0, 10**4),
+    "before": Range(1, 86400),
+    "long_minutes": Range(0, 86400),
+    "warmup": Range(0, 10**9),
+    "draft_steps": Range(0, 10**9),
+    "drafts": Range(0, 1000),
+    "token_margin": Range(0, 1000),
+    "diffusion_steps": Range(1, 1000),
+    "depth": Range(1, 256),
+    "frames": Range(2, 10**5),
+    "heads": Range(1, 1024),
+    **dict.fromkeys(("width", "hidden", "discriminator_width"), _SIZE),
+    **dict.fromkeys(("batch", "chunk", "save_every"), _COUNT),
+    **dict.fromkeys(("frames_per_token", "least", "length", "sequences"), _COUNT),
+    **dict.fromkeys(("characters", "samples", "windows", "starts", "repeats"), _COUNT),
+    **dict.fromkeys(("rollouts", "long_rollouts"), _COUNT),
+    **dict.fromkeys(("replications", "long_replications"), _COUNT),
+    **dict.fromkeys(("steps", "updates", "path_steps", "window_steps"), _UPDATES),
+    **dict.fromkeys(("autoencoder_steps", "polisher_steps"), _UPDATES),
+    **dict.fromkeys(("generator_steps", "amdm_steps", "full_pose_steps"), _UPDATES),
+    **dict.fromkeys(("ddpm_steps", "evaluator_steps", "recognizer_steps"), _UPDATES),
+}
+
+
+def check(args: Arguments) -> Arguments:
+    """Raises for an option out of range, before any work.
+
+    Args:
+      args: Dataclass of a command line; None stands for a default.
+
+    Returns:
+      The same.
+
+    Raises:
+      ValueError: names the option, its value and what is expected.
+    """
+    for field in dataclasses.fields(args):
+        value = getattr(args, field.name)
+        for one in value if isinstance(value, tuple) else (value,):
+            if isinstance(one, bool) or not isinstance(one, int | float):
+                continue
+            if one not in (limits := LIMITS[field.name]):
+                option = field.name.replace("_", "-")
+                raise ValueError(f"--{option} is {one}, expected a number in {limits}")
+    return args
+
+
+def announce(what: str, seconds: int) -> None:
+    """Says what a silence is for.
+
+    Args:
+      what: As in "compiling the rollout".
+      seconds: How long it takes on two CPU cores.
+    """
+    print(f"{what}, about {seconds} s", file=sys.stderr, flush=True)
 
 
 def start(main: Callable[[], None]) -> None:
@@ -13,13 +122,13 @@ def start(main: Callable[[], None]) -> None:
       main: The script.
 
     Raises:
-      SystemExit: with one line and status 1 after bad input or a training that
-        diverged; with status 130 after Ctrl-C.
+      SystemExit: with one line and status 1 after bad input, a training that diverged,
+        or a device without enough memory; with status 130 after Ctrl-C.
     """
     try:
         main()
-    except (OSError, ValueError, TrainingDiverged) as error:
-        sys.exit(f"error: {error}")
+    except (OSError, ValueError, TrainingDiverged, JaxRuntimeError) as error:
+        sys.exit(f"error: {' '.join(str(error).split())}")
     except KeyboardInterrupt as stop:
         # Its text, if there is one, says where the state was saved.
         if str(stop):

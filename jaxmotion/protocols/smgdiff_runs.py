@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 
+from jaxmotion import files
 from jaxmotion.data.ball_clips import BallClips, load_ball_clips, save_ball_clips
 from jaxmotion.learning import checkpoint
 from jaxmotion.protocols import smgdiff_data, stages
@@ -23,6 +24,8 @@ from jaxmotion.systems import (
 )
 from jaxmotion.systems.smgdiff_model import SYSTEM, Model
 from jaxmotion.typing import Key, Params
+
+_WHAT = "expected a run folder of `experiments/smgdiff.py train`"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -132,17 +135,16 @@ def write_run(run: Run) -> None:
     where = run.folder / "config.json"
     value = smgdiff_model.to_json(run.model)
     if where.exists():
-        found = json.loads(where.read_text())
-        differ = [name for name in value if found.get(name) != value[name]]
+        differ = stages.differences(files.read_object(where, what=_WHAT), value)
         if differ:
             raise ValueError(
-                f"{where}: another model, its {', '.join(differ)} differ: choose "
-                "another folder, or train with the same data and sizes"
+                f"{where}: another model: {differ}; choose another folder, or train "
+                "with the same data and sizes"
             )
         return
     save_ball_clips(run.folder / "train.npz", run.train)
     save_ball_clips(run.folder / "held_out.npz", run.held_out)
-    where.write_text(json.dumps(value, indent=1))
+    files.write_text(where, json.dumps(value, indent=1))
 
 
 def load_run(folder: Path) -> Run:
@@ -159,15 +161,7 @@ def load_run(folder: Path) -> Run:
       ValueError: if one is damaged or foreign; names it and the field.
     """
     where = folder / "config.json"
-    if not where.is_file():
-        raise FileNotFoundError(
-            f"no run in {folder}: expected {where}, as `experiments/smgdiff.py train` "
-            "writes it"
-        )
-    try:
-        value = json.loads(where.read_text())
-    except ValueError as error:
-        raise ValueError(f"{where}: not JSON ({error})") from None
+    value = files.read_object(where, what=_WHAT)
     return Run(
         folder=folder,
         model=smgdiff_model.from_json(value, where=str(where)),

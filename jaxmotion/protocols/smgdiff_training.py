@@ -62,7 +62,9 @@ def train_stage(
     arrays = smgdiff_data.scene_arrays(run.train, model.config.window)
     folder, key = run.folder / stage, jax.random.key(budget.seed)
     params = jax.jit(lambda key: smgdiff_runs.init_stage(key, model, stage))(key)
-    if draft_steps and stage.startswith("motion"):
+    source = run.folder / "train.npz"
+    draft = {"draft_steps": draft_steps} if stage.startswith("motion") else None
+    if draft_steps and draft:
         params = _fit(
             folder / "draft",
             dataclasses.replace(
@@ -72,8 +74,18 @@ def train_stage(
             params,
             arrays,
             budget=dataclasses.replace(budget, steps=draft_steps),
+            source=source,
         )
-    _fit(folder, model, stage, params, arrays, budget=budget)
+    _fit(
+        folder,
+        model,
+        stage,
+        params,
+        arrays,
+        budget=budget,
+        source=source,
+        settings=draft,
+    )
 
 
 def _fit(
@@ -84,6 +96,8 @@ def _fit(
     arrays: smgdiff_data.SceneArrays,
     *,
     budget: stages.Budget,
+    source: Path,
+    settings: dict[str, Any] | None = None,
 ) -> Params:
     """Trains a stage's parameters; returns their average."""
     is_motion, representation = stage.startswith("motion"), model.representation
@@ -111,6 +125,8 @@ def _fit(
         stage=stage,
         budget=budget,
         config=dict([smgdiff_runs.stage_config(model, stage)]),
+        source=source,
+        settings=settings,
         show=("loss", "foot") if is_motion else ("loss",),
     )
     return state.ema_params

@@ -5,14 +5,14 @@ system and stage it is, so that one cannot be taken for another.
 """
 
 import dataclasses
-import math
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
 
-from jaxmotion.learning import checkpoint, loop, training
+from jaxmotion.learning import checkpoint, fingerprint, loop, training
 from jaxmotion.typing import Key, Params
 
 
@@ -26,9 +26,10 @@ class Budget:
       optimizer: "muon" or "adamw" with cosine decay, AAMDM's "radam" or EMDM's "adam".
       learning_rate: Of the optimiser.
       ema: Decay of the parameters' moving average.
-      chunk: Updates of one compiled call; fewer, if these do not divide the steps.
+      chunk: Updates of one compiled call, at most.
       save_every: Updates between checkpoints.
       seed: Of parameters and batches.
+      override: Go on even if the checkpoint was trained with another budget or data.
     """
 
     steps: int
@@ -39,6 +40,123 @@ class Budget:
     chunk: int = 100
     save_every: int = 1000
     seed: int = 0
+    override: bool = False
+
+
+# What of a budget does not change what is trained.
+_FREE = ("chunk", "save_every", "override")
+
+
+def differences(found: dict[str, Any], given: dict[str, Any], prefix: str = "") -> str:
+    """Fields of a JSON object that another does not agree with, in one line.
+
+    Args:
+      found: What was stored; fields that `given` lacks do not count.
+      given: What should be the same; fields within fields are compared on their own.
+      prefix: Of the fields' names.
+
+    Returns:
+      As in "seed is 0, given 7; config.width is 64, given 16"; empty for none.
+    """
+    lines = []
+    found, given = json.loads(json.dumps([found, given]))  # tuples to lists
+    for name, value in given.items():
+        old = found.get(name, "not recorded")
+        if isinstance(value, dict) and isinstance(old, dict):
+            lines.append(differences(old, value, f"{prefix}{name}."))
+        elif old != value:
+            data = " (other data)" if name in ("data", "clips") else ""
+            lines.append(
+                f"{prefix}{name} is {_short(old)}, given {_short(value)}{data}"
+            )
+    return "; ".join(filter(None, lines))
+
+
+def _short(value: Any) -> str:
+    text = value if value == "not recorded" else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def check_resumed(
+    folder: Path,
+    found: dict[str, Any],
+    given: dict[str, Any],
+    *,
+    steps: int,
+    override: bool,
+) -> None:
+    """Raises unless a run would go on as it began.
+
+    Args:
+      folder: Of the run, with `checkpoints`.
+      found: Settings that its newest checkpoint was trained with.
+      given: Settings to go on with.
+      steps: Updates of the whole run that are asked for.
+      override: Whether other settings are meant so.
+
+    Raises:
+      ValueError: names the settings that differ, or says that more steps are done.
+    """
+    done = checkpoint.latest_step(folder / "checkpoints") or 0
+    if done > steps:
+        raise ValueError(
+            f"{folder}: has {done} steps, expected at most the {steps} to train"
+        )
+    differ = differences(found, given)
+    if differ and not override:
+        raise ValueError(
+            f"{folder}: at step {done}, and trained with other settings: {differ}; "
+            "--override goes on with those given"
+        )
+
+
+def made_from(paths: Sequence[Path]) -> dict[str, Any]:
+    """JSON of the files that a run folder's data are made from.
+
+    Raises:
+      OSError: if one cannot be read.
+    """
+    return {
+        "data": [str(path) for path in paths],
+        "fingerprints": [fingerprint.file_fingerprint(path) for path in paths],
+    }
+
+
+def check_made(
+    folder: Path, found: dict[str, Any], paths: Sequence[Path], given: dict[str, Any]
+) -> None:
+    """Raises unless a run folder's data are those that would be made now.
+
+    Files that are gone are taken to be the ones of that name; those that are there may
+    have other names.
+
+    Args:
+      folder: The run folder.
+      found: Its JSON, with what `made_from` gave.
+      paths: Files to make data from.
+      given: How.
+
+    Raises:
+      OSError: if a file is there but cannot be read.
+      ValueError: names what differs.
+    """
+    names, old = [str(path) for path in paths], found.get("data")
+    old = [old] if isinstance(old, str) else old
+    if all(path.is_file() for path in paths) and "fingerprints" in found:
+        now = made_from(paths)["fingerprints"]
+        same = found["fingerprints"] == now
+    else:
+        same, now = old == names, "unknown"
+    if not same:
+        raise ValueError(
+            f"{folder}: made from other data: {old} (fingerprint "
+            f"{found.get('fingerprints')}), given {names} ({now}); use another folder"
+        )
+    differ = differences(found, given)
+    if differ:
+        raise ValueError(
+            f"{folder}: its data were made otherwise: {differ}; use another folder"
+        )
 
 
 def make_optimizer(budget: Budget) -> training.Optimizer:
@@ -125,6 +243,8 @@ def fit(
     stage: str,
     budget: Budget,
     config: dict[str, Any],
+    source: Path,
+    settings: dict[str, Any] | None = None,
     show: tuple[str, ...] = ("loss",),
 ) -> Any:
     """Trains a stage, from its newest checkpoint if there is one.
@@ -139,38 +259,47 @@ def fit(
       stage: Name of the stage.
       budget: How long.
       config: JSON of what rebuilds the stage's networks.
+      source: File of the data, by which other data are told.
+      settings: JSON of how the stage is trained besides the budget.
       show: Names on the progress bar.
 
     Returns:
       The last state.
 
     Raises:
-      CheckpointError: if the folder holds another stage, or other sizes.
-      ValueError: if the checkpoint has other settings; names the field.
+      CheckpointError: if the folder holds another stage.
+      ValueError: if the checkpoint has other sizes, or other settings or data and the
+        budget does not override them, or more steps; names the fields.
       TrainingDiverged: if a loss is not finite.
     """
     value = {"system": system, "stage": stage} | config
+    own = {k: v for k, v in dataclasses.asdict(budget).items() if k not in _FREE}
+    how = own | {"data": fingerprint.file_fingerprint(source)} | (settings or {})
     if checkpoint.latest_step(folder / "checkpoints") is not None:
         found = check_stage(folder, stage, system=system)
-        differ = sorted(k for k in value if found.get(k) != value[k])
+        differ = differences(found, value)
         if differ:
-            raise ValueError(
-                f"{folder}: trained with other {', '.join(differ)}: expected "
-                f"{[value[k] for k in differ]}, found {[found.get(k) for k in differ]}"
-            )
+            raise ValueError(f"{folder}: of another model: {differ}")
+        check_resumed(
+            folder,
+            found.get("training", {}),
+            how,
+            steps=budget.steps,
+            override=budget.override,
+        )
         state = checkpoint.restore(folder / "checkpoints", state)
-    chunk = math.gcd(budget.steps, int(state.step), budget.chunk)
+    chunk = min(budget.steps, budget.chunk)
     run = training.train_chunk(update, sample_batch, num_steps=chunk)
-    settings = loop.Loop(
+    lengths = loop.Loop(
         num_steps=budget.steps,
         chunk=chunk,
         save_every=budget.save_every,
         folder=folder,
-        config=value,
+        config=value | {"training": how},
         show=show,
     )
     key = jax.random.fold_in(jax.random.key(budget.seed), 1)
-    return loop.train(run, state, key, data, loop=settings)
+    return loop.train(run, state, key, data, loop=lengths)
 
 
 def load_params(

@@ -125,25 +125,21 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         raise ValueError(
             f"{where}: field 'system' is {value.get('system')!r}, expected 'camdm'"
         )
-    known = {field.name for field in dataclasses.fields(camdm.Config)}
-    unknown = set(value.get("config", {})) - known
-    if unknown:
-        raise ValueError(f"{where}: field 'config' has unknown {sorted(unknown)}")
-    try:
-        config = {
-            name: tuple(x) if isinstance(x, list) else x
-            for name, x in value["config"].items()
-        }
-        model = Model(
-            config=camdm.Config(**config),
-            bones=model_json.skeleton_from_json(value["skeleton"]),
-            labels=tuple(value["labels"]),
-            source=value["source"],
-        )
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{where}: field {error} is missing or wrong") from error
-    except ValueError as error:
-        raise ValueError(f"{where}: field 'skeleton' is wrong: {error}") from error
+    parts = {
+        "config": lambda x: model_json.config_from_json(camdm.Config, x),
+        "skeleton": model_json.skeleton_from_json,
+        "labels": model_json.names_from_json,
+        "source": str,
+    }
+    made = {}
+    for field, make in parts.items():
+        if field not in value:
+            raise ValueError(f"{where}: field {field!r} is missing")
+        try:
+            made[field] = make(value[field])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{where}: field {field!r}: {error}") from error
+    model = Model(bones=made.pop("skeleton"), **made)
     config = model.config
     for name, found, expected in (
         ("skeleton", model.bones.num_joints, config.num_joints),
@@ -157,8 +153,12 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
     return dataclasses.replace(model, starts=starts)
 
 
-def _shapes(model: Model) -> Params:
-    return jax.eval_shape(lambda: camdm.init(jax.random.key(0), model.config))
+def _shapes(model: Model, where: Path) -> Params:
+    try:
+        return jax.eval_shape(lambda: camdm.init(jax.random.key(0), model.config))
+    except Exception as error:  # whatever a network makes of sizes that do not fit
+        line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{where}: field 'config' is of no network: {line}") from error
 
 
 # Models that come with the package, by name; each has a card beside it.
@@ -188,11 +188,11 @@ def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
     if path.is_file():
         _, value = checkpoint.import_params(path)
         model = from_json(value, where=str(path))
-        params, _ = checkpoint.import_params(path, like=_shapes(model))
+        params, _ = checkpoint.import_params(path, like=_shapes(model, path))
         return model, params, value
     steps = path / "checkpoints"
     value = checkpoint.load_config(steps)
     model = from_json(value, where=str(steps))
-    shapes = _shapes(model)
+    shapes = _shapes(model, path)
     found = checkpoint.restore_part(steps, {"ema_params": shapes})
     return model, found["ema_params"], value

@@ -88,20 +88,41 @@ def to_json(model: Model) -> dict[str, Any]:
     }
 
 
+def _numbers(name: str, value: Any, *, least: float) -> list[float]:
+    """A list of finite numbers; raises if it is none."""
+    if not isinstance(value, list):
+        raise ValueError(f"{name} is {value!r:.60}, expected a list of numbers")
+    for x in value:
+        right = isinstance(x, int | float) and not isinstance(x, bool)
+        if not (right and least <= x <= 1e6):
+            raise ValueError(f"{name} has {x!r:.60}, expected {least:g} to 1e+06")
+    return value
+
+
 def _representation(value: Mapping[str, Any]) -> Representation:
     bones = model_json.skeleton_from_json(value["skeleton"])
-    size = feature_layout(bones, tuple(value["joints"])).size
-    for name in ("mean", "std"):
-        if len(value[name]) != size:
+    joints = value["joints"]
+    right = isinstance(joints, list) and all(isinstance(x, int) for x in joints)
+    if not right or not all(0 <= x < bones.num_joints for x in joints):
+        raise ValueError(
+            f"joints is {joints!r:.60}, expected numbers below {bones.num_joints}"
+        )
+    size = feature_layout(bones, tuple(joints)).size
+    # A feature that never varies has a tiny deviation, but not none.
+    for name, least in (("mean", -1e6), ("std", 1e-12)):
+        if len(_numbers(name, value[name], least=least)) != size:
             raise ValueError(f"{name} has {len(value[name])} numbers, expected {size}")
+    scalars = ("fps", "radius", "reach", "contact_speed")
+    for name in scalars:
+        _numbers(name, [value[name]], least=1e-6)
     return Representation(
         bones=bones,
         normalizer=Normalizer(
             mean=jnp.asarray(value["mean"], jnp.float32),
             std=jnp.asarray(value["std"], jnp.float32),
         ),
-        joints=tuple(value["joints"]),
-        **{name: value[name] for name in ("fps", "radius", "reach", "contact_speed")},
+        joints=tuple(joints),
+        **{name: value[name] for name in scalars},
     )
 
 
@@ -122,19 +143,25 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         raise ValueError(
             f"{where}: field 'system' is {value.get('system')!r}, expected {SYSTEM!r}"
         )
-    try:
-        model = Model(
-            config=smgdiff.Config(**value["config"]),
-            paths=smgdiff_trajectory.Config(**value["paths"]),
-            representation=_representation(value["representation"]),
-            labels=tuple(value["labels"]),
-            speeds=tuple(value["speeds"]),
-            source=value["source"],
-        )
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{where}: field {error} is missing or wrong") from error
-    except ValueError as error:
-        raise ValueError(f"{where}: field 'representation': {error}") from error
+    parts = {
+        "config": lambda x: model_json.config_from_json(smgdiff.Config, x),
+        "paths": lambda x: model_json.config_from_json(smgdiff_trajectory.Config, x),
+        "representation": _representation,
+        "labels": model_json.names_from_json,
+        "speeds": lambda x: tuple(_numbers("speed", x, least=0.0)),
+        "source": str,
+    }
+    made = {}
+    for field, make in parts.items():
+        if field not in value:
+            raise ValueError(f"{where}: field {field!r} is missing")
+        try:
+            made[field] = make(value[field])
+        except KeyError as error:
+            raise ValueError(f"{where}: field {field!r}: {error} is missing") from error
+        except (TypeError, ValueError, IndexError) as error:
+            raise ValueError(f"{where}: field {field!r}: {error}") from error
+    model = Model(**made)
     labels, size = len(model.labels), model.representation.normalizer.mean.size
     for name, found, expected in (
         ("config.num_features", model.config.num_features, size),

@@ -70,7 +70,7 @@ def losses(folder):
 
 def test_training_leaves_every_stage(trained, data):
     config = json.loads((trained / "config.json").read_text())
-    assert config["system"] == "aamdm" and config["data"] == str(data)
+    assert config["system"] == "aamdm" and config["data"] == [str(data)]
     assert config["labels"] == [] and config["fps"] == 60.0
     # Sixteen clips and their mirror images.
     assert len(config["clips"]) == 32
@@ -177,8 +177,20 @@ BAD = [
     ("train --data {data} --out {file}/below {settings}", "plain/below"),
     ("train --data {data} --out {out} --field mood", "field 'mood'"),
     ("train --data {data} --out {out} {settings} --fps 24", "resampled to 24"),
-    ("train --data {data} --out {run} {settings} --fps 120", "{run}.*'fps': 120"),
-    ("train --data {data} --out {run} {settings} --width 48", "T5/polisher.*config"),
+    (
+        "train --data {data} --out {run} {settings} --fps 120",
+        "{run}: .*otherwise: fps is 60.0, given 120.0",
+    ),
+    (
+        "train --data {data} --out {run} {settings} --width 48",
+        "T5/polisher: of another model: config.width is 32, given 48",
+    ),
+    ("train --data {data} --out {run} {settings} --seed 1", "seed is 0, given 1"),
+    ("train --data {other} --out {run} {settings}", "{run}: made from other data"),
+    (
+        "train --data {data} --out {run} {settings} --polisher-steps 5",
+        "polisher: has 10 steps, expected at most the 5 to train",
+    ),
     ("evaluate --run {empty}", "{empty}"),
     ("evaluate --run {gone}", "{gone}"),
     ("evaluate --run {run} --rows amdm6", "unknown row 'amdm6'"),
@@ -189,7 +201,7 @@ BAD = [
     ("rollout --run {run} --row amdm6", "unknown row 'amdm6'"),
     ("rollout --run {run} --row mvae", "full_pose.*no checkpoint"),
     ("rollout --run {run} --row polish1_draft3", "T4.*no checkpoint"),
-    ("rollout --run {run} --seconds 0", "0.0 s"),
+    ("rollout --run {run} --seconds 0", "--seconds is 0.0, expected"),
 ]
 
 
@@ -202,6 +214,7 @@ def test_what_is_wrong_is_said_in_one_line(
     (tmp_path / "empty").mkdir()
     places = dict(
         gone=tmp_path / "gone.npz",
+        other=__file__,
         out=tmp_path / "out",
         file=tmp_path / "plain",
         empty=tmp_path / "empty",

@@ -1,9 +1,11 @@
 """experiments/camdm.py: train, evaluate and roll out on clips that the tests make."""
 
 import argparse
+import dataclasses
 import functools
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -40,6 +42,24 @@ def data(tmp_path_factory):
     path = tmp_path_factory.mktemp("data") / "clips.npz"
     clips_io.save_clips(path, samples.clips())
     return path
+
+
+@pytest.fixture(scope="module")
+def other(data):
+    """Other clips of the same skeleton and styles."""
+    clips = samples.clips()
+    path = data.with_name("other.npz")
+    moved = clips.root_position + 0.01
+    clips_io.save_clips(path, dataclasses.replace(clips, root_position=moved))
+    return path
+
+
+def contents(folder):
+    """Content of every file, and the folders."""
+    return {
+        path: path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
+    }
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +111,21 @@ def test_a_preset_says_how_to_train_unless_an_option_does(call, data, tmp_path):
 
     found = trained_with("--preset paper --ema 0.9 --batch 3")
     assert found == ["adamw", 1e-4, 3, 0, 0.0, 0.9]
+
+
+@pytest.mark.usefixtures("quick_compile")
+def test_other_settings_can_be_meant(call, data, trained, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(trained, folder)
+    # Where the data lie, and how often it saves, changes nothing that is trained.
+    moved = tmp_path / "moved.npz"
+    shutil.copy(data, moved)
+    same = SIZES.replace("--save-every 2", "--save-every 1")
+    call(f"train --data {moved} --out {folder} {same} --steps 2")
+    call(f"train --data {data} --out {folder} {SIZES} --steps 4 --batch 2 --override")
+    assert checkpoint.latest_step(folder / "checkpoints") == 4
+    config = json.loads((folder / "config.json").read_text())
+    assert config["experiment"]["batch"] == 2 and config["experiment"]["steps"] == 4
 
 
 def check_rollout(folder, seconds):
@@ -274,13 +309,53 @@ BAD = [
     ("train --data {gone} --out {out}", OSError, "gone"),
     ("train --data {data} --out {out} --label mood", ValueError, "field 'mood'"),
     ("train --data {data} --out {file}/below", OSError, "plain/below"),
-    ("train --data {data} --out {run} {sizes} --depth 2", ValueError, "another model"),
+    (
+        "train --data {data} --out {run} {sizes} --steps 2 --depth 2",
+        ValueError,
+        "run: at step 2, and trained with other settings: depth is 1, given 2; --over",
+    ),
+    (
+        "train --data {data} --out {run} {sizes} --steps 2 --depth 2 --override",
+        ValueError,
+        "another model",
+    ),
+    (
+        "train --data {data} --out {run} {sizes} --steps 2 --seed 7 --learning-rate .1",
+        ValueError,
+        "learning_rate is 0.001, given 0.1; seed is 0, given 7",
+    ),
+    ("train --data {data} --out {run} {sizes} --steps 4", ValueError, "steps is 2, gi"),
+    (
+        "train --data {data} --out {run} {sizes} --steps 1",
+        ValueError,
+        "has 2 steps, expected at most the 1 to train",
+    ),
+    (
+        "train --data {data} --out {run} {sizes} --steps 1 --override",
+        ValueError,
+        "has 2 steps, expected at most the 1 to train",
+    ),
+    (
+        "train --data {other} --out {run} {sizes} --steps 2",
+        ValueError,
+        "given '[0-9a-f]{{12}}' \\(other data\\)",
+    ),
+    (
+        "train --data {data} --out {out} {sizes} --steps 2 --init {run} --depth 2",
+        ValueError,
+        "run: expected a model .*config.depth is 1, given 2",
+    ),
+    ("train --data {data} --out {out} --devices 64", ValueError, "devices is 64, "),
+    ("train --data {data} --out {out} --held-out 2", ValueError, "--held-out is 2.0"),
+    ("export --run {run} --out {empty}", OSError, "empty is a folder"),
+    ("export --run {empty} --out {out}", ValueError, "empty"),
+    ("evaluate --run {gone}", ValueError, "gone"),
     ("rollout --run {empty} --style neutral", ValueError, "empty"),
     ("rollout --run {run} --style sad", ValueError, "the model has neutral, zombie"),
     ("rollout --run {run} --style zombie --to-style sad", ValueError, "style 'sad'"),
     ("rollout --run {run} --style zombie --data {gone}", OSError, "gone"),
     ("rollout --run {run} --style zombie --out {file}/below", OSError, "plain/below"),
-    ("rollout --run {run} --style zombie --seconds 0", ValueError, "0.0 s"),
+    ("rollout --run {run} --style zombie --seconds 0", ValueError, "--seconds is 0.0"),
     ("evaluate --run {empty}", ValueError, "empty"),
     ("evaluate --run {run} --seconds 2", ValueError, "too short to measure"),
     ("evaluate --run {run} --data {gone}", OSError, "gone"),
@@ -289,7 +364,7 @@ BAD = [
 
 @pytest.mark.parametrize("line, error, message", BAD)
 def test_what_is_wrong_is_named_before_any_work(
-    call, data, trained, tmp_path, line, error, message
+    call, data, other, trained, tmp_path, line, error, message
 ):
     (tmp_path / "plain").write_text("")
     (tmp_path / "empty").mkdir()
@@ -300,13 +375,13 @@ def test_what_is_wrong_is_named_before_any_work(
         empty=tmp_path / "empty",
         run=trained,
         data=data,
+        other=other,
         sizes=SIZES,
     )
-    before = (trained / "config.json").read_text()
-    with pytest.raises(error, match=message):
+    before = contents(trained), contents(tmp_path)
+    with pytest.raises(error, match=message.format()):
         call(line.format(**places))
-    assert (trained / "config.json").read_text() == before
-    assert checkpoint.latest_step(trained / "checkpoints") == 2
+    assert (contents(trained), contents(tmp_path)) == before
 
 
 def test_an_unknown_preset_lists_the_known_ones(call, trained, capsys):
@@ -335,7 +410,7 @@ def test_from_a_shell_train_resume_evaluate_and_roll_out(data, tmp_path):
     folder = tmp_path / "run"
     for line in (
         f"train --data {data} --out {folder} {SIZES} --steps 2",
-        f"train --data {data} --out {folder} {SIZES} --steps 4",
+        f"train --data {data} --out {folder} {SIZES} --steps 4 --override",
         f"evaluate --run {folder} --rollouts 8 --seconds 6 --recognizer-steps 30",
         f"rollout --run {folder} --style zombie --seconds 3",
     ):

@@ -187,8 +187,10 @@ BAD = {
     "sample --run {texts} --text walk --row naive": "checkpoint",
     "sample --run {texts} --text walk --row other": "unknown row 'other'",
     "sample --run {data} --action run": "cannot write here",
+    "sample --run {new} --action run": "no such file: expected a run folder",
+    "train --task action --data {data} --out {actions} --least 2 --fps 9": "fps is",
     "train --task action --data {data} --out {actions} --least 2 --fps 10 --merge": (
-        "its data were made with"
+        "its data were made otherwise"
     ),
     "train --data {data} --out {new} --merge walk": "expected old=new",
     "train --data {data} --out {new} --merge hop=walk": "unknown content",
@@ -228,6 +230,7 @@ def test_bad_input_is_one_clear_error(call, line, actions, texts, data, tmp_path
         (OSError, ValueError), match="(?i)" + BAD[line].replace("--", "-.")
     ):
         call("", *words)
+    assert list(tmp_path.iterdir()) == []  # not even the folder of a typing error
 
 
 @pytest.mark.parametrize("command", ["train", "evaluate", "sample"])

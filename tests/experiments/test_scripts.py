@@ -1,10 +1,13 @@
 """Every script ends bad input with one line, and its help has an example."""
 
+import dataclasses
 import runpy
 import sys
+import typing
 
 import pytest
 
+from jaxmotion.protocols import script
 from tests.experiments.conftest import FOLDER
 
 # What is wrong -> the line says so. quickstart.py and squ9.py have nothing to read.
@@ -31,13 +34,98 @@ def test_bad_input_is_one_line(load, name, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     line, message = WRONG[name]
     places = dict(gone=tmp_path / "gone", out=tmp_path / "out", file=tmp_path / "file")
-    script = FOLDER / f"{name}.py"
-    monkeypatch.setattr(sys, "argv", [str(script), *line.format(**places).split()])
+    path = FOLDER / f"{name}.py"
+    monkeypatch.setattr(sys, "argv", [str(path), *line.format(**places).split()])
     with pytest.raises(SystemExit) as stop:
-        runpy.run_path(str(script), run_name="__main__")
+        runpy.run_path(str(path), run_name="__main__")
     assert isinstance(stop.value.code, str)
     assert stop.value.code.startswith("error: ") and "\n" not in stop.value.code
     assert message in stop.value.code
+
+
+def commands(module):
+    """The dataclasses of a script's command lines."""
+    for value in vars(module).values():
+        if dataclasses.is_dataclass(value) and value.__module__ == module.__name__:
+            yield value
+
+
+def numbers(command):
+    """Its options that are numbers, None for the default or not."""
+    for name, hint in typing.get_type_hints(command).items():
+        if {int, float} & {hint, *typing.get_args(hint)}:
+            yield name
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_every_number_has_a_range_that_its_default_is_in(load, name):
+    for command in commands(load(name)):
+        known = {x.name: x for x in dataclasses.fields(command)}
+        for option in numbers(command):
+            assert option in script.LIMITS, f"{name}: {option}"
+            default = known[option].default
+            for one in default if isinstance(default, tuple) else (default,):
+                assert one is None or one in script.LIMITS[option]
+
+
+# One of each kind of mistake; before, most were noticed after minutes, or never.
+OUT_OF_RANGE = [
+    ("aamdm", "train --batch 0"),
+    ("aamdm", "train --fps -1"),
+    ("aamdm", "train --previous-noise nan"),
+    ("aamdm", "evaluate --long-rollouts 0"),
+    ("aamdm", "rollout --seconds inf"),
+    ("camdm", "train --width 0"),
+    ("camdm", "train --depth 0"),
+    ("camdm", "train --batch 0"),
+    ("camdm", "train --chunk 0"),
+    ("camdm", "train --save-every 0"),
+    ("camdm", "train --diffusion-steps 0"),
+    ("camdm", "train --learning-rate nan"),
+    ("camdm", "train --learning-rate -1"),
+    ("camdm", "train --ema 1"),
+    ("camdm", "train --ema inf"),
+    ("camdm", "train --held-out 1"),
+    ("camdm", "train --devices 0"),
+    ("camdm", "train --steps 0"),
+    ("camdm", "train --seed -1"),
+    ("camdm", "train --seed 4294967296"),
+    ("camdm", "evaluate --rollouts 0"),
+    ("camdm", "evaluate --recognizer-steps 0"),
+    ("camdm", "rollout --seconds 0"),
+    ("camdm", "speeds --speeds 1 nan"),
+    ("camdm_transitions", "--before 0"),
+    ("dribble", "--off-ball -0.1"),
+    ("emdm", "train --fps 0"),
+    ("emdm", "train --frames 0"),
+    ("emdm", "train --dropout inf"),
+    ("emdm", "evaluate --evaluator-steps 0"),
+    ("emdm", "sample --scale nan"),
+    ("evaluator", "train --updates 0"),
+    ("prepare_data", "--seed -1 procedural --out {out}.npz"),
+    ("quickstart", "--steps 0 --out {out}"),
+    ("quickstart", "--minutes inf --out {out}"),
+    ("serve", "--port 70000"),
+    ("serve", "--max-clients 0"),
+    ("smgdiff", "train --width 0"),
+    ("smgdiff", "train --draft-steps -1"),
+    ("smgdiff", "rollout --last-sigma 0"),
+    ("squ9", "--length 0 --out {out}"),
+    ("step_sweep", "--replications 0 --system camdm"),
+]
+
+
+@pytest.mark.parametrize(("name", "line"), OUT_OF_RANGE)
+def test_an_option_out_of_range_is_named_before_any_work(invoke, name, line, tmp_path):
+    option = next(x for x in line.split() if x.startswith("--"))
+    with pytest.raises(ValueError, match=f"^{option} is .*, expected .*in "):
+        invoke(name, line.format(out=tmp_path / "out"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_fewer_steps_than_a_row_of_losses_are_refused(invoke, tmp_path):
+    with pytest.raises(ValueError, match="--steps is 49, expected at least 50"):
+        invoke("quickstart", f"--steps 49 --out {tmp_path / 'out'}")
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

@@ -633,6 +633,7 @@ def test_other_addresses_are_warned_of(script, monkeypatch, capsys, host, local)
         raise ValueError("here")
 
     monkeypatch.setattr(script.runs, "load", stop)
+    monkeypatch.setattr(script, "check_address", lambda host, port: None)
     with pytest.raises(ValueError, match="here"):
         script.serve(script.Config(host=host))
     assert ("no authentication" in capsys.readouterr().err) is not local
@@ -641,6 +642,18 @@ def test_other_addresses_are_warned_of(script, monkeypatch, capsys, host, local)
 def test_at_least_one_client(script):
     with pytest.raises(ValueError, match="--max-clients is 0"):
         script.serve(script.Config(max_clients=0))
+
+
+def test_an_address_is_tried_before_anything_is_loaded(script, monkeypatch):
+    monkeypatch.setattr(script.runs, "load", None)
+    with pytest.raises(ValueError, match="--port is 70000, expected .* 65535"):
+        script.serve(script.Config(port=70000))
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        with pytest.raises(OSError, match=f"cannot listen on 127.0.0.1:{port}: Addr"):
+            script.serve(script.Config(port=port))
+    with pytest.raises(OSError, match="cannot listen on no.such.host.invalid:7777"):
+        script.serve(script.Config(host="no.such.host.invalid"))
 
 
 def test_only_known_systems_are_served(tmp_path):

@@ -87,7 +87,15 @@ def test_dribble_makes_skills_of_labels(invoke, tmp_path):
 BAD = {
     "train --data {data} --out {new} --stages motion": "unknown stage 'motion'",
     "train --data {none} --out {new}": "no clips file",
-    "evaluate --run {none}": "no run in",
+    f"train --data {{data}} --out {{run}} {SIZES} --width 24": "width is 16, given 24",
+    f"train --data {{data}} --out {{run}} {SIZES} --held-out 0.2": "held_out is 0.3, g",
+    f"train --data {__file__} --out {{run}} {SIZES}": "made from other data",
+    f"train --data {{data}} --out {{run}} {SIZES} --seed 3": "seed is 0, given 3",
+    f"train --data {{data}} --out {{run}} {SIZES} --path-steps 5": "has 10 steps, exp",
+    f"train --data {{data}} --out {{run}} {SIZES} --stages motion_8 --draft-steps 0": (
+        "motion_8: .*draft_steps is 10, given 0"
+    ),
+    "evaluate --run {none}": "no such file: expected a run folder",
     f"evaluate --run {{run}} {SHORT} --schedules middle": "unknown schedule 'middle'",
     "rollout --run {run} --skills dive": "unknown skill 'dive'",
     "rollout --run {run} --seconds 0.01": "too short",
@@ -100,8 +108,11 @@ def test_bad_input_is_one_clear_error(invoke, trained, data, tmp_path, line):
     places = dict(
         data=data, run=trained, new=tmp_path / "new", none=tmp_path / "none.npz"
     )
+    before = {x: x.read_bytes() for x in trained.rglob("*") if x.is_file()}
     with pytest.raises((OSError, ValueError), match=BAD[line]):
         invoke(
             "smgdiff",
             line.format(**places) + " " + (SHORT if "evaluate" in line else ""),
         )
+    assert list(tmp_path.iterdir()) == []
+    assert {x: x.read_bytes() for x in trained.rglob("*") if x.is_file()} == before

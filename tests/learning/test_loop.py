@@ -16,7 +16,7 @@ import pytest
 
 from jaxmotion.data import clips_io
 from jaxmotion.learning import checkpoint, training
-from jaxmotion.learning.loop import Loop, TrainingDiverged, train
+from jaxmotion.learning.loop import Loop, TrainingDiverged, check_writable, train
 from jaxmotion.systems import camdm, camdm_model
 from tests import tiny
 
@@ -127,14 +127,15 @@ def test_an_unwritable_folder_is_named_before_any_work(tmp_path):
         train(run, state, key, data, loop=loop_of(tmp_path / "file" / "run", 4))
 
 
-@pytest.mark.parametrize("sizes", [(5, 2, 2), (4, 2, 3)])
-def test_chunks_must_divide(tmp_path, sizes):
-    num_steps, chunk, save_every = sizes
+def test_chunks_need_not_divide(tmp_path):
     run, state, key, data = small_parts()
-    with pytest.raises(ValueError, match="multiples of the chunk"):
-        train(
-            run, state, key, data, loop=loop_of(tmp_path, num_steps, chunk, save_every)
-        )
+    settings = loop_of(tmp_path, 7, chunk=2, save_every=3)
+    final = train(run, state, key, data, loop=settings)
+    assert final.step == 7
+    assert [row["step"] for row in rows(tmp_path)] == [2, 3, 5, 6, 7]
+    assert checkpoint.latest_step(tmp_path / "checkpoints") == 7
+    at_6 = checkpoint.restore(tmp_path / "checkpoints", small_parts()[1], step=6)
+    assert at_6.step == 6
 
 
 def test_the_end_is_saved_even_between_checkpoints(tmp_path):
@@ -148,13 +149,11 @@ def test_the_end_is_saved_even_between_checkpoints(tmp_path):
 
 def test_ctrl_c_saves_what_was_reached(tmp_path):
     run, state, key, data = small_parts()
-    calls = []
 
-    def interrupted(*args):
-        calls.append(1)
-        if len(calls) == 3:
+    def interrupted(state, *args):
+        if int(state.step) == 4:
             os.kill(os.getpid(), signal.SIGINT)
-        return run(*args)
+        return run(state, *args)
 
     before = signal.getsignal(signal.SIGINT)
     settings = loop_of(tmp_path, 100, save_every=50)
@@ -178,6 +177,167 @@ def test_the_log_forgets_steps_that_no_checkpoint_has(tmp_path):
     restored = checkpoint.restore(tmp_path / "checkpoints", small_parts()[1])
     train(run, restored, key, data, loop=loop_of(tmp_path, 8))
     assert [row["step"] for row in rows(tmp_path)] == [2, 4, 6, 8]
+
+
+def test_a_chunk_in_pieces_is_the_whole_to_the_bit():
+    config = tiny.config(dropout=0.1)
+    run, state, key, data = tiny.training_parts(config, num_steps=6)
+    fresh = lambda: jax.tree.map(jnp.copy, state)  # noqa: E731
+    whole, rows = run(fresh(), key, data, 6)
+    scanned, _ = run(fresh(), key, data)
+    part, found = fresh(), []
+    for count in (1, 3, 2):
+        part, info = run(part, key, data, count)
+        found.append(jax.tree.map(lambda x, n=count: np.asarray(x)[:n], info))
+        assert not np.any(np.asarray(info["loss"])[count:])
+    jax.tree.map(np.testing.assert_array_equal, part, whole)
+    joined = jax.tree.map(lambda *x: np.concatenate(x), *found)
+    jax.tree.map(np.testing.assert_array_equal, joined, rows)
+    # Another program: equal up to how the compiler fused it.
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)  # noqa: E731
+    jax.tree.map(close, scanned.params, whole.params)
+
+
+def test_compiling_is_announced_and_the_bar_moves_from_the_first_step(tmp_path, capsys):
+    run, state, key, data = small_parts()
+    counts, seen = [], []
+
+    def slow(state, key, data, count):
+        counts.append(count)
+        seen.append(capsys.readouterr().err)
+        time.sleep(0.4 * count)
+        return run(state, key, data, count)
+
+    train(slow, state, key, data, loop=loop_of(tmp_path, 4))
+    assert seen[0].startswith("compiling the training step, about ")
+    assert "first step after" in seen[1] and "1/4" in seen[1]
+    assert counts[:2] == [1, 1] and sum(counts) == 4
+
+
+def test_a_finished_run_is_not_compiled_again(tmp_path, capsys):
+    run, state, key, data = small_parts()
+    final = train(run, state, key, data, loop=loop_of(tmp_path, 4))
+    capsys.readouterr()
+
+    def never(*_):
+        raise AssertionError("work was done")
+
+    train(never, final, key, data, loop=loop_of(tmp_path, 4))
+    assert "compiling" not in capsys.readouterr().err
+    with pytest.raises(ValueError, match="has 4 steps, expected at most the 2"):
+        train(never, final, key, data, loop=loop_of(tmp_path, 2))
+
+
+@pytest.mark.parametrize("field", ["num_steps", "chunk", "save_every"])
+def test_zero_is_refused_before_the_first_chunk(tmp_path, field):
+    """save_every=0 divided by zero after it, and the chunk was lost."""
+    sizes = {"num_steps": 4, "chunk": 2, "save_every": 2} | {field: 0}
+    with pytest.raises(ValueError, match=f"{field} is 0, expected at least 1"):
+        loop_of(tmp_path, **sizes)
+
+
+@pytest.mark.parametrize("line", ["5", "null", "[2]", "{}", '{"step": "2"}', "loss"])
+def test_a_row_of_the_log_that_is_none_is_named(tmp_path, line):
+    run, state, key, data = small_parts()
+    state = train(run, state, key, data, loop=loop_of(tmp_path, 4))
+    path = tmp_path / "losses.jsonl"
+    whole = path.read_text() + line + "\n"
+    path.write_text(whole)
+    with pytest.raises(ValueError, match=f"{path}: line 3 is .*'step'"):
+        train(run, state, key, data, loop=loop_of(tmp_path, 8))
+    assert path.read_text() == whole
+
+
+def test_the_log_is_replaced_whole(tmp_path, monkeypatch):
+    """A kill while rows behind the checkpoint are dropped leaves the log as it was."""
+    run, state, key, data = small_parts()
+    state = train(run, state, key, data, loop=loop_of(tmp_path, 4))
+    path = tmp_path / "losses.jsonl"
+    whole = path.read_text() + '{"step": 6, "loss": 1.0}\n'
+    path.write_text(whole)
+
+    def killed(*_):
+        raise SystemExit
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(SystemExit):
+        train(run, state, key, data, loop=loop_of(tmp_path, 8))
+    assert path.read_text() == whole
+
+
+def test_checking_a_folder_does_not_make_it(tmp_path):
+    check_writable(tmp_path / "a" / "b")
+    check_writable(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+FILLED = """
+import resource, sys
+from pathlib import Path
+import jax, jax.numpy as jnp, optax
+from jaxmotion.learning import training
+from jaxmotion.learning.loop import Loop, train
+from jaxmotion.protocols import script
+def main():
+    def run(state, key, data, count):
+        if int(state.step) == 2:
+            {fill}
+        return state, {{"loss": jnp.ones(2)}}
+    params = {{"w": jax.random.normal(jax.random.key(0), (200, 200))}}
+    state = training.init_train_state(params, optax.sgd(0.1))
+    folder = Path(sys.argv[1])
+    def counted(state, *rest):
+        state, info = run(state, *rest)
+        object.__setattr__(state, "step", state.step + rest[-1])
+        return state, info
+    settings = Loop(num_steps=6, chunk=2, save_every=2, folder=folder, config={{}})
+    train(counted, state, None, None, loop=settings)
+script.start(main)
+"""
+
+
+def full_disk(folder, fill, *before):
+    """A training whose disk is full after its first checkpoint; its last line."""
+    done = subprocess.run(
+        [*before, sys.executable, "-c", FILLED.format(fill=fill), str(folder)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 1, done.stderr
+    line = done.stderr.strip().splitlines()[-1]
+    assert line.startswith(f"error: {folder / 'checkpoints'}: cannot write step 4: ")
+    assert line.endswith("last good checkpoint: step 2")
+    return done.stderr
+
+
+def test_a_disk_that_takes_no_more_ends_in_one_line_and_keeps_the_checkpoint(tmp_path):
+    """A limit on the size of files needs no rights to set."""
+    full_disk(tmp_path, "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))")
+    assert checkpoint.latest_step(tmp_path / "checkpoints") == 2
+
+
+def test_a_full_disk_is_noticed_before_a_checkpoint_is_begun(tmp_path):
+    fill = (
+        "import shutil; shutil.disk_usage = lambda _: shutil._ntuple_diskusage(9,9,9)"
+    )
+    text = full_disk(tmp_path, fill)
+    assert "disk full: step 4 needs 0.3 MB, 0.0 MB are free" in text
+    assert "Traceback" not in text
+    assert checkpoint.latest_step(tmp_path / "checkpoints") == 2
+
+
+def test_a_full_disk_under_the_log_names_it(tmp_path):
+    run, state, key, data = small_parts()
+    log = tmp_path / "losses.jsonl"
+
+    def fill(*args):
+        if not log.exists():
+            log.symlink_to("/dev/full")
+        return run(*args)
+
+    with pytest.raises(OSError, match=f"No space left on device: '{log}'"):
+        train(fill, state, key, data, loop=loop_of(tmp_path, 4))
 
 
 def command(folder, steps):

@@ -48,7 +48,7 @@ def test_clips_are_chosen_mirrored_described_and_split(run, data):
     assert run.held_out.offsets.tolist() == [0, 32, 64, 96, 128]
     assert run.bones.names == person.NAMES and run.source == "made in the tests"
     assert run.embedding.num_joints == 6 and run.embedding.fps == 60.0
-    assert run.config["data"] == str(data) and run.config["mirrored"] is True
+    assert run.config["data"] == [str(data)] and run.config["mirrored"] is True
     assert len(run.config["clips"]) == 4
     # Sideways and turning velocities of the mirror images are the opposite ones.
     own, image = run.train.poses[:136], run.train.poses[136:]
@@ -216,7 +216,7 @@ def test_a_chain_of_another_space_is_named(run, space, chain):
 
 def test_a_chain_is_not_trained_over_another(run, space, chain):
     wide = dataclasses.replace(CONFIG, window=3)
-    with pytest.raises(ValueError, match="polisher: trained with other config"):
+    with pytest.raises(ValueError, match="polisher: of another model: config"):
         aamdm_chains.train_polisher(run, "full_pose", space, wide, BUDGET)
 
 

@@ -48,8 +48,11 @@ def loss(params, key, batch):
     return jnp.mean(gap**2), {}
 
 
-def fit(folder, *, steps=4, stage="polisher", config=CONFIG):
+def fit(folder, *, steps=4, stage="polisher", config=CONFIG, frames=b"1", **changes):
     """A stage up to some of the steps of the whole budget."""
+    source = folder.with_name(f"{folder.name}.frames")
+    source.parent.mkdir(parents=True, exist_ok=True)
+    source.write_bytes(frames)
     optimizer = aamdm_stages.make_optimizer(BUDGET)
     sample, arrays = aamdm_stages.frame_windows(
         data().poses, data(), 2, batch=BUDGET.batch
@@ -61,8 +64,9 @@ def fit(folder, *, steps=4, stage="polisher", config=CONFIG):
         sample,
         arrays,
         stage=stage,
-        budget=dataclasses.replace(BUDGET, steps=steps),
+        budget=dataclasses.replace(BUDGET, steps=steps, **changes),
         config=config,
+        source=source,
     )
 
 
@@ -79,13 +83,17 @@ def assert_same(found, expected):
         np.testing.assert_array_equal(a, b)
 
 
+def contents(folder):
+    return {x: x.read_bytes() for x in folder.rglob("*") if x.is_file()}
+
+
 # --- training ----------------------------------------------------------------------
 
 
 def test_a_resumed_stage_ends_as_one_without_a_break(trained, tmp_path):
     half = fit(tmp_path, steps=2)
     assert int(half.step) == 2
-    whole = fit(tmp_path)
+    whole = fit(tmp_path, override=True)
     assert_same(whole, trained[1])
     assert np.abs(whole.params["w"] - init()["w"]).max() > 0
     rows = [json.loads(x) for x in (tmp_path / "losses.jsonl").read_text().splitlines()]
@@ -96,7 +104,7 @@ def test_any_number_of_updates_can_be_made_and_gone_on_from(trained, tmp_path):
     """Three are not a multiple of the chunk of two."""
     assert int(fit(tmp_path, steps=3).step) == 3
     assert checkpoint.latest_step(tmp_path / "checkpoints") == 3
-    assert_same(fit(tmp_path), trained[1])
+    assert_same(fit(tmp_path, override=True), trained[1])
 
 
 def test_a_finished_stage_is_not_trained_again(trained):
@@ -111,10 +119,28 @@ def test_a_finished_stage_is_not_trained_again(trained):
 def test_other_settings_are_refused_and_named(trained):
     folder, state = trained
     other = CONFIG | {"config": {"width": 5}}
-    with pytest.raises(ValueError, match=f"{folder}.*other config") as error:
-        fit(folder, config=other)
-    assert "'width': 5" in str(error.value) and "'width': 3" in str(error.value)
-    assert checkpoint.latest_step(folder / "checkpoints") == 4
+    before = contents(folder)
+    changes = {
+        "of another model: config.width is 3, given 5": dict(config=other),
+        "at step 4, .*: batch is 4, given 5; seed is .*--override": dict(
+            batch=5, seed=8
+        ),
+        "learning_rate is .*, given 0.5": dict(learning_rate=0.5),
+        "ema is 0.5, given 0.25": dict(ema=0.25),
+        "optimizer is .*, given 'radam'": dict(optimizer="radam"),
+        "steps is 4, given 6": dict(steps=6),
+        "data is '[0-9a-f]{12}', .* .other data.;": dict(frames=b"2"),
+        "has 4 steps, expected at most the 3 to train": dict(steps=3),
+    }
+    for message, change in changes.items():
+        with pytest.raises(ValueError, match=f"^{folder}: .*{message}"):
+            fit(folder, **change)
+        assert contents(folder) == before
+    with pytest.raises(ValueError, match="has 4 steps"):
+        fit(folder, steps=3, override=True)
+    # How often it is saved changes nothing that is trained.
+    assert_same(fit(folder, chunk=1, save_every=1), state)
+    assert contents(folder) == before
 
 
 def test_a_stage_is_not_trained_in_the_folder_of_another(trained):

@@ -43,7 +43,7 @@ def test_only_the_weights_are_new(first):
 def test_another_network_is_refused(first):
     model, _, path = first
     config = dataclasses.replace(model.config, width=2 * model.config.width)
-    with pytest.raises(ValueError, match=r"a\.npz.*another config"):
+    with pytest.raises(ValueError, match=r"a\.npz.*to train: config\."):
         camdm_training.continued(dataclasses.replace(model, config=config), path)
 
 

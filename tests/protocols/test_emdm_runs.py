@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import shutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -67,13 +68,14 @@ def task(config=CONFIG, **describe):
         batch=batch,
         geometry=GEOMETRY,
         describe={"source": "tests", "actions": ["a", "b"]} | describe,
+        source=Path(__file__),
     )
 
 
 PROGRAMS = {}
 
 
-def fit(folder, row, *, given=None, steps=4):
+def fit(folder, row, *, given=None, steps=4, **changes):
     """Trains a row; its update is compiled once for all folders, its start never."""
     given = given or task()
     make, start, init = training.train_chunk, training.init_train_state, emdm.init
@@ -85,7 +87,7 @@ def fit(folder, row, *, given=None, steps=4):
         """As a restored state is: else it would be another program's."""
         return jax.device_put(start(*parts), jax.devices()[0])
 
-    budget = dataclasses.replace(BUDGET, steps=steps)
+    budget = dataclasses.replace(BUDGET, steps=steps, **changes)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(emdm, "init", lambda _, config: tiny.random_params(init, config))
         patch.setattr(training, "train_chunk", once)
@@ -204,7 +206,7 @@ def test_a_sampler_is_another_way_to_use_a_row(trained, monkeypatch):
 def test_a_resumed_row_ends_as_one_without_a_break(trained, tmp_path, row):
     fit(tmp_path, row, steps=2)
     assert checkpoint.latest_step(tmp_path / row / "checkpoints") == 2
-    fit(tmp_path, row)
+    fit(tmp_path, row, override=True)
     found, _ = emdm_runs.load_row(tmp_path, row)
     expected, _ = emdm_runs.load_row(trained, row)
     assert same(found, expected)
@@ -235,8 +237,22 @@ def test_a_finished_row_is_not_trained_again(trained):
 def test_other_sizes_or_data_are_refused(trained, changes, describe, field):
     given = task(dataclasses.replace(CONFIG, **changes), **describe)
     for row in ("emdm", "ddpm_1000"):
-        with pytest.raises(ValueError, match=f"{row}.*trained with other {field}"):
+        with pytest.raises(ValueError, match=f"{row}: of another model: {field}"):
             fit(trained, row, given=given)
+        assert checkpoint.latest_step(trained / row / "checkpoints") == 4
+
+
+def test_other_budgets_are_refused(trained):
+    other = dataclasses.replace(task(), source=Path(emdm_runs.__file__))
+    for row, message, change in (
+        ("emdm", "discriminator_rate is .*, given 0.5", dict(learning_rate=0.5)),
+        ("ddpm_1000", "learning_rate is .*, given 0.5", dict(learning_rate=0.5)),
+        ("emdm", "seed is 0, given 3", dict(seed=3)),
+        ("emdm", "data is .* .other data.", dict(given=other)),
+        ("emdm", "has 4 steps, expected at most the 3", dict(steps=3)),
+    ):
+        with pytest.raises(ValueError, match=f"{row}: .*{message}"):
+            fit(trained, row, **change)
         assert checkpoint.latest_step(trained / row / "checkpoints") == 4
 
 
@@ -340,9 +356,9 @@ def test_settings_come_back_with_their_system(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "no run folder of.*config.json"),
-        ("{", "no run folder"),
-        ("[1]", "no run folder"),
+        (None, "config.json: no such file: expected a run folder of"),
+        ("{", "config.json: not JSON"),
+        ("[1]", "config.json: a JSON list, expected an object"),
         (
             '{"field": "content"}',
             "config.json: field 'system' is None, expected 'emdm'",
@@ -356,6 +372,6 @@ def test_settings_come_back_with_their_system(tmp_path):
 def test_other_folders_are_named(tmp_path, content, message):
     if content is not None:
         (tmp_path / "config.json").write_text(content)
-    with pytest.raises(ValueError, match=message) as error:
+    with pytest.raises((OSError, ValueError), match=message) as error:
         emdm_runs.read_config(tmp_path)
     assert str(tmp_path) in str(error.value)

@@ -43,7 +43,7 @@ BAD = {
     "no system": (lambda v: v.pop("system"), "'system' is None"),
     "unknown field": (
         lambda v: v["config"].update(size=3),
-        "'config' has unknown.*size",
+        "'config': has unknown.*size",
     ),
     "no config": (lambda v: v.pop("config"), "config"),
     "no skeleton": (lambda v: v.pop("skeleton"), "skeleton"),
@@ -90,6 +90,49 @@ BAD = {
         lambda v: v["skeleton"].update(parents=[-1, 0.0, 1, 0, 3]),
         "'skeleton'.*parents should be whole numbers, found 0.0",
     ),
+    "config that is a list": (
+        lambda v: v.update(config=[1]),
+        "'config': a JSON list, expected an object",
+    ),
+    "labels that are numbers": (
+        lambda v: v.update(labels=[1, 2]),
+        "'labels': .1, 2., expected a list of different names",
+    ),
+    "odd heads": (
+        lambda v: v["config"].update(heads=3),
+        r"width is 16, expected a multiple of heads \(3\)",
+    ),
+    **{
+        f"{name} {value}": (
+            lambda v, name=name, value=value: v["config"].update({name: value}),
+            f"'config': {name} is .*, expected ",
+        )
+        for name, value in (
+            ("num_steps", 0),
+            ("num_steps", 8.0),
+            ("num_steps", True),
+            ("network", "x"),
+            ("network", None),
+            ("heads", 0),
+            ("width", 10**9),
+            ("width", "16"),
+            ("depth", -1),
+            ("future", 10**6),
+            ("heading", "north"),
+            ("rotation_layout", 3),
+            ("norm", ["post"]),
+            ("fps", -1.0),
+            ("fps", float("nan")),
+            ("dropout", float("inf")),
+            ("dropout", 1.0),
+            ("weight_foot", -1.0),
+            ("weight_foot", 1e300),
+            ("rotation_mean", 0.5),
+            ("rotation_mean", [float("nan")]),
+            ("token_margin", -1),
+            ("token_window", "box"),
+        )
+    },
     "another skeleton": (
         lambda v: v["config"].update(num_joints=7),
         "'skeleton' has 5 entries, the config 7",
