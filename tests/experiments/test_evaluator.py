@@ -89,8 +89,8 @@ BAD = {
     "train --data {clips} --out {new} --label mood": "field 'mood'",
     "train --data {clips} {clips} --out {new}": "data has 2 files, expected one",
     "train --data {clips} --out {new} --frames 30": "--frames is not for kind 'style'",
-    "train --data {clips} --out {new} --held-out 1.5": "between 0 and 1",
-    "train --data {clips} --out {new} --updates 0": "updates is 0, expected at least 1",
+    "train --data {clips} --out {new} --held-out 1.5": "--held-out is 1.5, expected a number in .0, 1.",
+    "train --data {clips} --out {new} --updates 0": "--updates is 0, expected a number in",
     "train --data {clips} --out {clips}": "clips.npz exists; --overwrite",
     "train --data {clips} --out {clips}/below/e.npz": "below",
     "train --kind action --data {clips} --out {new}": "content",
@@ -101,7 +101,7 @@ BAD = {
     "train --kind ball --data {clips} --out {new}": "ball",
     "train --kind ball --data {ball} --out {new} --label style": "expected 'skill'",
     "show {gone}": "gone.npz",
-    "show {clips}": "clips.npz: not an export",
+    "show {clips}": "clips.npz: field .config. is missing",
 }
 
 
