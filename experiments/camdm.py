@@ -371,18 +371,18 @@ class Export:
       run: Run folder of `train`.
       out: File to write; parameters are stored as float16.
       starts: Poses per style that the model itself stands in, stored with it, so that
-        characters start without any recording; 0 for none.
+        characters start without any recording; None for none.
     """
 
     run: Path = Path("runs/camdm")
     out: Path = Path("camdm.npz")
-    starts: int = 0
+    starts: int | None = None
 
 
 def export(args: Export) -> None:
     """Writes the file."""
     model, params, _ = camdm_model.load(args.run)
-    if args.starts:
+    if args.starts is not None:
         run = camdm_runs.load_run(args.run)
         starts = camdm_evaluation.own_starts(run, number=args.starts)
         model = dataclasses.replace(model, starts=starts)

@@ -47,7 +47,9 @@ class Budget:
 _FREE = ("chunk", "save_every", "override")
 
 
-def differences(found: dict[str, Any], given: dict[str, Any], prefix: str = "") -> str:
+def differences(
+    found: dict[str, Any], given: dict[str, Any], *, prefix: str = ""
+) -> str:
     """Fields of a JSON object that another does not agree with, in one line.
 
     Args:
@@ -63,7 +65,7 @@ def differences(found: dict[str, Any], given: dict[str, Any], prefix: str = "") 
     for name, value in given.items():
         old = found.get(name, "not recorded")
         if isinstance(value, dict) and isinstance(old, dict):
-            lines.append(differences(old, value, f"{prefix}{name}."))
+            lines.append(differences(old, value, prefix=f"{prefix}{name}."))
         elif old != value:
             data = " (other data)" if name in ("data", "clips") else ""
             lines.append(
