@@ -22,6 +22,7 @@ import suite
 import tyro
 import workload_diversity as workload
 
+from jaxmotion import files
 from jaxmotion.control import presets
 from jaxmotion.evaluation import table
 from jaxmotion.protocols import provenance, script
@@ -213,7 +214,7 @@ def main() -> None:
     text = table.to_markdown(rows)
     peak = memory.peak()
     print(text, f"{peak['what']}: {peak['bytes'] / memory.GIB:.2f} GiB", sep="\n")
-    (args.out / "diversity.md").write_text(text + "\n")
+    files.write_text(args.out / "diversity.md", text + "\n")
     metrics = [
         suite.Metric(f"memory {x['model']}", x["total"] / memory.GIB, "GiB")
         for x in needs

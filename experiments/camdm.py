@@ -327,6 +327,7 @@ def speeds(args: Speeds) -> None:
     run = camdm_runs.load_run(args.run, args.data)
     out = args.out or args.run / "speeds"
     loop.check_writable(out)
+    script.announce("compiling the rollouts", 40)
     rows, plans, report = camdm_speeds.speed_table(
         run,
         args.speeds,

@@ -129,7 +129,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         "config": lambda x: model_json.config_from_json(camdm.Config, x),
         "skeleton": model_json.skeleton_from_json,
         "labels": model_json.names_from_json,
-        "source": str,
+        "source": lambda x: model_json.names_from_json([x])[0],
     }
     made = {}
     for field, make in parts.items():

@@ -149,7 +149,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         "representation": _representation,
         "labels": model_json.names_from_json,
         "speeds": lambda x: tuple(_numbers("speed", x, least=0.0)),
-        "source": str,
+        "source": lambda x: model_json.names_from_json([x])[0],
     }
     made = {}
     for field, make in parts.items():
