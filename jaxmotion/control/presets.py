@@ -9,7 +9,6 @@ trigger re-plans whenever the command changes.
 * "strafe": moves into the eight directions with a fixed facing, then turns slowly on
   the way, as the published preset of CAMDM does (55 s there).
 * "stop_and_go": travels, stands, travels on.
-* "straight": travels along +z.
 
 Source: ours, after the preset of CAMDM's release (Chen et al. 2024).
 """
@@ -54,12 +53,7 @@ def _stop_and_go() -> list[_Segment]:
     return segments
 
 
-PRESETS = {
-    "forward": _forward,
-    "strafe": _strafe,
-    "stop_and_go": _stop_and_go,
-    "straight": lambda: [(1.0, 0.0, 0.0, 1.0)],
-}
+PRESETS = {"forward": _forward, "strafe": _strafe, "stop_and_go": _stop_and_go}
 
 
 def _unit(degrees: np.ndarray) -> np.ndarray:

@@ -271,6 +271,19 @@ def preset_batch(
     return jax.tree.map(lambda *x: jnp.stack(x), *each)
 
 
+def straight_batch(
+    speed: float, labels: np.ndarray, *, seconds: float, fps: float
+) -> trajectory.Command:
+    """Straight on along +z at one speed (m/s) for each character; 0 to stand."""
+    each = [
+        presets.segment_commands(
+            [(seconds, 0.0, 0.0, speed, int(label))], seconds=seconds, fps=fps
+        )
+        for label in labels
+    ]
+    return jax.tree.map(lambda *x: jnp.stack(x), *each)
+
+
 def steered_rollouts(
     params: Params,
     key: Key,

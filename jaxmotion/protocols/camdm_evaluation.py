@@ -121,8 +121,8 @@ def own_starts(run: Run, *, number: int, seed: int = 0) -> skeleton.Motion:
     found = []
     for label in range(len(model.labels)):
         labels = np.full(many, label)
-        commands = protocol.preset_batch(
-            "straight", labels, np.zeros(many), seconds=12.0, fps=model.config.fps
+        commands = protocol.straight_batch(
+            0.0, labels, seconds=12.0, fps=model.config.fps
         )
         states = protocol.start_states(
             run.train, model, labels, field=run.field, seed=seed

@@ -119,9 +119,7 @@ def speed_table(
     rows: dict[str, dict[str, table.Cell]] = {}
     plans: dict[str, by_frame.ByFrame] = {}
     for speed in speeds:
-        commands = protocol.preset_batch(
-            "straight", labels, np.full(rollouts, speed), seconds=seconds, fps=fps
-        )
+        commands = protocol.straight_batch(speed, labels, seconds=seconds, fps=fps)
         frames = protocol.steered_rollouts(
             run.params,
             jax.random.key(seed),

@@ -13,7 +13,13 @@ from jaxmotion.systems import camdm_model
 from tests import tiny
 from tests.protocols import samples
 
-EXPERIMENT = {"contents": [], "label": "style", "held_out": 0.3}
+EXPERIMENT = {
+    "contents": [],
+    "label": "style",
+    "labels": [],
+    "held_out": 0.3,
+    "held_out_clips": [],
+}
 
 
 def saved(folder, experiment=None, clips=None):

@@ -102,7 +102,7 @@ def test_files_that_are_no_evaluators_are_named(tmp_path):
     with pytest.raises(ValueError, match=str(path)):
         evaluators.load(path)
     clips_io.save_clips(path, tiny.clips())
-    with pytest.raises(ValueError, match=f"{path}: not an export"):
+    with pytest.raises(ValueError, match=f"{path}: field 'config' is missing"):
         evaluators.load(path)
     evaluators.save(path, samples.evaluator())
     content = path.read_bytes()
