@@ -119,9 +119,11 @@ function draw() {
   clock.textContent = (now / data.fps).toFixed(2) + " s of " +
     ((frames - 1) / data.fps).toFixed(2) + " s";
 }
-let last = performance.now();
+let last = null;
 function loop(time) {
-  if (playing) frame = (frame + (time - last) / 1000 * data.fps) % frames;
+  // The first time of an animation may lie before the script's own.
+  if (playing && last !== null)
+    frame = (frame + (time - last) / 1000 * data.fps) % frames;
   last = time; draw(); requestAnimationFrame(loop);
 }
 function toggle() {
