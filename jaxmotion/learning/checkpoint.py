@@ -206,7 +206,8 @@ def _foreign(folder: Path, step: int, error: Exception) -> CheckpointError:
 
 
 def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
+    # Orbax tells whole stories in one line.
+    return (str(error).splitlines() or [type(error).__name__])[0][:300]
 
 
 def _check_shapes(folder: Path, step: int, like: Any, found: Any) -> None:

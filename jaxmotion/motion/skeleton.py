@@ -113,7 +113,7 @@ def check_skeleton(*, offsets: Any, parents: Any, names: Any, feet: Any) -> None
     count = len(parents)
     try:
         found = np.asarray(offsets, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"offsets should be {count} rows of 3 numbers") from None
     if found.shape != (count, 3):
         raise ValueError(f"offsets have shape {found.shape}, expected {(count, 3)}")

@@ -12,7 +12,6 @@ as two and two.
 import dataclasses
 import functools
 import json
-import zipfile
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,9 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion import files
-from jaxmotion.data import clips_io, mirror, selection
+from jaxmotion.data import clips_io, mirror, npz, selection
 from jaxmotion.learning import checkpoint, training
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion import pose
+from jaxmotion.motion.skeleton import MAX_METRES, Skeleton
 from jaxmotion.protocols import aamdm_data, aamdm_stages, stages
 from jaxmotion.protocols.aamdm_data import PoseData
 from jaxmotion.protocols.aamdm_stages import Budget
@@ -34,8 +34,6 @@ from jaxmotion.systems import (
 )
 from jaxmotion.systems.aamdm_space import Autoencoder, Space
 
-# What a JSON or an archive of another kind leads to.
-_WRONG = (AttributeError, TypeError, ValueError)
 SpaceName = Literal["embedded", "full_pose"]
 
 
@@ -145,34 +143,78 @@ def load_run(folder: Path) -> Run:
       ValueError: if it is no run folder of AAMDM; names the file and the field.
     """
     path = folder / "config.json"
-    try:
-        value = files.read_object(path, what="expected a run folder of AAMDM")
-        if value.get("system") != "aamdm":
+    for needed in (path, folder / "frames.npz"):
+        if not needed.is_file():
             raise ValueError(
-                f"field 'system' is {value.get('system')!r}, expected 'aamdm'"
+                f"{folder}: no run folder of `experiments/aamdm.py train`: {needed.name} "
+                "is missing"
             )
-        with np.load(folder / "frames.npz", allow_pickle=False) as file:
-            data = PoseData(
-                poses=jnp.asarray(file["poses"]),
-                paths=jnp.asarray(file["paths"]),
-                offsets=jnp.asarray(file["offsets"]),
-                fps=float(value["fps"]),
-            )
-        train, held_out = aamdm_data.split_ends(data, value["held_out"])
-        return Run(
-            folder=folder,
-            bones=model_json.skeleton_from_json(value["skeleton"]),
-            train=train,
-            held_out=held_out,
-            source=value["source"],
-            config=value,
-        )
-    except KeyError as error:
-        raise ValueError(f"{path}: field {error} is missing") from error
-    except (OSError, EOFError, zipfile.BadZipFile, *_WRONG) as error:
+    value = files.read_object(
+        path, what="expected a run folder of `experiments/aamdm.py train`"
+    )
+    if value.get("system") != "aamdm":
         raise ValueError(
-            f"{folder}: no run folder of `experiments/aamdm.py train`: {error}"
-        ) from error
+            f"{path}: field 'system' is {value.get('system')!r:.80}, expected 'aamdm'"
+        )
+    for name in ("skeleton", "fps", "held_out", "source"):
+        if name not in value:
+            raise ValueError(f"{path}: field {name!r} is missing")
+    limits = {"fps": (5, clips_io.RATES[1]), "held_out": (0, 1)}
+    for name, (low, high) in limits.items():
+        right = isinstance(value[name], int | float) and low < value[name] < high
+        if not right or isinstance(value[name], bool):
+            raise ValueError(
+                f"{path}: field {name!r} is {value[name]!r:.80}, expected more than "
+                f"{low:g} and less than {high:g}"
+            )
+    if not isinstance(value["source"], str):
+        raise ValueError(f"{path}: field 'source' is no text: {value['source']!r:.80}")
+    try:
+        bones = model_json.skeleton_from_json(value["skeleton"])
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"{path}: field 'skeleton': {error}") from None
+    frames = _read_frames(folder / "frames.npz", bones, fps=float(value["fps"]))
+    try:
+        train, held_out = aamdm_data.split_ends(frames, value["held_out"])
+    except ValueError as error:
+        raise ValueError(f"{folder}: {error}") from None
+    return Run(
+        folder=folder,
+        bones=bones,
+        train=train,
+        held_out=held_out,
+        source=value["source"],
+        config=value,
+    )
+
+
+def _read_frames(path: Path, bones: Skeleton, *, fps: float) -> PoseData:
+    """The frames of a run folder; raises unless its arrays agree."""
+    arrays = files.read_arrays(path, name=str(path), what="frame")
+    wanted = {"poses": ("f", 2), "paths": ("f", 2), "offsets": ("i", 1)}
+    npz.check_fields(str(path), arrays, wanted)
+    offsets = arrays["offsets"].astype(np.int64)
+    number = offsets[-1] if offsets.size else 0
+    if offsets.size < 2 or offsets[0] != 0 or (np.diff(offsets) < 1).any():
+        raise ValueError(f"{path}: field 'offsets' should ascend from 0")
+    features = {"poses": pose.pose_layout(bones.num_joints).size, "paths": 12}
+    for name, size in features.items():
+        shape = arrays[name].shape
+        if shape != (number, size):
+            raise ValueError(
+                f"{path}: field {name!r} has shape {shape}, expected {(number, size)}"
+            )
+        # Positions, velocities and directions; also keeps them within float32.
+        if not (np.abs(arrays[name].astype(np.float64)) <= MAX_METRES).all():
+            raise ValueError(
+                f"{path}: field {name!r} has numbers that are not within {MAX_METRES:g}"
+            )
+    return PoseData(
+        poses=jnp.asarray(arrays["poses"], jnp.float32),
+        paths=jnp.asarray(arrays["paths"], jnp.float32),
+        offsets=jnp.asarray(offsets, jnp.int32),
+        fps=fps,
+    )
 
 
 def train_autoencoder(run: Run, budget: Budget) -> Autoencoder:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.learning import checkpoint
-from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.skeleton import MAX_METRES, Motion, Skeleton
 from jaxmotion.systems import camdm, model_json
 from jaxmotion.typing import Params
 
@@ -86,10 +86,10 @@ def _starts_from_json(value: Any, config: camdm.Config, where: str) -> Motion | 
         return None
     try:
         root, joints = (
-            np.asarray(value[name], np.float32)
+            np.asarray(value[name], np.float64)
             for name in ("root_position", "joint_rotation")
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{where}: field 'starts' is wrong: {error}") from None
     number = root.shape[1] if root.ndim > 1 else 0
     lead = (config.num_labels, number, config.past)
@@ -99,11 +99,13 @@ def _starts_from_json(value: Any, config: camdm.Config, where: str) -> Motion | 
             f"{where}: field 'starts' has shapes {root.shape} and {joints.shape}, "
             f"expected {expected[0]} and {expected[1]} of at least one start per label"
         )
-    if not (np.isfinite(root).all() and np.isfinite(joints).all()):
-        raise ValueError(f"{where}: field 'starts' has numbers that are not finite")
+    if not all((np.abs(x) <= MAX_METRES).all() for x in (root, joints)):
+        raise ValueError(
+            f"{where}: field 'starts' has numbers that are not within {MAX_METRES:g}"
+        )
     return Motion(
-        root_position=jnp.asarray(root),
-        joint_rotation=jnp.asarray(joints),
+        root_position=jnp.asarray(root, jnp.float32),
+        joint_rotation=jnp.asarray(joints, jnp.float32),
         fps=config.fps,
     )
 

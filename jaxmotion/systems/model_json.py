@@ -28,7 +28,7 @@ def skeleton_to_json(bones: Skeleton) -> dict[str, Any]:
     }
 
 
-def skeleton_from_json(value: dict[str, Any]) -> Skeleton:
+def skeleton_from_json(value: Any) -> Skeleton:
     """Inverse of `skeleton_to_json`.
 
     Args:
@@ -38,9 +38,11 @@ def skeleton_from_json(value: dict[str, Any]) -> Skeleton:
       The skeleton.
 
     Raises:
-      KeyError, TypeError: if a field is missing or of the wrong type.
+      KeyError: if a field is missing.
       ValueError: if the fields are not those of a skeleton; says what is wrong.
     """
+    if not isinstance(value, dict):
+        raise ValueError(f"a JSON {type(value).__name__}, expected an object")
     fields = {name: value[name] for name in ("offsets", "parents", "names", "feet")}
     for name, found in fields.items():
         if not isinstance(found, list):
@@ -97,7 +99,7 @@ def _check_field(name: str, kind: Any, value: Any) -> Any:
         raise TypeError(f"{name}: no rule for {kind}")
     if not right:
         raise ValueError(f"{name} is {value!r:.60}, expected {expected}")
-    return value
+    return float(value) if kind is float else value
 
 
 def config_from_json(kind: type, value: Any) -> Any:

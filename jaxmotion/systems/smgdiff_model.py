@@ -5,7 +5,6 @@ model can be used without the experiment or the data that made it.
 """
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -99,10 +98,12 @@ def _numbers(name: str, value: Any, *, least: float) -> list[float]:
     return value
 
 
-def _representation(value: Mapping[str, Any]) -> Representation:
+def _representation(value: Any) -> Representation:
+    if not isinstance(value, dict):
+        raise ValueError(f"a JSON {type(value).__name__}, expected an object")
     bones = model_json.skeleton_from_json(value["skeleton"])
     joints = value["joints"]
-    right = isinstance(joints, list) and all(isinstance(x, int) for x in joints)
+    right = isinstance(joints, list) and all(type(x) is int for x in joints)
     if not right or not all(0 <= x < bones.num_joints for x in joints):
         raise ValueError(
             f"joints is {joints!r:.60}, expected numbers below {bones.num_joints}"
@@ -122,7 +123,7 @@ def _representation(value: Mapping[str, Any]) -> Representation:
             std=jnp.asarray(value["std"], jnp.float32),
         ),
         joints=tuple(joints),
-        **{name: value[name] for name in scalars},
+        **{name: float(value[name]) for name in scalars},
     )
 
 

@@ -148,7 +148,7 @@ def test_characters_start_in_poses_of_the_models_own(run):
         (lambda v: v["starts"].pop("joint_rotation"), "'starts' is wrong"),
         (
             lambda v: v["starts"]["root_position"][0][0][0].__setitem__(0, np.nan),
-            "'starts' has numbers that are not finite",
+            "'starts' has numbers that are not within",
         ),
     ):
         bad = copy.deepcopy(value)
