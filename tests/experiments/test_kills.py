@@ -56,8 +56,13 @@ def start(system, folder, out):
 
 
 def rows(out):
-    """Rows of losses so far, of all stages."""
-    return sum(path.read_bytes().count(b"\n") for path in out.rglob("losses.jsonl"))
+    """Rows of losses so far, of all stages; checkpoints come and go meanwhile."""
+    number = 0
+    for place, folders, files in os.walk(out):
+        folders[:] = [name for name in folders if name != "checkpoints"]
+        if "losses.jsonl" in files:
+            number += Path(place, "losses.jsonl").read_bytes().count(b"\n")
+    return number
 
 
 def kill_some(system, folder, out, kills, generator):
@@ -77,7 +82,7 @@ def kill_some(system, folder, out, kills, generator):
             if rows(out) >= known + more and (more or time.monotonic() > begun + wait):
                 time.sleep(0.0 if early else wait)
                 break
-            time.sleep(0.005)
+            time.sleep(0.02)
         if made < kills and process.poll() is None:
             process.send_signal(signal.SIGKILL)
             made += process.wait() == -signal.SIGKILL
@@ -132,7 +137,8 @@ def main(folder, *wanted):
         begun = time.monotonic()
         made, found, torn = check(system, folder, int(kills))
         seconds = time.monotonic() - begun
-        print(f"{system}: {made} kills, {seconds:.0f} s, rows {found}, left {torn}")
+        words = f"{system}: {made} kills, {seconds:.0f} s, rows {found}, left {torn}"
+        print(words, flush=True)
 
 
 if __name__ == "__main__":
