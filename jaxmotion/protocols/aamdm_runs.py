@@ -146,8 +146,8 @@ def load_run(folder: Path) -> Run:
     for needed in (path, folder / "frames.npz"):
         if not needed.is_file():
             raise ValueError(
-                f"{folder}: no run folder of `experiments/aamdm.py train`: {needed.name} "
-                "is missing"
+                f"{folder}: no run folder of `experiments/aamdm.py train`: "
+                f"{needed.name} is missing"
             )
     value = files.read_object(
         path, what="expected a run folder of `experiments/aamdm.py train`"
