@@ -179,7 +179,7 @@ def test_what_was_held_out_is_not_trained_on(texts):
 BAD = {
     "sample --run {actions} --action jump": "unknown action 'jump'",
     "sample --run {actions} --action run --frames 21": "21 frames, the model makes",
-    "sample --run {actions} --action run --frames 0": "0 frames, the model makes",
+    "sample --run {actions} --action run --frames 0": "--frames is 0, expected a",
     "sample --run {actions} --text walk": "not from 'text'",
     "sample --run {actions}": "expected --action",
     "sample --run {texts} --text TEXT:": "empty",
