@@ -181,10 +181,13 @@ def load(path: Path) -> Evaluator:
     for name, wanted in expected.items():
         _require(path, name, value.get(name), wanted)
     for name, kind in _FIELDS.items():
-        if not isinstance(value.get(name), kind):
+        right = isinstance(value.get(name), kind)
+        if kind is list:
+            right = right and all(isinstance(x, str) for x in value[name])
+        if not right or isinstance(value[name], bool):
             raise checkpoint.CheckpointError(
                 f"{path}: field {name!r} is {value.get(name)!r}, expected "
-                f"{kind.__name__}"
+                f"{'names' if kind is list else kind.__name__}"
             )
     if value["kind"] not in Kind.__args__:
         raise checkpoint.CheckpointError(

@@ -87,7 +87,7 @@ def to_json(model: Model) -> dict[str, Any]:
     }
 
 
-def _numbers(name: str, value: Any, *, least: float) -> list[float]:
+def _numbers(name: str, value: Any, *, least: float) -> list[int | float]:
     """A list of finite numbers; raises if it is none."""
     if not isinstance(value, list):
         raise ValueError(f"{name} is {value!r:.60}, expected a list of numbers")

@@ -28,7 +28,7 @@ COMMANDS = {
     "--polisher-steps 2500 --generator-steps 2500 --batch 4 --width 8",
     "emdm": "--task action --field style --least 2 --held-out 0.3 --frames 20 --merge "
     "--rows emdm ddpm_50 --steps 2500 --ddpm-steps 2500 --batch 2 --width 8 --depth 1 "
-    "--hidden 8 --discriminator-width 8",
+    "--hidden 8 --discriminator-width 64",
     "smgdiff": "--width 8 --depth 1 --steps 2500 --draft-steps 1500 --path-steps 2500 "
     "--batch 2 --held-out 0.3",
 }
