@@ -3,7 +3,7 @@
 Losses of 20 updates, a rollout, rows of an evaluation and of a sweep, by the scripts as
 users call them, with tiny models; and the metrics of the quickstart.
 
-python -m tests.same_numbers write          what the code computes now becomes the record
+python -m tests.same_numbers write          makes what is computed now the record
 python -m tests.same_numbers check          says what differs from the record
 python -m tests.same_numbers check camdm    of one system
 """

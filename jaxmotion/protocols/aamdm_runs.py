@@ -312,4 +312,4 @@ def load_space(run: Run, name: SpaceName) -> Space:
         own = Autoencoder(params=params, statistics=statistics, config=config)
         return _space(run, own)
 
-    return aamdm_stages.load_space(run.folder / name, like)
+    return aamdm_stages.restore_space(run.folder / name, like)

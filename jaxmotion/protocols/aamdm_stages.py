@@ -62,7 +62,7 @@ def save_space(folder: Path, space: Space, config: dict[str, Any]) -> None:
     checkpoint.save(folder / "checkpoints", 0, leaves, value)
 
 
-def load_space(folder: Path, like: Callable[[], Space]) -> Space:
+def restore_space(folder: Path, like: Callable[[], Space]) -> Space:
     """Reads what `save_space` wrote.
 
     Args:

@@ -184,7 +184,7 @@ def test_one_stage_is_not_taken_for_another(trained):
     for read in (
         lambda: aamdm_stages.check_stage(folder, "generator"),
         lambda: aamdm_stages.load_params(folder, "generator", init, adversarial=True),
-        lambda: aamdm_stages.load_space(folder, lambda: space(None)),
+        lambda: aamdm_stages.restore_space(folder, lambda: space(None)),
     ):
         with pytest.raises(checkpoint.CheckpointError, match=str(folder)) as error:
             read()
@@ -203,7 +203,7 @@ def test_a_folder_without_checkpoints_is_named(tmp_path):
     for read in (
         lambda: aamdm_stages.check_stage(tmp_path, "polisher"),
         lambda: aamdm_stages.load_params(tmp_path, "polisher", init),
-        lambda: aamdm_stages.load_space(tmp_path, lambda: space(None)),
+        lambda: aamdm_stages.restore_space(tmp_path, lambda: space(None)),
     ):
         with pytest.raises(checkpoint.CheckpointError, match=str(tmp_path)):
             read()
@@ -269,9 +269,9 @@ def space(autoencoder):
 def test_a_space_is_read_back(tmp_path, embedded):
     made = space(embedded)
     aamdm_stages.save_space(tmp_path, made, {"source": "tests"})
-    found = aamdm_stages.load_space(tmp_path, lambda: jax.tree.map(jnp.copy, made))
+    found = aamdm_stages.restore_space(tmp_path, lambda: jax.tree.map(jnp.copy, made))
     assert jax.tree.structure(found) == jax.tree.structure(made)
     assert_same(found, made)
     with pytest.raises(checkpoint.CheckpointError, match=str(tmp_path)):
         other = space(not embedded)
-        aamdm_stages.load_space(tmp_path, lambda: jax.tree.map(jnp.copy, other))
+        aamdm_stages.restore_space(tmp_path, lambda: jax.tree.map(jnp.copy, other))
