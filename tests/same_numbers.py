@@ -28,7 +28,7 @@ TRAIN = {
     "camdm": "--held-out 0.5 --contents --width 16 --depth 1 --batch 2 --warmup 1 "
     "--diffusion-steps 2 --chunk 10 --save-every 10 --steps 20",
     "aamdm": "--field style --labels --rows aamdm --autoencoder-steps 20 "
-    "--polisher-steps 20 --generator-steps 20 --batch 4 --width 8",
+    "--polisher-steps 20 --generator-steps 20 --batch 4 --width 32",
     "emdm": "--task action --field style --least 2 --held-out 0.3 --frames 20 --merge "
     "--rows emdm ddpm_50 --steps 20 --ddpm-steps 20 --batch 2 --width 8 --depth 1 "
     "--hidden 8 --discriminator-width 64",

@@ -25,7 +25,7 @@ COMMANDS = {
     "camdm": "--held-out 0.5 --contents --width 16 --depth 1 --batch 2 --warmup 1 "
     "--diffusion-steps 2 --chunk 2 --save-every 4 --steps 200",
     "aamdm": "--field style --labels --rows aamdm --autoencoder-steps 2500 "
-    "--polisher-steps 2500 --generator-steps 2500 --batch 4 --width 8",
+    "--polisher-steps 2500 --generator-steps 2500 --batch 4 --width 32",
     "emdm": "--task action --field style --least 2 --held-out 0.3 --frames 20 --merge "
     "--rows emdm ddpm_50 --steps 2500 --ddpm-steps 2500 --batch 2 --width 8 --depth 1 "
     "--hidden 8 --discriminator-width 64",
