@@ -19,13 +19,16 @@ import tyro
 import workload
 from jaxtyping import Array
 
+from jaxmotion import cli
 from jaxmotion.control import rollout
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import training
-from jaxmotion.protocols import camdm_training, script
-from jaxmotion.systems import camdm, camdm_control, camdm_loss, camdm_model
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import loss as camdm_loss
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.typing import Key, Params
 
 COLUMNS = {
@@ -94,7 +97,10 @@ def phases(name: str, function: Callable, given: tuple) -> dict[str, Any]:
 
 
 def unrolled(
-    config: camdm.Config, params: Params, key: Key, condition: camdm.Condition
+    config: camdm_model.Config,
+    params: Params,
+    key: Key,
+    condition: camdm_model.Condition,
 ) -> Array:
     """The sampler with a Python loop over the steps, for comparison.
 
@@ -108,7 +114,7 @@ def unrolled(
       Clean features.
     """
     table = schedule.cosine_schedule(config.num_steps)
-    net = camdm.network(config)
+    net = camdm_model.network(config)
     arguments = condition.arguments(config)
     context = net.apply({"params": params}, *arguments, method="encode")
 
@@ -169,8 +175,8 @@ def programs(args: Config) -> Iterator[tuple[str, Callable, tuple]]:
         (),
     )
 
-    def scanned(params: Params, key: Key, condition: camdm.Condition) -> Array:
-        return camdm.planner(params, config=config)(key, condition)
+    def scanned(params: Params, key: Key, condition: camdm_model.Condition) -> Array:
+        return camdm_model.planner(params, config=config)(key, condition)
 
     condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
     given = (params, jax.random.key(1), condition)
@@ -181,7 +187,7 @@ def programs(args: Config) -> Iterator[tuple[str, Callable, tuple]]:
     yield name, *training_program(args, model, params, clips)
 
     def rolled(params: Params, key: Key, states: Any, commands: Any) -> Any:
-        controller = camdm_control.controller(params, model.bones, config=config)
+        controller = camdm_controller.controller(params, model.bones, config=config)
         return rollout.rollout(controller, key, states, commands)
 
     steered = workload.steered(model, clips, args.characters, seconds=args.seconds)
@@ -204,4 +210,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

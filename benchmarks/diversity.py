@@ -22,10 +22,9 @@ import suite
 import tyro
 import workload_diversity as workload
 
-from jaxmotion import files
+from jaxmotion import cli, files, reporting
 from jaxmotion.control import presets
 from jaxmotion.evaluation import table
-from jaxmotion.protocols import provenance, script
 
 WALKER = Path(__file__).parents[1] / "jaxmotion" / "assets" / "walker.npz"
 
@@ -227,9 +226,9 @@ def main() -> None:
         memory=needs,
         peak_memory=peak,
         seeds=list(range(args.seed, args.seed + args.sets)),
-        commit=provenance.git_commit(),
+        commit=reporting.git_commit(),
     )
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

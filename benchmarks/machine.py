@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from jaxmotion.protocols import provenance
+from jaxmotion import reporting
 
 
 def busy() -> tuple[float, float, float] | None:
@@ -94,7 +94,7 @@ def environment() -> dict[str, Any]:
     return {
         "device": str(jax.devices()[0]),
         "devices": len(jax.devices()),
-        "cpu": provenance.processor(),
+        "cpu": reporting.processor(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         **versions("jax", "jaxlib", "flax", "numpy", "jaxmotion"),

@@ -27,8 +27,8 @@ import torch_camdm
 import tyro
 import workload
 
-from jaxmotion.protocols import script
-from jaxmotion.systems import camdm
+from jaxmotion import cli
+from jaxmotion.systems.camdm import model as camdm_model
 
 EAGER = "torch eager"
 OURS = "ours, constants"
@@ -82,7 +82,9 @@ class Config:
     gate: Path | None = None
 
 
-def our_calls(config: camdm.Config, params: Any, given: tuple) -> dict[str, Callable]:
+def our_calls(
+    config: camdm_model.Config, params: Any, given: tuple
+) -> dict[str, Callable]:
     """Compiled plans: parameters as arguments, and as constants.
 
     Args:
@@ -93,8 +95,8 @@ def our_calls(config: camdm.Config, params: Any, given: tuple) -> dict[str, Call
     Returns:
       Calls without arguments.
     """
-    free = jax.jit(lambda p, k, c: camdm.planner(p, config=config)(k, c))
-    bound = jax.jit(lambda k, c: camdm.planner(params, config=config)(k, c))
+    free = jax.jit(lambda p, k, c: camdm_model.planner(p, config=config)(k, c))
+    bound = jax.jit(lambda k, c: camdm_model.planner(params, config=config)(k, c))
     free, _ = timing.compile_program(free, params, *given)
     bound, _ = timing.compile_program(bound, *given)
     return {
@@ -104,7 +106,10 @@ def our_calls(config: camdm.Config, params: Any, given: tuple) -> dict[str, Call
 
 
 def compiled_call(
-    net: torch.nn.Module, config: camdm.Config, condition: camdm.Condition, limit: int
+    net: torch.nn.Module,
+    config: camdm_model.Config,
+    condition: camdm_model.Condition,
+    limit: int,
 ) -> tuple[Callable | None, str]:
     """The same through torch.compile, if that works within a time.
 
@@ -137,7 +142,10 @@ def compiled_call(
 
 
 def largest_difference(
-    config: camdm.Config, params: Any, net: torch.nn.Module, condition: camdm.Condition
+    config: camdm_model.Config,
+    params: Any,
+    net: torch.nn.Module,
+    condition: camdm_model.Condition,
 ) -> float:
     """Largest difference of the two forward passes, at the last step.
 
@@ -153,7 +161,7 @@ def largest_difference(
     given = condition.arguments(config)
     x_t = np.ones((config.future, config.num_features), np.float32)
     t = config.num_steps
-    ours = jax.jit(camdm.network(config).apply)(
+    ours = jax.jit(camdm_model.network(config).apply)(
         {"params": params}, x_t, jnp.int32(t), *given
     )
     theirs = [torch.from_numpy(np.array(x)[None]) for x in given[:4]]
@@ -229,7 +237,7 @@ def main() -> None:
     threads = machine.use_cores(args.threads)
     torch.set_num_threads(threads)
     config = workload.paper_config(steps=args.steps)
-    params = camdm.init(jax.random.key(0), config)
+    params = camdm_model.init(jax.random.key(0), config)
     condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
     nets = [
         torch_camdm.load(torch_camdm.TorchCamdm(config, batch_first=first), params)
@@ -281,4 +289,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

@@ -18,8 +18,8 @@ import tyro
 import workload
 import workload_aamdm
 
+from jaxmotion import cli
 from jaxmotion.control import rollout
-from jaxmotion.protocols import script
 
 # Characters at a time unless told: what was fastest on two cores.
 CHUNKS = {"camdm": (4,), "aamdm": (0,)}
@@ -242,4 +242,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

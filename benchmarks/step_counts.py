@@ -22,8 +22,8 @@ import workload_emdm
 import workload_smgdiff
 from jaxtyping import Array
 
-from jaxmotion.protocols import script
-from jaxmotion.systems import camdm
+from jaxmotion import cli
+from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.typing import Params
 from jaxmotion.viz import figure
 
@@ -84,7 +84,7 @@ class Config:
 
 
 def sampler(
-    config: camdm.Config, params: Params, batch: int, chunk: int, arguments: bool
+    config: camdm_model.Config, params: Params, batch: int, chunk: int, arguments: bool
 ) -> tuple[Callable, tuple]:
     """One batch of plans as a jitted function.
 
@@ -99,8 +99,8 @@ def sampler(
       The function and its arguments.
     """
 
-    def plans(params: Params, keys: Array, conditions: camdm.Condition) -> Array:
-        plan = camdm.planner(params, config=config)
+    def plans(params: Params, keys: Array, conditions: camdm_model.Condition) -> Array:
+        plan = camdm_model.planner(params, config=config)
         if batch == 1:
             return plan(keys[0], jax.tree.map(lambda x: x[0], conditions))
         if not chunk or batch < 16:
@@ -152,7 +152,7 @@ def program(
     config = workload.paper_config(
         steps=steps, width=args.width or 256, frames_per_token=args.frames_per_token
     )
-    params = camdm.init(jax.random.key(0), config)
+    params = camdm_model.init(jax.random.key(0), config)
     run, given = sampler(config, params, batch, args.chunk, args.arguments)
     return run, given, config.future
 
@@ -238,4 +238,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

@@ -16,13 +16,13 @@ from torch import nn
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.networks import blocks
-from jaxmotion.systems import camdm
+from jaxmotion.systems.camdm import model as camdm_model
 
 
 class TorchCamdm(nn.Module):
     """The denoiser, for a batch: `forward(x_t, t, past, path, facing, label)`."""
 
-    def __init__(self, config: camdm.Config, *, batch_first: bool = False):
+    def __init__(self, config: camdm_model.Config, *, batch_first: bool = False):
         """Makes it with random weights.
 
         Args:
@@ -203,7 +203,7 @@ def posterior_table(beta: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def plan_call(
-    net: Callable, config: camdm.Config, condition: camdm.Condition
+    net: Callable, config: camdm_model.Config, condition: camdm_model.Condition
 ) -> Callable[[], torch.Tensor]:
     """One plan in PyTorch, with its own noise drawn in the call as ours is.
 

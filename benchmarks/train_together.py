@@ -24,10 +24,14 @@ import timing
 import tyro
 import workload
 
+from jaxmotion import cli
 from jaxmotion.data import windows
 from jaxmotion.learning import training
-from jaxmotion.protocols import camdm_training, script
-from jaxmotion.systems import aamdm, aamdm_loss, camdm, camdm_loss
+from jaxmotion.systems.aamdm import loss as aamdm_loss
+from jaxmotion.systems.aamdm import model as aamdm_model
+from jaxmotion.systems.camdm import loss as camdm_loss
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.typing import Key
 
 COLUMNS = {
@@ -102,7 +106,7 @@ def camdm_program(width: int, batch: int) -> Program:
         update=training.make_update(loss, optimizer),
         sample=camdm_training.window_sampler(field="style", batch=batch),
         init=lambda key: training.init_train_state(
-            camdm.init(key, model.config), optimizer
+            camdm_model.init(key, model.config), optimizer
         ),
         data=(clips, windows.window_index(clips, model.config.window)),
     )
@@ -118,13 +122,13 @@ def aamdm_program(width: int, batch: int) -> Program:
     Returns:
       The program.
     """
-    config = aamdm.Config(features=64, width=width)
+    config = aamdm_model.Config(features=64, width=width)
     optimizer = training.radam()
     shape = (4096, config.window + 1, config.features)
     frames = np.random.default_rng(0).normal(size=shape)
 
     def init(key: Key) -> training.TrainState:
-        params = aamdm.init(key, config)["polisher"]
+        params = aamdm_model.init(key, config)["polisher"]
         return training.init_train_state(params, optimizer)
 
     def sample(key: Key, data: jax.Array) -> jax.Array:
@@ -218,4 +222,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

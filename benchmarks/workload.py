@@ -13,8 +13,9 @@ from jaxmotion.control.rollout import Controller
 from jaxmotion.data import procedural
 from jaxmotion.data.clips import Clips
 from jaxmotion.motion import trajectory
-from jaxmotion.protocols import camdm as protocol
-from jaxmotion.systems import camdm, camdm_control, camdm_model
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.typing import Params
 
 
@@ -43,7 +44,7 @@ class Load:
 
 def paper_config(
     *, steps: int = 8, width: int = 256, frames_per_token: int = 1, **sizes: Any
-) -> camdm.Config:
+) -> camdm_model.Config:
     """The paper's network: 25 joints and 100 styles, 3.44 million parameters.
 
     Args:
@@ -56,7 +57,7 @@ def paper_config(
       The configuration.
     """
     defaults = {"num_joints": 25, "num_labels": 100}
-    return camdm.Config(
+    return camdm_model.Config(
         **(defaults | sizes),
         num_steps=steps,
         width=width,
@@ -65,7 +66,7 @@ def paper_config(
     )
 
 
-def conditions(config: camdm.Config, batch: int) -> camdm.Condition:
+def conditions(config: camdm_model.Config, batch: int) -> camdm_model.Condition:
     """A batch of conditions of plausible size; their values do not change the time.
 
     Args:
@@ -81,7 +82,7 @@ def conditions(config: camdm.Config, batch: int) -> camdm.Condition:
     normal = lambda *shape: jnp.asarray(  # noqa: E731
         rng.normal(size=(batch, *shape)), jnp.float32
     )
-    return camdm.Condition(
+    return camdm_model.Condition(
         past=normal(config.past, config.num_features),
         trajectory=trajectory.Trajectory(
             position=normal(config.future, 2), facing=jnp.asarray(facing, jnp.float32)
@@ -116,7 +117,7 @@ def walker_model(
         model = camdm_model.Model(
             config=config, bones=clips.skeleton, labels=labels, source=clips.source
         )
-        return model, camdm.init(jax.random.key(0), config)
+        return model, camdm_model.init(jax.random.key(0), config)
     model, params, _ = camdm_model.load(run)
     if (model.labels, model.bones.names) != (labels, clips.skeleton.names):
         raise ValueError(
@@ -133,7 +134,7 @@ def steered(
     *,
     seconds: float,
     staggered: bool = False,
-) -> tuple[camdm_control.CharacterState, trajectory.Command]:
+) -> tuple[camdm_controller.CharacterState, trajectory.Command]:
     """Start states, and commands of the preset "forward" at 1 m/s.
 
     Args:
@@ -148,10 +149,10 @@ def steered(
       States [characters], commands [characters, ticks].
     """
     labels = np.arange(characters) % len(model.labels)
-    states = protocol.start_states(clips, model, labels, field="style", seed=0)
+    states = camdm_steering.start_states(clips, model, labels, field="style", seed=0)
     fps = model.config.fps
     ticks, extra = round(seconds * fps), 30.0 if staggered else 0.0
-    commands = protocol.preset_batch(
+    commands = camdm_steering.preset_batch(
         "forward", labels, np.ones(characters), seconds=seconds + extra, fps=fps
     )
     places = np.random.default_rng(0).integers(0, round(extra * fps) + 1, characters)
@@ -178,7 +179,7 @@ def camdm_load(
     model, params = walker_model(clips, run, **sizes)
     return Load(
         params=params,
-        controller=lambda params: camdm_control.controller(
+        controller=lambda params: camdm_controller.controller(
             params, model.bones, config=model.config
         ),
         start=lambda number: steered(

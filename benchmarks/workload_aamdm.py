@@ -13,15 +13,21 @@ import workload
 from jaxmotion.data import procedural
 from jaxmotion.diffusion import schedule
 from jaxmotion.motion import pose, trajectory
-from jaxmotion.motion.layout import unpack
-from jaxmotion.protocols import aamdm_chains, aamdm_data, aamdm_runs
-from jaxmotion.systems import aamdm, aamdm_control, aamdm_embedding, aamdm_space
+from jaxmotion.motion.features import unpack
+from jaxmotion.systems.aamdm import controller as aamdm_controller
+from jaxmotion.systems.aamdm import data as aamdm_data
+from jaxmotion.systems.aamdm import embedding as aamdm_embedding
+from jaxmotion.systems.aamdm import model as aamdm_model
+from jaxmotion.systems.aamdm import space as aamdm_space
+from jaxmotion.systems.aamdm import training as aamdm_training
 from jaxmotion.typing import Params
 
 FPS = 60.0
 
 
-def _random(width: int) -> tuple[aamdm.Config, Params, aamdm_space.Space, Any, int]:
+def _random(
+    width: int,
+) -> tuple[aamdm_model.Config, Params, aamdm_space.Space, Any, int]:
     """A character of the procedural walker with untrained networks."""
     clips = procedural.make_clips(minutes=1.0)
     joints = clips.skeleton.num_joints
@@ -35,15 +41,17 @@ def _random(width: int) -> tuple[aamdm.Config, Params, aamdm_space.Space, Any, i
     space = aamdm_space.fit_space(
         data.poses, data.paths, aamdm_data.starts(data, 2), autoencoder=own
     )
-    config = aamdm.Config(features=space.num_features, width=width)
-    return config, aamdm.init(jax.random.key(1), config), space, data, joints
+    config = aamdm_model.Config(features=space.num_features, width=width)
+    return config, aamdm_model.init(jax.random.key(1), config), space, data, joints
 
 
-def _trained(folder: Path) -> tuple[aamdm.Config, Params, aamdm_space.Space, Any, int]:
+def _trained(
+    folder: Path,
+) -> tuple[aamdm_model.Config, Params, aamdm_space.Space, Any, int]:
     """Likewise, of a run folder."""
-    run = aamdm_runs.load_run(folder)
-    space = aamdm_runs.load_space(run, "embedded")
-    params, config = aamdm_chains.load_networks(
+    run = aamdm_training.load_run(folder)
+    space = aamdm_training.load_space(run, "embedded")
+    params, config = aamdm_training.load_networks(
         run, "embedded", space, drafts=3, polishes=2
     )
     return config, params, space, run.held_out, run.bones.num_joints
@@ -63,9 +71,9 @@ def make_load(run: Path | None, *, width: int, seconds: float) -> workload.Load:
     config, params, space, data, joints = _trained(run) if run else _random(width)
 
     def controller(params: Params) -> Any:
-        step = aamdm.transition(params["networks"], config=config)
-        return aamdm_control.controller(
-            aamdm_control.guided(step, scale=0.0),
+        step = aamdm_model.transition(params["networks"], config=config)
+        return aamdm_controller.controller(
+            aamdm_controller.guided(step, scale=0.0),
             params["space"],
             num_joints=joints,
             fps=FPS,
@@ -75,7 +83,7 @@ def make_load(run: Path | None, *, width: int, seconds: float) -> workload.Load:
     def start(number: int) -> tuple[Any, trajectory.Command]:
         rows = jnp.arange(number) * 7 % data.num_frames
         states = jax.vmap(
-            lambda pose, path: aamdm_control.init_state(
+            lambda pose, path: aamdm_controller.init_state(
                 space, pose, path, num_joints=joints
             )
         )(data.poses[rows], data.paths[rows])
@@ -99,7 +107,7 @@ def make_load(run: Path | None, *, width: int, seconds: float) -> workload.Load:
 def _networks(load: workload.Load) -> dict[str, Callable]:
     """The three networks, each jitted: draft, polish, and the decoder of poses."""
     params, config = load.params["networks"], load.config
-    net, space = aamdm.network(config), load.params["space"]
+    net, space = aamdm_model.network(config), load.params["space"]
     return {
         "draft": jax.jit(
             lambda x, t, previous, z: net.apply(

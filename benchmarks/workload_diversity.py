@@ -15,11 +15,12 @@ from jaxtyping import Array, Float
 
 from jaxmotion.control import rollout
 from jaxmotion.evaluation import diversity
-from jaxmotion.learning import recognition
+from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.motion import skeleton, trajectory
-from jaxmotion.protocols import camdm as protocol
-from jaxmotion.protocols import camdm_runs
-from jaxmotion.systems import camdm_control, camdm_model
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import steering as camdm_steering
+from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.typing import Key, Params
 
 # More rollouts at a time leave a processor's cache, and are slower.
@@ -42,7 +43,7 @@ class Load:
     name: str
     model: camdm_model.Model
     params: Params
-    state: camdm_control.CharacterState
+    state: camdm_controller.CharacterState
     commands: trajectory.Command
 
 
@@ -101,7 +102,7 @@ def make_load(
         clips, field = workload.make_clips(), "style"
         model, params = workload.walker_model(clips, run)
     else:
-        found = camdm_runs.load_run(run)
+        found = camdm_training.load_run(run)
         model, params, clips, field = (
             found.model,
             found.params,
@@ -109,12 +110,12 @@ def make_load(
             found.field,
         )
     label = np.array([0 if style is None else model.label(style)])
-    speeds = np.asarray(protocol.style_speeds(clips, field=field))[label]
+    speeds = np.asarray(camdm_steering.style_speeds(clips, field=field))[label]
     speeds = speeds if speed is None else np.array([speed])
-    commands = protocol.preset_batch(
+    commands = camdm_steering.preset_batch(
         preset, label, speeds, seconds=seconds, fps=model.config.fps
     )
-    states = protocol.start_states(clips, model, label, field=field, seed=seed)
+    states = camdm_steering.start_states(clips, model, label, field=field, seed=seed)
     state, command = jax.tree.map(lambda x: x[0], (states, commands))
     return Load(
         name=run.name, model=model, params=params, state=state, commands=command
@@ -156,7 +157,7 @@ def one_rollout(
     key: Key,
     load: Load,
     *,
-    control: camdm_control.Control,
+    control: camdm_controller.Control,
     guided: Array | int,
     every: int,
 ) -> Motions:
@@ -177,7 +178,7 @@ def one_rollout(
       Kept frames, without the axis of rollouts.
     """
     bones, config = load.model.bones, load.model.config
-    driver = camdm_control.controller(params, bones, config=config, control=control)
+    driver = camdm_controller.controller(params, bones, config=config, control=control)
     start = dataclasses.replace(load.state, guided=jnp.asarray(guided, jnp.int32))
 
     def body(state: Any, xs: tuple) -> tuple[Any, tuple[Array, Array]]:
@@ -193,7 +194,7 @@ def one_rollout(
         root_position=root, joint_rotation=rotation, fps=config.fps / every
     )
     world = skeleton.joint_positions(bones, motion)
-    pose = recognition.recognizer_input(bones, motion).reshape(world.shape)
+    pose = style_evaluator.recognizer_input(bones, motion).reshape(world.shape)
     return Motions(world=world, pose=pose)
 
 
@@ -202,7 +203,7 @@ def _function(load: Load, number: int, every: int, chunk: int) -> Callable:
 
     def roll(params: Params, key: Key, guided: Array, scale: Array) -> Motions:
         # The scale is traced: one program serves all of them.
-        control = dataclasses.replace(camdm_control.Control(), guidance_scale=scale)
+        control = dataclasses.replace(camdm_controller.Control(), guidance_scale=scale)
 
         def one(i: Array) -> Motions:
             return one_rollout(

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmotion.protocols import emdm_runs
-from jaxmotion.systems import emdm
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.typing import Params
 
 # HumanAct12: 25 rows of 6 numbers, 60 frames, 12 actions.
@@ -32,9 +32,9 @@ def program(
       The jitted function, its arguments, and frames of a motion.
     """
     if paper:
-        config = emdm.Config(**_SIZES, num_steps=steps)
+        config = emdm_model.Config(**_SIZES, num_steps=steps)
     else:
-        config = emdm.Config(
+        config = emdm_model.Config(
             **_SIZES,
             num_steps=steps,
             width=width,
@@ -44,16 +44,16 @@ def program(
             frames_per_token=4,
             norm="pre",
         )
-    params = emdm.init(jax.random.key(0), config)["generator"]
-    vectors = emdm.action_vectors(jnp.arange(batch) % 12, 12)
-    conditions = emdm.make_condition(vectors, config=config)
+    params = emdm_model.init(jax.random.key(0), config)["generator"]
+    vectors = emdm_model.action_vectors(jnp.arange(batch) % 12, 12)
+    conditions = emdm_model.make_condition(vectors, config=config)
     at_once = chunk if chunk and batch >= 16 else batch
 
-    def motions(params: Params, key: Array, conditions: emdm.Condition) -> Array:
-        sample = emdm.sampler(params, config=config)
+    def motions(params: Params, key: Array, conditions: emdm_model.Condition) -> Array:
+        sample = emdm_model.sampler(params, config=config)
         if batch == 1:
             return sample(key, jax.tree.map(lambda x: x[0], conditions))
-        return emdm_runs.sample_many(sample, chunk=at_once)(key, conditions, None)
+        return emdm_training.sample_many(sample, chunk=at_once)(key, conditions, None)
 
     given = (jax.random.key(1), conditions)
     if arguments:

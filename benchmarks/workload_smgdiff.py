@@ -12,9 +12,10 @@ from jaxmotion.data.builders import smpl
 from jaxmotion.motion.features import Normalizer
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.motion.trajectory import Trajectory
-from jaxmotion.systems import smgdiff, smgdiff_guidance
-from jaxmotion.systems.smgdiff_guidance import UNGUIDED, Guidance
-from jaxmotion.systems.smgdiff_scene import Representation, feature_layout
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import model as smgdiff_model
+from jaxmotion.systems.smgdiff.guidance import UNGUIDED, Guidance
+from jaxmotion.systems.smgdiff.scene import Representation, feature_layout
 from jaxmotion.typing import Params
 
 
@@ -59,7 +60,7 @@ def program(
         joints=bones.feet,
         fps=30.0,
     )
-    config = smgdiff.Config(
+    config = smgdiff_model.Config(
         num_features=size,
         num_labels=6,
         num_steps=steps,
@@ -67,11 +68,11 @@ def program(
         hidden=4 * width,
         frames_per_token=frames_per_token,
     )
-    params = smgdiff.init(jax.random.key(0), config)
+    params = smgdiff_model.init(jax.random.key(0), config)
     guidance = Guidance(min_acceleration=0.0) if guided else UNGUIDED
     key_past, key_path, key_run = jax.random.split(jax.random.key(1), 3)
     facing = jnp.broadcast_to(jnp.array([0.0, 1.0]), (batch, config.future, 2))
-    conditions = smgdiff.Condition(
+    conditions = smgdiff_model.Condition(
         past=0.3 * jax.random.normal(key_past, (batch, config.past, size)),
         trajectory=Trajectory(
             position=jax.random.normal(key_path, (batch, config.future, 2)),
@@ -81,7 +82,9 @@ def program(
         ball=jnp.broadcast_to(jnp.array([0.0, 0.11, 0.5]), (batch, 3)),
     )
 
-    def plans(params: Params, keys: Array, conditions: smgdiff.Condition) -> Array:
+    def plans(
+        params: Params, keys: Array, conditions: smgdiff_model.Condition
+    ) -> Array:
         plan = smgdiff_guidance.planner(
             params, config=config, representation=representation, guided=guidance
         )

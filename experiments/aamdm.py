@@ -18,15 +18,11 @@ from baselines import rows, tables
 from reports import aamdm as paper
 from reports import results, verdicts
 
+from jaxmotion import cli, reporting
 from jaxmotion.learning import loop
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import (
-    aamdm_evaluation,
-    aamdm_runs,
-    aamdm_stages,
-    artifacts,
-    script,
-)
+from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
+from jaxmotion.systems.aamdm import training as aamdm_training
 
 Steering = Literal["forward", "strafe", "stop_and_go"]
 
@@ -155,7 +151,7 @@ def train(args: Train) -> None:
     names = args.rows or rows.ALL
     rows.check(names)
     loop.check_writable(args.out)
-    run = aamdm_runs.prepare(
+    run = aamdm_training.prepare(
         args.out,
         args.data,
         field=args.field,
@@ -171,8 +167,8 @@ def train(args: Train) -> None:
         previous_noise=args.previous_noise,
     )
 
-    def budget(steps: int, **more) -> aamdm_stages.Budget:
-        return aamdm_stages.Budget(
+    def budget(steps: int, **more) -> aamdm_training.Budget:
+        return aamdm_training.Budget(
             steps=steps,
             batch=args.batch,
             seed=args.seed,
@@ -190,8 +186,8 @@ def train(args: Train) -> None:
                 steps = budget(
                     args.autoencoder_steps, optimizer="adamw", learning_rate=1e-3
                 )
-                autoencoder = aamdm_runs.train_autoencoder(run, steps)
-            spaces[where] = aamdm_runs.make_space(run, autoencoder)
+                autoencoder = aamdm_training.train_autoencoder(run, steps)
+            spaces[where] = aamdm_training.make_space(run, autoencoder)
         steps = args.full_pose_steps if name == "full_pose" else args.polisher_steps
         rows.train_row(
             name,
@@ -214,13 +210,13 @@ def evaluate(args: Evaluate) -> None:
     rows.check(args.rows)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
-    run = aamdm_runs.load_run(args.run)
-    script.announce("compiling the rollouts of each row", 40)
+    run = aamdm_training.load_run(args.run)
+    cli.announce("compiling the rollouts of each row", 40)
     table, report = tables.evaluate(run, args, out)
     here = results.Measured(path=out / "metrics.json", rows=table, about=report)
     report["claims"] = verdicts.lines(paper.TABLES, {paper.RUN: here})
     note = "div and fid are of joint positions in the character's axes: no recogniser."
-    artifacts.write_table(out, table, report, (note,))
+    reporting.write_table(out, table, report, (note,))
     for line in report["claims"]:
         print(line)
 
@@ -228,17 +224,17 @@ def evaluate(args: Evaluate) -> None:
 def rollout(args: Rollout) -> None:
     """Writes rollout.bvh, rollout.gif and rollout.html."""
     rows.check((args.row,))
-    run = aamdm_runs.load_run(args.run)
+    run = aamdm_training.load_run(args.run)
     out = args.out or args.run / "rollout"
     loop.check_writable(out)
-    space = aamdm_runs.load_space(run, rows.space_of(args.row))
+    space = aamdm_training.load_space(run, rows.space_of(args.row))
     step = rows.load_row(args.row, run, space, scale=args.scale)
     states = aamdm_evaluation.start_states(run, space, 1, seed=args.seed)
     ticks = round(args.seconds * run.train.fps)
     given = aamdm_evaluation.commands(
         run, 1, ticks, preset=args.preset, speed=args.speed
     )
-    script.announce("compiling the rollout", 40)
+    cli.announce("compiling the rollout", 40)
     roll = aamdm_evaluation.roller(run, space, step, steered=args.steered)
     _, frames = roll(jax.random.key(args.seed), states, given)
     motion = skeleton.Motion(
@@ -246,7 +242,7 @@ def rollout(args: Rollout) -> None:
         joint_rotation=frames.joint_rotation[0],
         fps=run.train.fps,
     )
-    artifacts.write_rollout(
+    reporting.write_rollout(
         out,
         run.bones,
         motion,
@@ -265,10 +261,10 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = script.check(tyro.cli(Command, description=__doc__))
+    args = cli.check(tyro.cli(Command, description=__doc__))
     run = {Train: train, Evaluate: evaluate, Rollout: rollout}
     run[type(args)](args)
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

@@ -17,22 +17,18 @@ import jax
 import numpy as np
 import tyro
 
-from jaxmotion import files
+from jaxmotion import cli, files, reporting
 from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import by_frame
-from jaxmotion.learning import checkpoint, loop
-from jaxmotion.protocols import (
-    artifacts,
-    camdm_evaluation,
-    camdm_runs,
-    camdm_speeds,
-    camdm_training,
-    evaluators,
-    script,
-    stages,
-)
-from jaxmotion.systems import camdm_control, camdm_model, camdm_published
+from jaxmotion.evaluators import frozen
+from jaxmotion.learning import checkpoint, loop, runs
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import published as camdm_published
+from jaxmotion.systems.camdm import speeds as camdm_speeds
+from jaxmotion.systems.camdm import training as camdm_training
 
 Steering = Literal["forward", "strafe", "stop_and_go"]
 
@@ -82,7 +78,7 @@ class Train:
     out: Path = Path("runs/camdm")
     preset: Literal["small", "planted", "paper"] = "small"
     init: Path | None = None
-    contents: tuple[str, ...] = camdm_runs.CONTENTS
+    contents: tuple[str, ...] = camdm_training.CONTENTS
     label: str = "style"
     labels: tuple[str, ...] = ()
     held_out: float = 0.1
@@ -139,7 +135,7 @@ def train(args: Train) -> None:
     """Trains, with checkpoints."""
     args = with_preset(args)
     loop.check_writable(args.out)
-    clips, _ = camdm_runs.split_data(
+    clips, _ = camdm_training.split_data(
         args.data,
         args.contents,
         args.label,
@@ -152,12 +148,12 @@ def train(args: Train) -> None:
     model, params = model_of(args, clips), None
     if args.init:
         model, params = camdm_training.continued(model, args.init)
-    made_by = camdm_runs.arguments_json(args) | {
-        "clips": evaluators.clips_fingerprint(clips, args.label)
+    made_by = camdm_training.arguments_json(args) | {
+        "clips": frozen.clips_fingerprint(clips, args.label)
     }
     config = camdm_model.to_json(model) | {"experiment": made_by}
     if checkpoint.latest_step(args.out / "checkpoints") is not None:
-        stages.check_resumed(
+        runs.check_resumed(
             args.out,
             checkpoint.load_config(args.out / "checkpoints").get("experiment", {}),
             {name: value for name, value in made_by.items() if name not in FREE},
@@ -300,11 +296,11 @@ class Rollout:
 
 def evaluate(args: Evaluate) -> None:
     """Writes the table."""
-    evaluator = None if args.evaluator is None else evaluators.load(args.evaluator)
-    run = camdm_runs.load_run(args.run, args.data, args.contents)
+    evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
+    run = camdm_training.load_run(args.run, args.data, args.contents)
     out = args.out or _beside(args.run) / "evaluation"
     loop.check_writable(out)
-    script.announce("compiling the rollouts", 40)
+    cli.announce("compiling the rollouts", 40)
     rows, report = camdm_evaluation.evaluate_run(
         run,
         preset=args.preset,
@@ -316,37 +312,37 @@ def evaluate(args: Evaluate) -> None:
         seed=args.seed,
         evaluator=evaluator,
     )
-    report = {"arguments": camdm_runs.arguments_json(args)} | report
-    notes = (evaluators.note(report["evaluator"]),)
-    artifacts.write_table(out, rows, report, notes)
+    report = {"arguments": camdm_training.arguments_json(args)} | report
+    notes = (frozen.note(report["evaluator"]),)
+    reporting.write_table(out, rows, report, notes)
     print(report)
 
 
 def speeds(args: Speeds) -> None:
     """Writes the table, and jerk and slide by frame of the plan below it."""
-    run = camdm_runs.load_run(args.run, args.data)
+    run = camdm_training.load_run(args.run, args.data)
     out = args.out or args.run / "speeds"
     loop.check_writable(out)
-    script.announce("compiling the rollouts", 40)
+    cli.announce("compiling the rollouts", 40)
     rows, plans, report = camdm_speeds.speed_table(
         run,
         args.speeds,
         style=args.style or run.model.labels[0],
         rollouts=args.rollouts,
         seconds=args.seconds,
-        control=camdm_control.Control(follow=args.follow),
+        control=camdm_controller.Control(follow=args.follow),
         seed=args.seed,
     )
-    report = {"arguments": camdm_runs.arguments_json(args)} | report
-    artifacts.write_table(out, rows, report, (by_frame.to_markdown(plans),))
+    report = {"arguments": camdm_training.arguments_json(args)} | report
+    reporting.write_table(out, rows, report, (by_frame.to_markdown(plans),))
 
 
 def rollout(args: Rollout) -> None:
     """Writes rollout.bvh, rollout.gif and rollout.html."""
-    run = camdm_runs.load_run(args.run, args.data)
+    run = camdm_training.load_run(args.run, args.data)
     out = args.out or _beside(args.run) / "rollout"
     loop.check_writable(out)
-    script.announce("compiling the rollout", 40)
+    cli.announce("compiling the rollout", 40)
     motion, velocity = camdm_evaluation.steer_one(
         run,
         args.style,
@@ -357,7 +353,7 @@ def rollout(args: Rollout) -> None:
         seed=args.seed,
     )
     title = " to ".join(filter(None, (args.style, args.to_style)))
-    artifacts.write_rollout(
+    reporting.write_rollout(
         out, run.model.bones, motion, velocity, title=title, caption=run.model.source
     )
 
@@ -384,7 +380,7 @@ def export(args: Export) -> None:
     """Writes the file."""
     model, params, _ = camdm_model.load(args.run)
     if args.starts is not None:
-        run = camdm_runs.load_run(args.run)
+        run = camdm_training.load_run(args.run)
         starts = camdm_evaluation.own_starts(run, number=args.starts)
         model = dataclasses.replace(model, starts=starts)
     config = camdm_model.to_json(model) | {"experiment": {"label": "style"}}
@@ -422,11 +418,11 @@ class Import:
 
 def import_weights(args: Import) -> None:
     """Writes the file."""
-    bones = camdm_runs.released_skeleton(args.skeleton, scale=args.scale)
+    bones = camdm_training.released_skeleton(args.skeleton, scale=args.scale)
     labels = args.labels and camdm_published.read_styles(args.labels)
     model, params = camdm_published.load(args.weights, bones=bones, labels=labels)
     # Which clips to use, as `train` would note it.
-    clips = camdm_runs.arguments_json(Train(data=args.data, contents=()))
+    clips = camdm_training.arguments_json(Train(data=args.data, contents=()))
     config = camdm_model.to_json(model) | {"experiment": clips}
     checkpoint.export_params(args.out, params, config, dtype=np.float32)
     print(
@@ -452,7 +448,7 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = script.check(tyro.cli(Command, description=__doc__))
+    args = cli.check(tyro.cli(Command, description=__doc__))
     run = {
         Train: train,
         Evaluate: evaluate,
@@ -465,4 +461,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

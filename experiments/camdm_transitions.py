@@ -16,17 +16,13 @@ from pathlib import Path
 import jax
 import tyro
 
+from jaxmotion import cli, reporting
+from jaxmotion.evaluators import frozen
 from jaxmotion.learning import loop
-from jaxmotion.protocols import (
-    artifacts,
-    camdm_evaluation,
-    camdm_runs,
-    camdm_transitions,
-    evaluators,
-    provenance,
-    script,
-)
-from jaxmotion.systems.camdm_control import RELEASED, Control
+from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import training as camdm_training
+from jaxmotion.systems.camdm import transitions as camdm_transitions
+from jaxmotion.systems.camdm.controller import RELEASED, Control
 
 CONTROLS = {
     "guided once, scale 0.7 (paper)": Control(),
@@ -79,11 +75,11 @@ def measure(args: Config) -> None:
     Args:
       args: Of the command line.
     """
-    evaluator = None if args.evaluator is None else evaluators.load(args.evaluator)
-    run = camdm_runs.load_run(args.run, args.data, args.contents)
+    evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
+    run = camdm_training.load_run(args.run, args.data, args.contents)
     out = args.out or args.run / "transitions"
     loop.check_writable(out)
-    script.announce("compiling the rollouts of each row", 40)
+    cli.announce("compiling the rollouts of each row", 40)
     changes = camdm_transitions.make_changes(
         run,
         preset=args.preset,
@@ -100,32 +96,32 @@ def measure(args: Config) -> None:
         run, changes, CONTROLS, judge, chunk=args.chunk, seed=args.seed
     )
     report = {
-        "arguments": camdm_runs.arguments_json(args),
+        "arguments": camdm_training.arguments_json(args),
         "source": run.model.source,
         "rollouts": int(changes.old.size),
         "recognised_in_clips_%": camdm_transitions.clip_accuracy(run, judge).value,
-        "evaluator": evaluators.describe(
+        "evaluator": frozen.describe(
             judge.params,
             evaluator,
-            reference=evaluators.clips_fingerprint(run.train, run.field),
+            reference=frozen.clips_fingerprint(run.train, run.field),
         ),
-        **provenance.provenance(),
+        **reporting.provenance(),
     }
     notes = (
         f"{changes.old.size} rollouts a row: every ordered pair of "
         f"{len(run.model.labels)} styles, {args.replications} times.",
         # Without the clips of Fréchet distances: there are none.
-        evaluators.note({k: report["evaluator"][k] for k in ("fingerprint", "origin")}),
+        frozen.note({k: report["evaluator"][k] for k in ("fingerprint", "origin")}),
         f"It is right in {report['recognised_in_clips_%']:.1f} % of the windows of "
         "held-out clips.",
     )
-    artifacts.write_table(out, rows, report, notes)
+    reporting.write_table(out, rows, report, notes)
 
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    measure(script.check(tyro.cli(Config, description=__doc__)))
+    measure(cli.check(tyro.cli(Config, description=__doc__)))
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

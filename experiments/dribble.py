@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
+from jaxmotion import cli
 from jaxmotion.data import clips_io, selection
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips, take_ball_clips
 from jaxmotion.data.clips import Clips, take_clips
@@ -24,7 +25,6 @@ from jaxmotion.data.dribble import (
 )
 from jaxmotion.data.dribble_touches import Dribble
 from jaxmotion.learning import loop
-from jaxmotion.protocols import script
 
 _FAR, _NEAR = (2.5, 5.0), (0.4, 0.8)
 
@@ -130,7 +130,7 @@ def describe(data: BallClips) -> None:
 
 def main() -> None:
     """Reads, synthesises, writes."""
-    config = script.check(tyro.cli(Config, description=__doc__))
+    config = cli.check(tyro.cli(Config, description=__doc__))
     loop.check_writable(config.out.parent)
     if config.out.exists() and not config.overwrite:
         raise FileExistsError(f"{config.out} exists; --overwrite replaces it")
@@ -142,4 +142,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

@@ -18,10 +18,12 @@ from typing import Annotated, Literal
 import tyro
 from emdm_tasks import evaluation, sampling, setup
 
-from jaxmotion.learning import loop
-from jaxmotion.learning.matching import Padding
-from jaxmotion.protocols import emdm_rows, emdm_runs, emdm_text, script, stages
-from jaxmotion.systems import emdm as emdm_system
+from jaxmotion import cli
+from jaxmotion.evaluators.text_motion import Padding
+from jaxmotion.learning import loop, runs
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import text as emdm_text
+from jaxmotion.systems.emdm import training as emdm_training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Train:
       override: Go on with these settings where a row began with others.
     """
 
-    task: emdm_runs.TaskName = "action"
+    task: emdm_training.TaskName = "action"
     data: tuple[Path, ...] = (Path("data/bandai1.npz"), Path("data/bandai2.npz"))
     out: Path = Path("runs/emdm_action")
     rows: tuple[str, ...] = ("emdm",)
@@ -181,18 +183,18 @@ class Sample:
 
 def train(args: Train) -> None:
     """Trains row by row."""
-    emdm_rows.check_rows(args.rows)
+    emdm_training.check_rows(args.rows)
     for row in args.rows:
-        if row in emdm_rows.SAMPLERS:
+        if row in emdm_training.SAMPLERS:
             raise ValueError(
-                f"row {row!r} samples {emdm_rows.SAMPLERS[row][0]!r}: train that"
+                f"row {row!r} samples {emdm_training.SAMPLERS[row][0]!r}: train that"
             )
     loop.check_writable(args.out)
     task = setup.prepare(args)
     for row in args.rows:
         begun = time.perf_counter()
-        latent = emdm_rows.row_config(task.base, row).latent
-        budget = stages.Budget(
+        latent = emdm_training.row_config(task.base, row).latent
+        budget = runs.Budget(
             steps=args.steps if latent else args.ddpm_steps,
             batch=args.batch,
             learning_rate=args.learning_rate if latent else args.ddpm_rate,
@@ -202,16 +204,18 @@ def train(args: Train) -> None:
         judge = dataclasses.replace(
             budget, optimizer="adam", learning_rate=args.discriminator_rate
         )
-        emdm_runs.train_row(args.out, task, row, generator=budget, discriminator=judge)
+        emdm_training.train_row(
+            args.out, task, row, generator=budget, discriminator=judge
+        )
         print(f"{row}: {time.perf_counter() - begun:.0f} s", flush=True)
 
 
 def evaluate(args: Evaluate) -> None:
     """Writes the table."""
-    emdm_rows.check_rows(args.rows)
+    emdm_training.check_rows(args.rows)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
-    script.announce("compiling the evaluator and the sampler of each row", 40)
+    cli.announce("compiling the evaluator and the sampler of each row", 40)
     evaluation.evaluate(args, out)
 
 
@@ -219,7 +223,7 @@ def sample(args: Sample) -> None:
     """Writes one motion for each action or sentence."""
     out = args.out or args.run / "samples"
     loop.check_writable(out)
-    script.announce("compiling the sampler", 40)
+    cli.announce("compiling the sampler", 40)
     sampling.sample(args, out)
 
 
@@ -254,9 +258,9 @@ def import_weights(args: Import) -> None:
             f"{args.run}: field 'text_form' is {form!r}, expected 'released': CLIP's "
             "vectors are what the weights know"
         )
-    base, frames = emdm_system.Config(features=1), run.config["frames"]
+    base, frames = emdm_model.Config(features=1), run.config["frames"]
     task = emdm_text.make_task(run, base, frames=frames)
-    config = emdm_runs.import_row(
+    config = emdm_training.import_row(
         args.run, task, args.weights, heads=args.heads, num_steps=args.diffusion_steps
     )
     print(
@@ -275,10 +279,10 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = script.check(tyro.cli(Command, description=__doc__))
+    args = cli.check(tyro.cli(Command, description=__doc__))
     run = {Train: train, Evaluate: evaluate, Sample: sample}
     (run | {Import: import_weights})[type(args)](args)
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

@@ -18,18 +18,16 @@ from typing import Annotated, Literal
 import tyro
 from emdm_tasks import setup
 
+from jaxmotion import cli
 from jaxmotion.data import selection
 from jaxmotion.data.ball_clips import load_ball_clips
+from jaxmotion.evaluators import frozen
+from jaxmotion.evaluators import training as evaluator_training
+from jaxmotion.evaluators.frozen import Evaluator
 from jaxmotion.learning import loop
-from jaxmotion.protocols import (
-    camdm_runs,
-    emdm_data,
-    evaluator_training,
-    evaluators,
-    script,
-    smgdiff_data,
-)
-from jaxmotion.protocols.evaluators import Evaluator
+from jaxmotion.systems.camdm import training as camdm_training
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.smgdiff import data as smgdiff_data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,8 +97,8 @@ def one_file(args: Train) -> Path:
 def train_style(args: Train) -> Evaluator:
     """Of windows of a label, for CAMDM."""
     field = args.label or "style"
-    contents = camdm_runs.CONTENTS if args.contents is None else args.contents
-    train, held_out = camdm_runs.split_data(
+    contents = camdm_training.CONTENTS if args.contents is None else args.contents
+    train, held_out = camdm_training.split_data(
         one_file(args), contents, field, args.held_out
     )
     steps = 1500 if args.updates is None else args.updates
@@ -176,7 +174,7 @@ def train(args: Train) -> None:
     run, _ = KINDS[args.kind]
     print(f"training on {', '.join(map(str, args.data))}: minutes", flush=True)
     evaluator = run(args)
-    evaluators.save(args.out, evaluator)
+    frozen.save(args.out, evaluator)
     megabytes = args.out.stat().st_size / 1e6
     seconds = time.perf_counter() - begun
     print(f"wrote {args.out}, {megabytes:.1f} MB, after {seconds:.0f} s")
@@ -185,7 +183,7 @@ def train(args: Train) -> None:
 
 def show(args: Show) -> None:
     """Prints the fields, the fingerprint first."""
-    value = evaluators.to_json(evaluators.load(args.file))
+    value = frozen.to_json(frozen.load(args.file))
     lines = {"fingerprint": value.pop("fingerprint"), "file": args.file} | value
     lines["accuracy"] = f"{100 * value['accuracy']:.1f} % of held-out clips' windows"
     if math.isnan(value["accuracy"]):
@@ -218,7 +216,7 @@ def import_weights(args: Import) -> None:
     """Writes the file."""
     if args.out.exists() and not args.overwrite:
         raise FileExistsError(f"{args.out} exists; --overwrite replaces it")
-    evaluators.save(args.out, evaluators.released_style(args.weights))
+    frozen.save(args.out, frozen.released_style(args.weights))
     show(Show(file=args.out))
 
 
@@ -231,9 +229,9 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = script.check(tyro.cli(Command, description=__doc__))
+    args = cli.check(tyro.cli(Command, description=__doc__))
     {Train: train, Show: show, Import: import_weights}[type(args)](args)
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

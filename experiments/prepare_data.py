@@ -23,11 +23,11 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
+from jaxmotion import cli
 from jaxmotion.data import clips_io, mirror, resample, selection, text_motion_io
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
 from jaxmotion.data.text_motion import TextMotions
-from jaxmotion.protocols import script
 
 Source = Literal[
     "bandai_namco/1",
@@ -313,8 +313,8 @@ def prepare(config: Config) -> None:
 
 def main() -> None:
     """Parses the command line and prepares the data."""
-    prepare(script.check(tyro.cli(Config, description=__doc__)))
+    prepare(cli.check(tyro.cli(Config, description=__doc__)))
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

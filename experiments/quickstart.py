@@ -25,14 +25,18 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from jaxmotion import cli, reporting
 from jaxmotion.control import presets
 from jaxmotion.data import procedural, selection, windows
 from jaxmotion.data.gaits import GAITS, Gait
 from jaxmotion.learning import loop, training
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import artifacts, camdm_rows, camdm_training, script
-from jaxmotion.protocols import camdm as protocol
-from jaxmotion.systems import camdm, camdm_control, camdm_loss, camdm_model
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import loss as camdm_loss
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import steering as camdm_steering
+from jaxmotion.systems.camdm import training as camdm_training
 
 # Seconds, direction of travel and facing (degrees from +z towards +x), m/s, style.
 COURSE = (
@@ -115,22 +119,22 @@ def steer_shipped(args: Config):
     many = args.characters
     commands = jax.tree.map(lambda x: jnp.repeat(x[None], many, axis=0), course)
     labels = np.zeros(many, int)
-    frames = protocol.steered_rollouts(
+    frames = camdm_steering.steered_rollouts(
         params,
         jax.random.key(args.seed),
-        protocol.own_states(model, labels, seed=args.seed),
+        camdm_steering.own_states(model, labels, seed=args.seed),
         commands,
         model=model,
-        control=camdm_control.Control(follow=1.0),
+        control=camdm_controller.Control(follow=1.0),
         chunk=4,
     )
-    made = protocol.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=0)
+    made = camdm_steering.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=0)
     standing = jax.tree.map(lambda x: x[0], model.starts)
     toes = skeleton.joint_positions(model.bones, standing)[..., model.bones.feet, 1]
-    row = camdm_rows.metric_row(
+    row = camdm_evaluation.metric_row(
         model.bones, made, None, height=float(toes.min()) + 0.01
     )
-    artifacts.write_rollout(
+    reporting.write_rollout(
         args.out,
         model.bones,
         first_motion(frames, fps),
@@ -145,7 +149,7 @@ def start_model(args: Config, clips, key):
     """A new model for these clips, or the shipped one with a style to learn."""
     if args.from_scratch:
         model = camdm_training.make_model(clips, field="style", **SIZE)
-        return model, camdm.init(key, model.config)
+        return model, camdm_model.init(key, model.config)
     model, params, _ = camdm_model.load("walker")
     config = dataclasses.replace(model.config, num_labels=model.config.num_labels + 1)
     table = params["embed_label"]["embedding"]
@@ -213,8 +217,8 @@ def steer(args: Config, clips, model, params, key):
     """Rolls out the characters; returns frames and the style of each character."""
     styles = [model.label(name) for name in args.styles]
     labels = np.resize(styles, args.characters)
-    speeds = np.asarray(protocol.style_speeds(clips, field="style"))[labels]
-    commands = protocol.preset_batch(
+    speeds = np.asarray(camdm_steering.style_speeds(clips, field="style"))[labels]
+    commands = camdm_steering.preset_batch(
         "forward", labels, speeds, seconds=args.seconds, fps=model.config.fps
     )
     # The first character goes through all the styles, one after the other.
@@ -222,9 +226,11 @@ def steer(args: Config, clips, model, params, key):
     order = jnp.asarray(styles)[jnp.arange(ticks) * len(styles) // ticks]
     label = commands.label.at[0].set(order)
     commands = dataclasses.replace(commands, label=label)
-    states = protocol.start_states(clips, model, labels, field="style", seed=args.seed)
-    control = camdm_control.Control(follow=1.0)
-    frames = protocol.steered_rollouts(
+    states = camdm_steering.start_states(
+        clips, model, labels, field="style", seed=args.seed
+    )
+    control = camdm_controller.Control(follow=1.0)
+    frames = camdm_steering.steered_rollouts(
         params, key, states, commands, model=model, control=control, chunk=4
     )
     return jax.block_until_ready(frames), labels
@@ -242,18 +248,20 @@ def train_walker(args: Config):
     model, params = start_model(args, clips, key_init)
     params, losses = train(args, clips, model, params, key_train)
     print(f"loss {losses[0]:.4f} -> {losses[-1]:.4f}")
-    script.announce("compiling the rollouts", 40)
+    cli.announce("compiling the rollouts", 40)
     frames, labels = steer(args, clips, model, params, key_roll)
 
     fps = model.config.fps
-    made = protocol.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=30)
-    real = protocol.data_windows(clips, stride=protocol.WINDOW, field="style")
+    made = camdm_steering.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=30)
+    real = camdm_steering.data_windows(
+        clips, stride=camdm_steering.WINDOW, field="style"
+    )
     height = procedural.TOE_HEIGHT + 0.01
     rows = {
-        "data": camdm_rows.metric_row(model.bones, real, None, height=height),
-        "rollouts": camdm_rows.metric_row(model.bones, made, None, height=height),
+        "data": camdm_evaluation.metric_row(model.bones, real, None, height=height),
+        "rollouts": camdm_evaluation.metric_row(model.bones, made, None, height=height),
     }
-    artifacts.write_rollout(
+    reporting.write_rollout(
         args.out,
         model.bones,
         first_motion(frames, fps),
@@ -266,16 +274,16 @@ def train_walker(args: Config):
 
 def main() -> None:
     """Runs the quickstart."""
-    args = script.check(tyro.cli(Config, description=__doc__))
+    args = cli.check(tyro.cli(Config, description=__doc__))
     steps_of(args)
     loop.check_writable(args.out)
     begun = time.perf_counter()
     rows, report = train_walker(args) if args.train else steer_shipped(args)
     seconds = time.perf_counter() - begun
     report |= {"seconds": seconds, "jax": jax.__version__}
-    artifacts.write_table(args.out, rows, report)
+    reporting.write_table(args.out, rows, report)
     print(f"done in {seconds:.0f} s: see {args.out}")
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

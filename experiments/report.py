@@ -17,8 +17,8 @@ import tyro
 from reports import results, verdicts, writing
 from reports.claims import Source
 
+from jaxmotion import cli, reporting
 from jaxmotion.learning import loop
-from jaxmotion.protocols import provenance, script
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,7 +95,7 @@ def report(args: Config) -> None:
         source: tuple(x.format(run=folders[source]) for x in source.commands)
         for source in folders
     }
-    decided = writing.write(args.out, found, commands, provenance.provenance())
+    decided = writing.write(args.out, found, commands, reporting.provenance())
     for name in verdicts.Verdict.__args__:
         own = [(t, c) for t, c, decision in decided if decision.verdict == name]
         print(f"{name}: {len(own)}")
@@ -106,8 +106,8 @@ def report(args: Config) -> None:
 
 def main() -> None:
     """Parses the command line and writes the report."""
-    report(script.check(tyro.cli(Config, description=__doc__)))
+    report(cli.check(tyro.cli(Config, description=__doc__)))
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

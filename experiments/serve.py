@@ -20,7 +20,7 @@ import tyro
 from serving import protocol, runs, simulation
 from serving.server import Limits, Server
 
-from jaxmotion.protocols import script
+from jaxmotion import cli
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +108,7 @@ def serve(args: Config) -> None:
       OSError: if the run cannot be read or the address not be listened on.
       ValueError: if the run cannot be served.
     """
-    script.check(args)
+    cli.check(args)
     if not is_local(args.host):
         print(
             f"warning: {args.host} may be reached from other machines, and there is no "
@@ -119,7 +119,7 @@ def serve(args: Config) -> None:
     check_address(args.host, args.port)
     characters = runs.load(args.run, args.data)
     begin = time.perf_counter()
-    script.announce("compiling all that a tick may need", 60)
+    cli.announce("compiling all that a tick may need", 60)
     simulation.warm(characters)
     seconds = time.perf_counter() - begin
     print(
@@ -138,4 +138,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

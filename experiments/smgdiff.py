@@ -17,20 +17,15 @@ from typing import Annotated, Any, Literal
 import tyro
 from smgdiff_tasks import playing, tables
 
-from jaxmotion import files
+from jaxmotion import cli, files
 from jaxmotion.data.ball_clips import load_ball_clips
-from jaxmotion.learning import loop
-from jaxmotion.protocols import (
-    evaluators,
-    script,
-    smgdiff_data,
-    smgdiff_evaluation,
-    smgdiff_runs,
-    smgdiff_training,
-    stages,
-)
-from jaxmotion.protocols.camdm_runs import arguments_json
-from jaxmotion.systems.smgdiff_guidance import SCHEDULES, TUNED
+from jaxmotion.evaluators import frozen
+from jaxmotion.learning import loop, runs
+from jaxmotion.systems.camdm.training import arguments_json
+from jaxmotion.systems.smgdiff import data as smgdiff_data
+from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import training as smgdiff_training
+from jaxmotion.systems.smgdiff.guidance import SCHEDULES, TUNED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +56,7 @@ class Train:
 
     data: Path = Path("data/dribble.npz")
     out: Path = Path("runs/smgdiff")
-    stages: tuple[str, ...] = ("paths_1", "motion_8")
+    runs: tuple[str, ...] = ("paths_1", "motion_8")
     preset: Literal["small", "paper"] = "small"
     width: int | None = None
     depth: int | None = None
@@ -182,25 +177,25 @@ def sizes_of(args: Train) -> dict[str, Any]:
 def train(args: Train) -> None:
     """Trains stage by stage."""
     for stage in args.stages:
-        smgdiff_runs.check_stage_name(stage)
+        smgdiff_training.check_stage_name(stage)
     loop.check_writable(args.out)
     arguments = args.out / "arguments.json"
     how = {name: getattr(args, name) for name in MADE}
     if (args.out / "config.json").exists():
         found = files.read_object(arguments, what="expected what `train` writes")
-        stages.check_made(args.out, found, [args.data], how)
-        run = smgdiff_runs.load_run(args.out)
+        runs.check_made(args.out, found, [args.data], how)
+        run = smgdiff_training.load_run(args.out)
     else:
         data = load_ball_clips(args.data)
         kept, held_out = smgdiff_data.split(data, fraction=args.held_out)
-        model = smgdiff_runs.make_model(kept, sizes=sizes_of(args))
-        run = smgdiff_runs.Run(
+        model = smgdiff_training.make_model(kept, sizes=sizes_of(args))
+        run = smgdiff_training.Run(
             folder=args.out, model=model, train=kept, held_out=held_out
         )
-        prints = stages.made_from([args.data])["fingerprints"]
+        prints = runs.made_from([args.data])["fingerprints"]
         value = arguments_json(args) | {"fingerprints": prints}
         files.write_text(arguments, json.dumps(value))
-        smgdiff_runs.write_run(run)
+        smgdiff_training.write_run(run)
     clips = run.train.clips
     print(
         f"{clips.num_clips} clips, {clips.num_frames / clips.fps / 60:.1f} minutes, of "
@@ -209,7 +204,7 @@ def train(args: Train) -> None:
     for stage in args.stages:
         begun = time.perf_counter()
         number = args.steps if stage.startswith("motion") else args.path_steps
-        budget = stages.Budget(
+        budget = runs.Budget(
             steps=number,
             batch=args.batch,
             learning_rate=args.learning_rate,
@@ -226,11 +221,11 @@ def evaluate(args: Evaluate) -> None:
     """Writes the tables."""
     for schedule in args.schedules:
         tables.guidance_of(args, schedule)
-    evaluator = None if args.evaluator is None else evaluators.load(args.evaluator)
-    run = smgdiff_runs.load_run(args.run)
+    evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
+    run = smgdiff_training.load_run(args.run)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
-    script.announce("compiling the recogniser and each row's plans", 40)
+    cli.announce("compiling the recogniser and each row's plans", 40)
     setting = smgdiff_evaluation.make_setting(
         run.train,
         run.held_out,
@@ -243,10 +238,10 @@ def evaluate(args: Evaluate) -> None:
     )
     found = {
         "windows": int(setting.known.label.shape[0]),
-        "evaluator": evaluators.describe(
+        "evaluator": frozen.describe(
             setting.judge.params,
             evaluator,
-            reference=evaluators.clips_fingerprint(run.train, smgdiff_data.FIELD),
+            reference=frozen.clips_fingerprint(run.train, smgdiff_data.FIELD),
         ),
     }
     if "schedules" in args.tables:
@@ -263,10 +258,10 @@ def evaluate(args: Evaluate) -> None:
 
 def rollout(args: Rollout) -> None:
     """Writes the rollout."""
-    run = smgdiff_runs.load_run(args.run)
+    run = smgdiff_training.load_run(args.run)
     out = args.out or args.run / "rollout"
     loop.check_writable(out)
-    script.announce("compiling the rollout", 40)
+    cli.announce("compiling the rollout", 40)
     playing.play(args, run, out)
 
 
@@ -279,10 +274,10 @@ Command = (
 
 def main() -> None:
     """Parses the command line and runs the command."""
-    args = script.check(tyro.cli(Command, description=__doc__))
+    args = cli.check(tyro.cli(Command, description=__doc__))
     run = {Train: train, Evaluate: evaluate, Rollout: rollout}
     run[type(args)](args)
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

@@ -22,11 +22,11 @@ import numpy as np
 import tyro
 from baselines import amdm, lmm, mvae
 
-from jaxmotion import files
+from jaxmotion import cli, files
 from jaxmotion.evaluation import modes
 from jaxmotion.learning import adversarial, loop, training
-from jaxmotion.protocols import script
-from jaxmotion.systems import aamdm, aamdm_loss
+from jaxmotion.systems.aamdm import loss as aamdm_loss
+from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.viz import scatter
 
 CENTRES = np.stack(np.meshgrid(*2 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(9, 2)
@@ -78,9 +78,9 @@ def fit(update, state, key, *, steps: int, batch: int, window: int):
 
 def train_aamdm(args: Config, key):
     """AAMDM on the points themselves; returns its stepper."""
-    config = aamdm.Config(features=2, width=args.width, latent=16)
+    config = aamdm_model.Config(features=2, width=args.width, latent=16)
     key_init, key_p, key_g = jax.random.split(key, 3)
-    params = aamdm.init(key_init, config)
+    params = aamdm_model.init(key_init, config)
     polisher_loss = functools.partial(aamdm_loss.polisher_loss, config=config)
     optimizer = training.radam(learning_rate=1e-3)
     state = fit(
@@ -111,7 +111,7 @@ def train_aamdm(args: Config, key):
         window=3,
     )
     trained = {"polisher": state.ema_params, "generator": gan.generator.ema_params}
-    return aamdm.transition(trained, config=config)
+    return aamdm_model.transition(trained, config=config)
 
 
 def train_baseline(args: Config, key, module, config, *, window: int):
@@ -142,9 +142,9 @@ def roll(step, key, start, length: int):
 
 def main() -> None:
     """Trains, rolls out, scores and plots."""
-    args = script.check(tyro.cli(Config, description=__doc__))
+    args = cli.check(tyro.cli(Config, description=__doc__))
     loop.check_writable(args.out)
-    script.announce("compiling each model's training", 40)
+    cli.announce("compiling each model's training", 40)
     began = time.perf_counter()
     key, key_start, key_roll, key_data = jax.random.split(jax.random.key(args.seed), 4)
     sizes = dict(features=2, width=args.width)
@@ -197,4 +197,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

@@ -20,8 +20,9 @@ import tyro
 from sweeps import aamdm, budgets, camdm, emdm, run, smgdiff
 from sweeps.system import Job
 
-from jaxmotion.protocols import evaluators, script
-from jaxmotion.protocols.camdm_runs import arguments_json
+from jaxmotion import cli
+from jaxmotion.evaluators import frozen
+from jaxmotion.systems.camdm.training import arguments_json
 
 SYSTEMS = {
     "camdm": camdm.SYSTEM,
@@ -69,9 +70,7 @@ class Config:
     seed: int = 0
 
 
-def load_evaluator(
-    args: Config, kind: evaluators.Kind | None
-) -> evaluators.Evaluator | None:
+def load_evaluator(args: Config, kind: frozen.Kind | None) -> frozen.Evaluator | None:
     """The frozen recogniser that the arguments name.
 
     Args:
@@ -88,7 +87,7 @@ def load_evaluator(
         return None
     if kind is None:
         raise ValueError(f"evaluator: {args.system} is judged without a recogniser")
-    found = evaluators.load(args.evaluator)
+    found = frozen.load(args.evaluator)
     if found.kind != kind:
         raise ValueError(
             f"evaluator: {args.evaluator} is of kind {found.kind!r}, {args.system} "
@@ -131,7 +130,7 @@ def make_job(args: Config) -> tuple[Job, Path]:
 def main() -> None:
     """Parses the command line and runs the sweep."""
     numbers = [budgets.describe(name, x.amounts) for name, x in SYSTEMS.items()]
-    args = script.check(tyro.cli(Config, description="\n\n".join([__doc__, *numbers])))
+    args = cli.check(tyro.cli(Config, description="\n\n".join([__doc__, *numbers])))
     job, out = make_job(args)
     shown = arguments_json(args) | {
         "data": [str(file) for file in job.data],
@@ -142,4 +141,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    script.start(main)
+    cli.start(main)

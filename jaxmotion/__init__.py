@@ -8,10 +8,10 @@ from jaxmotion import (
     data,
     diffusion,
     evaluation,
+    evaluators,
     learning,
     motion,
     networks,
-    protocols,
     systems,
 )
 
@@ -22,9 +22,9 @@ __all__ = [
     "data",
     "diffusion",
     "evaluation",
+    "evaluators",
     "learning",
     "motion",
     "networks",
-    "protocols",
     "systems",
 ]

@@ -53,7 +53,7 @@ def config():
 @pytest.fixture(scope="session")
 def params(config):
     """Parameters of it."""
-    from jaxmotion.systems import camdm
+    from jaxmotion.systems.camdm import model as camdm_model
     from tests import tiny
 
-    return tiny.random_params(camdm.init, config, seed=7)
+    return tiny.random_params(camdm_model.init, config, seed=7)

@@ -14,7 +14,8 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips, clips_from_motions
 from jaxmotion.learning import training
 from jaxmotion.motion.skeleton import Motion, Skeleton
-from jaxmotion.systems import camdm, camdm_loss
+from jaxmotion.systems.camdm import loss as camdm_loss
+from jaxmotion.systems.camdm import model as camdm_model
 
 NAMES = ("Hips", "LeftUpLeg", "LeftToe", "RightUpLeg", "RightToe")
 PARENTS = (-1, 0, 1, 0, 3)
@@ -94,7 +95,7 @@ def clips(num_frames: int = 80) -> Clips:
     )
 
 
-def config(**changes) -> camdm.Config:
+def config(**changes) -> camdm_model.Config:
     """A CAMDM that compiles in seconds: 4 past, 12 future frames, 2 layers of 16."""
     sizes = dict(
         num_joints=len(NAMES),
@@ -108,7 +109,7 @@ def config(**changes) -> camdm.Config:
         hidden=32,
         dropout=0.0,
     )
-    return camdm.Config(**(sizes | changes))
+    return camdm_model.Config(**(sizes | changes))
 
 
 def random_params(init, *args, seed: int = 0):
@@ -128,7 +129,7 @@ def random_params(init, *args, seed: int = 0):
 
 
 def training_parts(
-    config: camdm.Config,
+    config: camdm_model.Config,
     *,
     num_steps: int,
     batch: int = 8,
@@ -150,6 +151,6 @@ def training_parts(
     objective = functools.partial(camdm_loss.loss, bones=walker.skeleton, config=config)
     update = training.make_update(objective, optimizer, ema_decay=0.9)
     run = training.train_chunk(update, sample_batch, num_steps=num_steps, mesh=mesh)
-    params = random_params(camdm.init, config, seed=3)
+    params = random_params(camdm_model.init, config, seed=3)
     state = training.init_train_state(params, optimizer)
     return run, state, jax.random.key(3), (walker, index)

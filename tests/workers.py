@@ -14,7 +14,8 @@ import numpy as np
 from jaxmotion.control import rollout
 from jaxmotion.learning import training
 from jaxmotion.motion.trajectory import Command
-from jaxmotion.systems import camdm, camdm_control
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
 # No attention: the gradient of its keys' biases is zero but for rounding, which Adam
@@ -46,15 +47,17 @@ def roll(mesh=None, chunk=None):
     """A rollout of characters who need their plans at different ticks."""
     bones = tiny.skeleton()
     past = tiny.walk(CONFIG.past)
-    state = camdm_control.init_state(bones, past, config=CONFIG)
+    state = camdm_controller.init_state(bones, past, config=CONFIG)
     states = jax.tree.map(lambda x: jnp.stack([x] * CHARACTERS), state)
-    control = camdm_control.Control(apply=5, reuse=6)
+    control = camdm_controller.Control(apply=5, reuse=6)
 
     def run(params, key, states, commands):
-        made = camdm_control.controller(params, bones, config=CONFIG, control=control)
+        made = camdm_controller.controller(
+            params, bones, config=CONFIG, control=control
+        )
         return rollout.rollout(made, key, states, commands, mesh=mesh, chunk=chunk)
 
-    params = tiny.random_params(camdm.init, CONFIG)
+    params = tiny.random_params(camdm_model.init, CONFIG)
     # Poses near a standing one: rotations of arbitrary six numbers magnify rounding.
     standing = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0, 1.0, 0.0]), CONFIG.num_joints)
     root = jnp.array([0.0, 0.9, 0.0, 0.0, 0.0, 0.0])

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmotion.diffusion import chain, guidance, schedule, tables
+from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.networks import mlp
-from jaxmotion.systems import aamdm_control
+from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.typing import Key, Params
 
 
@@ -58,7 +58,7 @@ def init(key: Key, config: Config) -> Params:
 
 def _predict(params: Params, key: Key, x_0: Array, previous: Array, config: Config):
     """Predicted noise, true noise, and the clean frame that the prediction means."""
-    table = tables.cosine_schedule(config.num_steps)
+    table = schedule.cosine_schedule(config.num_steps)
     key_t, key_noise = jax.random.split(key)
     t = jax.random.randint(key_t, x_0.shape[:1], 1, config.num_steps + 1)
     noise = jax.random.normal(key_noise, x_0.shape)
@@ -86,7 +86,7 @@ def stepper(params: Params, *, config: Config, scale: float = 0.0):
     With a goal for the path features every prediction of the clean frame moves down
     the gradient of their distance, by `scale` (eq. 13 of AAMDM).
     """
-    table = tables.cosine_schedule(config.num_steps)
+    table = schedule.cosine_schedule(config.num_steps)
 
     def step(key: Key, previous: Array, goal: Array | None = None) -> Array:
         def denoise(key: Key, x_t: Array, t: Array) -> Array:
@@ -96,7 +96,7 @@ def stepper(params: Params, *, config: Config, scale: float = 0.0):
 
         if goal is not None:
             denoise = guidance.gradient_guidance(
-                table, denoise, aamdm_control.path_objective(goal), scale=scale
+                table, denoise, aamdm_controller.path_objective(goal), scale=scale
             )
 
         def reverse(key: Key, x_t: Array, t: Array) -> Array:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmotion.systems import aamdm_control
+from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.typing import Key, Params
 
 
@@ -147,7 +147,7 @@ def stepper(params: Params, *, config: Config, candidates: int = 32):
             return decode(key, previous)
         keys = jax.random.split(key, candidates)
         frames = jax.vmap(lambda k: decode(k, previous))(keys)
-        values = jax.vmap(aamdm_control.path_objective(goal))(frames)
+        values = jax.vmap(aamdm_controller.path_objective(goal))(frames)
         return frames[jnp.argmin(values)]
 
     return step

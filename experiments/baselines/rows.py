@@ -19,12 +19,14 @@ import jax
 
 from baselines import amdm, lmm, mvae
 from jaxmotion.learning import training
-from jaxmotion.protocols import aamdm_chains, aamdm_stages
-from jaxmotion.protocols.aamdm_runs import Run, SpaceName
-from jaxmotion.protocols.aamdm_stages import Budget
-from jaxmotion.systems import aamdm, aamdm_control, aamdm_loss, aamdm_space
-from jaxmotion.systems.aamdm_control import Stepper
-from jaxmotion.systems.aamdm_space import Space
+from jaxmotion.systems.aamdm import controller as aamdm_controller
+from jaxmotion.systems.aamdm import loss as aamdm_loss
+from jaxmotion.systems.aamdm import model as aamdm_model
+from jaxmotion.systems.aamdm import space as aamdm_space
+from jaxmotion.systems.aamdm import training as aamdm_training
+from jaxmotion.systems.aamdm.controller import Stepper
+from jaxmotion.systems.aamdm.space import Space
+from jaxmotion.systems.aamdm.training import Budget, Run, SpaceName
 
 TABLE_1 = ("aamdm", "amdm5", "lmm", "mvae")
 TABLE_2 = tuple(
@@ -90,7 +92,7 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
     common = dict(features=space.num_features, width=sizes.width)
     if is_chain(name):
         polishes, drafts = _steps(name)
-        return aamdm.Config(
+        return aamdm_model.Config(
             **common,
             polishes=polishes,
             drafts=drafts,
@@ -123,12 +125,12 @@ def train_baseline(
 ) -> None:
     """Trains a row that is not AAMDM."""
     config = _config(name, space, sizes)
-    optimizer = aamdm_stages.make_optimizer(budget)
+    optimizer = aamdm_training.make_optimizer(budget)
     params = _BASELINES[name].init(jax.random.key(budget.seed), config)
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     loss = _baseline_loss(name, frames, space, config)
     length, given = _WINDOWS[name]
-    windows, arrays = aamdm_stages.frame_windows(
+    windows, arrays = aamdm_training.frame_windows(
         frames, run.train, length, batch=budget.batch
     )
 
@@ -140,7 +142,7 @@ def train_baseline(
         )
         return found.at[:, given].add(noise)
 
-    aamdm_stages.fit(
+    aamdm_training.fit(
         _folder(run, name),
         training.init_train_state(params, optimizer),
         training.make_update(loss, optimizer, ema_decay=budget.ema),
@@ -170,9 +172,9 @@ def train_row(
         return
     config, where = _config(name, space, sizes), space_of(name)
     if config.polishes:
-        aamdm_chains.train_polisher(run, where, space, config, polisher)
+        aamdm_training.train_polisher(run, where, space, config, polisher)
     if config.drafts:
-        aamdm_chains.train_generator(run, where, space, config, generator)
+        aamdm_training.train_generator(run, where, space, config, generator)
 
 
 def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
@@ -192,7 +194,7 @@ def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
     """
     if is_chain(name):
         polishes, drafts = _steps(name)
-        transition = aamdm_chains.load_chain(
+        transition = aamdm_training.load_chain(
             run,
             space_of(name),
             space,
@@ -200,11 +202,11 @@ def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
             polishes=polishes,
             target=_target(name),
         )
-        return aamdm_control.guided(transition, scale=scale)
+        return aamdm_controller.guided(transition, scale=scale)
     module, folder = _BASELINES[name], _folder(run, name)
-    stored = aamdm_stages.check_stage(folder, name)["config"]
+    stored = aamdm_training.check_stage(folder, name)["config"]
     config = module.Config(**stored)
-    params = aamdm_stages.load_params(
+    params = aamdm_training.load_params(
         folder, name, lambda: module.init(jax.random.key(0), config)
     )
     if name == "lmm":

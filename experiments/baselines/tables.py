@@ -8,23 +8,19 @@ import jax
 import numpy as np
 
 from baselines import rows
-from jaxmotion import files
+from jaxmotion import files, reporting
 from jaxmotion.evaluation import table
 from jaxmotion.learning import checkpoint
-from jaxmotion.protocols import (
-    aamdm_evaluation,
-    aamdm_rows,
-    aamdm_runs,
-    camdm_runs,
-    provenance,
-)
-from jaxmotion.systems.aamdm_control import Frame
+from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
+from jaxmotion.systems.aamdm import training as aamdm_training
+from jaxmotion.systems.aamdm.controller import Frame
+from jaxmotion.systems.camdm import training as camdm_training
 
 Row = dict[str, table.Cell]
 
 
 def trained_rows(
-    run: aamdm_runs.Run, names: tuple[str, ...], args: Any
+    run: aamdm_training.Run, names: tuple[str, ...], args: Any
 ) -> dict[str, tuple[Any, Any]]:
     """Steppers and spaces of rows; without names, of all that the folder has."""
     found, spaces = {}, {}
@@ -33,7 +29,7 @@ def trained_rows(
         scale = args.amdm_scale if name.startswith("amdm") else args.scale
         try:
             if where not in spaces:
-                spaces[where] = aamdm_runs.load_space(run, where)
+                spaces[where] = aamdm_training.load_space(run, where)
             step = rows.load_row(name, run, spaces[where], scale=scale)
             found[name] = (step, spaces[where])
         except checkpoint.CheckpointError as error:
@@ -51,7 +47,7 @@ def _skip(frames: Frame, ticks: int) -> Frame:
 
 
 def _unbounded(
-    run: aamdm_runs.Run, space: Any, step: Any, reference: Any, args: Any
+    run: aamdm_training.Run, space: Any, step: Any, reference: Any, args: Any
 ) -> table.Cell:
     """Free rollouts that diverge if nothing keeps them within the data's bounds."""
     ticks = round(args.seconds * run.train.fps)
@@ -62,16 +58,16 @@ def _unbounded(
     roll = aamdm_evaluation.roller(run, space, step, steered=False, bounded=False)
     frames = roll(jax.random.key(args.seed), states, given)[1]
     positions = aamdm_evaluation.positions_of(run.bones, frames)
-    found = aamdm_rows.long_health(positions, None, reference, fps=run.train.fps)
+    found = aamdm_evaluation.long_health(positions, None, reference, fps=run.train.fps)
     return table.Cell(value=float(found["diverged"]), samples=found["rollouts"])
 
 
 def measure(
     name: str,
-    run: aamdm_runs.Run,
+    run: aamdm_training.Run,
     space: Any,
     step: Any,
-    reference: aamdm_rows.Reference,
+    reference: aamdm_evaluation.Reference,
     args: Any,
 ) -> Row:
     """One row: free, steered, and frames a second."""
@@ -88,12 +84,14 @@ def measure(
         )
         roll = aamdm_evaluation.roller(run, space, step, steered=steered)
         frames = _skip(roll(key, states, given)[1], skip)
-        found = aamdm_rows.free_row(key_pairs, run.bones, reference, frames, fps=fps)
+        found = aamdm_evaluation.free_row(
+            key_pairs, run.bones, reference, frames, fps=fps
+        )
         if steered:
             wanted = ("fid", "ffr_mann", "ffr_gmd", "diverged")
             found = {f"{k}_uc": found[k] for k in wanted if k in found}
             if "fid_uc" in found:
-                found |= aamdm_rows.control_row(frames, fps=fps)
+                found |= aamdm_evaluation.control_row(frames, fps=fps)
         row |= found
     ticks = 20 if name == "amdm200" else 300
     rate = aamdm_evaluation.frames_per_second(run, space, step, ticks=ticks)
@@ -102,7 +100,7 @@ def measure(
 
 
 def data_rows(
-    run: aamdm_runs.Run, reference: aamdm_rows.Reference, args: Any
+    run: aamdm_training.Run, reference: aamdm_evaluation.Reference, args: Any
 ) -> dict[str, Row]:
     """Rows of real frames: those trained on, and those held out."""
     found, ticks = {}, round(args.seconds * run.train.fps)
@@ -117,7 +115,7 @@ def data_rows(
             run, data, args.rollouts, length, seed=args.seed
         )
         key = jax.random.key(args.seed)
-        found[name] = aamdm_rows.free_row(
+        found[name] = aamdm_evaluation.free_row(
             key, run.bones, reference, frames, fps=run.train.fps
         )
         print(f"{name}: {args.rollouts} windows of {length} frames")
@@ -125,10 +123,10 @@ def data_rows(
 
 
 def long_rollouts(
-    run: aamdm_runs.Run,
+    run: aamdm_training.Run,
     space: Any,
     step: Any,
-    reference: aamdm_rows.Reference,
+    reference: aamdm_evaluation.Reference,
     args: Any,
 ) -> dict[str, Any]:
     """Health of rollouts of many minutes, free and steered."""
@@ -142,7 +140,7 @@ def long_rollouts(
         roll = aamdm_evaluation.roller(run, space, step, steered=steered)
         frames = roll(jax.random.key(args.seed), states, given)[1]
         positions = aamdm_evaluation.positions_of(run.bones, frames)
-        found["steered" if steered else "free"] = aamdm_rows.long_health(
+        found["steered" if steered else "free"] = aamdm_evaluation.long_health(
             positions,
             frames.desired_velocity if steered else None,
             reference,
@@ -153,19 +151,19 @@ def long_rollouts(
 
 
 def evaluate(
-    run: aamdm_runs.Run, args: Any, out: Path
+    run: aamdm_training.Run, args: Any, out: Path
 ) -> tuple[dict[str, Row], dict[str, Any]]:
     """The table, and what belongs beside it; rows.json has what is done so far."""
     steppers = trained_rows(run, args.rows, args)
-    reference = aamdm_rows.make_reference(run.bones, run.train)
+    reference = aamdm_evaluation.make_reference(run.bones, run.train)
     found = data_rows(run, reference, args)
     for name, (step, space) in steppers.items():
         found[name] = measure(name, run, space, step, reference, args)
         files.write_text(out / "rows.json", json.dumps(table.to_json(found), indent=1))
     report = {
-        "arguments": camdm_runs.arguments_json(args),
+        "arguments": camdm_training.arguments_json(args),
         "source": run.source,
-        **provenance.provenance(),
+        **reporting.provenance(),
     }
     if args.long_minutes and "aamdm" in steppers:
         step, space = steppers["aamdm"]

@@ -8,13 +8,16 @@ from jaxtyping import Array
 
 from emdm_tasks.judge import Judge
 from emdm_tasks.scores import ORDER
-from jaxmotion.evaluation import by_frame
+from jaxmotion.evaluation import by_frame, columns
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import cells, emdm_action, emdm_runs, evaluators
-from jaxmotion.protocols import emdm_action_evaluation as protocol
-from jaxmotion.protocols.emdm_data import ActionArrays
-from jaxmotion.systems import emdm, emdm_motion
+from jaxmotion.systems.emdm import action_evaluation as emdm_action_evaluation
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import features as emdm_features
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
+from jaxmotion.systems.emdm.data import ActionArrays
 
 
 def make_judge(args: Any) -> Judge:
@@ -44,7 +47,7 @@ def make_judge(args: Any) -> Judge:
             f"padding is {args.padding!r}, but {args.run} does not make motions from "
             "texts: expected 'zeros'"
         )
-    run = emdm_action.load_run(args.run)
+    run = emdm_data.load_run(args.run)
     number = len(run.actions)
     each = args.samples // number
     if each < 2:
@@ -54,7 +57,7 @@ def make_judge(args: Any) -> Judge:
         )
     frozen = None if args.evaluator is None else evaluators.load(args.evaluator)
     steps = 1500 if args.evaluator_steps is None else args.evaluator_steps
-    recognizer = protocol.load_recognizer(
+    recognizer = emdm_action_evaluation.load_recognizer(
         run, num_steps=steps, seed=0, evaluator=frozen
     )
     trained = (run.clips.source, steps, 0)
@@ -62,30 +65,30 @@ def make_judge(args: Any) -> Judge:
         trained = (frozen.source, frozen.updates, frozen.seed)
     wanted = jnp.repeat(jnp.arange(number), each)
     key_motion, key_state, *keys_real = jax.random.split(jax.random.key(args.seed), 4)
-    truth = protocol.real_positions(key_motion, wanted, run.train)
-    reference = protocol.moments(recognizer, run)(key_state, truth)
-    ground = protocol.ground_height(run)
-    score = protocol.scorer(recognizer, run, reference, ground=ground)
+    truth = emdm_action_evaluation.real_positions(key_motion, wanted, run.train)
+    reference = emdm_action_evaluation.moments(recognizer, run)(key_state, truth)
+    ground = emdm_action_evaluation.ground_height(run)
+    score = emdm_action_evaluation.scorer(recognizer, run, reference, ground=ground)
 
     def score_real(key: Array, part: ActionArrays) -> dict[str, Cell]:
         def once(key: Array) -> dict[str, Array]:
             key_motion, key_score = jax.random.split(key)
-            positions = protocol.real_positions(key_motion, wanted, part)
+            positions = emdm_action_evaluation.real_positions(key_motion, wanted, part)
             return score(key_score, positions, wanted)
 
         keys = jax.random.split(key, args.replications)
-        return cells.row([once(key) for key in keys], order=ORDER)
+        return columns.row([once(key) for key in keys], order=ORDER)
 
     conditional = run.config["task"] == "action"
-    conditions = emdm.Condition(
-        vector=emdm.action_vectors(wanted, number if conditional else 0),
+    conditions = emdm_model.Condition(
+        vector=emdm_model.action_vectors(wanted, number if conditional else 0),
         keep=jnp.ones(wanted.shape, bool),
         mask=jnp.ones((*wanted.shape, run.train.frames), bool),
     )
 
     @jax.jit
     def positions_of(x: Array) -> Array:
-        motion = emdm_motion.to_motion(x, run.representation)
+        motion = emdm_features.to_motion(x, run.representation)
         return skeleton.joint_positions(run.clips.skeleton, motion)
 
     def score_row(key: Array, many) -> dict[str, Array]:
@@ -110,7 +113,7 @@ def make_judge(args: Any) -> Judge:
             contact_height=ground + 0.05,
         )
 
-    scale = emdm_runs.guidance_scale(args.scale, default=1.0)
+    scale = emdm_training.guidance_scale(args.scale, default=1.0)
     return Judge(
         by_frame=places,
         real={

@@ -9,25 +9,20 @@ from jaxtyping import Array
 
 from emdm_tasks import actions, texts
 from emdm_tasks.scores import ORDER
-from jaxmotion.evaluation import by_frame
+from jaxmotion import reporting
+from jaxmotion.evaluation import by_frame, columns
 from jaxmotion.evaluation.table import Cell
-from jaxmotion.protocols import (
-    artifacts,
-    cells,
-    emdm_rows,
-    emdm_runs,
-    evaluators,
-    provenance,
-)
-from jaxmotion.protocols.camdm_runs import arguments_json
-from jaxmotion.systems import emdm
+from jaxmotion.evaluators import frozen
+from jaxmotion.systems.camdm.training import arguments_json
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
 
 # Rows with so many network calls a motion are replicated less often.
 _LONG = 500
 _CHUNK = 32
 
 
-def calls(config: emdm.Config, row: str) -> int:
+def calls(config: emdm_model.Config, row: str) -> int:
     """Network calls of one motion.
 
     Args:
@@ -37,7 +32,11 @@ def calls(config: emdm.Config, row: str) -> int:
     Returns:
       Steps of its sampler.
     """
-    return emdm_rows.SAMPLERS[row][1] if row in emdm_rows.SAMPLERS else config.num_steps
+    return (
+        emdm_training.SAMPLERS[row][1]
+        if row in emdm_training.SAMPLERS
+        else config.num_steps
+    )
 
 
 def trained_rows(folder: Path) -> tuple[str, ...]:
@@ -49,17 +48,22 @@ def trained_rows(folder: Path) -> tuple[str, ...]:
     Returns:
       Their names.
     """
-    rows = [row for row in emdm_rows.ROWS if (folder / row / "checkpoints").is_dir()]
-    more = [name for name, (row, _) in emdm_rows.SAMPLERS.items() if row in rows]
+    rows = [
+        row for row in emdm_training.ROWS if (folder / row / "checkpoints").is_dir()
+    ]
+    more = [name for name, (row, _) in emdm_training.SAMPLERS.items() if row in rows]
     return (*rows, *more)
 
 
 def _milliseconds(
-    sample: emdm.Sample, condition: emdm.Condition, scale: Array | None, frames: int
+    sample: emdm_model.Sample,
+    condition: emdm_model.Condition,
+    scale: Array | None,
+    frames: int,
 ) -> Cell:
     """Time of one motion at batch 1, per frame, as the paper gives it."""
     run = jax.jit(lambda key: sample(key, condition, scale=scale))
-    return cells.milliseconds(run, parts=frames, least=3)
+    return columns.milliseconds(run, parts=frames, least=3)
 
 
 def evaluate(args: Any, out: Path) -> None:
@@ -72,7 +76,7 @@ def evaluate(args: Any, out: Path) -> None:
     Raises:
       ValueError: if nothing was trained, or a row was not.
     """
-    value = emdm_runs.read_config(args.run)
+    value = emdm_training.read_config(args.run)
     rows = args.rows or trained_rows(args.run)
     if not rows:
         raise ValueError(f"{args.run}: no row was trained")
@@ -82,15 +86,15 @@ def evaluate(args: Any, out: Path) -> None:
     places: dict[str, by_frame.ByFrame] = {}
     for row in rows:
         begun = time.perf_counter()
-        params, config = emdm_runs.load_row(args.run, row)
-        sample = emdm_runs.row_sampler(params, config, row)
+        params, config = emdm_training.load_row(args.run, row)
+        sample = emdm_training.row_sampler(params, config, row)
         number = calls(config, row)
         count = args.long_replications if number >= _LONG else args.replications
         scale = judge.scale
-        many = emdm_runs.sample_many(sample, chunk=_CHUNK)
+        many = emdm_training.sample_many(sample, chunk=_CHUNK)
         keys = jax.random.split(jax.random.key(args.seed + 1), args.replications)
         results = [judge.score(key, many) for key in keys[:count]]
-        found[row] = cells.row(results, order=ORDER) | {
+        found[row] = columns.row(results, order=ORDER) | {
             "ms a frame": _milliseconds(sample, judge.one, scale, config.frames),
             "network calls": Cell(value=float(number)),
         }
@@ -102,9 +106,9 @@ def evaluate(args: Any, out: Path) -> None:
         "arguments": arguments_json(args),
         "run": value,
         "evaluator": judge.describe,
-    } | provenance.provenance()
-    notes = (evaluators.note(judge.describe), *judge.notes)
+    } | reporting.provenance()
+    notes = (frozen.note(judge.describe), *judge.notes)
     if places:
         report["by_frame_of_the_token"] = by_frame.to_json(places)
         notes += (by_frame.to_markdown(places),)
-    artifacts.write_table(out, found, report, notes)
+    reporting.write_table(out, found, report, notes)

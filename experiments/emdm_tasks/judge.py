@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from jaxmotion.evaluation.by_frame import ByFrame
 from jaxmotion.evaluation.table import Cell
-from jaxmotion.systems import emdm
+from jaxmotion.systems.emdm import model as emdm_model
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,7 +30,7 @@ class Judge:
     real: dict[str, dict[str, Cell]]
     score: Callable[[Array, Callable[..., Array]], dict[str, Array]]
     scale: Array | None
-    one: emdm.Condition
+    one: emdm_model.Condition
     samples: int
     describe: dict[str, Any]
     notes: tuple[str, ...] = ()

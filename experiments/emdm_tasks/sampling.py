@@ -8,9 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion import reporting
 from jaxmotion.motion import humanml_skeleton, skeleton
-from jaxmotion.protocols import artifacts, emdm_action, emdm_runs, emdm_text
-from jaxmotion.systems import emdm, emdm_motion
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import features as emdm_features
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import text as emdm_text
+from jaxmotion.systems.emdm import training as emdm_training
 
 
 def sample(args: Any, out: Path) -> None:
@@ -24,7 +28,7 @@ def sample(args: Any, out: Path) -> None:
       ValueError: if an action is unknown, a text is empty or too long, the length is
         out of range, or the run has another task.
     """
-    task = emdm_runs.read_config(args.run).get("task")
+    task = emdm_training.read_config(args.run).get("task")
     given = {"action": args.action, "text": args.text}
     for name, values in given.items():
         if values and name != task:
@@ -38,15 +42,15 @@ def sample(args: Any, out: Path) -> None:
 
 def _generate(args: Any, vectors: Any, scale: float) -> np.ndarray:
     """Features of one motion for each vector, cut to their length."""
-    params, config = emdm_runs.load_row(args.run, args.row)
+    params, config = emdm_training.load_row(args.run, args.row)
     length = config.frames if args.frames is None else args.frames
-    conditions = emdm.make_condition(
+    conditions = emdm_model.make_condition(
         vectors, (length,) * vectors.shape[0], config=config
     )
-    run = emdm_runs.sample_many(
-        emdm_runs.row_sampler(params, config, args.row), chunk=8
+    run = emdm_training.sample_many(
+        emdm_training.row_sampler(params, config, args.row), chunk=8
     )
-    given = emdm_runs.guidance_scale(args.scale, default=scale)
+    given = emdm_training.guidance_scale(args.scale, default=scale)
     return run(jax.random.key(args.seed), conditions, given)[:, :length]
 
 
@@ -55,24 +59,24 @@ def _file_name(text: str) -> str:
 
 
 def _from_actions(args: Any, out: Path) -> None:
-    run = emdm_action.load_run(args.run)
+    run = emdm_data.load_run(args.run)
     for action in args.action:
         if action not in run.actions:
             raise ValueError(
                 f"unknown action {action!r}: expected one of {', '.join(run.actions)}"
             )
     numbers = jnp.asarray([run.actions.index(a) for a in args.action], jnp.int32)
-    vectors = emdm.action_vectors(numbers, len(run.actions))
+    vectors = emdm_model.action_vectors(numbers, len(run.actions))
     if not args.action:
         vectors = jnp.zeros((1, 0))
-    motions = emdm_motion.to_motion(_generate(args, vectors, 1.0), run.representation)
+    motions = emdm_features.to_motion(_generate(args, vectors, 1.0), run.representation)
     for i, title in enumerate(args.action or ("motion",)):
         motion = skeleton.Motion(
             root_position=motions.root_position[i],
             joint_rotation=motions.joint_rotation[i],
             fps=run.clips.fps,
         )
-        artifacts.write_rollout(
+        reporting.write_rollout(
             out,
             run.clips.skeleton,
             motion,
@@ -93,7 +97,7 @@ def _from_texts(args: Any, out: Path) -> None:
         bones, motion = humanml_skeleton.motion_from_joints(
             positions[i], run.motions.fps
         )
-        artifacts.write_rollout(
+        reporting.write_rollout(
             out,
             bones,
             motion,

@@ -5,15 +5,11 @@ from typing import Any
 
 from jaxmotion.data import clips_io, selection, text_motion_io
 from jaxmotion.data.text_motion import TextMotions
-from jaxmotion.protocols import (
-    emdm_action,
-    emdm_captioned,
-    emdm_data,
-    emdm_runs,
-    emdm_text,
-    stages,
-)
-from jaxmotion.systems import emdm
+from jaxmotion.learning import runs
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import text as emdm_text
+from jaxmotion.systems.emdm import training as emdm_training
 
 # Labels of Bandai-Namco that name the same action as others.
 MERGE = ("bye=wave-right-hand", "byebye=wave-both-hands", "dash=run")
@@ -21,7 +17,7 @@ MERGE = ("bye=wave-right-hand", "byebye=wave-both-hands", "dash=run")
 _SHORTEST = 40
 
 
-def base_config(args: Any, recon: float) -> emdm.Config:
+def base_config(args: Any, recon: float) -> emdm_model.Config:
     """Sizes and weights of the row "emdm"; the task sets the rest.
 
     Args:
@@ -31,7 +27,7 @@ def base_config(args: Any, recon: float) -> emdm.Config:
     Returns:
       The configuration.
     """
-    return emdm.Config(
+    return emdm_model.Config(
         features=1,
         width=args.width,
         depth=args.depth,
@@ -52,11 +48,11 @@ def _same(folder: Path, paths: tuple[Path, ...], made: dict[str, Any]) -> bool:
     """Whether the folder has data made so; an error if it has other data."""
     if not (folder / "config.json").exists():
         return False
-    stages.check_made(folder, emdm_runs.read_config(folder), paths, made)
+    runs.check_made(folder, emdm_training.read_config(folder), paths, made)
     return True
 
 
-def prepare(args: Any) -> emdm_runs.Task:
+def prepare(args: Any) -> emdm_training.Task:
     """Makes a run folder's data, or loads those it has.
 
     Args:
@@ -93,7 +89,7 @@ def merges(pairs: tuple[str, ...]) -> dict[str, str]:
     return merge
 
 
-def _prepare_actions(args: Any) -> emdm_runs.Task:
+def _prepare_actions(args: Any) -> emdm_training.Task:
     merge = merges(args.merge)
     made = dict(
         task=args.task,
@@ -109,19 +105,19 @@ def _prepare_actions(args: Any) -> emdm_runs.Task:
             args.data, field=args.field, merge=merge, least=args.least, fps=made["fps"]
         )
         clips_io.save_clips(args.out / "data.npz", clips)
-        made |= stages.made_from(args.data) | {"left_out": list(left_out)}
-        emdm_runs.write_config(args.out, made)
-    run = emdm_action.load_run(args.out)
+        made |= runs.made_from(args.data) | {"left_out": list(left_out)}
+        emdm_training.write_config(args.out, made)
+    run = emdm_data.load_run(args.out)
     print(
         f"{run.clips.num_clips} clips of {len(run.actions)} actions: "
         f"{', '.join(run.actions)}; left out: {', '.join(run.config['left_out'])}"
     )
-    return emdm_action.make_task(
+    return emdm_data.make_task(
         run, base_config(args, 1.0), conditional=args.task == "action"
     )
 
 
-def _prepare_texts(args: Any) -> emdm_runs.Task:
+def _prepare_texts(args: Any) -> emdm_training.Task:
     form = args.text_form or emdm_text.default_form(args.encoder)
     made = dict(
         task=args.task,
@@ -137,7 +133,7 @@ def _prepare_texts(args: Any) -> emdm_runs.Task:
         emdm_text.make_encoder(args.encoder, form)
         motions = _text_motions(args, made["fps"])
         text_motion_io.save_text_motions(args.out / "data.npz", motions)
-        emdm_runs.write_config(args.out, made | stages.made_from(args.data))
+        emdm_training.write_config(args.out, made | runs.made_from(args.data))
     run = emdm_text.load_run(args.out)
     counts = {s: run.motions.clips_of(s).size for s in run.motions.split_names}
     print(
@@ -152,7 +148,7 @@ def _text_motions(args: Any, fps: float) -> TextMotions:
     if len(args.data) == 1 and text_motion_io.is_text_motions(args.data[0]):
         return text_motion_io.load_text_motions(args.data[0])
     clips = selection.concatenate([clips_io.load_clips(path) for path in args.data])
-    motions, error = emdm_captioned.from_labels(
+    motions, error = emdm_data.from_labels(
         clips,
         unseen=args.unseen,
         held_out=args.held_out,

@@ -10,11 +10,12 @@ from jaxtyping import Array
 from emdm_tasks.judge import Judge
 from emdm_tasks.scores import ORDER
 from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
-from jaxmotion.evaluation import diversity, frechet
+from jaxmotion.evaluation import columns, diversity, frechet
 from jaxmotion.learning.fingerprint import fingerprint
-from jaxmotion.protocols import cells, emdm_runs, emdm_text
-from jaxmotion.protocols import emdm_text_evaluation as protocol
-from jaxmotion.systems import emdm
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import text as emdm_text
+from jaxmotion.systems.emdm import text_evaluation as emdm_text_evaluation
+from jaxmotion.systems.emdm import training as emdm_training
 
 # Multimodality: sentences, motions of each, pairs of them.
 _SENTENCES, _REPEATS, _PAIRS = 16, 8, 10
@@ -43,7 +44,7 @@ def make_judge(args: Any) -> Judge:
         raise ValueError(
             f"matcher is {args.matcher} and glove is {args.glove}: published weights "
             "read GloVe's vectors, so give both, --glove the folder with "
-            f"{', '.join(protocol.GLOVE)}, or neither"
+            f"{', '.join(emdm_text_evaluation.GLOVE)}, or neither"
         )
     run = emdm_text.load_run(args.run)
     frames, number = run.config["frames"], args.samples // 32 * 32
@@ -51,9 +52,11 @@ def make_judge(args: Any) -> Judge:
         raise ValueError(f"samples is {args.samples}, expected at least 64")
     steps = 600 if args.evaluator_steps is None else args.evaluator_steps
     judge = (
-        protocol.published_evaluator(run, args.matcher, glove=args.glove)
+        emdm_text_evaluation.published_evaluator(run, args.matcher, glove=args.glove)
         if args.matcher
-        else protocol.train_evaluator(run, frames=frames, num_steps=steps, seed=0)
+        else emdm_text_evaluation.train_evaluator(
+            run, frames=frames, num_steps=steps, seed=0
+        )
     )
     arrays = {
         split: text_arrays(run.motions, split=split, max_frames=frames)
@@ -62,13 +65,13 @@ def make_judge(args: Any) -> Judge:
     }
     draw = jax.jit(sample_text_batch, static_argnames="batch")
     embed = jax.jit(
-        lambda x, frames, padding: protocol.embed(
+        lambda x, frames, padding: emdm_text_evaluation.embed(
             run, judge, x, frames, padding=padding
         ),
         static_argnums=2,
     )
     score = {
-        padding: protocol.make_scorer(run, judge, padding=padding)
+        padding: emdm_text_evaluation.make_scorer(run, judge, padding=padding)
         for padding in {"zeros", args.padding}
     }
 
@@ -86,18 +89,18 @@ def make_judge(args: Any) -> Judge:
             return score["zeros"](key_score, x, length, caption, references[split])
 
         keys = jax.random.split(jax.random.key(args.seed + 7), args.replications)
-        return cells.row([once(key) for key in keys], order=ORDER)
+        return columns.row([once(key) for key in keys], order=ORDER)
 
     vectors, index = jnp.asarray(run.vectors, jnp.float32), jnp.asarray(run.index)
 
-    def conditions(caption: Array, length: Array) -> emdm.Condition:
-        return emdm.Condition(
+    def conditions(caption: Array, length: Array) -> emdm_model.Condition:
+        return emdm_model.Condition(
             vector=vectors[index[caption]],
             keep=jnp.ones(caption.shape, bool),
             mask=jnp.arange(frames)[None] < length[:, None],
         )
 
-    scale = emdm_runs.guidance_scale(args.scale, default=2.5)
+    scale = emdm_training.guidance_scale(args.scale, default=2.5)
 
     def score_split(key: Array, many, split: str) -> dict[str, Array]:
         key_draw, key_sample, key_score = jax.random.split(key, 3)

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import camdm as protocol
-from jaxmotion.protocols import camdm_runs
-from jaxmotion.systems import camdm, camdm_control, camdm_model
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import steering as camdm_steering
+from jaxmotion.systems.camdm import training as camdm_training
 from serving.controlled import ControlledSimulation
 
 
@@ -25,7 +26,7 @@ def mean_pose(model: camdm_model.Model) -> skeleton.Motion:
     """
     config = model.config
     zeros = jnp.zeros((config.past, config.num_features))
-    motion = camdm.to_motion(zeros, config=config)
+    motion = camdm_model.to_motion(zeros, config=config)
     lowest = jnp.min(skeleton.joint_positions(model.bones, motion)[..., 1])
     raised = motion.root_position.at[:, 1].set(-lowest)
     return dataclasses.replace(motion, root_position=raised)
@@ -33,7 +34,7 @@ def mean_pose(model: camdm_model.Model) -> skeleton.Motion:
 
 def first_state(
     run: Path, data: Path | None, model: camdm_model.Model
-) -> camdm_control.CharacterState:
+) -> camdm_controller.CharacterState:
     """The state that characters begin with.
 
     Args:
@@ -51,9 +52,9 @@ def first_state(
     """
     config = model.config
     if data is None and config.rotation_mean and config.heading == "facing":
-        return camdm_control.init_state(model.bones, mean_pose(model), config=config)
-    loaded = camdm_runs.load_run(run, data)
-    states = protocol.start_states(
+        return camdm_controller.init_state(model.bones, mean_pose(model), config=config)
+    loaded = camdm_training.load_run(run, data)
+    states = camdm_steering.start_states(
         loaded.train, model, np.zeros(1, int), field=loaded.field, seed=0
     )
     return jax.tree.map(lambda x: x[0], states)
@@ -75,7 +76,7 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
     """
     model, params, _ = camdm_model.load(run)
     return ControlledSimulation(
-        camdm_control.controller(params, model.bones, config=model.config),
+        camdm_controller.controller(params, model.bones, config=model.config),
         model.bones,
         first_state(run, data, model),
         lambda frame: {"root": frame.root_position, "rotations": frame.joint_rotation},

@@ -4,8 +4,11 @@ from pathlib import Path
 
 import jax
 
-from jaxmotion.protocols import smgdiff_evaluation, smgdiff_runs
-from jaxmotion.systems import smgdiff_control, smgdiff_guidance, smgdiff_trajectory
+from jaxmotion.systems.smgdiff import controller as smgdiff_controller
+from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import training as smgdiff_training
+from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from serving.controlled import ControlledSimulation
 
 
@@ -25,13 +28,13 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
     """
     if data is not None:
         raise ValueError(f"--data {data}: players start from the clips in {run}")
-    loaded = smgdiff_runs.load_run(run)
-    model, params = smgdiff_runs.load_stage(loaded, "motion_8")
-    paths, path_params = smgdiff_runs.load_stage(loaded, "paths_1")
+    loaded = smgdiff_training.load_run(run)
+    model, params = smgdiff_training.load_stage(loaded, "motion_8")
+    paths, path_params = smgdiff_training.load_stage(loaded, "paths_1")
     known = smgdiff_evaluation.situations(loaded.train, model, number=8, seed=0)
     past = jax.tree.map(lambda x: x[0], known.past)
     bones = model.representation.bones
-    driver = smgdiff_control.controller(
+    driver = smgdiff_controller.controller(
         smgdiff_trajectory.generator(path_params, config=paths.paths),
         smgdiff_guidance.planner(
             params,
@@ -45,7 +48,7 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
     return ControlledSimulation(
         driver,
         bones,
-        smgdiff_control.init_state(bones, past, config=model.config),
+        smgdiff_controller.init_state(bones, past, config=model.config),
         lambda frame: {
             "root": frame.root_position,
             "rotations": frame.joint_rotation,

@@ -7,19 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion import reporting
 from jaxmotion.control import rollout
 from jaxmotion.motion import skeleton
 from jaxmotion.motion.trajectory import Command
-from jaxmotion.protocols import (
-    artifacts,
-    smgdiff_evaluation,
-    smgdiff_players,
-    smgdiff_runs,
-)
-from jaxmotion.protocols.smgdiff_runs import Run
-from jaxmotion.systems import smgdiff_control, smgdiff_guidance, smgdiff_trajectory
-from jaxmotion.systems.smgdiff_model import Model
-from jaxmotion.systems.smgdiff_trajectory import Generate
+from jaxmotion.systems.smgdiff import controller as smgdiff_controller
+from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import players as smgdiff_players
+from jaxmotion.systems.smgdiff import training as smgdiff_training
+from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
+from jaxmotion.systems.smgdiff.model import Model
+from jaxmotion.systems.smgdiff.training import Run
+from jaxmotion.systems.smgdiff.trajectory import Generate
 from smgdiff_tasks.tables import guidance_of
 
 # The direction of the command turns by so much, every so often.
@@ -68,7 +68,7 @@ def generator_of(run: Run, stage: str) -> Generate:
     """
     if stage == "straight":
         return smgdiff_players.straight(run.model)
-    model, params = smgdiff_runs.load_stage(run, stage)
+    model, params = smgdiff_training.load_stage(run, stage)
     return smgdiff_trajectory.generator(params, config=model.paths)
 
 
@@ -80,10 +80,10 @@ def play(args: Any, run: Run, out: Path) -> None:
       run: The run.
       out: Folder.
     """
-    model, params = smgdiff_runs.load_stage(run, f"motion_{args.steps}")
+    model, params = smgdiff_training.load_stage(run, f"motion_{args.steps}")
     features, bones = model.representation, model.representation.bones
     steered = commands(model, args.skills or model.labels, seconds=args.seconds)
-    driver = smgdiff_control.controller(
+    driver = smgdiff_controller.controller(
         generator_of(run, args.paths),
         smgdiff_guidance.planner(
             params,
@@ -97,20 +97,20 @@ def play(args: Any, run: Run, out: Path) -> None:
     known = smgdiff_evaluation.situations(run.train, model, number=2000, seed=args.seed)
     first = int(np.flatnonzero(np.asarray(known.label) == int(steered.label[0]))[0])
     past = jax.tree.map(lambda x: x[first], known.past)
-    state = smgdiff_control.init_state(bones, past, config=model.config)
+    state = smgdiff_controller.init_state(bones, past, config=model.config)
     one = lambda tree: jax.tree.map(lambda x: x[None], tree)  # noqa: E731
     run_all = jax.jit(lambda *given: rollout.rollout(driver, *given)[1])
     frames = run_all(jax.random.key(args.seed), one(state), one(steered))
     scene = smgdiff_players.to_scene(jax.tree.map(lambda x: x[0], frames), model)
     touch = np.asarray(scene.touch) > 0.5
-    artifacts.write_rollout(
+    reporting.write_rollout(
         out,
         bones,
         scene.motion,
         steered.velocity,
         title=", ".join(args.skills or model.labels),
         caption=model.source,
-        ball=artifacts.Ball(
+        ball=reporting.Ball(
             position=np.asarray(scene.ball),
             touch=touch,
             joints=features.joints,

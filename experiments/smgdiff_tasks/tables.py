@@ -8,24 +8,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmotion.evaluation import by_frame
+from jaxmotion import reporting
+from jaxmotion.evaluation import by_frame, columns
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.evaluators import frozen
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import (
-    artifacts,
-    cells,
-    evaluators,
-    provenance,
-    smgdiff_evaluation,
-    smgdiff_players,
-    smgdiff_runs,
-)
-from jaxmotion.protocols.camdm_runs import arguments_json
-from jaxmotion.protocols.smgdiff_evaluation import Setting
-from jaxmotion.protocols.smgdiff_runs import Run
-from jaxmotion.systems import smgdiff_guidance, smgdiff_trajectory
-from jaxmotion.systems.smgdiff_guidance import SCHEDULES, UNGUIDED, Guidance, Plan
-from jaxmotion.systems.smgdiff_model import Model
+from jaxmotion.systems.camdm.training import arguments_json
+from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import players as smgdiff_players
+from jaxmotion.systems.smgdiff import training as smgdiff_training
+from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
+from jaxmotion.systems.smgdiff.evaluation import Setting
+from jaxmotion.systems.smgdiff.guidance import SCHEDULES, UNGUIDED, Guidance, Plan
+from jaxmotion.systems.smgdiff.model import Model
+from jaxmotion.systems.smgdiff.training import Run
 
 Rows = dict[str, dict[str, Cell]]
 Places = dict[str, by_frame.ByFrame]
@@ -51,7 +48,7 @@ _ORDER = (
 
 
 def _row(scores: list[dict[str, Array]]) -> dict[str, Cell]:
-    return cells.row(scores, order=_ORDER)
+    return columns.row(scores, order=_ORDER)
 
 
 def guidance_of(args: Any, schedule: str) -> Guidance:
@@ -81,13 +78,13 @@ def guidance_of(args: Any, schedule: str) -> Guidance:
 def _milliseconds(plan: Plan, setting: Setting) -> Cell:
     """Time of one plan at batch 1; its parameters are constants of the program."""
     condition = jax.tree.map(lambda x: x[0], setting.known.condition)
-    return cells.milliseconds(jax.jit(lambda key: plan(key, condition)))
+    return columns.milliseconds(jax.jit(lambda key: plan(key, condition)))
 
 
 def _plan_row(
     run: Run, setting: Setting, steps: int, guided: Guidance, chunk: int
 ) -> tuple[dict[str, Cell], by_frame.ByFrame]:
-    model, params = smgdiff_runs.load_stage(run, f"motion_{steps}")
+    model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
     plan = smgdiff_guidance.planner(
         params, config=model.config, representation=model.representation, guided=guided
     )
@@ -180,7 +177,7 @@ def _generators(run: Run) -> dict[str, tuple[Model, Any]]:
     """Trained trajectory generators by name."""
     found = {}
     for folder in sorted(run.folder.glob("paths_*")):
-        model, params = smgdiff_runs.load_stage(run, folder.name)
+        model, params = smgdiff_training.load_stage(run, folder.name)
         found[f"generator, T = {model.paths.num_steps}"] = smgdiff_trajectory.generator(
             params, config=model.paths
         )
@@ -198,7 +195,7 @@ def paths(args: Any, run: Run, setting: Setting) -> tuple[Rows, dict[str, Any]]:
     Returns:
       The rows, and how much each generator's paths depend on their noise.
     """
-    model, params = smgdiff_runs.load_stage(run, f"motion_{args.steps}")
+    model, params = smgdiff_training.load_stage(run, f"motion_{args.steps}")
     generators = _generators(run)
     shares = {
         name: {
@@ -258,8 +255,8 @@ def write(
     folder = out / name
     folder.mkdir(parents=True, exist_ok=True)
     report = {"arguments": arguments_json(args), "source": run.model.source} | more
-    notes = (evaluators.note(more["evaluator"]),)
+    notes = (frozen.note(more["evaluator"]),)
     if places:
         report["by_frame_of_the_token"] = by_frame.to_json(places)
         notes += (by_frame.to_markdown(places),)
-    artifacts.write_table(folder, rows, report | provenance.provenance(), notes)
+    reporting.write_table(folder, rows, report | reporting.provenance(), notes)

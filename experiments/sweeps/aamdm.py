@@ -11,10 +11,11 @@ import jax
 from jaxtyping import Array
 
 from jaxmotion.data import clips_io
-from jaxmotion.protocols import aamdm_evaluation, aamdm_rows, aamdm_runs
-from jaxmotion.protocols.aamdm_data import PoseData
-from jaxmotion.systems.aamdm_control import Frame, Stepper
-from jaxmotion.systems.aamdm_space import Space
+from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
+from jaxmotion.systems.aamdm import training as aamdm_training
+from jaxmotion.systems.aamdm.controller import Frame, Stepper
+from jaxmotion.systems.aamdm.data import PoseData
+from jaxmotion.systems.aamdm.space import Space
 from sweeps import points
 from sweeps.budgets import Amount
 from sweeps.points import Point
@@ -100,9 +101,9 @@ class Setting:
     """
 
     job: Job
-    run: aamdm_runs.Run
+    run: aamdm_training.Run
     space: Space
-    reference: aamdm_rows.Reference
+    reference: aamdm_evaluation.Reference
 
     @property
     def rollouts(self) -> int:
@@ -122,7 +123,7 @@ def _stepper(setting: Setting, point: Point) -> Stepper:
 
 
 def _frames_row(setting: Setting, key: Array, frames: Frame) -> Row:
-    return aamdm_rows.free_row(
+    return aamdm_evaluation.free_row(
         key,
         setting.run.bones,
         setting.reference,
@@ -159,7 +160,7 @@ def score(setting: Setting, point: Point) -> Row:
             row |= found
         elif "fid" in found:
             row |= {"fid_uc": found["fid"]}
-            row |= aamdm_rows.control_row(frames, fps=run.train.fps)
+            row |= aamdm_evaluation.control_row(frames, fps=run.train.fps)
     return row
 
 
@@ -187,12 +188,12 @@ def write_rollout(job: Job, point: Point, folder: Path) -> None:
 
 def bench(job: Job) -> Bench:
     """Free and steered rollouts beside recorded windows."""
-    run, budget = aamdm_runs.load_run(job.models), job.budget
+    run, budget = aamdm_training.load_run(job.models), job.budget
     setting = Setting(
         job=job,
         run=run,
-        space=aamdm_runs.load_space(run, "embedded"),
-        reference=aamdm_rows.make_reference(run.bones, run.train),
+        space=aamdm_training.load_space(run, "embedded"),
+        reference=aamdm_evaluation.make_reference(run.bones, run.train),
     )
     return Bench(
         real={

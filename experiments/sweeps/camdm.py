@@ -13,21 +13,17 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.data import windows
-from jaxmotion.evaluation import camdm_release as released
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.evaluators import frozen
+from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import camdm as protocol
-from jaxmotion.protocols import (
-    camdm_distances,
-    camdm_evaluation,
-    camdm_release,
-    camdm_rows,
-    camdm_runs,
-    camdm_styles,
-    evaluators,
-)
-from jaxmotion.systems import camdm, camdm_loss, camdm_model
+from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import loss as camdm_loss
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import release as camdm_release
+from jaxmotion.systems.camdm import steering as camdm_steering
+from jaxmotion.systems.camdm import training as camdm_training
 from sweeps import points
 from sweeps.budgets import Amount
 from sweeps.points import Point
@@ -95,13 +91,13 @@ def trainer(job: Job) -> Callable[[Point], None]:
     return train
 
 
-def _run_of(job: Job, run: camdm_runs.Run, point: Point) -> camdm_runs.Run:
+def _run_of(job: Job, run: camdm_training.Run, point: Point) -> camdm_training.Run:
     """The same clips with another model."""
     model, params, _ = camdm_model.load(_folder(job, point))
     return dataclasses.replace(run, model=model, params=params)
 
 
-def condition_of(run: camdm_runs.Run, *, seed: int) -> camdm.Condition:
+def condition_of(run: camdm_training.Run, *, seed: int) -> camdm_model.Condition:
     """One condition of a plan, from a held-out window."""
     config = run.model.config
     index = windows.window_index(run.held_out, config.window, short="skip")
@@ -127,34 +123,38 @@ class Judge:
       labels: Style of each character; those of one style are neighbours.
     """
 
-    recognizer: camdm_styles.Recognized
+    recognizer: style_evaluator.Recognized
     reference: np.ndarray
-    styles: released.Groups
+    styles: camdm_release.Groups
     height: float
     root: float
     count: int
     labels: np.ndarray
 
 
-def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
+def _judge(job: Job, run: camdm_training.Run) -> tuple[Judge, dict[str, Row]]:
     """Trains the recogniser; scores the clips."""
     bones, field = run.model.bones, run.field
     styles, budget = len(run.model.labels), job.budget
     ticks = round(budget["seconds"] * run.model.config.fps)
-    protocol.check_ticks(ticks, fps=run.model.config.fps, skip=camdm_evaluation.SKIP)
+    camdm_steering.check_ticks(
+        ticks, fps=run.model.config.fps, skip=camdm_evaluation.SKIP
+    )
     key_fit, _ = jax.random.split(jax.random.key(job.seed))
     recognizer = camdm_evaluation.recognizer(
         key_fit, run, job.evaluator, num_steps=budget["recognizer_updates"]
     )
-    real = protocol.data_windows(run.held_out, stride=protocol.WINDOW, field=field)
-    dense = protocol.data_windows(run.train, stride=10, field=field)
-    feature, hits = camdm_styles.recognized(bones, real, recognizer)
-    reference, _ = camdm_styles.recognized(bones, dense, recognizer)
-    own = camdm_distances.random_half(
+    real = camdm_steering.data_windows(
+        run.held_out, stride=camdm_steering.WINDOW, field=field
+    )
+    dense = camdm_steering.data_windows(run.train, stride=10, field=field)
+    feature, hits = style_evaluator.recognized(bones, real, recognizer)
+    reference, _ = style_evaluator.recognized(bones, dense, recognizer)
+    own = camdm_evaluation.random_half(
         np.asarray(dense.group), np.asarray(dense.label), job.seed
     )
-    made = styles * ((ticks - camdm_evaluation.SKIP) // protocol.WINDOW)
-    height = camdm_rows.contact_height(bones, real)
+    made = styles * ((ticks - camdm_evaluation.SKIP) // camdm_steering.WINDOW)
+    height = camdm_evaluation.contact_height(bones, real)
     judge = Judge(
         recognizer=recognizer,
         reference=reference,
@@ -165,7 +165,7 @@ def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
         labels=np.repeat(np.arange(styles), job.replications),
     )
     distances = functools.partial(
-        camdm_distances.frechet_cells,
+        camdm_evaluation.frechet_cells,
         count=judge.count,
         seed=job.seed,
         repeats=job.replications,
@@ -173,7 +173,7 @@ def _judge(job: Job, run: camdm_runs.Run) -> tuple[Judge, dict[str, Row]]:
     whole = camdm_release.of_clips(run.held_out, field=field)
     return judge, {
         GROUND_TRUTH: distances(feature, reference)
-        | camdm_rows.metric_row(bones, real, hits, height=height)
+        | camdm_evaluation.metric_row(bones, real, hits, height=height)
         | _released(judge, bones, whole),
         NOISE_FLOOR: distances(reference[own], reference[~own]),
     }
@@ -194,7 +194,7 @@ def _released(
 def _fid(job: Job, judge: Judge, features: np.ndarray, owner: np.ndarray) -> Cell:
     """Fréchet distance of each replication's windows to the training windows."""
     found = [
-        camdm_distances.frechet_cell(
+        camdm_evaluation.frechet_cell(
             features[owner == i],
             judge.reference,
             count=judge.count,
@@ -206,34 +206,34 @@ def _fid(job: Job, judge: Judge, features: np.ndarray, owner: np.ndarray) -> Cel
     return table.cell(jnp.asarray(found, jnp.float32))
 
 
-def score(job: Job, judge: Judge, run: camdm_runs.Run) -> Row:
+def score(job: Job, judge: Judge, run: camdm_training.Run) -> Row:
     """Steers one character a style in each replication, and measures them."""
     model, bones, fps = run.model, run.model.bones, run.model.config.fps
     _, commands = camdm_evaluation.preset_of_run(
         run, PRESET, judge.labels, seconds=job.budget["seconds"], speed=None
     )
-    states = protocol.start_states(
+    states = camdm_steering.start_states(
         run.held_out, model, judge.labels, field=run.field, seed=job.seed
     )
     _, key = jax.random.split(jax.random.key(job.seed))
-    frames = protocol.steered_rollouts(
+    frames = camdm_steering.steered_rollouts(
         run.params, key, states, commands, model=model, chunk=job.budget["chunk"]
     )
-    made = protocol.rollout_windows(
+    made = camdm_steering.rollout_windows(
         frames, jnp.asarray(judge.labels), fps=fps, skip=camdm_evaluation.SKIP
     )
-    features, hits = camdm_styles.recognized(bones, made, judge.recognizer)
+    features, hits = style_evaluator.recognized(bones, made, judge.recognizer)
     owner = np.asarray(made.group) % job.replications
     # Of each replication, not of each character: these are what is independent.
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
-    health = camdm_rows.rollout_health(bones, frames, fps=fps, height=judge.root)
+    health = camdm_evaluation.rollout_health(bones, frames, fps=fps, height=judge.root)
     row = {"fid": _fid(job, judge, features, owner)}
-    row |= camdm_distances.unbiased_cells(features, judge.reference, seed=job.seed)
-    row |= camdm_rows.metric_row(bones, grouped, hits, height=judge.height)
+    row |= camdm_evaluation.unbiased_cells(features, judge.reference, seed=job.seed)
+    row |= camdm_evaluation.metric_row(bones, grouped, hits, height=judge.height)
     whole = camdm_release.of_rollouts(frames, commands, fps=fps)
     replication = np.arange(judge.labels.size) % job.replications
     row |= _released(judge, bones, whole, replication)
-    row["diversity_m2"] = camdm_rows.repeat_diversity(
+    row["diversity_m2"] = camdm_evaluation.repeat_diversity(
         bones, made, repeats=job.replications
     )
     for name in ("diverged", "frozen"):
@@ -243,13 +243,13 @@ def score(job: Job, judge: Judge, run: camdm_runs.Run) -> Row:
 
 def bench(job: Job) -> Bench:
     """The evaluation of `experiments/camdm.py`, in replications."""
-    run = camdm_runs.load_run(_folder(job, job.points[0]), None, CONTENTS)
+    run = camdm_training.load_run(_folder(job, job.points[0]), None, CONTENTS)
     judge, real = _judge(job, run)
 
     def sampler(point: Point) -> Callable[[Array], Array]:
         own = _run_of(job, run, point)
         condition = condition_of(own, seed=job.seed)
-        plan = camdm.planner(own.params, config=own.model.config)
+        plan = camdm_model.planner(own.params, config=own.model.config)
         return jax.jit(lambda key: plan(key, condition))
 
     def rollout(point: Point, folder: Path) -> None:
@@ -279,10 +279,10 @@ def bench(job: Job) -> Bench:
             "fid_windows": judge.count,
             "fid_reference_windows": len(judge.reference),
             "rollouts": int(judge.labels.size),
-            "evaluator": evaluators.describe(
+            "evaluator": frozen.describe(
                 judge.recognizer.params,
                 job.evaluator,
-                reference=evaluators.clips_fingerprint(run.train, run.field),
+                reference=frozen.clips_fingerprint(run.train, run.field),
             ),
         },
     )

@@ -9,9 +9,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxmotion import reporting
+from jaxmotion.evaluation import columns
+from jaxmotion.learning import runs
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import artifacts, cells, emdm_action, emdm_runs, stages
-from jaxmotion.systems import emdm, emdm_motion
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import features as emdm_features
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
 from sweeps import points
 from sweeps.budgets import Amount
 from sweeps.points import Point
@@ -76,7 +81,7 @@ def trainer(job: Job) -> Callable[[Point], None]:
     """Trains the row "emdm" with other T; the data are in the folder above."""
     args = _arguments(job)
     task = script.setup.prepare(args)
-    generator = stages.Budget(
+    generator = runs.Budget(
         steps=args.steps,
         batch=args.batch,
         learning_rate=args.learning_rate,
@@ -88,7 +93,7 @@ def trainer(job: Job) -> Callable[[Point], None]:
 
     def train(point: Point) -> None:
         base = dataclasses.replace(task.base, num_steps=point.steps)
-        emdm_runs.train_row(
+        emdm_training.train_row(
             _folder(job, point),
             dataclasses.replace(task, base=base),
             ROW,
@@ -99,35 +104,35 @@ def trainer(job: Job) -> Callable[[Point], None]:
     return train
 
 
-def _load(job: Job, point: Point) -> emdm.Sample:
-    params, config = emdm_runs.load_row(_folder(job, point), ROW)
-    return emdm_runs.row_sampler(params, config, ROW)
+def _load(job: Job, point: Point) -> emdm_model.Sample:
+    params, config = emdm_training.load_row(_folder(job, point), ROW)
+    return emdm_training.row_sampler(params, config, ROW)
 
 
-def write_motion(job: Job, run: emdm_action.ActionRun, point: Point, out: Path) -> None:
+def write_motion(job: Job, run: emdm_data.ActionRun, point: Point, out: Path) -> None:
     """One motion of the first action."""
-    condition = emdm.Condition(
-        vector=emdm.action_vectors(jnp.zeros((), int), len(run.actions)),
+    condition = emdm_model.Condition(
+        vector=emdm_model.action_vectors(jnp.zeros((), int), len(run.actions)),
         keep=jax.numpy.ones((), bool),
         mask=jax.numpy.ones(run.train.frames, bool),
     )
     sample = _load(job, point)
     make = jax.jit(lambda key: sample(key, condition, scale=None))
-    motion = emdm_motion.to_motion(make(jax.random.key(job.seed)), run.representation)
+    motion = emdm_features.to_motion(make(jax.random.key(job.seed)), run.representation)
     motion = skeleton.Motion(
         root_position=motion.root_position,
         joint_rotation=motion.joint_rotation,
         fps=run.clips.fps,
     )
     title = f"{run.actions[0]}, {point.row}"
-    artifacts.write_rollout(
+    reporting.write_rollout(
         out, run.clips.skeleton, motion, None, title=title, caption=run.clips.source
     )
 
 
 def bench(job: Job) -> Bench:
     """The evaluation of `experiments/emdm.py`."""
-    run, budget = emdm_action.load_run(job.models), job.budget
+    run, budget = emdm_data.load_run(job.models), job.budget
     judge = script.evaluation.actions.make_judge(
         script.Evaluate(
             run=job.models,
@@ -141,9 +146,9 @@ def bench(job: Job) -> Bench:
     floor, truth = judge.real.values()
 
     def score(point: Point) -> Row:
-        many = emdm_runs.sample_many(_load(job, point), chunk=CHUNK)
+        many = emdm_training.sample_many(_load(job, point), chunk=CHUNK)
         keys = jax.random.split(jax.random.key(job.seed + 1), job.replications)
-        found = cells.row([judge.score(key, many) for key in keys])
+        found = columns.row([judge.score(key, many) for key in keys])
         return {column: found[column] for column in truth}
 
     def sampler(point: Point) -> Callable[[Array], Array]:

@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jaxmotion import files
+from jaxmotion import files, reporting
+from jaxmotion.evaluators import frozen
 from jaxmotion.learning import loop
-from jaxmotion.protocols import evaluators, provenance
 from sweeps import budgets, latency, report
 from sweeps.system import Bench, Job, Rows, System
 
@@ -101,7 +101,7 @@ def sweep(name: str, system: System, job: Job, out: Path, arguments: Any) -> Non
     load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
     _rollouts(bench, job, out / "rollouts")
     seconds["all"] = time.perf_counter() - begun
-    whole = provenance.provenance() | {
+    whole = reporting.provenance() | {
         "system": name,
         "arguments": arguments,
         "budget": job.budget,
@@ -147,7 +147,7 @@ def _rollouts(bench: Bench, job: Job, folder: Path) -> None:
 
 def _notes(system: System, job: Job, whole: dict[str, Any]) -> list[str]:
     budget = ", ".join(f"{key} {value:g}" for key, value in job.budget.items())
-    judge = [evaluators.note(whole["evaluator"])] if "evaluator" in whole else []
+    judge = [frozen.note(whole["evaluator"])] if "evaluator" in whole else []
     return [
         f"Data: {whole['source']}.",
         f"Trained with the same budget, data and seed {job.seed}: {budget} (--help "

@@ -7,15 +7,13 @@ import jax
 import smgdiff as script
 from jaxtyping import Array
 
-from jaxmotion.protocols import (
-    cells,
-    evaluators,
-    smgdiff_data,
-    smgdiff_evaluation,
-    smgdiff_runs,
-)
-from jaxmotion.systems import smgdiff_guidance
-from jaxmotion.systems.smgdiff_guidance import UNGUIDED, Plan
+from jaxmotion.evaluation import columns
+from jaxmotion.evaluators import frozen
+from jaxmotion.systems.smgdiff import data as smgdiff_data
+from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import training as smgdiff_training
+from jaxmotion.systems.smgdiff.guidance import UNGUIDED, Plan
 from sweeps import points
 from sweeps.budgets import Amount
 from sweeps.points import Point
@@ -82,7 +80,7 @@ def trainer(job: Job) -> Callable[[Point], None]:
 
 def bench(job: Job) -> Bench:
     """The evaluation of the paper's table 3."""
-    run, budget = smgdiff_runs.load_run(job.models), job.budget
+    run, budget = smgdiff_training.load_run(job.models), job.budget
     setting = smgdiff_evaluation.make_setting(
         run.train,
         run.held_out,
@@ -97,7 +95,7 @@ def bench(job: Job) -> Bench:
     condition = jax.tree.map(lambda x: x[0], setting.known.condition)
 
     def planner(point: Point) -> Plan:
-        model, params = smgdiff_runs.load_stage(run, _stage(point))
+        model, params = smgdiff_training.load_stage(run, _stage(point))
         return smgdiff_guidance.planner(
             params,
             config=model.config,
@@ -109,7 +107,7 @@ def bench(job: Job) -> Bench:
         many = smgdiff_evaluation.plan_many(
             planner(point), run.model, chunk=budget["chunk"]
         )
-        found = cells.row(smgdiff_evaluation.score_plans(setting, many))
+        found = columns.row(smgdiff_evaluation.score_plans(setting, many))
         return {column: found[column] for column in ground_truth}
 
     def sampler(point: Point) -> Callable[[Array], Array]:
@@ -141,10 +139,10 @@ def bench(job: Job) -> Bench:
             f"the path that was walked; Fréchet distances to {2 * windows} training "
             "windows",
             "windows": windows,
-            "evaluator": evaluators.describe(
+            "evaluator": frozen.describe(
                 setting.judge.params,
                 job.evaluator,
-                reference=evaluators.clips_fingerprint(run.train, smgdiff_data.FIELD),
+                reference=frozen.clips_fingerprint(run.train, smgdiff_data.FIELD),
             ),
         },
     )

@@ -8,7 +8,7 @@ from typing import Any
 from jaxtyping import Array
 
 from jaxmotion.evaluation.table import Cell
-from jaxmotion.protocols.evaluators import Evaluator, Kind
+from jaxmotion.evaluators.frozen import Evaluator, Kind
 from sweeps.budgets import Amounts
 from sweeps.points import Point
 

@@ -7,7 +7,7 @@ import dataclasses
 
 import jax
 
-from jaxmotion.motion.layout import FeatureLayout, feature_layout
+from jaxmotion.motion.features import FeatureLayout, feature_layout
 
 
 @jax.tree_util.register_dataclass

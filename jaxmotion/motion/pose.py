@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmotion.motion import ground, rotation, rotation_vector
-from jaxmotion.motion.layout import FeatureLayout, feature_layout, pack, unpack
+from jaxmotion.motion.features import FeatureLayout, feature_layout, pack, unpack
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.trajectory import PlanarFrame, Trajectory
 

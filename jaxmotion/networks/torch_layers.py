@@ -3,7 +3,7 @@
 A weight [out, in] becomes a kernel [in, out], that of a convolution [out, in, width]
 becomes [width, in, out]. Attention has its three projections one below the other. So
 has a GRU its gates r, z, n; the two biases of r and of z are added, those of n stay
-apart, because one of them is inside the product with r (networks/matching.py).
+apart, because one of them is inside the product with r (evaluators/network.py).
 """
 
 from collections.abc import Collection, Mapping

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.systems import camdm
+from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
@@ -117,9 +117,9 @@ def test_unrolled_sampler_is_the_scanned_one(load):
     """What compile_times compares computes the same."""
     compile_times, workload = load("compile_times"), load("workload")
     config = tiny.config(num_steps=2)
-    params = tiny.random_params(camdm.init, config)
+    params = tiny.random_params(camdm_model.init, config)
     condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
-    scan = jax.jit(camdm.planner(params, config=config))
+    scan = jax.jit(camdm_model.planner(params, config=config))
     loop = jax.jit(lambda k, c: compile_times.unrolled(config, params, k, c))
     found, expected = (f(jax.random.key(0), condition) for f in (loop, scan))
     np.testing.assert_allclose(found, expected, atol=1e-5)

@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from jaxmotion.motion.trajectory import Command
-from jaxmotion.systems import camdm, camdm_control, camdm_model
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 CONFIG = tiny.config(depth=1, heading="facing", num_steps=2)
-CONTROL = camdm_control.Control(apply=4, reuse=6)
+CONTROL = camdm_controller.Control(apply=4, reuse=6)
 TICKS = 10
 
 
@@ -167,13 +168,13 @@ def small(load, bones, quick_compile):
     model = camdm_model.Model(
         config=CONFIG, bones=bones, labels=tiny.STYLES, source="made in the tests"
     )
-    state = camdm_control.init_state(bones, tiny.walk(CONFIG.past), config=CONFIG)
+    state = camdm_controller.init_state(bones, tiny.walk(CONFIG.past), config=CONFIG)
     ahead = jnp.broadcast_to(jnp.array([0.0, 1.0]), (TICKS, 2))
     commands = Command(velocity=ahead, facing=ahead, label=jnp.zeros(TICKS, jnp.int32))
     given = workload.Load(
         name="small",
         model=model,
-        params=tiny.random_params(camdm.init, CONFIG),
+        params=tiny.random_params(camdm_model.init, CONFIG),
         state=state,
         commands=commands,
     )

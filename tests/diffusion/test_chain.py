@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import chain
-from jaxmotion.diffusion import schedule as S
+from jaxmotion.diffusion import chain, schedule
 from tests.reference import diffusion as reference
 
 MEAN, VARIANCE = 1.5, 0.30
@@ -59,7 +58,7 @@ def test_output_moments_of_an_exact_denoiser(num_steps, stochastic):
     betas = reference.cosine_betas(num_steps)
     mean, variance = reference.ancestral_moments(betas, MEAN, VARIANCE, stochastic)
     denoise = exact_denoiser(betas, stochastic)
-    step = chain.ancestral_step(S.cosine_schedule(num_steps), denoise)
+    step = chain.ancestral_step(schedule.cosine_schedule(num_steps), denoise)
     n = 200_000
     x = chain.sample(step, jax.random.key(3), (n,), num_steps=num_steps)
     # z-scores: 4 standard errors of a normal sample's mean and variance.
@@ -79,7 +78,7 @@ def test_only_a_stochastic_denoiser_keeps_the_data_variance():
 def test_ancestral_step_is_the_published_update():
     table = reference.coefficients(reference.cosine_betas(T))
     x_t, key = random(0), jax.random.key(5)
-    step = chain.ancestral_step(S.cosine_schedule(T), tanh_denoiser)
+    step = chain.ancestral_step(schedule.cosine_schedule(T), tanh_denoiser)
     for t in range(1, T + 1):
         found = step(jax.random.clone(key), x_t, jnp.array(t))
         noise = jax.random.normal(jax.random.split(jax.random.clone(key))[1], x_t.shape)
@@ -94,7 +93,7 @@ def test_ancestral_step_is_the_published_update():
 def test_ddim_step_is_the_published_update(eta):
     betas = reference.vp_betas(T)
     x_t, key = random(0), jax.random.key(5)
-    step = chain.ddim_step(S.vp_schedule(T), tanh_denoiser, eta=eta)
+    step = chain.ddim_step(schedule.vp_schedule(T), tanh_denoiser, eta=eta)
     for t in range(1, T + 1):
         found = step(jax.random.clone(key), x_t, jnp.array(t))
         noise = jax.random.normal(jax.random.split(jax.random.clone(key))[1], x_t.shape)
@@ -105,7 +104,7 @@ def test_ddim_step_is_the_published_update(eta):
         np.testing.assert_allclose(found, expected, atol=3e-6)
 
 
-@pytest.mark.parametrize("make", [S.cosine_schedule, S.vp_schedule])
+@pytest.mark.parametrize("make", [schedule.cosine_schedule, schedule.vp_schedule])
 def test_ddim_with_full_noise_is_ancestral(make):
     table = make(T)
     key, x = jax.random.key(0), random(1)
@@ -121,7 +120,7 @@ def test_ddim_with_full_noise_is_ancestral(make):
 
 
 def test_ddim_of_a_traced_eta():
-    table, x = S.cosine_schedule(T), random(1)
+    table, x = schedule.cosine_schedule(T), random(1)
 
     @jax.jit
     def run(eta):
@@ -134,7 +133,7 @@ def test_ddim_of_a_traced_eta():
 
 
 def test_deterministic_ddim_ignores_the_key():
-    step = chain.ddim_step(S.cosine_schedule(T), tanh_denoiser)
+    step = chain.ddim_step(schedule.cosine_schedule(T), tanh_denoiser)
     one, other = (
         chain.reverse_chain(step, jax.random.key(k), random(1), start=T) for k in (0, 1)
     )
@@ -149,7 +148,7 @@ def test_deterministic_ddim_ignores_the_key():
         lambda s, d: chain.ddim_step(s, d, eta=1.0),
     ],
 )
-@pytest.mark.parametrize("make", [S.cosine_schedule, S.vp_schedule])
+@pytest.mark.parametrize("make", [schedule.cosine_schedule, schedule.vp_schedule])
 def test_the_last_step_returns_the_prediction_exactly(factory, make):
     x_t = random(2)
     step = factory(make(T), tanh_denoiser)
@@ -165,7 +164,7 @@ def test_the_last_step_returns_the_prediction_exactly(factory, make):
 
 @pytest.mark.parametrize("cut", range(T + 1))
 def test_a_cut_chain_is_the_whole_chain(cut):
-    step = chain.ancestral_step(S.cosine_schedule(T), noisy_denoiser)
+    step = chain.ancestral_step(schedule.cosine_schedule(T), noisy_denoiser)
     key, x = jax.random.key(11), random(3)
     whole = chain.reverse_chain(step, jax.random.clone(key), x, start=T)
     top = chain.reverse_chain(step, jax.random.clone(key), x, start=T, stop=cut)
@@ -174,7 +173,7 @@ def test_a_cut_chain_is_the_whole_chain(cut):
 
 
 def test_the_chain_is_a_python_loop():
-    table = S.cosine_schedule(T)
+    table = schedule.cosine_schedule(T)
     step = chain.ancestral_step(table, noisy_denoiser)
     key, x = jax.random.key(11), random(3)
     expected, states = x, []
@@ -192,7 +191,7 @@ def test_the_chain_is_a_python_loop():
 
 
 def test_trace_of_a_part_and_of_nothing():
-    step = chain.ancestral_step(S.cosine_schedule(T), tanh_denoiser)
+    step = chain.ancestral_step(schedule.cosine_schedule(T), tanh_denoiser)
     x = random(3)
     run = chain.reverse_chain_trace
     assert run(step, jax.random.key(0), x, start=5, stop=2)[1].shape == (3, 5, 3)
@@ -202,7 +201,7 @@ def test_trace_of_a_part_and_of_nothing():
 
 
 def test_vmap_over_characters_is_a_loop():
-    step = chain.ancestral_step(S.cosine_schedule(T), noisy_denoiser)
+    step = chain.ancestral_step(schedule.cosine_schedule(T), noisy_denoiser)
 
     def run(key, x):
         return chain.reverse_chain(step, key, x, start=T)
@@ -215,7 +214,7 @@ def test_vmap_over_characters_is_a_loop():
 
 
 def test_sample_starts_from_normal_noise_and_jits():
-    step = chain.ancestral_step(S.cosine_schedule(T), tanh_denoiser)
+    step = chain.ancestral_step(schedule.cosine_schedule(T), tanh_denoiser)
     key = jax.random.key(7)
 
     def run(key):
@@ -240,7 +239,7 @@ def test_one_compile_and_one_trace_of_the_network():
     @jax.jit
     @chex.assert_max_traces(n=1)
     def run(key, x):
-        step = chain.ancestral_step(S.cosine_schedule(T), network)
+        step = chain.ancestral_step(schedule.cosine_schedule(T), network)
         return chain.reverse_chain(step, key, x, start=T)
 
     one, other = (run(jax.random.key(k), random(0)) for k in (0, 1))
@@ -248,7 +247,7 @@ def test_one_compile_and_one_trace_of_the_network():
 
 
 def test_gradients_flow_through_the_chain():
-    table = S.cosine_schedule(4)
+    table = schedule.cosine_schedule(4)
 
     def end(shift):
         def denoise(key, x_t, t):
@@ -267,7 +266,7 @@ def test_half_precision_network_in_a_float32_chain():
     def half(key, x_t, t):
         return tanh_denoiser(key, x_t.astype(jnp.bfloat16), t)
 
-    step = chain.ancestral_step(S.cosine_schedule(T), half)
+    step = chain.ancestral_step(schedule.cosine_schedule(T), half)
     x = chain.reverse_chain(step, jax.random.key(0), random(0), start=T)
     assert x.dtype == jnp.float32
 
@@ -275,7 +274,7 @@ def test_half_precision_network_in_a_float32_chain():
 @pytest.mark.parametrize("run", [chain.reverse_chain, chain.reverse_chain_trace])
 @pytest.mark.parametrize(("start", "stop"), [(2, 3), (3, -1), (-1, -2), (-1, 0)])
 def test_bad_range_of_steps(run, start, stop):
-    step = chain.ancestral_step(S.cosine_schedule(T), tanh_denoiser)
+    step = chain.ancestral_step(schedule.cosine_schedule(T), tanh_denoiser)
     with pytest.raises(ValueError, match=f"start={start}, stop={stop}"):
         run(step, jax.random.key(0), random(0), start=start, stop=stop)
 
@@ -283,4 +282,4 @@ def test_bad_range_of_steps(run, start, stop):
 @pytest.mark.parametrize("eta", [-0.1, 1.5])
 def test_bad_eta(eta):
     with pytest.raises(ValueError, match="eta is"):
-        chain.ddim_step(S.cosine_schedule(T), tanh_denoiser, eta=eta)
+        chain.ddim_step(schedule.cosine_schedule(T), tanh_denoiser, eta=eta)

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import chain, guidance
-from jaxmotion.diffusion import schedule as S
+from jaxmotion.diffusion import chain, guidance, schedule
 from tests.reference import diffusion as reference
 from tests.reference import smgdiff as oracle
 
@@ -44,7 +43,7 @@ def nothing(x_0):
 
 
 def dsg(objective=distance, denoise=network, **options):
-    return guidance.dsg_step(S.cosine_schedule(T), denoise, objective, **options)
+    return guidance.dsg_step(schedule.cosine_schedule(T), denoise, objective, **options)
 
 
 def by_hand(key, x_t, t):
@@ -137,7 +136,7 @@ def test_only_the_last_step_is_shortened():
 
 @pytest.mark.parametrize("rate", [0.0, 0.5, 1.0])
 def test_nothing_to_guide_is_the_ancestral_step(rate):
-    plain = chain.ancestral_step(S.cosine_schedule(T), network)
+    plain = chain.ancestral_step(schedule.cosine_schedule(T), network)
     for t in STEPS:
         key, x_t = jax.random.key(t), random(t)
         found = dsg(nothing, rate=rate)(clone(key), x_t, jnp.array(t))
@@ -220,7 +219,7 @@ def test_a_goal_that_is_reached_stays_finite():
 
 def test_end_two_is_what_the_formulas_say():
     """Six ancestral steps, then two guided ones; the noises are those of the keys."""
-    table, key, start = S.cosine_schedule(T), jax.random.key(21), random(21)
+    table, key, start = schedule.cosine_schedule(T), jax.random.key(21), random(21)
 
     @jax.jit
     def run(key, x):
@@ -268,7 +267,7 @@ def test_a_stochastic_network_is_called_once_and_keeps_its_key():
     key, x_t, t = jax.random.key(6), random(6), jnp.array(3)
     found = dsg(nothing, noisy)(clone(key), x_t, t)
     assert len(calls) == 1
-    plain = chain.ancestral_step(S.cosine_schedule(T), noisy)
+    plain = chain.ancestral_step(schedule.cosine_schedule(T), noisy)
     np.testing.assert_allclose(found, plain(clone(key), x_t, t), atol=1e-6)
 
 
@@ -310,7 +309,7 @@ def test_guidance_lowers_the_objective_and_the_noise_alone_does_not():
     denoise = lambda key, x_t, t: zero[t - 1] + (one - zero)[t - 1] * x_t  # noqa: E731
     goal = MEAN + 2 * np.sqrt(VARIANCE)
     objective = lambda x: 0.5 * jnp.mean(jnp.square(x - goal))  # noqa: E731
-    plain = chain.ancestral_step(S.cosine_schedule(T), denoise)
+    plain = chain.ancestral_step(schedule.cosine_schedule(T), denoise)
 
     def gain(key, rate):
         """By how much two guided steps end lower than two plain ones do."""

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import chain, gan, tables
+from jaxmotion.diffusion import chain, gan, schedule
 
 NUMBER = 200_000
 
@@ -17,7 +17,7 @@ def coefficients(table, t):
 
 
 @pytest.mark.parametrize("t", [1, 2, 5])
-@pytest.mark.parametrize("make", [tables.cosine_schedule, tables.vp_schedule])
+@pytest.mark.parametrize("make", [schedule.cosine_schedule, schedule.vp_schedule])
 def test_pairs_have_the_joint_gaussian_of_the_chain(make, t):
     """Given x_0: means, variances and the covariance of x_{t-1} and x_t."""
     table = make(5)
@@ -35,7 +35,7 @@ def test_pairs_have_the_joint_gaussian_of_the_chain(make, t):
 
 
 def test_each_sample_has_its_own_step():
-    table, x_0 = tables.cosine_schedule(4), jnp.ones((3, 2))
+    table, x_0 = schedule.cosine_schedule(4), jnp.ones((3, 2))
     key = jax.random.key(0)
     together = gan.q_pair(table, key, x_0, jnp.array([1, 2, 4]))
     for i, t in enumerate((1, 2, 4)):
@@ -47,7 +47,7 @@ def test_each_sample_has_its_own_step():
 @pytest.mark.parametrize("t", [1, 3])
 def test_posterior_samples_have_the_posteriors_moments(t):
     """Oracle: Bayes' rule for the two Gaussians of x_{t-1}."""
-    table = tables.vp_schedule(4)
+    table = schedule.vp_schedule(4)
     x_0, x_t = jnp.full(NUMBER, 0.7), jnp.full(NUMBER, -0.4)
     x_prev = gan.posterior_sample(table, jax.random.key(1), x_0, x_t, jnp.array(t))
     beta, before, _ = coefficients(table, t)
@@ -63,7 +63,7 @@ def test_posterior_samples_have_the_posteriors_moments(t):
 
 def test_an_exact_generator_keeps_the_variance_of_the_data():
     """x_0 ~ N(1.5, 0.3): the ideal GAN draws x_0 from its law given x_t."""
-    table, variance = tables.cosine_schedule(3), 0.3
+    table, variance = schedule.cosine_schedule(3), 0.3
 
     def exact(key, x_t, t):
         alpha_bar = table.alpha_bar[t]

@@ -4,8 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import chain, guidance, tables
-from jaxmotion.diffusion import schedule as S
+from jaxmotion.diffusion import chain, guidance, schedule
 
 
 def random(seed, shape=(5, 3)):
@@ -64,7 +63,7 @@ def test_a_network_sees_one_matrix_product_for_both_conditions():
 
 
 def test_guided_chain_jits_with_a_traced_scale():
-    table = S.cosine_schedule(4)
+    table = schedule.cosine_schedule(4)
 
     @jax.jit
     @chex.assert_max_traces(n=1)
@@ -127,7 +126,7 @@ def test_gradient_guidance_of_a_linear_denoiser(t):
     """Oracle in float64: x_0 = A x_t + b, J = |x_0 - g|^2 / 2."""
     rng = np.random.default_rng(0)
     a, b, g, x = rng.normal(size=(3, 3)), *rng.normal(size=(3, 3))
-    table = tables.cosine_schedule(5)
+    table = schedule.cosine_schedule(5)
     as32 = lambda y: jnp.asarray(y, jnp.float32)  # noqa: E731
     denoise = lambda key, x_t, t: as32(a) @ x_t + as32(b)  # noqa: E731
     objective = lambda x_0: 0.5 * jnp.sum(jnp.square(x_0 - as32(g)))  # noqa: E731
@@ -139,7 +138,7 @@ def test_gradient_guidance_of_a_linear_denoiser(t):
 
 
 def test_gradient_guidance_passes_the_key_and_vanishes_with_its_scale():
-    table = tables.cosine_schedule(5)
+    table = schedule.cosine_schedule(5)
     denoise = lambda key, x_t, t: jnp.tanh(x_t + jax.random.normal(key, (3,)))  # noqa: E731
     guided = guidance.gradient_guidance(table, denoise, jnp.sum, scale=0.0)
     key, x, t = jax.random.key(3), random(0, (3,)), jnp.array(2)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from jaxtyping import TypeCheckError
 
-from jaxmotion.diffusion import schedule as S
+from jaxmotion.diffusion import schedule
 from tests.reference import diffusion as reference
 
 # Published or independently computed tables, steps 1..T. Cosine T = 4 is the JSON that
@@ -96,9 +96,9 @@ TABLES = [("cosine", T, t) for T, t in COSINE.items()] + [
     ("vp", T, t) for T, t in VP.items()
 ]
 SCHEDULES = {
-    "cosine": (S.cosine_schedule, reference.cosine_betas),
-    "vp": (S.vp_schedule, reference.vp_betas),
-    "linear": (S.linear_schedule, reference.linear_betas),
+    "cosine": (schedule.cosine_schedule, reference.cosine_betas),
+    "vp": (schedule.vp_schedule, reference.vp_betas),
+    "linear": (schedule.linear_schedule, reference.linear_betas),
 }
 
 
@@ -106,8 +106,8 @@ def posterior_coefficients(table):
     """c1, c2 and v of all steps, read off the posterior by unit inputs."""
     t = jnp.arange(1, table.num_steps + 1)
     one, zero = jnp.ones(table.num_steps), jnp.zeros(table.num_steps)
-    c1, v = S.posterior(table, one, zero, t)
-    c2, _ = S.posterior(table, zero, one, t)
+    c1, v = schedule.posterior(table, one, zero, t)
+    c2, _ = schedule.posterior(table, zero, one, t)
     return {"c1": c1, "c2": c2, "v": v}
 
 
@@ -128,10 +128,10 @@ def test_published_tables(name, num_steps, expected):
 
 def test_published_log_variances():
     expected = [-2.071257, -0.870617, -0.156659]
-    v = posterior_coefficients(S.cosine_schedule(4))["v"][1:]
+    v = posterior_coefficients(schedule.cosine_schedule(4))["v"][1:]
     np.testing.assert_allclose(jnp.log(v), expected, atol=1e-6)
     expected = [-3.445032, -2.373948, -1.751072, -1.276037, -0.849555, -0.418353]
-    v = posterior_coefficients(S.cosine_schedule(8))["v"][1:]
+    v = posterior_coefficients(schedule.cosine_schedule(8))["v"][1:]
     np.testing.assert_allclose(jnp.log(v), [*expected, -0.039155], atol=1e-6)
 
 
@@ -166,26 +166,26 @@ def test_index_zero_is_clean(name):
 
 
 def test_vp_ends_at_the_same_alpha_bar_for_every_length():
-    ends = [float(S.vp_schedule(n).alpha_bar[-1]) for n in (1, 4, 10, 200)]
+    ends = [float(schedule.vp_schedule(n).alpha_bar[-1]) for n in (1, 4, 10, 200)]
     np.testing.assert_allclose(ends, 4.31905e-5, rtol=2e-6)
 
 
 def test_hyperparameters_reach_the_tables():
     for found, betas in [
         (
-            S.cosine_schedule(6, offset=0.05, max_beta=0.9),
+            schedule.cosine_schedule(6, offset=0.05, max_beta=0.9),
             reference.cosine_betas(6, 0.05, 0.9),
         ),
         (
-            S.vp_schedule(6, beta_min=0.2, beta_max=9.0, t_min=0.01),
+            schedule.vp_schedule(6, beta_min=0.2, beta_max=9.0, t_min=0.01),
             reference.vp_betas(6, 0.2, 9.0, 0.01),
         ),
         (
-            S.linear_schedule(6, beta_min=0.1, beta_max=0.5),
+            schedule.linear_schedule(6, beta_min=0.1, beta_max=0.5),
             reference.linear_betas(6, 0.1, 0.5),
         ),
         (
-            S.linear_schedule(40, scaled=True),
+            schedule.linear_schedule(40, scaled=True),
             reference.linear_betas(40, scale=25.0),
         ),
     ]:
@@ -197,20 +197,20 @@ def test_hyperparameters_reach_the_tables():
 
 
 def test_scaled_linear_schedule_may_end_in_pure_noise():
-    table = S.linear_schedule(20, scaled=True)
+    table = schedule.linear_schedule(20, scaled=True)
     x_0, x_t = random(0, (2,)), random(1, (2,))
     assert table.beta[-1] == 1.0 and table.alpha_bar[-1] == 0.0
-    mean, variance = S.posterior(table, x_0, x_t, jnp.array(20))
+    mean, variance = schedule.posterior(table, x_0, x_t, jnp.array(20))
     np.testing.assert_allclose(mean, jnp.sqrt(table.alpha_bar[19]) * x_0, rtol=1e-6)
     np.testing.assert_allclose(variance, table.one_minus_alpha_bar[19], rtol=1e-6)
 
 
 def test_posterior_is_bayes_product():
     betas = reference.cosine_betas(8)
-    table = S.cosine_schedule(8)
+    table = schedule.cosine_schedule(8)
     x_0, x_t = random(0), random(1)
     for t in range(2, 9):
-        mean, variance = S.posterior(table, x_0, x_t, jnp.array(t))
+        mean, variance = schedule.posterior(table, x_0, x_t, jnp.array(t))
         expected = reference.bayes_posterior(
             betas, t - 1, np.float64(x_0), np.float64(x_t)
         )
@@ -223,22 +223,22 @@ def test_posterior_is_bayes_product():
 def test_posterior_at_the_last_step_returns_x_0_exactly(name, num_steps):
     table = SCHEDULES[name][0](num_steps)
     x_0, x_t = random(2), random(3)
-    mean, variance = S.posterior(table, x_0, x_t, jnp.array(1))
+    mean, variance = schedule.posterior(table, x_0, x_t, jnp.array(1))
     np.testing.assert_array_equal(mean, x_0)
     assert float(jnp.max(jnp.abs(variance))) == 0.0
 
 
 def test_q_sample_is_repeated_q_step():
-    table = S.cosine_schedule(5)
+    table = schedule.cosine_schedule(5)
     rng = np.random.default_rng(0)
     x_0 = jnp.full((200_000,), 0.7, jnp.float32)
     x = x_0
     for t in range(1, 4):
         noise = jnp.asarray(rng.normal(size=x.shape), jnp.float32)
-        x = S.q_step(table, x, jnp.array(t), noise)
+        x = schedule.q_step(table, x, jnp.array(t), noise)
     # Moments of the closed form; z-scores of mean and variance.
-    signal = S.q_sample(table, x_0, jnp.array(3), jnp.zeros_like(x_0))[0]
-    spread = S.q_sample(table, jnp.zeros(()), jnp.array(3), jnp.ones(()))
+    signal = schedule.q_sample(table, x_0, jnp.array(3), jnp.zeros_like(x_0))[0]
+    spread = schedule.q_sample(table, jnp.zeros(()), jnp.array(3), jnp.ones(()))
     n, variance = x.size, float(spread) ** 2
     assert abs(float(x.mean() - signal)) / np.sqrt(variance / n) < 4
     assert abs(float(x.var()) / variance - 1) / np.sqrt(2 / n) < 4
@@ -246,13 +246,15 @@ def test_q_sample_is_repeated_q_step():
 
 def test_q_sample_agrees_with_float64():
     alpha_bar = reference.coefficients(reference.vp_betas(10))["alpha_bar"]
-    table = S.vp_schedule(10)
+    table = schedule.vp_schedule(10)
     x_0, noise = random(4), random(5)
-    np.testing.assert_array_equal(S.q_sample(table, x_0, jnp.array(0), noise), x_0)
+    np.testing.assert_array_equal(
+        schedule.q_sample(table, x_0, jnp.array(0), noise), x_0
+    )
     for t in (1, 4, 10):
         expected = np.sqrt(alpha_bar[t - 1]) * np.float64(x_0)
         expected += np.sqrt(1 - alpha_bar[t - 1]) * np.float64(noise)
-        found = S.q_sample(table, x_0, jnp.array(t), noise)
+        found = schedule.q_sample(table, x_0, jnp.array(t), noise)
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
@@ -262,32 +264,41 @@ def test_q_step_agrees_with_float64():
     for t in (1, 5, 8):
         expected = np.sqrt(1 - betas[t - 1]) * np.float64(x)
         expected += np.sqrt(betas[t - 1]) * np.float64(noise)
-        found = S.q_step(S.cosine_schedule(8), x, jnp.array(t), noise)
+        found = schedule.q_step(schedule.cosine_schedule(8), x, jnp.array(t), noise)
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_conversions_round_trip():
-    table = S.cosine_schedule(8)
+    table = schedule.cosine_schedule(8)
     x_0, noise = random(6), random(7)
     for t in range(1, 9):
         t = jnp.array(t)
-        x_t = S.q_sample(table, x_0, t, noise)
+        x_t = schedule.q_sample(table, x_0, t, noise)
         gain = float(jnp.sqrt(1 / table.alpha_bar[t]))
-        found = S.x0_from_noise(table, noise, x_t, t)
+        found = schedule.x0_from_noise(table, noise, x_t, t)
         np.testing.assert_allclose(found, x_0, atol=1e-6 * gain)
         gain = float(jnp.sqrt(1 / table.one_minus_alpha_bar[t]))
-        found = S.noise_from_x0(table, x_0, x_t, t)
+        found = schedule.noise_from_x0(table, x_0, x_t, t)
         np.testing.assert_allclose(found, noise, atol=1e-6 * gain)
 
 
 @pytest.mark.parametrize("shape", [(6,), (6, 1), (1,), (6, 3)])
 def test_t_with_leading_axes_is_a_loop(shape):
-    table = S.cosine_schedule(8)
+    table = schedule.cosine_schedule(8)
     x, y = random(8, (6, 3, 2)), random(9, (6, 3, 2))
     t = jnp.asarray(np.random.default_rng(1).integers(1, 9, shape))
     full = np.broadcast_to(np.reshape(t, shape + (1,) * (2 - len(shape))), (6, 3))
-    for function in (S.q_sample, S.q_step, S.noise_from_x0, S.x0_from_noise):
-        arguments = (table, x, t, y) if function in (S.q_sample, S.q_step) else None
+    for function in (
+        schedule.q_sample,
+        schedule.q_step,
+        schedule.noise_from_x0,
+        schedule.x0_from_noise,
+    ):
+        arguments = (
+            (table, x, t, y)
+            if function in (schedule.q_sample, schedule.q_step)
+            else None
+        )
         arguments = arguments or (table, x, y, t)
         found = function(*arguments)
         for i in range(6):
@@ -298,9 +309,9 @@ def test_t_with_leading_axes_is_a_loop(shape):
                     for a in arguments
                 )
                 np.testing.assert_allclose(found[i, j], function(*swap), rtol=1e-6)
-    mean, variance = S.posterior(table, x, y, t)
+    mean, variance = schedule.posterior(table, x, y, t)
     for i in range(6):
-        one = S.posterior(table, x[i, 1], y[i, 1], jnp.array(full[i, 1]))
+        one = schedule.posterior(table, x[i, 1], y[i, 1], jnp.array(full[i, 1]))
         np.testing.assert_allclose(mean[i, 1], one.mean, rtol=1e-6)
         variances = jnp.broadcast_to(variance, mean.shape)[i, 1]
         np.testing.assert_allclose(
@@ -309,30 +320,30 @@ def test_t_with_leading_axes_is_a_loop(shape):
 
 
 def test_steps_out_of_range_clamp():
-    table = S.cosine_schedule(4)
+    table = schedule.cosine_schedule(4)
     x, y = random(0), random(1)
-    for function in (S.posterior, S.noise_from_x0):
+    for function in (schedule.posterior, schedule.noise_from_x0):
         for outside, inside in [(0, 1), (-3, 1), (9, 4)]:
             chex.assert_trees_all_equal(
                 function(table, x, y, jnp.array(outside)),
                 function(table, x, y, jnp.array(inside)),
             )
-    low, high = (S.q_sample(table, x, jnp.array(t), y) for t in (-2, 7))
+    low, high = (schedule.q_sample(table, x, jnp.array(t), y) for t in (-2, 7))
     np.testing.assert_array_equal(low, x)
-    np.testing.assert_array_equal(high, S.q_sample(table, x, jnp.array(4), y))
+    np.testing.assert_array_equal(high, schedule.q_sample(table, x, jnp.array(4), y))
 
 
 def test_half_precision_stays_half_precision():
-    table = S.cosine_schedule(4)
+    table = schedule.cosine_schedule(4)
     x, y = random(0).astype(jnp.bfloat16), random(1).astype(jnp.bfloat16)
-    assert S.q_sample(table, x, jnp.array(2), y).dtype == jnp.bfloat16
-    assert S.posterior(table, x, y, jnp.array(2)).mean.dtype == jnp.bfloat16
+    assert schedule.q_sample(table, x, jnp.array(2), y).dtype == jnp.bfloat16
+    assert schedule.posterior(table, x, y, jnp.array(2)).mean.dtype == jnp.bfloat16
 
 
 def test_respace_keeps_the_steps():
-    table = S.vp_schedule(10)
+    table = schedule.vp_schedule(10)
     steps = (1, 4, 10)
-    short = S.respace(table, steps)
+    short = schedule.respace(table, steps)
     kept = table.log_alpha_bar[jnp.array(steps)]
     np.testing.assert_array_equal(short.log_alpha_bar[1:], kept)
     alpha_bar = reference.coefficients(reference.vp_betas(10))["alpha_bar"][[0, 3, 9]]
@@ -341,44 +352,50 @@ def test_respace_keeps_the_steps():
 
 
 def test_respace_to_all_steps_is_the_same_schedule():
-    table = S.cosine_schedule(50)
-    chex.assert_trees_all_close(S.respace(table, tuple(range(1, 51))), table, atol=1e-6)
+    table = schedule.cosine_schedule(50)
+    chex.assert_trees_all_close(
+        schedule.respace(table, tuple(range(1, 51))), table, atol=1e-6
+    )
 
 
 def test_schedule_from_betas_rebuilds_a_schedule_and_jits():
     betas = reference.cosine_betas(8)
-    eager = S.schedule_from_betas(jnp.asarray(betas, jnp.float32))
-    traced = jax.jit(S.schedule_from_betas)(jnp.asarray(betas, jnp.float32))
+    eager = schedule.schedule_from_betas(jnp.asarray(betas, jnp.float32))
+    traced = jax.jit(schedule.schedule_from_betas)(jnp.asarray(betas, jnp.float32))
     chex.assert_trees_all_close(eager, traced, rtol=1e-6)
-    chex.assert_trees_all_close(eager, S.cosine_schedule(8), rtol=5e-5)
+    chex.assert_trees_all_close(eager, schedule.cosine_schedule(8), rtol=5e-5)
 
 
 def test_schedule_is_a_pytree_that_maps_and_jits():
-    table = S.cosine_schedule(8)
+    table = schedule.cosine_schedule(8)
     leaves, treedef = jax.tree.flatten(table)
     assert len(leaves) == 2
     assert jax.tree.unflatten(treedef, leaves).num_steps == 8
-    inside = jax.jit(lambda: S.cosine_schedule(8))()
+    inside = jax.jit(lambda: schedule.cosine_schedule(8))()
     chex.assert_trees_all_close(inside, table, rtol=1e-6)
     x, y = random(0), random(1)
     with jax.disable_jit():
-        eager = S.posterior(table, x, y, jnp.array(3))
+        eager = schedule.posterior(table, x, y, jnp.array(3))
     chex.assert_trees_all_close(
-        eager, S.posterior(table, x, y, jnp.array(3)), rtol=1e-6
+        eager, schedule.posterior(table, x, y, jnp.array(3)), rtol=1e-6
     )
     # A stack of schedules of one length maps like any array.
-    stack = jax.tree.map(lambda a, b: jnp.stack([a, b]), table, S.vp_schedule(8))
-    both = jax.vmap(lambda s: S.q_sample(s, x, jnp.array(2), y))(stack)
+    stack = jax.tree.map(lambda a, b: jnp.stack([a, b]), table, schedule.vp_schedule(8))
+    both = jax.vmap(lambda s: schedule.q_sample(s, x, jnp.array(2), y))(stack)
     np.testing.assert_allclose(
-        both[1], S.q_sample(S.vp_schedule(8), x, jnp.array(2), y), rtol=1e-6
+        both[1],
+        schedule.q_sample(schedule.vp_schedule(8), x, jnp.array(2), y),
+        rtol=1e-6,
     )
 
 
 def test_gradients_are_finite_and_reach_the_betas():
     def loss(beta):
-        table = S.schedule_from_betas(beta)
-        x_t = S.q_sample(table, random(0), jnp.array(2), random(1))
-        return jnp.sum(S.posterior(table, random(0), x_t, jnp.array(2)).mean ** 2)
+        table = schedule.schedule_from_betas(beta)
+        x_t = schedule.q_sample(table, random(0), jnp.array(2), random(1))
+        return jnp.sum(
+            schedule.posterior(table, random(0), x_t, jnp.array(2)).mean ** 2
+        )
 
     beta = jnp.asarray(reference.cosine_betas(4), jnp.float32)
     gradient = jax.grad(loss)(beta)
@@ -392,25 +409,40 @@ def test_gradients_are_finite_and_reach_the_betas():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: S.cosine_schedule(0), "num_steps is 0"),
-        (lambda: S.cosine_schedule(4, max_beta=1.0), "max_beta is 1.0"),
-        (lambda: S.cosine_schedule(4, offset=-0.1), "offset is -0.1"),
-        (lambda: S.vp_schedule(-1), "num_steps is -1"),
-        (lambda: S.vp_schedule(4, t_min=1.0), "t_min is 1.0"),
-        (lambda: S.vp_schedule(4, beta_min=0.0), "beta_min is 0.0"),
-        (lambda: S.vp_schedule(4, beta_max=0.01), "beta_max is 0.01"),
-        (lambda: S.linear_schedule(4, beta_max=1.5), "beta_max is 1.5"),
-        (lambda: S.linear_schedule(4, beta_min=0.0), "beta_min is 0.0"),
-        (lambda: S.linear_schedule(19, scaled=True), "at least 20 steps"),
-        (lambda: S.linear_schedule(8, scaled=True), "at least 20 steps"),
-        (lambda: S.schedule_from_betas(jnp.array([])), "T >= 1"),
-        (lambda: S.schedule_from_betas(jnp.array([0.1, 1.0, 0.2])), "step 2 is 1.0"),
-        (lambda: S.schedule_from_betas(jnp.array([0.1, jnp.nan])), "step 2 is nan"),
-        (lambda: S.schedule_from_betas(jnp.array([0.0, 0.5])), "step 1 is 0.0"),
-        (lambda: S.respace(S.cosine_schedule(4), ()), "empty"),
-        (lambda: S.respace(S.cosine_schedule(4), (2, 5)), "step 5 after 2"),
-        (lambda: S.respace(S.cosine_schedule(4), (2, 2)), "step 2 after 2"),
-        (lambda: S.respace(S.cosine_schedule(4), (0, 2)), "step 0 after 0"),
+        (lambda: schedule.cosine_schedule(0), "num_steps is 0"),
+        (lambda: schedule.cosine_schedule(4, max_beta=1.0), "max_beta is 1.0"),
+        (lambda: schedule.cosine_schedule(4, offset=-0.1), "offset is -0.1"),
+        (lambda: schedule.vp_schedule(-1), "num_steps is -1"),
+        (lambda: schedule.vp_schedule(4, t_min=1.0), "t_min is 1.0"),
+        (lambda: schedule.vp_schedule(4, beta_min=0.0), "beta_min is 0.0"),
+        (lambda: schedule.vp_schedule(4, beta_max=0.01), "beta_max is 0.01"),
+        (lambda: schedule.linear_schedule(4, beta_max=1.5), "beta_max is 1.5"),
+        (lambda: schedule.linear_schedule(4, beta_min=0.0), "beta_min is 0.0"),
+        (lambda: schedule.linear_schedule(19, scaled=True), "at least 20 steps"),
+        (lambda: schedule.linear_schedule(8, scaled=True), "at least 20 steps"),
+        (lambda: schedule.schedule_from_betas(jnp.array([])), "T >= 1"),
+        (
+            lambda: schedule.schedule_from_betas(jnp.array([0.1, 1.0, 0.2])),
+            "step 2 is 1.0",
+        ),
+        (
+            lambda: schedule.schedule_from_betas(jnp.array([0.1, jnp.nan])),
+            "step 2 is nan",
+        ),
+        (lambda: schedule.schedule_from_betas(jnp.array([0.0, 0.5])), "step 1 is 0.0"),
+        (lambda: schedule.respace(schedule.cosine_schedule(4), ()), "empty"),
+        (
+            lambda: schedule.respace(schedule.cosine_schedule(4), (2, 5)),
+            "step 5 after 2",
+        ),
+        (
+            lambda: schedule.respace(schedule.cosine_schedule(4), (2, 2)),
+            "step 2 after 2",
+        ),
+        (
+            lambda: schedule.respace(schedule.cosine_schedule(4), (0, 2)),
+            "step 0 after 0",
+        ),
     ],
 )
 def test_bad_arguments(make, message):
@@ -419,16 +451,20 @@ def test_bad_arguments(make, message):
 
 
 def test_shapes_that_do_not_fit():
-    table, t = S.cosine_schedule(4), jnp.array(1)
+    table, t = schedule.cosine_schedule(4), jnp.array(1)
     # Annotations catch the first two where they are checked, as they are in tests.
-    for function in (S.posterior, S.noise_from_x0, S.x0_from_noise):
+    for function in (
+        schedule.posterior,
+        schedule.noise_from_x0,
+        schedule.x0_from_noise,
+    ):
         with pytest.raises((ValueError, TypeCheckError)):
             function(table, random(0, (4, 3)), random(1, (4, 1)), t)
     with pytest.raises((ValueError, TypeCheckError)):
-        S.q_sample(table, random(0, (4, 3)), t, random(1, (4, 1)))
+        schedule.q_sample(table, random(0, (4, 3)), t, random(1, (4, 1)))
     for shape in [(3,), (4, 3, 2)]:
         with pytest.raises(ValueError, match="t has shape"):
-            S.posterior(
+            schedule.posterior(
                 table, random(0, (4, 3)), random(1, (4, 3)), jnp.ones(shape, int)
             )
 
@@ -437,7 +473,7 @@ def test_one_compile_for_all_steps():
     @jax.jit
     @chex.assert_max_traces(n=1)
     def program(table, x, y, t):
-        return S.posterior(table, x, y, t)
+        return schedule.posterior(table, x, y, t)
 
     for t in (1, 2, 3):
-        program(S.cosine_schedule(4), random(t), random(t + 1), jnp.array(t))
+        program(schedule.cosine_schedule(4), random(t), random(t + 1), jnp.array(t))

@@ -19,8 +19,10 @@ from PIL import Image
 from jaxmotion.data import bvh, bvh_text, clips_io, windows
 from jaxmotion.learning import checkpoint
 from jaxmotion.motion import trajectory
-from jaxmotion.protocols import camdm_release, camdm_runs
-from jaxmotion.systems import camdm_model, camdm_published
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import published as camdm_published
+from jaxmotion.systems.camdm import release as camdm_release
+from jaxmotion.systems.camdm import training as camdm_training
 from tests.protocols import samples
 
 ROOT = Path(__file__).parents[2]
@@ -196,7 +198,7 @@ def test_one_style_trains_with_clips_held_out_by_name(call, data, tmp_path):
     )
     model, _, _ = camdm_model.load(tmp_path)
     assert model.labels == ("neutral",)
-    run = camdm_runs.load_run(tmp_path)
+    run = camdm_training.load_run(tmp_path)
     assert list(run.held_out.clip_names) == held_out
     call(f"rollout --run {tmp_path} --style neutral --seconds 1")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from jaxmotion.data import clips_io
-from jaxmotion.protocols import evaluators
+from jaxmotion.evaluators import frozen
 from tests.protocols import samples
 
 FOLDER = Path(__file__).parents[2] / "experiments"
@@ -39,7 +39,7 @@ def test_what_is_missing_is_named(invoke, tmp_path, line, message):
 def test_a_tiny_run_twice_gives_the_same_table(invoke, tmp_path):
     clips = samples.clips()
     clips_io.save_clips(tmp_path / "clips.npz", clips)
-    evaluators.save(
+    frozen.save(
         tmp_path / "judge.npz",
         samples.evaluator(
             "style", labels=samples.STYLES, joints=clips.skeleton.names, frames=60

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from jaxmotion.data import bvh_text, clips_io, procedural
-from jaxmotion.protocols import emdm_runs
-from jaxmotion.systems import emdm_published
+from jaxmotion.systems.emdm import published as emdm_published
+from jaxmotion.systems.emdm import training as emdm_training
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "experiments" / "emdm.py"
@@ -269,7 +269,7 @@ def test_released_weights_become_a_row(call, released, tmp_path):
         call(line)
     assert not (released / "run" / "emdm").exists()
     call(f"{line} --heads 4")
-    params, config = emdm_runs.load_row(released / "run", "emdm")
+    params, config = emdm_training.load_row(released / "run", "emdm")
     assert (config.frames, config.num_steps, config.latent) == (40, 10, 5)
     wanted = emdm_published.load(released / "t2m.pth", frames=40, heads=4)
     assert config == wanted[0]

@@ -12,10 +12,11 @@ import pytest
 
 from jaxmotion.data import clips_io
 from jaxmotion.data.ball_clips import save_ball_clips
-from jaxmotion.learning import recognition
+from jaxmotion.evaluators import frozen as evaluators
+from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.learning.fingerprint import fingerprint
-from jaxmotion.protocols import camdm as protocol
-from jaxmotion.protocols import camdm_evaluation, camdm_styles, evaluators
+from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import steering as camdm_steering
 from tests import ball_walker, tiny
 from tests.protocols import samples
 
@@ -235,10 +236,10 @@ def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
     run, evaluator = samples.run(), evaluators.load(out)
     get = functools.partial(camdm_evaluation.recognizer, jax.random.key(0))
     judge = get(run, evaluator, num_steps=1)
-    windows = protocol.data_windows(run.train, stride=60, field="style")
+    windows = camdm_steering.data_windows(run.train, stride=60, field="style")
     bones = run.model.bones
-    features, hits = camdm_styles.recognized(bones, windows, judge)
-    x = np.array(recognition.released_input(bones, windows.motion))
+    features, hits = style_evaluator.recognized(bones, windows, judge)
+    x = np.array(style_evaluator.released_input(bones, windows.motion))
     with torch.inference_mode():
         wanted, logits = peer(torch.from_numpy(x.swapaxes(1, 2)))
     assert wanted.std() > 0.1

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from jaxmotion.evaluation.table import Cell
-from jaxmotion.protocols import camdm_release
+from jaxmotion.systems.camdm import release as camdm_release
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "report.py"
 

@@ -7,7 +7,7 @@ import typing
 
 import pytest
 
-from jaxmotion.protocols import script
+from jaxmotion import cli
 from tests.experiments.conftest import FOLDER
 
 # What is wrong -> the line says so. quickstart.py and squ9.py have nothing to read.
@@ -62,10 +62,10 @@ def test_every_number_has_a_range_that_its_default_is_in(load, name):
     for command in commands(load(name)):
         known = {x.name: x for x in dataclasses.fields(command)}
         for option in numbers(command):
-            assert option in script.LIMITS, f"{name}: {option}"
+            assert option in cli.LIMITS, f"{name}: {option}"
             default = known[option].default
             for one in default if isinstance(default, tuple) else (default,):
-                assert one is None or one in script.LIMITS[option]
+                assert one is None or one in cli.LIMITS[option]
 
 
 # One of each kind of mistake; before, most were noticed after minutes, or never.

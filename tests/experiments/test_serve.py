@@ -26,8 +26,8 @@ import pytest
 from jaxmotion.control import rollout
 from jaxmotion.learning import checkpoint
 from jaxmotion.motion import skeleton
-from jaxmotion.protocols import camdm_runs
-from jaxmotion.systems import camdm, camdm_model
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import training as camdm_training
 from tests import tiny
 from tests.protocols import samples
 
@@ -706,7 +706,7 @@ def model_and_params():
     model = camdm_model.Model(
         config=config, bones=tiny.skeleton(), labels=tiny.STYLES, source="tests"
     )
-    return model, tiny.random_params(camdm.init, config, seed=1)
+    return model, tiny.random_params(camdm_model.init, config, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -802,7 +802,7 @@ def test_without_a_mean_pose_characters_start_with_real_ones(monkeypatch):
     module, found = load("serving.camdm"), samples.run()
     asked = []
     monkeypatch.setattr(
-        camdm_runs, "load_run", lambda run, data: asked.append((run, data)) or found
+        camdm_training, "load_run", lambda run, data: asked.append((run, data)) or found
     )
     state = module.first_state(Path("run"), None, found.model)
     assert asked == [(Path("run"), None)]

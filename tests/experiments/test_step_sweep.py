@@ -13,7 +13,7 @@ from PIL import Image
 from jaxmotion.data import bvh_text, clips_io, procedural
 from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.evaluation import table
-from jaxmotion.protocols import evaluators
+from jaxmotion.evaluators import frozen
 from tests import ball_walker
 from tests.protocols import samples
 
@@ -375,7 +375,7 @@ BAD = {
 @pytest.mark.parametrize("line", BAD)
 def test_what_is_wrong_is_named_before_any_work(call, data, tmp_path, line):
     (tmp_path / "plain").write_text("")
-    evaluators.save(tmp_path / "judge.npz", samples.evaluator("ball"))
+    frozen.save(tmp_path / "judge.npz", samples.evaluator("ball"))
     places = dict(
         data=data,
         gone=tmp_path / "gone.npz",

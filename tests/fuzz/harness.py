@@ -1,7 +1,7 @@
 """Malformed inputs by the thousand, and what must come of each.
 
 A reader returns a value that an independent reader confirms, or raises one line that a
-script prints (see `jaxmotion.protocols.script`). Anything else is a failure: another
+script prints (see `jaxmotion.cli`). Anything else is a failure: another
 exception, several lines, a warning, an input that takes longer than `SECONDS`, or a
 value that differs. Seeds are fixed: input n of a target is the same on every machine.
 """

@@ -9,20 +9,19 @@ import optax
 import pytest
 
 from jaxmotion.data import clips_io
+from jaxmotion.evaluators import frozen
 from jaxmotion.learning import checkpoint, training
-from jaxmotion.protocols import (
-    aamdm_runs,
-    emdm_runs,
-    evaluators,
-    smgdiff_data,
-    smgdiff_runs,
-)
-from jaxmotion.systems import camdm_model, smgdiff_model
+from jaxmotion.systems.aamdm import training as aamdm_training
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.emdm import training as emdm_training
+from jaxmotion.systems.smgdiff import data as smgdiff_data
+from jaxmotion.systems.smgdiff import model as smgdiff_model
+from jaxmotion.systems.smgdiff import training as smgdiff_training
 from tests import ball_walker, person, tiny
 from tests.fuzz import harness, mutations
 from tests.fuzz.test_npz import fields_of
 from tests.protocols import samples
-from tests.protocols.test_smgdiff import PATHS, SIZES
+from tests.systems.smgdiff.test_training import PATHS, SIZES
 
 # Orbax abandons its other reads when one fails.
 pytestmark = [
@@ -135,7 +134,7 @@ def test_models_as_json(capsys, camdm_value, system):
     module, value = camdm_model, camdm_value
     if system == "smgdiff":
         train, _ = smgdiff_data.split(ball_walker.clips(60), fraction=0.3)
-        model = smgdiff_runs.make_model(train, sizes=SIZES, paths=PATHS)
+        model = smgdiff_training.make_model(train, sizes=SIZES, paths=PATHS)
         module, value = smgdiff_model, smgdiff_model.to_json(model)
 
     def confirm(given, model):
@@ -163,17 +162,17 @@ def test_evaluators(tmp_path, capsys):
     path = tmp_path / "x.npz"
     contents = []
     for kind in ("style", "action", "ball"):
-        evaluators.save(path, samples.evaluator(kind))
+        frozen.save(path, samples.evaluator(kind))
         contents.append(path.read_bytes())
 
     def confirm(data, found):
         fields = fields_of(data)
         value = json.loads(str(fields["config"]))
-        says(evaluators.to_json(found), value)
+        says(frozen.to_json(found), value)
         same_params(found.params, fields)
 
     target = harness.Target(
-        "evaluators", lambda _: evaluators.load(path), confirm, names=("x.npz",)
+        "evaluators", lambda _: frozen.load(path), confirm, names=("x.npz",)
     )
     for seed in range(INPUTS["evaluators"]):
         random = np.random.default_rng(seed)
@@ -202,9 +201,9 @@ def spoil(folder, random, names):
 def test_runs_of_smgdiff(tmp_path, capsys):
     folder = tmp_path / "run"
     train, held_out = smgdiff_data.split(ball_walker.clips(60), fraction=0.3)
-    model = smgdiff_runs.make_model(train, sizes=SIZES, paths=PATHS)
-    smgdiff_runs.write_run(
-        smgdiff_runs.Run(folder=folder, model=model, train=train, held_out=held_out)
+    model = smgdiff_training.make_model(train, sizes=SIZES, paths=PATHS)
+    smgdiff_training.write_run(
+        smgdiff_training.Run(folder=folder, model=model, train=train, held_out=held_out)
     )
 
     def confirm(_, run):
@@ -215,7 +214,7 @@ def test_runs_of_smgdiff(tmp_path, capsys):
 
     target = harness.Target(
         "runs of SMGDiff",
-        lambda _: smgdiff_runs.load_run(folder),
+        lambda _: smgdiff_training.load_run(folder),
         confirm,
         names=("run",),
     )
@@ -232,7 +231,7 @@ def test_runs_of_smgdiff(tmp_path, capsys):
 def test_runs_of_aamdm(tmp_path, capsys):
     folder, data = tmp_path / "run", tmp_path / "clips.npz"
     clips_io.save_clips(data, person.clips((160, 90, 160, 30)))
-    aamdm_runs.prepare(
+    aamdm_training.prepare(
         folder,
         data,
         field="theme",
@@ -257,7 +256,10 @@ def test_runs_of_aamdm(tmp_path, capsys):
         assert 0 < run.train.fps < np.inf
 
     target = harness.Target(
-        "runs of AAMDM", lambda _: aamdm_runs.load_run(folder), confirm, names=("run",)
+        "runs of AAMDM",
+        lambda _: aamdm_training.load_run(folder),
+        confirm,
+        names=("run",),
     )
     target.feed("untouched", None)
     for seed in range(1, INPUTS["aamdm"]):
@@ -270,7 +272,7 @@ def test_runs_of_aamdm(tmp_path, capsys):
 
 def test_runs_of_emdm(tmp_path, capsys):
     value = {"task": "text", "data": "data.npz", "frames": 60, "classes": ["a", "b"]}
-    emdm_runs.write_config(tmp_path, value)
+    emdm_training.write_config(tmp_path, value)
     path = tmp_path / "config.json"
 
     def confirm(data, found):
@@ -280,7 +282,7 @@ def test_runs_of_emdm(tmp_path, capsys):
 
     target = harness.Target(
         "configs of EMDM",
-        lambda _: emdm_runs.read_config(tmp_path),
+        lambda _: emdm_training.read_config(tmp_path),
         confirm,
         names=("config.json",),
     )

@@ -17,7 +17,7 @@ import pytest
 from jaxmotion.data import clips_io
 from jaxmotion.learning import checkpoint, training
 from jaxmotion.learning.loop import Loop, TrainingDiverged, check_writable, train
-from jaxmotion.systems import camdm, camdm_model
+from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -372,7 +372,9 @@ def test_a_killed_training_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
         model, _, config = camdm_model.load(folder)
         assert config["experiment"]["steps"] == steps
         assert checkpoint.latest_step(folder / "checkpoints") == steps
-        params = jax.eval_shape(lambda m=model: camdm.init(jax.random.key(0), m.config))
+        params = jax.eval_shape(
+            lambda m=model: camdm_model.init(jax.random.key(0), m.config)
+        )
         like = {"params": params, "ema_params": params}
         states.append(checkpoint.restore_part(folder / "checkpoints", like))
     jax.tree.map(np.testing.assert_array_equal, *states)

@@ -10,19 +10,19 @@ import pytest
 from jaxmotion.diffusion import schedule
 from jaxmotion.motion import trajectory
 from jaxmotion.networks import blocks
-from jaxmotion.systems import camdm
+from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
 torch = pytest.importorskip("torch")
 from benchmarks import torch_camdm  # noqa: E402
 
 BATCH = 3
-CONFIG = camdm.Config(num_joints=25, num_labels=100)  # the paper's
+CONFIG = camdm_model.Config(num_joints=25, num_labels=100)  # the paper's
 
 
 @functools.cache
 def parameters():
-    return tiny.random_params(camdm.init, CONFIG, seed=5)
+    return tiny.random_params(camdm_model.init, CONFIG, seed=5)
 
 
 @functools.cache
@@ -38,7 +38,7 @@ def conditions():
     )
     angle = rng.uniform(0, 2 * np.pi, (BATCH, CONFIG.future))
     facing = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
-    return camdm.Condition(
+    return camdm_model.Condition(
         past=normal(CONFIG.past, CONFIG.num_features),
         trajectory=trajectory.Trajectory(
             position=normal(CONFIG.future, 2), facing=jnp.asarray(facing, jnp.float32)
@@ -65,7 +65,7 @@ def test_forward_pass(batch_first):
     arguments = conditions().arguments(CONFIG)
     t = np.array([1, 4, 8])
     x_t = np.random.default_rng(1).normal(size=(BATCH, 45, 156)).astype(np.float32)
-    ours = jax.jit(camdm.network(CONFIG).apply)(
+    ours = jax.jit(camdm_model.network(CONFIG).apply)(
         {"params": parameters()}, x_t, jnp.asarray(t), *arguments
     )
     with torch.inference_mode():
@@ -94,7 +94,7 @@ def test_sampler():
     with jax.debug_key_reuse(False):
         keys = jax.random.split(jax.random.key(2), BATCH)
         noise = jax.jit(jax.vmap(noises, out_axes=1))(keys)
-        plan = camdm.planner(parameters(), config=CONFIG)
+        plan = camdm_model.planner(parameters(), config=CONFIG)
         ours = jax.jit(jax.vmap(plan))(keys, condition)
     beta = schedule.cosine_schedule(CONFIG.num_steps).beta
     table = torch_camdm.posterior_table(np.asarray(beta))

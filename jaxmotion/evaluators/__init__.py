@@ -1,0 +1,1 @@
+"""Learned evaluators of motions: networks, training, frozen files."""

@@ -1,0 +1,400 @@
+"""A convolutional recogniser of style, and the features for Fréchet distances.
+
+Two residual convolutions over time, then three linear layers; the 512 activations
+before the last are the features. Differs from the released one: layer and group norms
+stand in for batch norms, so that a prediction does not depend on its batch and the
+network has no state beside its parameters. `StyleClassifier` is the released one after
+its training, for published weights.
+
+Source: released feature extractor of CAMDM (Chen et al. 2024).
+"""
+
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.networks.convolution import convolve
+
+
+class InferenceBatchNorm(nn.Module):
+    """Batch norm whose statistics are parameters, as training left them.
+
+    Attributes:
+      channels: Channels, the last axis.
+    """
+
+    channels: int
+
+    def setup(self):
+        """Makes the four vectors."""
+        zeros, ones = nn.initializers.zeros, nn.initializers.ones
+        shape = (self.channels,)
+        self.mean = self.param("mean", zeros, shape)
+        self.variance = self.param("variance", ones, shape)
+        self.scale = self.param("scale", ones, shape)
+        self.bias = self.param("bias", zeros, shape)
+
+    def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+        """Standardizes each channel, then scales and shifts it."""
+        factor = self.scale * jax.lax.rsqrt(self.variance + 1e-5)
+        shift = self.bias - self.mean * factor
+        factor, shift = (jnp.broadcast_to(v, x.shape) for v in (factor, shift))
+        return x * factor + shift
+
+
+class ResidualConvolution(nn.Module):
+    """Convolution of width 3, norm and leaky ReLU, added to a 1 x 1 convolution.
+
+    Attributes:
+      channels: Output channels.
+      frozen: Batch norm in inference mode in place of group norm.
+    """
+
+    channels: int
+    frozen: bool = False
+
+    def setup(self):
+        """Makes the two convolutions and the norm."""
+        self.main = nn.Conv(self.channels, (3,), conv_general_dilated=convolve)
+        self.norm = (
+            InferenceBatchNorm(self.channels) if self.frozen else nn.GroupNorm(8)
+        )
+        self.side = nn.Conv(self.channels, (1,), conv_general_dilated=convolve)
+
+    def __call__(
+        self, x: Float[Array, "batch frames channels_in"]
+    ) -> Float[Array, "batch frames channels"]:
+        """Applies it along time.
+
+        Args:
+          x: Frames.
+
+        Returns:
+          As many frames.
+        """
+        return nn.leaky_relu(self.norm(self.main(x))) + self.side(x)
+
+
+class Recognizer(nn.Module):
+    """Windows of poses to features and class logits.
+
+    Attributes:
+      num_classes: Classes.
+      num_features: Width of the feature layer.
+      dropout: Rate after the convolutions.
+      frozen: Batch norms in inference mode in place of layer and group norms.
+    """
+
+    num_classes: int
+    num_features: int = 512
+    dropout: float = 0.5
+    frozen: bool = False
+
+    def setup(self):
+        """Makes the layers."""
+        self.convolution_1 = ResidualConvolution(64, self.frozen)
+        self.convolution_2 = ResidualConvolution(128, self.frozen)
+        self.hidden = nn.Dense(1024)
+        self.hidden_norm = self._norm(1024)
+        self.feature = nn.Dense(self.num_features)
+        self.feature_norm = self._norm(self.num_features)
+        self.out = nn.Dense(self.num_classes)
+        self.drop = nn.Dropout(self.dropout)
+
+    def _norm(self, channels: int) -> nn.Module:
+        if self.frozen:
+            return InferenceBatchNorm(channels)
+        return nn.LayerNorm(epsilon=1e-5)
+
+    def __call__(
+        self, x: Float[Array, "batch frames channels"], *, train: bool = False
+    ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
+        """Recognises windows.
+
+        Args:
+          x: Joint positions, root-relative and facing +z in each frame, metres;
+            all windows of the length that it was initialised with.
+          train: Whether to drop; needs rngs={"dropout": key}.
+
+        Returns:
+          Features, and logits.
+        """
+        x = self.convolution_2(self.convolution_1(x))
+        x = self.drop(x, deterministic=not train).reshape(x.shape[0], -1)
+        x = nn.leaky_relu(self.hidden_norm(self.hidden(x)))
+        features = nn.leaky_relu(self.feature_norm(self.feature(x)))
+        return features, self.out(features)
+
+
+class StyleClassifier(Recognizer):
+    """The released recognizer; its input is `learning.recognition.released_input`."""
+
+    frozen: bool = True
+
+
+class ActionRecognizer(nn.Module):
+    """Motions to features and class logits.
+
+    Attributes:
+      num_classes: Classes.
+      num_features: Width of the feature layer.
+      hidden: Width of both states.
+    """
+
+    num_classes: int
+    num_features: int = 30
+    hidden: int = 128
+
+    def setup(self):
+        """Makes the layers."""
+        self.lower = nn.RNN(nn.GRUCell(self.hidden))
+        self.upper = nn.RNN(nn.GRUCell(self.hidden))
+        self.feature = nn.Dense(self.num_features)
+        self.out = nn.Dense(self.num_classes)
+
+    def __call__(
+        self,
+        x: Float[Array, "batch frames channels"],
+        state: Float[Array, "batch 2 hidden"],
+    ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
+        """Recognises motions.
+
+        Args:
+          x: Joint positions in the frame of the first pose, metres; any length.
+          state: States of the lower and the upper layer before the first frame.
+
+        Returns:
+          Features in (-1, 1), and logits.
+        """
+        x = self.lower(x, initial_carry=state[:, 0])
+        x = self.upper(x, initial_carry=state[:, 1])
+        features = jnp.tanh(self.feature(x[:, -1]))
+        return features, self.out(features)
+
+
+Padding = Literal["zeros", "kept"]
+UNIT = 4  # frames of a movement: two convolutions of stride 2
+
+_XAVIER = nn.initializers.xavier_normal()
+_SLOPE = 0.2
+
+
+class MovementEncoder(nn.Module):
+    """Two convolutions of width 4 and stride 2, and a linear layer.
+
+    Attributes:
+      width: Channels of each layer.
+      dropout: Rate after each convolution.
+    """
+
+    width: int = 512
+    dropout: float = 0.2
+
+    def setup(self):
+        """Makes the layers."""
+        halve = dict(
+            strides=(2,),
+            padding=((1, 1),),
+            kernel_init=_XAVIER,
+            conv_general_dilated=convolve,
+        )
+        self.convolution_1 = nn.Conv(self.width, (4,), **halve)
+        self.convolution_2 = nn.Conv(self.width, (4,), **halve)
+        self.out = nn.Dense(self.width, kernel_init=_XAVIER)
+        self.drop = nn.Dropout(self.dropout)
+
+    def __call__(
+        self, x: Float[Array, "batch frames channels"], *, train: bool = False
+    ) -> Float[Array, "batch units width"]:
+        """Encodes movements.
+
+        Args:
+          x: Frames; those beyond the last whole movement are dropped.
+          train: Whether to drop; needs rngs={"dropout": key}.
+
+        Returns:
+          One row for `UNIT` frames. A row sees 3 frames on each side of its own.
+        """
+        for convolution in (self.convolution_1, self.convolution_2):
+            x = self.drop(convolution(x), deterministic=not train)
+            x = nn.leaky_relu(x, _SLOPE)
+        return self.out(x)
+
+
+class SequenceEncoder(nn.Module):
+    """Linear layer, bidirectional GRU with learned first states, and two layers more.
+
+    Attributes:
+      width: Channels of the GRU, one direction.
+      embedding: Channels of the result.
+    """
+
+    width: int
+    embedding: int
+
+    def setup(self):
+        """Makes the layers."""
+        self.input = nn.Dense(self.width, kernel_init=_XAVIER)
+        self.start = self.param("start", nn.initializers.normal(1.0), (2, self.width))
+        self.forward = nn.RNN(nn.GRUCell(self.width), return_carry=True)
+        self.backward = nn.RNN(nn.GRUCell(self.width), return_carry=True, reverse=True)
+        self.hidden = nn.Dense(self.width, kernel_init=_XAVIER)
+        self.norm = nn.LayerNorm(epsilon=1e-5)
+        self.out = nn.Dense(self.embedding, kernel_init=_XAVIER)
+
+    def __call__(
+        self, x: Float[Array, "batch rows channels"], length: Int[Array, " batch"]
+    ) -> Float[Array, "batch embedding"]:
+        """Embeds sequences of different lengths.
+
+        Args:
+          x: Sequences; rows at and after a sequence's length are not read.
+          length: In 1..rows.
+
+        Returns:
+          Embeddings.
+        """
+        x = self.input(x)
+        states = []
+        for start, pass_over in zip(
+            self.start, (self.forward, self.backward), strict=True
+        ):
+            carry = jnp.broadcast_to(start[None], (x.shape[0], self.width))
+            state, _ = pass_over(x, initial_carry=carry, seq_lengths=length)
+            states.append(state)
+        x = self.norm(self.hidden(jnp.concatenate(states, axis=-1)))
+        return self.out(nn.leaky_relu(x, _SLOPE))
+
+
+class TextEncoder(nn.Module):
+    """Word vectors, plus a linear layer of their tags, through a sequence encoder.
+
+    Attributes:
+      width: Channels of the GRU, one direction.
+      embedding: Channels of the result.
+    """
+
+    width: int = 512
+    embedding: int = 512
+
+    @nn.compact
+    def __call__(
+        self,
+        vectors: Float[Array, "batch slots word"],
+        tags: Float[Array, "batch slots classes"],
+        words: Int[Array, " batch"],
+    ) -> Float[Array, "batch embedding"]:
+        """Embeds sentences of different lengths.
+
+        Args:
+          vectors: Word vectors.
+          tags: One-hot parts of speech.
+          words: Of each sentence, with its marks of start and end; in 1..slots.
+
+        Returns:
+          Embeddings.
+        """
+        tagged = nn.Dense(vectors.shape[-1], kernel_init=_XAVIER, name="tags")(tags)
+        encoder = SequenceEncoder(self.width, self.embedding, name="sequence")
+        return encoder(vectors + tagged, words)
+
+
+class Matcher(nn.Module):
+    """Both towers: motions and sentences to embeddings that can be compared.
+
+    Attributes:
+      movement_width: Channels of a movement.
+      motion_width: Channels of the motions' GRU, one direction.
+      text_width: Channels of the sentences' GRU, one direction.
+      embedding: Channels of an embedding.
+      dropout: Rate in the movement encoder.
+    """
+
+    movement_width: int = 512
+    motion_width: int = 1024
+    text_width: int = 512
+    embedding: int = 512
+    dropout: float = 0.2
+
+    def setup(self):
+        """Makes the three encoders."""
+        self.movement = MovementEncoder(self.movement_width, self.dropout)
+        self.motion = SequenceEncoder(self.motion_width, self.embedding)
+        self.text = TextEncoder(self.text_width, self.embedding)
+
+    def embed_motion(
+        self,
+        features: Float[Array, "batch frames channels"],
+        frames: Int[Array, " batch"],
+        *,
+        train: bool = False,
+        padding: Padding = "zeros",
+    ) -> Float[Array, "batch embedding"]:
+        """Embeds motions of different lengths.
+
+        Only whole movements count, but as in the source the last one's convolutions
+        reach 3 frames beyond it, so motions that are to be compared are padded to one
+        length (there 196 frames).
+
+        Args:
+          features: Normalised to mean 0 and deviation 1, without contact labels.
+          frames: Of each motion, at least `UNIT`.
+          train: Whether to drop; needs rngs={"dropout": key}.
+          padding: What is seen beyond the whole movements: "zeros", or "kept", what is
+            there.
+
+        Returns:
+          Embeddings.
+        """
+        units = frames // UNIT
+        if padding == "zeros":
+            inside = jnp.arange(features.shape[1])[None] < UNIT * units[:, None]
+            features = jnp.where(inside[..., None], features, 0.0)
+        return self.motion(self.movement(features, train=train), units)
+
+    def embed_text(
+        self,
+        vectors: Float[Array, "batch slots word"],
+        tags: Float[Array, "batch slots classes"],
+        words: Int[Array, " batch"],
+    ) -> Float[Array, "batch embedding"]:
+        """Embeds sentences of different lengths.
+
+        Args:
+          vectors: As `TextEncoder`.
+          tags: As `TextEncoder`.
+          words: As `TextEncoder`.
+
+        Returns:
+          Embeddings.
+        """
+        return self.text(vectors, tags, words)
+
+    def __call__(
+        self,
+        features: Float[Array, "batch frames channels"],
+        frames: Int[Array, " batch"],
+        vectors: Float[Array, "batch slots word"],
+        tags: Float[Array, "batch slots classes"],
+        words: Int[Array, " batch"],
+        *,
+        train: bool = False,
+    ) -> tuple[Float[Array, "batch embedding"], Float[Array, "batch embedding"]]:
+        """Both embeddings; see the two methods.
+
+        Args:
+          features: As `embed_motion`.
+          frames: As `embed_motion`.
+          vectors: As `embed_text`.
+          tags: As `embed_text`.
+          words: As `embed_text`.
+          train: Whether to drop; needs rngs={"dropout": key}.
+
+        Returns:
+          Embeddings of the sentences and of the motions.
+        """
+        motion = self.embed_motion(features, frames, train=train)
+        return self.embed_text(vectors, tags, words), motion

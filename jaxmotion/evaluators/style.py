@@ -1,0 +1,407 @@
+"""Training of the style recogniser on clips, and its use on motions.
+
+Source: released feature extractor of CAMDM (Chen et al. 2024): windows of 60 frames,
+cross entropy, Adam 1e-3.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.data.clips import Clips
+from jaxmotion.evaluators.network import Recognizer, StyleClassifier
+from jaxmotion.learning import training
+from jaxmotion.motion import rotation, skeleton, trajectory
+from jaxmotion.motion.facing import body_facing, plain_names
+from jaxmotion.systems.camdm.steering import WINDOW, Windows, data_windows
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RecognizerConfig:
+    """Size of the recogniser.
+
+    Attributes:
+      num_classes: Classes.
+      num_joints: Joints of the skeleton.
+      frames: Frames of a window, at 30 fps.
+    """
+
+    num_classes: int
+    num_joints: int
+    frames: int = 60
+
+    @property
+    def network(self) -> Recognizer:
+        """The module of this size."""
+        return Recognizer(self.num_classes)
+
+    def read(
+        self, bones: skeleton.Skeleton, motion: skeleton.Motion
+    ) -> Float[Array, "*batch frames channels"]:
+        """What the network looks at."""
+        return recognizer_input(bones, motion)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReleasedConfig(RecognizerConfig):
+    """Size of the released classifier: 15 joints, and windows of 60 frames."""
+
+    num_joints: int = 15
+
+    @property
+    def network(self) -> StyleClassifier:
+        """The module of this size."""
+        return StyleClassifier(self.num_classes)
+
+    def read(
+        self, bones: skeleton.Skeleton, motion: skeleton.Motion
+    ) -> Float[Array, "*batch frames channels"]:
+        """What the network looks at."""
+        return released_input(bones, motion)
+
+
+# The joints of the released classifier as `plain_names` has them, of Mixamo's skeleton
+# and of 100STYLE's own.
+_RELEASED_NAMES = tuple(
+    ("hips", "neck", "head")
+    + tuple(f"{side}{part}" for side in ("right", "left") for part in arm)
+    + tuple(f"{side}{part}" for side in ("right", "left") for part in leg)
+    for arm, leg in (
+        (("collar", "shoulder", "elbow"), ("hip", "knee", "ankle")),
+        (("shoulder", "arm", "forearm"), ("upleg", "leg", "foot")),
+    )
+)
+RELEASED_JOINTS = _RELEASED_NAMES[1]
+
+
+def released_joints(bones: skeleton.Skeleton) -> tuple[int, ...]:
+    """The joints that the released classifier looks at, in its order.
+
+    Raises:
+      ValueError: if the skeleton has neither Mixamo's nor 100STYLE's names.
+    """
+    plain = plain_names(bones)
+    for names in _RELEASED_NAMES:
+        if set(names) <= set(plain):
+            return tuple(plain.index(name) for name in names)
+    raise ValueError(
+        f"the released classifier needs the joints {', '.join(RELEASED_JOINTS)}, or "
+        f"{', '.join(_RELEASED_NAMES[0])}; the skeleton has {', '.join(bones.names)}"
+    )
+
+
+def released_input(
+    bones: skeleton.Skeleton, motion: skeleton.Motion
+) -> Float[Array, "*batch frames channels"]:
+    """What the released classifier looks at.
+
+    Positions of 15 joints relative to the root, each frame turned so that hips and
+    shoulders face +x.
+
+    Args:
+      bones: The skeleton.
+      motion: Frames of it, at 30 a second.
+
+    Returns:
+      Metres; three channels a joint.
+
+    Raises:
+      ValueError: as of `released_joints`.
+
+    Source: released feature extractor of CAMDM (Chen et al. 2024).
+    """
+    joints = jnp.asarray(released_joints(bones))
+    positions = skeleton.joint_positions(bones, motion)
+    turn = rotation.matrix_from_facing(body_facing(bones, positions))
+    local = positions[..., joints, :] - positions[..., :1, :]
+    x, y, z = jnp.moveaxis(jnp.einsum("...ji,...kj->...ki", turn, local), -1, 0)
+    local = jnp.stack([z, y, -x], axis=-1)  # from facing +z
+    return local.reshape(*local.shape[:-2], -1)
+
+
+def recognizer_input(
+    bones: skeleton.Skeleton, motion: skeleton.Motion
+) -> Float[Array, "*batch frames channels"]:
+    """Joint positions relative to the root and turned to face +z, in each frame.
+
+    So neither where a character walks nor how fast or where it faces is visible, but
+    what its limbs do.
+
+    Args:
+      bones: The skeleton.
+      motion: Frames of it.
+
+    Returns:
+      Metres; three channels a joint, the root's height in place of its zeros.
+    """
+    positions = skeleton.joint_positions(bones, motion)
+    facing = trajectory.root_trajectory(bones, motion).facing
+    turn = jnp.swapaxes(rotation.matrix_from_facing(facing), -1, -2)
+    local = positions - positions[..., :1, :]
+    local = jnp.einsum("...ij,...kj->...ki", turn, local)
+    local = local.at[..., 0, 1].set(positions[..., 0, 1])
+    return local.reshape(*local.shape[:-2], -1)
+
+
+def cross_entropy(
+    logits: Float[Array, "batch classes"], labels: Int[Array, " batch"]
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Mean cross entropy, and how often the largest logit is the right one.
+
+    Args:
+      logits: One row a sample.
+      labels: Its class.
+
+    Returns:
+      The loss in nats, and the accuracy.
+    """
+    log_probability = jax.nn.log_softmax(logits)
+    losses = -jnp.take_along_axis(log_probability, labels[:, None], axis=-1)
+    accuracy = jnp.mean(jnp.argmax(logits, axis=-1) == labels)
+    return jnp.mean(losses), {"accuracy": accuracy}
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init_recognizer(key: Key, config: RecognizerConfig) -> Params:
+    """Initial parameters.
+
+    Args:
+      key: Consumed.
+      config: Its size.
+
+    Returns:
+      Parameters of `Recognizer`.
+    """
+    x = jnp.zeros((1, config.frames, 3 * config.num_joints))
+    return config.network.init(key, x)["params"]
+
+
+def recognizer_loss(
+    params: Params,
+    key: Key,
+    batch: tuple[Float[Array, "batch frames channels"], Int[Array, " batch"]],
+    *,
+    config: RecognizerConfig,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Cross entropy of a batch.
+
+    Args:
+      params: The recogniser's parameters.
+      key: Consumed by dropout.
+      batch: Windows of `recognizer_input`, and their classes.
+      config: Its size.
+
+    Returns:
+      The loss, and the accuracy.
+    """
+    x, labels = batch
+    _, logits = config.network.apply(
+        {"params": params}, x, train=True, rngs={"dropout": key}
+    )
+    return cross_entropy(logits, labels)
+
+
+def recognize(
+    params: Params,
+    x: Float[Array, "batch frames channels"],
+    *,
+    config: RecognizerConfig,
+) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
+    """Features and logits of windows.
+
+    Args:
+      params: The recogniser's parameters.
+      x: Windows of `recognizer_input`.
+      config: Its size.
+
+    Returns:
+      Features (for Fréchet distances), and logits.
+    """
+    return config.network.apply({"params": params}, x)
+
+
+def train_recognizer(
+    key: Key,
+    x: Float[Array, "windows frames channels"],
+    labels: Int[Array, " windows"],
+    *,
+    config: RecognizerConfig,
+    num_steps: int = 1500,
+    batch: int = 128,
+    learning_rate: float = 1e-3,
+) -> tuple[Params, dict[str, Array]]:
+    """Trains a recogniser as one compiled program.
+
+    Args:
+      key: Consumed.
+      x: Windows of `recognizer_input`.
+      labels: Their classes.
+      config: Its size.
+      num_steps: Updates.
+      batch: Windows an update, drawn with replacement.
+      learning_rate: Of Adam, with cosine decay to a tenth.
+
+    Returns:
+      The moving average of the parameters, and losses and accuracies by step.
+    """
+    return train_classifier(
+        key,
+        lambda key: init_recognizer(key, config),
+        functools.partial(recognizer_loss, config=config),
+        (x, labels),
+        num_steps=num_steps,
+        batch=batch,
+        learning_rate=learning_rate,
+        weight_decay=1e-4,
+    )
+
+
+def train_classifier(
+    key: Key,
+    init: Callable[[Key], Params],
+    loss: training.Loss,
+    data: tuple[Float[Array, "samples frames channels"], Int[Array, " samples"]],
+    *,
+    num_steps: int,
+    batch: int,
+    learning_rate: float,
+    weight_decay: float = 0.0,
+    max_norm: float | None = None,
+) -> tuple[Params, dict[str, Array]]:
+    """Trains any classifier of motions as one compiled program.
+
+    Args:
+      key: Consumed.
+      init: Initial parameters from a key.
+      loss: Loss of a batch of samples and classes.
+      data: Samples, and their classes.
+      num_steps: Updates.
+      batch: Samples an update, drawn with replacement.
+      learning_rate: Of Adam, with cosine decay to a tenth.
+      weight_decay: Decoupled.
+      max_norm: Clip the gradient to this global norm; None to leave it.
+
+    Returns:
+      The moving average of the parameters, and losses and accuracies by step.
+    """
+    key_init, key_train = jax.random.split(key)
+    optimizer = training.adamw_cosine(
+        learning_rate=learning_rate,
+        num_steps=num_steps,
+        weight_decay=weight_decay,
+        max_norm=max_norm,
+    )
+
+    def sample_batch(key: Key, data: tuple[Array, Array]) -> tuple[Array, Array]:
+        x, labels = data
+        chosen = jax.random.randint(key, (batch,), 0, x.shape[0])
+        return x[chosen], labels[chosen]
+
+    update = training.make_update(loss, optimizer, ema_decay=0.99)
+    run = training.train_chunk(update, sample_batch, num_steps=num_steps)
+    state = training.init_train_state(init(key_init), optimizer)
+    state, info = run(state, key_train, data)
+    return state.ema_params, info
+
+
+def in_batches(function: Callable[[Any], Any], x: Any, *, size: int = 256) -> Any:
+    """Applies a jitted function to slices of the first axis, to bound the memory.
+
+    Args:
+      function: Array or pytree with a first axis to the like.
+      x: Its argument.
+      size: Rows at a time.
+
+    Returns:
+      The results, put together.
+    """
+    number = jax.tree.leaves(x)[0].shape[0]
+    parts = [
+        jax.device_get(function(jax.tree.map(lambda a: a[i : i + size], x)))  # noqa: B023
+        for i in range(0, number, size)
+    ]
+    return jax.tree.map(lambda *p: np.concatenate(p), *parts)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Recognized:
+    """A style recogniser and its size.
+
+    Attributes:
+      params: Its parameters.
+      config: Its size.
+      classes: Its class of each label; none if they are the same.
+    """
+
+    params: Params
+    config: RecognizerConfig
+    classes: tuple[int, ...] = ()
+
+
+def fit_recognizer(
+    key: Key, clips: Clips, *, field: str, num_steps: int = 1500, batch: int = 128
+) -> Recognized:
+    """Trains the style recogniser on windows with a stride of 10 frames.
+
+    Args:
+      key: Consumed.
+      clips: Training clips.
+      field: Label field that is the style.
+      num_steps: Updates.
+      batch: Windows an update.
+
+    Returns:
+      The recogniser.
+    """
+    found = data_windows(clips, stride=10, field=field)
+    config = RecognizerConfig(
+        num_classes=len(clips.names(field)),
+        num_joints=clips.skeleton.num_joints,
+        frames=WINDOW,
+    )
+    to_input = jax.jit(functools.partial(recognizer_input, clips.skeleton))
+    x = jnp.asarray(in_batches(to_input, found.motion))
+    params, _ = train_recognizer(
+        key, x, found.label, config=config, num_steps=num_steps, batch=batch
+    )
+    return Recognized(params=params, config=config)
+
+
+def recognized(
+    bones: skeleton.Skeleton, found: Windows, recognizer: Recognized
+) -> tuple[np.ndarray, np.ndarray]:
+    """Features of windows, and whether each one's style is recognised.
+
+    Args:
+      bones: The skeleton.
+      found: Windows.
+      recognizer: From `fit_recognizer`.
+
+    Returns:
+      Features [windows, 512], and hits [windows] (0 or 1).
+    """
+    run = functools.partial(_recognize, recognizer.params, bones, recognizer.config)
+    label = found.label
+    if recognizer.classes:
+        label = jnp.asarray(recognizer.classes)[label]
+    return in_batches(run, (found.motion, label))
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _recognize(
+    params: Params,
+    bones: skeleton.Skeleton,
+    config: RecognizerConfig,
+    x: tuple[skeleton.Motion, Array],
+) -> tuple[Array, Array]:
+    motion, label = x
+    given = config.read(bones, motion)
+    feature, logits = recognize(params, given, config=config)
+    return feature, (jnp.argmax(logits, axis=-1) == label).astype(jnp.float32)

@@ -1,1 +1,0 @@
-"""How each system is evaluated: compositions of data, systems and metrics."""

@@ -1,0 +1,184 @@
+"""What an experiment leaves behind: a rollout to look at, and a table to cite."""
+
+import dataclasses
+import datetime
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from jaxmotion import files
+from jaxmotion.control import presets
+from jaxmotion.data import bvh
+from jaxmotion.evaluation import table
+from jaxmotion.motion import skeleton
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ball:
+    """A ball beside a motion.
+
+    Attributes:
+      position: World position of its centre, metres.
+      touch: Which of the joints touch it.
+      joints: Joints that may touch it.
+      radius: Metres.
+    """
+
+    position: Float[np.ndarray, "frames 3"]
+    touch: Bool[np.ndarray, "frames touching"]
+    joints: tuple[int, ...]
+    radius: float
+
+
+def write_rollout(
+    folder: Path,
+    bones: skeleton.Skeleton,
+    motion: skeleton.Motion,
+    desired_velocity: Float[Array, "frames 2"] | None,
+    *,
+    title: str,
+    caption: str = "",
+    name: str = "rollout",
+    ball: Ball | None = None,
+) -> None:
+    """Writes a motion as BVH, GIF and HTML, and a ball as CSV.
+
+    Args:
+      folder: Where to; made if missing.
+      bones: The skeleton.
+      motion: Frames of one character, world.
+      desired_velocity: What was commanded, metres a second; its integral is drawn as
+        the commanded path. None if nothing was.
+      title: Of the pictures.
+      caption: Below them: the source of the data and its licence.
+      name: Of the files, without their ends.
+      ball: What the person plays with; None for nothing.
+
+    Raises:
+      OSError: if a file cannot be written.
+    """
+    # matplotlib is slow to import, and only those who draw need it.
+    from jaxmotion.viz import animation, html
+
+    fps = motion.fps
+    folder.mkdir(parents=True, exist_ok=True)
+    bvh.write_bvh(folder / f"{name}.bvh", bvh.bvh_from_motion(bones, motion))
+    positions = np.asarray(skeleton.joint_positions(bones, motion))
+    walked = positions[:, 0, ::2]
+    commanded = None
+    if desired_velocity is not None:
+        path = presets.integrate_path(desired_velocity, fps)
+        commanded = np.asarray(path) + walked[0]
+    shown = dict(fps=fps, names=bones.names, commanded=commanded, walked=walked)
+    shown |= dict(title=title, caption=caption)
+    gif, page = dict(shown), dict(shown)
+    if ball is not None:
+        _write_ball(folder / f"{name}_ball.csv", ball, fps)
+        place = dict(ball=ball.position, radius=ball.radius)
+        gif |= place | dict(feet=ball.joints, contact=ball.touch)
+        page |= place | dict(touch=np.any(ball.touch, axis=-1))
+    animation.save_gif(folder / f"{name}.gif", positions, bones.parents, **gif)
+    html.save_html(folder / f"{name}.html", positions, bones.parents, **page)
+    print(f"wrote {name}.bvh, {name}.gif and {name}.html to {folder}")
+
+
+def _write_ball(path: Path, ball: Ball, fps: float) -> None:
+    """Time, position in metres, and whether something touches it, one frame a line."""
+    lines = ["seconds,x,y,z,touch"]
+    for frame, (place, touch) in enumerate(zip(ball.position, ball.touch, strict=True)):
+        numbers = ",".join(f"{value:.4f}" for value in place)
+        lines.append(f"{frame / fps:.4f},{numbers},{int(np.any(touch))}")
+    files.write_text(path, "\n".join(lines) + "\n")
+
+
+def write_table(
+    folder: Path,
+    rows: dict[str, dict[str, table.Cell]],
+    report: dict[str, Any],
+    notes: tuple[str, ...] = (),
+) -> None:
+    """Writes metrics.json and table.md, and prints the table.
+
+    Args:
+      folder: Where to; made if missing.
+      rows: The table.
+      report: What belongs beside it: arguments, versions, hardware, bounds.
+      notes: Lines below the table.
+    """
+    whole = report | {"rows": table.to_json(rows)}
+    files.write_text(folder / "metrics.json", json.dumps(whole, indent=1))
+    text = "\n\n".join([table.to_markdown(rows), *notes])
+    files.write_text(folder / "table.md", text + "\n")
+    print(text)
+
+
+_PACKAGES = ("jaxmotion", "jax", "jaxlib", "flax", "optax", "numpy")
+
+
+def processor() -> str:
+    """Name of the processor.
+
+    Returns:
+      As Linux or Python name it.
+    """
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(x.split(":")[1].strip() for x in lines if "model name" in x)
+    except (OSError, StopIteration):
+        return platform.processor()
+
+
+def git_commit() -> str | None:
+    """Commit of this code.
+
+    Returns:
+      Its hash, with "+" behind it if files differ from it; None outside a repository.
+    """
+
+    def git(*words: str) -> str:
+        found = subprocess.run(
+            ["git", *words],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return found.stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("+" if changed else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def provenance() -> dict[str, Any]:
+    """What a table was made with.
+
+    Returns:
+      Versions, hardware, commit, command and date, as a JSON object.
+    """
+    found: dict[str, Any] = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found | {
+        "machine": platform.machine(),
+        "cpu": processor(),
+        "cores": os.cpu_count(),
+        "devices": [str(device) for device in jax.devices()],
+        "git_commit": git_commit(),
+        "command": " ".join(["python", *sys.argv]),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }

@@ -1,0 +1,279 @@
+"""AAMDM's run-time: a character that takes one generated frame a tick.
+
+One tick (1/60 s) of one character:
+
+1. the path that the user wants, by springs from how the character moves now, at a
+   third, two thirds and a whole second ahead;
+2. the next frame, each of its denoising steps guided down the gradient of the distance
+   between its path features and those wanted (eq. 13), or unguided;
+3. the pose that the frame means, and the simulation bone moved on by its velocity.
+
+The controller takes any stepper `step(key, frame, goal) -> frame`, so that baselines,
+which are steered in other ways, run in it too; `guided` makes one of AAMDM.
+
+Source: Li et al. 2024 (AAMDM), sections 3.5 and 3.6. J is ours: half the squared
+distance of the 12 features in units of their deviation over the data.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.control.rollout import Controller
+from jaxmotion.motion import features, ground, path_features, pose, spring
+from jaxmotion.motion.features import unpack
+from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
+from jaxmotion.systems.aamdm import space as aamdm_space
+from jaxmotion.systems.aamdm.embedding import PATH
+from jaxmotion.systems.aamdm.model import Transition
+from jaxmotion.systems.aamdm.space import Space
+from jaxmotion.typing import Key, Objective
+
+# `step(key, previous, goal)`; the goal is None where nothing is asked for.
+Stepper = Callable[[Key, Array, Array | None], Array]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class CharacterState:
+    """A character between two ticks.
+
+    Attributes:
+      frame: Its frame, as the space has it.
+      bone: Its simulation bone, world.
+      velocity: Of the bone, metres a second, world.
+      turn_rate: Of the bone, radians a second.
+    """
+
+    frame: Float[Array, "*batch channels"]
+    bone: PlanarFrame
+    velocity: Float[Array, "*batch 2"]
+    turn_rate: Float[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """What a tick shows.
+
+    Attributes:
+      root_position: World, metres.
+      joint_rotation: Parent-local, two columns each.
+      bone: The simulation bone, world.
+      velocity: Of the bone, metres a second, world.
+      path: Path features that the frame promises.
+      wanted: Path features that the user asked for at this tick.
+      desired_velocity: Metres a second, as commanded.
+      desired_facing: As commanded.
+    """
+
+    root_position: Float[Array, "*batch 3"]
+    joint_rotation: Float[Array, "*batch joints 6"]
+    bone: PlanarFrame
+    velocity: Float[Array, "*batch 2"]
+    path: Float[Array, "*batch 12"]
+    wanted: Float[Array, "*batch 12"]
+    desired_velocity: Float[Array, "*batch 2"]
+    desired_facing: Float[Array, "*batch 2"]
+
+
+def init_state(
+    space: Space,
+    vector: Float[Array, " features"],
+    path: Float[Array, " 12"],
+    *,
+    num_joints: int,
+) -> CharacterState:
+    """A character at the origin that faces +z, in a real pose.
+
+    Args:
+      space: The space.
+      vector: Its pose vector.
+      path: Its path features.
+      num_joints: Joints of the skeleton.
+
+    Returns:
+      The state.
+    """
+    parts = unpack(pose.pose_layout(num_joints), vector)
+    return CharacterState(
+        frame=aamdm_space.to_frames(space, vector, path),
+        bone=PlanarFrame(origin=jnp.zeros(2), facing=jnp.array([0.0, 1.0])),
+        velocity=parts["root_velocity"][::2],
+        turn_rate=parts["root_angular_velocity"][1],
+    )
+
+
+def wanted_path(
+    state: CharacterState, command: Command, *, fps: float, half_life: float
+) -> Float[Array, " 12"]:
+    """Path features that a command asks for.
+
+    Args:
+      state: The character.
+      command: What the user wants now.
+      fps: Frames a second.
+      half_life: Of the springs, seconds.
+
+    Returns:
+      Path features in the axes of the character's bone.
+
+    Source: Holden et al. 2020, released code (controller).
+    """
+    times = jnp.array(path_features.path_offsets(fps)) / fps
+    over = lambda x: jnp.broadcast_to(x, (times.shape[0], *x.shape))  # noqa: E731
+    position, _, _ = spring.velocity_spring(
+        over(state.bone.origin),
+        over(state.velocity),
+        over(jnp.zeros(2)),
+        over(command.velocity),
+        half_life=half_life,
+        dt=times[:, None],
+    )
+    facing, _ = spring.facing_spring(
+        over(state.bone.facing),
+        over(state.turn_rate),
+        over(command.facing),
+        half_life=half_life,
+        dt=times,
+    )
+    path = Trajectory(position=position, facing=facing)
+    return path_features.query(path, state.bone)
+
+
+def path_objective(goal: Float[Array, " 12"]) -> Objective:
+    """Half the squared distance of a frame's path features to those wanted.
+
+    Args:
+      goal: Path features as the first 12 channels of a frame.
+
+    Returns:
+      J of eq. 13, a function of frames; each feature in its deviation over the data.
+    """
+
+    def objective(frame: Float[Array, " channels"], /) -> Float[Array, ""]:
+        return 0.5 * jnp.sum(jnp.square(frame[:PATH] - goal))
+
+    return objective
+
+
+def guided(transition: Transition, *, scale: float | Float[Array, ""]) -> Stepper:
+    """AAMDM as a stepper: steered by the gradient of the objective.
+
+    Args:
+      transition: From `aamdm.transition`.
+      scale: Strength of the guidance, epsilon of eq. 13.
+
+    Returns:
+      `step(key, previous, goal)`; unguided where the goal is None.
+    """
+
+    def step(key: Key, previous: Array, goal: Array | None) -> Array:
+        if goal is None:
+            return transition(key, previous)
+        objective = path_objective(goal)
+        return transition(key, previous, objective=objective, scale=scale)
+
+    return step
+
+
+def advance(
+    space: Space,
+    state: CharacterState,
+    command: Command,
+    *,
+    num_joints: int,
+    fps: float,
+    wanted: Float[Array, " 12"] | None,
+) -> tuple[CharacterState, Frame]:
+    """Decodes the character's frame, moves its bone on, and shows it.
+
+    Args:
+      space: The space.
+      state: The character, with the new frame and the old bone.
+      command: What the user wants now.
+      num_joints: Joints of the skeleton.
+      fps: Frames a second.
+      wanted: Path features that were asked for; None for those that the frame has.
+
+    Returns:
+      The state after the tick, and what it shows.
+    """
+    vector = aamdm_space.to_poses(space, state.frame)
+    parts = unpack(pose.pose_layout(num_joints), vector)
+    moved, turned = parts["root_velocity"], parts["root_angular_velocity"]
+    bone = pose.advance_frame(state.bone, moved, turned, fps=fps)
+    velocity = ground.out_of_frame(moved[::2], bone.facing)
+    root, rot6d = pose.place(vector, bone, num_joints=num_joints)
+    path = aamdm_space.to_paths(space, state.frame)
+    state = CharacterState(
+        frame=state.frame, bone=bone, velocity=velocity, turn_rate=turned[1]
+    )
+    return state, Frame(
+        root_position=root,
+        joint_rotation=rot6d,
+        bone=bone,
+        velocity=velocity,
+        path=path,
+        wanted=path if wanted is None else wanted,
+        desired_velocity=command.velocity,
+        desired_facing=command.facing,
+    )
+
+
+def controller(
+    step: Stepper,
+    space: Space,
+    *,
+    num_joints: int,
+    fps: float,
+    steered: bool = True,
+    bounded: bool = True,
+    half_life: float = 0.27,
+) -> Controller:
+    """The run-time as the three functions that `rollout.rollout` composes.
+
+    Args:
+      step: Makes the next frame.
+      space: The space.
+      num_joints: Joints of the skeleton.
+      fps: Frames a second.
+      steered: Whether commands matter; if not, none of the steering is compiled in.
+      bounded: Whether frames are kept within the bounds of the data; ours.
+      half_life: Of the springs that turn a command into a path, seconds.
+
+    Returns:
+      A controller that makes a frame in every tick.
+    """
+
+    def wanted(state: CharacterState, command: Command) -> Array:
+        return wanted_path(state, command, fps=fps, half_life=half_life)
+
+    def plan(key: Key, state: CharacterState, command: Command) -> CharacterState:
+        goal = None
+        if steered:
+            path = aamdm_space.path_normalizer(space)
+            goal = features.normalize(path, wanted(state, command))
+        frame = step(key, state.frame, goal)
+        if bounded:
+            frame = aamdm_space.keep_within(space, frame)
+        return dataclasses.replace(state, frame=frame)
+
+    def show(state: CharacterState, command: Command) -> tuple[CharacterState, Frame]:
+        return advance(
+            space,
+            state,
+            command,
+            num_joints=num_joints,
+            fps=fps,
+            wanted=wanted(state, command) if steered else None,
+        )
+
+    return Controller(
+        urgency=lambda state, command: jnp.ones((), jnp.int32),
+        plans=(plan,),
+        advance=show,
+    )

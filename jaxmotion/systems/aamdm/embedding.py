@@ -1,0 +1,274 @@
+"""AAMDM's embedded space: a pose as its path features and a learned latent.
+
+    xz = [x, z],   x = path features [12],   z = E(y) [52],   y ~ D(xz)
+
+and the autoencoder's loss, which looks at poses in their own channels and, through
+forward kinematics F, in the character's axes:
+
+    L_val = |y' - y| + |F(y') - F(y)|,  L_vel = the same of frame differences a second,
+    L_reg = |z|^2 + |z| + the differences of z.
+
+Source: Li et al. 2024 (AAMDM), section 3.1, eq. 1-4. Norms, weights and normalisation
+are those of Learned Motion Matching (Holden et al. 2020, released code), since the
+paper gives none. So are terms that its equations do not have: differences of local
+positions and rotations beside eq. 2's of F, and the latent's |z| and differences beside
+eq. 3's square.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.motion import features, pose, rotation
+from jaxmotion.motion.features import unpack
+from jaxmotion.systems.aamdm import network as aamdm_network
+from jaxmotion.typing import Key, Params
+
+PATH = 12
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Weights:
+    """Weights of the autoencoder's terms: ours, after Learned Motion Matching."""
+
+    position: float = 75.0
+    rotation: float = 10.0
+    velocity: float = 10.0
+    angular_velocity: float = 1.25
+    root_velocity: float = 2.0
+    root_angular_velocity: float = 2.0
+    contact: float = 2.0
+    character_position: float = 15.0
+    character_rotation: float = 5.0
+    position_change: float = 10.0
+    rotation_change: float = 1.75
+    character_position_change: float = 2.0
+    character_rotation_change: float = 0.75
+    latent: float = 0.1
+    latent_square: float = 0.1
+    latent_change: float = 0.01
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Sizes of the autoencoder.
+
+    Attributes:
+      num_joints: Joints of the skeleton.
+      fps: Frames a second.
+      latent: Channels of z (paper: 52, so that xz has 64).
+      width: Channels of a hidden layer (ours; the paper gives none).
+      weights: Of the loss.
+    """
+
+    num_joints: int
+    fps: float = 60.0
+    latent: int = 52
+    width: int = 512
+    weights: Weights = Weights()
+
+    @property
+    def num_features(self) -> int:
+        """Channels of a pose vector."""
+        return pose.pose_layout(self.num_joints).size
+
+    @property
+    def num_embedded(self) -> int:
+        """Channels of an embedded vector."""
+        return PATH + self.latent
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Statistics:
+    """How poses and paths are scaled, from the training frames.
+
+    Attributes:
+      pose: Mean and deviation of each channel: the decoder's output.
+      group: The same mean, and one deviation for each kind of channel: the encoder's
+        input. It keeps a joint that hardly moves from being blown up.
+      path: Mean of each path feature, and the mean deviation of the positions and of
+        the facings.
+    """
+
+    pose: features.Normalizer
+    group: features.Normalizer
+    path: features.Normalizer
+
+
+def fit_statistics(
+    poses: Float[Array, "frames features"],
+    paths: Float[Array, "frames 12"],
+    *,
+    config: Config,
+) -> Statistics:
+    """Statistics of training frames; constant channels get a floor of 1e-4.
+
+    Args:
+      poses: Pose vectors.
+      paths: Path features.
+      config: Sizes.
+
+    Returns:
+      The statistics.
+
+    Source: Holden et al. 2020, released code: train_decompressor, database. Differs:
+      the deviation of a kind is the mean of its channels', there of all its numbers.
+    """
+    own = features.fit_normalizer(poses)
+    spread = jnp.sqrt(jnp.mean((poses - own.mean[None]) ** 2, axis=0))
+    layout = pose.pose_layout(config.num_joints)
+    groups = [
+        jnp.full(stop - start, jnp.mean(spread[start:stop]))
+        for _, start, stop in layout.fields
+    ]
+    group = jnp.maximum(jnp.concatenate(groups), 1e-4)
+    path = features.fit_normalizer(paths)
+    halves = jnp.mean(path.std.reshape(2, PATH // 2), axis=1)
+    return Statistics(
+        pose=own,
+        group=features.Normalizer(mean=own.mean, std=group),
+        path=features.Normalizer(
+            mean=path.mean, std=jnp.repeat(halves, PATH // 2, axis=0)
+        ),
+    )
+
+
+def _nets(
+    config: Config,
+) -> tuple[aamdm_network.PoseEncoder, aamdm_network.PoseDecoder]:
+    return (
+        aamdm_network.PoseEncoder(latent=config.latent, width=config.width),
+        aamdm_network.PoseDecoder(features=config.num_features, width=config.width),
+    )
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init(key: Key, config: Config) -> Params:
+    """Initial parameters.
+
+    Args:
+      key: Consumed.
+      config: Sizes.
+
+    Returns:
+      {"encoder", "decoder"}.
+    """
+    key_e, key_d = jax.random.split(key)
+    encoder, decoder = _nets(config)
+    pose_like = jnp.zeros(config.num_features)
+    return {
+        "encoder": encoder.init(key_e, pose_like)["params"],
+        "decoder": decoder.init(key_d, jnp.zeros(config.num_embedded))["params"],
+    }
+
+
+def encode(
+    params: Params,
+    statistics: Statistics,
+    poses: Float[Array, "*batch features"],
+    paths: Float[Array, "*batch 12"],
+    *,
+    config: Config,
+) -> Float[Array, "*batch embedded"]:
+    """Embeds poses; path features stay in metres, for those who steer.
+
+    Args:
+      params: The autoencoder's.
+      statistics: Of the training frames.
+      poses: Pose vectors.
+      paths: Path features.
+      config: Sizes.
+
+    Returns:
+      [path features in metres, latent].
+    """
+    given = features.normalize(statistics.group, poses)
+    latent = _nets(config)[0].apply({"params": params["encoder"]}, given)
+    return jnp.concatenate([paths, latent], axis=-1)
+
+
+def decode(
+    params: Params,
+    statistics: Statistics,
+    embedded: Float[Array, "*batch embedded"],
+    *,
+    config: Config,
+) -> Float[Array, "*batch features"]:
+    """Pose vectors of embedded vectors.
+
+    Args:
+      params: The autoencoder's.
+      statistics: Of the training frames.
+      embedded: As `encode` returns them.
+      config: Sizes.
+
+    Returns:
+      Pose vectors in their own units.
+    """
+    path = features.normalize(statistics.path, embedded[..., :PATH])
+    given = jnp.concatenate([path, embedded[..., PATH:]], axis=-1)
+    found = _nets(config)[1].apply({"params": params["decoder"]}, given)
+    return features.denormalize(statistics.pose, found)
+
+
+def _views(poses: Array, parents: tuple[int, ...], joints: int) -> dict[str, Array]:
+    """Poses in their own channels, and in the character's axes."""
+    parts = unpack(pose.pose_layout(joints), poses)
+    split = lambda x, n: x.reshape(*x.shape[:-1], joints, n)  # noqa: E731
+    position, rot6d = split(parts["position"], 3), split(parts["rotation"], 6)
+    where, turned = pose.character_transforms(parents, position, rot6d)
+    axes = rotation.rot6d_from_matrix(turned)
+    return parts | {"character_position": where, "character_rotation": axes}
+
+
+def loss(
+    params: Params,
+    key: Key,
+    batch: tuple[Float[Array, "batch 2 features"], Float[Array, "batch 2 12"]],
+    *,
+    statistics: Statistics,
+    parents: tuple[int, ...],
+    config: Config,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """The autoencoder's loss on pairs of neighbouring frames; L1 means throughout.
+
+    Args:
+      params: The autoencoder's.
+      key: Not used; losses have one.
+      batch: Pose vectors and path features.
+      statistics: Of the training frames.
+      parents: Parent of each joint.
+      config: Sizes and weights.
+
+    Returns:
+      The weighted sum, and "value", "change" and "latent", its weighted parts.
+
+    Source: Li et al. 2024 (AAMDM), eq. 1-4.
+    """
+    del key
+    poses, paths = batch
+    embedded = encode(params, statistics, poses, paths, config=config)
+    found = decode(params, statistics, embedded, config=config)
+    views = [_views(x, parents, config.num_joints) for x in (found, poses)]
+    weights: dict[str, Any] = dataclasses.asdict(config.weights)
+    value = change = jnp.zeros(())
+    for name, mine in views[0].items():
+        error = mine - views[1][name]
+        value = value + weights[name] * jnp.mean(jnp.abs(error))
+        if f"{name}_change" in weights:
+            rate = (error[:, 1] - error[:, 0]) * config.fps
+            change = change + weights[f"{name}_change"] * jnp.mean(jnp.abs(rate))
+    latent = embedded[..., PATH:]
+    rate = jnp.diff(latent, axis=1) * config.fps
+    regular = (
+        weights["latent"] * jnp.mean(jnp.abs(latent))
+        + weights["latent_square"] * jnp.mean(jnp.square(latent))
+        + weights["latent_change"] * jnp.mean(jnp.abs(rate))
+    )
+    terms = {"value": value, "change": change, "latent": regular}
+    return value + change + regular, terms

@@ -1,0 +1,401 @@
+"""Rollouts of AAMDM and its baselines, free and under control.
+
+Every method is a stepper in a space, and goes through the same run-time, from the same
+held-out poses, with the same commands.
+
+Source: Li et al. 2024 (AAMDM), section 4.1.
+"""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmotion.control import presets, rollout
+from jaxmotion.evaluation import (
+    alignment,
+    contact,
+    diversity,
+    frechet,
+    health,
+    smoothness,
+    table,
+)
+from jaxmotion.motion import features, ground, path_features, pose, skeleton
+from jaxmotion.motion.features import unpack
+from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
+from jaxmotion.systems.aamdm import controller as aamdm_controller
+from jaxmotion.systems.aamdm.controller import CharacterState, Frame, Stepper
+from jaxmotion.systems.aamdm.data import PoseData, starts
+from jaxmotion.systems.aamdm.space import Space
+from jaxmotion.systems.aamdm.training import Run
+from jaxmotion.typing import Key
+
+
+def start_states(run: Run, space: Space, number: int, *, seed: int) -> CharacterState:
+    """Characters in held-out poses, each at the origin and facing +z.
+
+    Args:
+      run: The run.
+      space: Their space.
+      number: Characters.
+      seed: Of the choice of poses.
+
+    Returns:
+      States, batch axis first.
+    """
+    data = run.held_out
+    chosen = np.random.default_rng(seed).integers(0, data.num_frames, number)
+    init = functools.partial(
+        aamdm_controller.init_state, space, num_joints=run.bones.num_joints
+    )
+    return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen])
+
+
+def commands(
+    run: Run, number: int, ticks: int, *, preset: str, speed: float
+) -> Command:
+    """The same commands for every character.
+
+    Args:
+      run: The run.
+      number: Characters.
+      ticks: Length.
+      preset: Of `presets.PRESETS`.
+      speed: Metres a second.
+
+    Returns:
+      Commands [characters, ticks, ...].
+
+    Raises:
+      ValueError: if there is no such preset.
+    """
+    fps = run.train.fps
+    one = presets.preset_commands(
+        preset, seconds=ticks / fps, fps=fps, speed=speed, label=0
+    )
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (number, *x.shape)), one)
+
+
+def roller(
+    run: Run,
+    space: Space,
+    step: Stepper,
+    *,
+    steered: bool,
+    bounded: bool = True,
+) -> Callable[[Key, CharacterState, Command], tuple[CharacterState, Frame]]:
+    """Rollouts as one jitted function.
+
+    Args:
+      run: The run.
+      space: The space.
+      step: Makes the next frame.
+      steered: Whether commands matter.
+      bounded: Whether frames are kept within the bounds of the data.
+
+    Returns:
+      `roll(key, states, commands) -> (states, frames)`.
+    """
+    driver = aamdm_controller.controller(
+        step,
+        space,
+        num_joints=run.bones.num_joints,
+        fps=run.train.fps,
+        steered=steered,
+        bounded=bounded,
+    )
+    return jax.jit(functools.partial(rollout.rollout, driver))
+
+
+@jax.jit
+def positions_of(bones: skeleton.Skeleton, frames: Frame) -> jax.Array:
+    """World positions of the joints in rollouts.
+
+    Args:
+      bones: The skeleton.
+      frames: Displayed frames.
+
+    Returns:
+      Positions [characters, ticks, joints, 3], metres.
+    """
+    return skeleton.forward_kinematics(
+        bones, frames.root_position, frames.joint_rotation
+    )
+
+
+def data_frames(
+    run: Run, data: PoseData, number: int, ticks: int, *, seed: int
+) -> Frame:
+    """Windows of real frames as if they were rollouts.
+
+    Args:
+      run: The run.
+      data: Where they come from.
+      number: Windows.
+      ticks: Frames a window.
+      seed: Of their choice.
+
+    Returns:
+      Frames; what they wanted is their own path and velocity.
+
+    Raises:
+      ValueError: if no clip is that long.
+    """
+    first = starts(data, ticks)
+    chosen = np.random.default_rng(seed).integers(0, first.shape[0], number)
+    joints, fps = run.bones.num_joints, data.fps
+
+    @jax.jit
+    def window(start: jax.Array) -> Frame:
+        cut = functools.partial(
+            jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=ticks
+        )
+        poses, paths = cut(data.poses), cut(data.paths)
+        origin = PlanarFrame(origin=jnp.zeros(2), facing=jnp.array([0.0, 1.0]))
+        bone = pose.integrate_root(poses, origin, num_joints=joints, fps=fps)
+        root, rot6d = pose.place(poses, bone, num_joints=joints)
+        velocity = jnp.gradient(bone.origin, axis=0) * fps
+        return Frame(
+            root_position=root,
+            joint_rotation=rot6d,
+            bone=bone,
+            velocity=velocity,
+            path=paths,
+            wanted=paths,
+            desired_velocity=velocity,
+            desired_facing=bone.facing,
+        )
+
+    return jax.lax.map(window, first[chosen])
+
+
+def frames_per_second(
+    run: Run, space: Space, step: Stepper, *, ticks: int = 300, repeats: int = 5
+) -> float:
+    """Frames a second of one character, generated one after the other.
+
+    Args:
+      run: The run.
+      space: The space.
+      step: Makes the next frame.
+      ticks: Frames of a timed rollout.
+      repeats: Timed rollouts; the median counts.
+
+    Returns:
+      Frames a second, decoding and placing included, compilation not.
+    """
+    states = start_states(run, space, 1, seed=0)
+    given = commands(run, 1, ticks, preset="forward", speed=1.0)
+    roll = roller(run, space, step, steered=False)
+    jax.block_until_ready(roll(jax.random.key(0), states, given))
+    times = []
+    for i in range(repeats):
+        begun = time.perf_counter()
+        jax.block_until_ready(roll(jax.random.key(i), states, given))
+        times.append(time.perf_counter() - begun)
+    return ticks / float(np.median(times))
+
+
+PAIRS = 2000
+STRIDE = 5  # frames; neighbours are nearly the same
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Reference:
+    """What rows are compared with.
+
+    Attributes:
+      normalizer: Of joint positions in the character's axes.
+      moments: Of the training frames' positions, normalised.
+      toe_height: Height of the resting toes, metres.
+      root_height: Median height of the root, metres.
+    """
+
+    normalizer: features.Normalizer
+    moments: frechet.Moments
+    toe_height: float
+    root_height: float
+
+
+def _pose_positions(bones: skeleton.Skeleton, poses: Array) -> Array:
+    parts = unpack(pose.pose_layout(bones.num_joints), poses)
+    split = lambda x: x.reshape(*x.shape[:-1], bones.num_joints, -1)  # noqa: E731
+    position, rot6d = split(parts["position"]), split(parts["rotation"])
+    return pose.character_transforms(bones.parents, position, rot6d)[0]
+
+
+def make_reference(bones: skeleton.Skeleton, data: PoseData) -> Reference:
+    """The reference of training frames.
+
+    Args:
+      bones: The skeleton.
+      data: Training frames.
+
+    Returns:
+      The reference; every fifth frame counts.
+    """
+    found = jax.jit(lambda x: _pose_positions(bones, x))(data.poses[::STRIDE])
+    toes = np.asarray(found[:, jnp.array(bones.feet), 1])
+    flat = found.reshape(len(found), -1)
+    # A centimetre: the chest hardly leaves the bone's axis.
+    normalizer = features.fit_normalizer(flat, floor=0.01)
+    return Reference(
+        normalizer=normalizer,
+        moments=frechet.moments(features.normalize(normalizer, flat)),
+        toe_height=float(np.percentile(toes, 5)),
+        root_height=float(np.median(np.asarray(found[:, 0, 1]))),
+    )
+
+
+def _character_features(reference: Reference, frames: Frame, positions: Array) -> Array:
+    """Normalised positions in the character's axes [characters, ticks, 3 J]."""
+    origin = frames.bone.origin[..., None, :]
+    facing = jnp.broadcast_to(
+        frames.bone.facing[..., None, :], positions.shape[:-1] + (2,)
+    )
+    planar = ground.into_frame(positions[..., ::2] - origin, facing)
+    local = jnp.stack([planar[..., 0], positions[..., 1], planar[..., 1]], axis=-1)
+    flat = local.reshape(*local.shape[:2], -1)
+    return features.normalize(reference.normalizer, flat)
+
+
+def free_row(
+    key: Key,
+    bones: skeleton.Skeleton,
+    reference: Reference,
+    frames: Frame,
+    *,
+    fps: float,
+    groups: int = 4,
+) -> dict[str, table.Cell]:
+    """Columns that need no commands.
+
+    Args:
+      key: Consumed; of the pairs for diversity.
+      bones: The skeleton.
+      reference: What to compare with.
+      frames: Rollouts [characters, ticks, ...].
+      fps: Frames a second.
+      groups: Groups of rollouts for the intervals of DIV and FID; divides their number.
+
+    Returns:
+      div and fid over groups; ffr_mann, ffr_gmd, speed, acceleration and jerk over
+      rollouts; diverged, the number of rollouts with numbers that no body shows. If
+      a position is not finite there is no other column.
+
+    Raises:
+      ValueError: if the groups do not divide the rollouts.
+    """
+    if frames.root_position.shape[0] % groups:
+        raise ValueError(
+            f"{frames.root_position.shape[0]} rollouts in {groups} groups: expected a "
+            "number that they divide"
+        )
+    positions = positions_of(bones, frames)
+    height = reference.root_height
+    diverged = np.asarray(
+        health.has_diverged(positions, fps=fps, min_root=0.1, max_root=2.5 * height)
+    )
+    row = {"diverged": table.Cell(value=float(diverged.sum()), samples=diverged.size)}
+    if not bool(jnp.all(jnp.isfinite(positions))):
+        return row
+    embedded = _character_features(reference, frames, positions)
+    parts = embedded[:, ::STRIDE].reshape(groups, -1, embedded.shape[-1])
+    keys = jax.random.split(key, groups)
+    spread = [
+        diversity.diversity(k, x, num_pairs=PAIRS)
+        for k, x in zip(keys, parts, strict=True)
+    ]
+    distance = [
+        frechet.frechet_distance(frechet.moments(x), reference.moments) for x in parts
+    ]
+    feet = positions[..., jnp.array(bones.feet), :]
+    feet = feet.at[..., 1].add(-reference.toe_height)
+    speed = jnp.linalg.norm(frames.velocity, axis=-1).mean(axis=1)
+    return row | {
+        "div": table.cell(jnp.stack(spread)),
+        "fid": table.cell(jnp.stack(distance)),
+        "ffr_mann": table.cell(
+            contact.skating_frame_ratio(feet, fps), bounds=(0.0, 1.0)
+        ),
+        "ffr_gmd": table.cell(contact.skate_ratio(feet, fps), bounds=(0.0, 1.0)),
+        "speed_m/s": table.cell(speed),
+        "acceleration_m/s2": table.cell(smoothness.acceleration(positions, fps)),
+        "jerk_m/s3": table.cell(smoothness.jerk(positions, fps)),
+    }
+
+
+def _realised(frames: Frame, fps: float) -> tuple[Array, Array]:
+    """Path features that came true, and those asked for, at the same ticks."""
+    bone = Trajectory(position=frames.bone.origin, facing=frames.bone.facing)
+    found = jax.vmap(lambda x: path_features.path_features(x, fps=fps))(bone)
+    last = max(path_features.path_offsets(fps))
+    # What was asked for at tick i + 1 was asked of the bone after tick i.
+    return found[:, : -last - 1], frames.wanted[:, 1:-last]
+
+
+def control_row(frames: Frame, *, fps: float) -> dict[str, table.Cell]:
+    """Columns of how well commands were followed.
+
+    Args:
+      frames: Steered rollouts.
+      fps: Frames a second.
+
+    Returns:
+      te_promised: mean absolute difference of the 12 path features of the frame and
+      those wanted, metres and components of unit vectors together, as the paper's |x|;
+      te_realised: the same of where the character went; trajectory_error_deg: angle
+      between the commanded and the actual velocity.
+    """
+    promised = jnp.abs(frames.path - frames.wanted).mean(axis=(1, 2))
+    found, wanted = _realised(frames, fps)
+    realised = jnp.abs(found - wanted).mean(axis=(1, 2))
+    angle = alignment.trajectory_error(
+        frames.desired_velocity, frames.bone.origin, fps
+    ).error
+    return {
+        "te_promised": table.cell(promised),
+        "te_realised": table.cell(realised),
+        "trajectory_error_deg": table.cell(angle, scale=180.0 / np.pi),
+    }
+
+
+def long_health(
+    positions: Float[Array, "characters frames joints 3"],
+    desired_velocity: Float[Array, "characters frames 2"] | None,
+    reference: Reference,
+    *,
+    fps: float,
+) -> dict[str, int]:
+    """How many long rollouts diverged or froze.
+
+    Args:
+      positions: World positions.
+      desired_velocity: What was commanded; None for free rollouts, of which those are
+        frozen whose limbs move at less than 0.05 m/s on average through 30 s. Under
+        control, 2 s of that while 0.3 m/s are wanted are enough.
+      reference: Heights of the body.
+      fps: Frames a second.
+
+    Returns:
+      Counts "diverged" (root below 0.1 m or above 2.5 times its median height, a joint
+      faster than 20 m/s, or no number), "frozen" and "rollouts".
+    """
+    height = reference.root_height
+    diverged = health.has_diverged(
+        positions, fps=fps, min_root=0.1, max_root=2.5 * height
+    )
+    free = desired_velocity is None
+    wanted = jnp.ones((*positions.shape[:2], 2)) if free else desired_velocity
+    frozen = health.is_frozen(positions, wanted, fps=fps, seconds=30.0 if free else 2.0)
+    return {
+        "diverged": int(diverged.sum()),
+        "frozen": int(frozen.sum()),
+        "rollouts": int(frozen.size),
+    }

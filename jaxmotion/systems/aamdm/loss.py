@@ -1,0 +1,206 @@
+"""AAMDM's losses: the diffusion model over windows, and the two players of the GAN.
+
+Source: Li et al. 2024 (AAMDM), eq. 6-12; norms and weights are ours (L1 means).
+Differs: eq. 8 divides differences of neighbouring frames by h times the frame's time,
+here they are per frame and `Config.weight_velocity` scales them. The paper trains both
+modules on windows of ten frames and does not say how the GAN's are used; here the GAN
+sees three: one to predict, the one before it, and one more from which the generator may
+have predicted that. The R1 penalty and `own_previous` are ours.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.diffusion import gan, schedule
+from jaxmotion.systems.aamdm import model as aamdm_model
+from jaxmotion.systems.aamdm.model import Config
+from jaxmotion.typing import Key, Params
+
+Frames = Float[Array, "batch frames features"]
+Scale = Float[Array, " features"] | None
+
+
+def _shaken(key: Key, frame: Array, config: Config, change: Scale) -> Array:
+    noise = random_noise(key, frame.shape, largest=config.previous_noise)
+    return frame + (noise if change is None else noise * change.reshape(1, -1))
+
+
+def random_noise(
+    key: Key, shape: tuple[int, int], *, largest: float
+) -> Float[Array, "batch features"]:
+    """Noise of a different size for each row, uniform up to the largest.
+
+    Args:
+      key: Consumed.
+      shape: Rows and channels.
+      largest: Largest deviation.
+
+    Returns:
+      The noise.
+    """
+    key_size, key_noise = jax.random.split(key)
+    size = largest * jax.random.uniform(key_size, (shape[0], 1))
+    return size * jax.random.normal(key_noise, shape)
+
+
+def polisher_loss(
+    params: Params,
+    key: Key,
+    windows: Frames,
+    *,
+    config: Config,
+    change: Scale = None,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Loss of the diffusion model on windows, fed with its own predictions.
+
+    The first frame is given. Each further frame is noised to a random step and
+    predicted from it and from the prediction of the frame before; the gradient runs
+    through the whole window.
+
+    Args:
+      params: The diffusion model's.
+      key: Consumed.
+      windows: Frames of the data, `config.window` + 1 each.
+      config: The method.
+      change: Deviation of each channel's changes; for `target` "change" only. Errors
+        are then measured in it.
+
+    Returns:
+      The weighted sum, and its terms "value" and "velocity".
+    """
+    aamdm_model.check_change(config, change)
+    table, net = config.table(), aamdm_model.network(config)
+    size, frames, _ = windows.shape
+    if config.previous_noise:
+        key, key_shake = jax.random.split(key)
+        first = _shaken(key_shake, windows[:, 0], config, change)
+        windows = windows.at[:, 0].set(first)
+    key_t, key_noise = jax.random.split(key)
+    steps = jax.random.randint(key_t, (frames, size), 1, config.num_steps + 1)
+    noise = jnp.swapaxes(jax.random.normal(key_noise, windows.shape), 0, 1)
+
+    def predict(previous: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
+        frame, noise, t = given
+        x_0 = aamdm_model.to_target(frame, jax.lax.stop_gradient(previous), change)
+        x_t = schedule.q_sample(table, x_0, t, noise)
+        found = net.apply({"params": params}, x_t, t, previous)
+        prediction = aamdm_model.from_target(found, previous, change)
+        return prediction, prediction
+
+    over_time = jnp.swapaxes(windows, 0, 1)
+    given = (over_time[1:], noise[1:], steps[1:])
+    _, predictions = jax.lax.scan(predict, over_time[0], given)
+    error = predictions - over_time[1:]
+    if change is not None:
+        error = error / change.reshape(1, 1, -1)
+    # The first frame is given: its error is zero.
+    velocity = jnp.diff(jnp.concatenate([jnp.zeros_like(error[:1]), error]), axis=0)
+    terms = {
+        "value": jnp.mean(jnp.abs(error)),
+        "velocity": jnp.mean(jnp.abs(velocity)),
+    }
+    return terms["value"] + config.weight_velocity * terms["velocity"], terms
+
+
+def discriminator_loss(
+    params: Params,
+    generator: Params,
+    key: Key,
+    windows: Frames,
+    *,
+    config: Config,
+    change: Scale = None,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """The discriminator's loss on the last frames of windows, with its R1 penalty.
+
+    Args:
+      params: The discriminator's.
+      generator: The generator's.
+      key: Consumed.
+      windows: Frames of the data, at least three each; the last three are used.
+      config: The method.
+      change: Deviation of each channel's changes; for `target` "change" only.
+
+    Returns:
+      The loss, and "adversarial" and "r1".
+    """
+    previous, t, x_prev, x_t, fake = _pairs(generator, key, windows, config, change)
+    net = aamdm_model.discriminator(config)
+    judge = lambda x: net.apply({"params": params}, x, x_t, t, previous)  # noqa: E731
+    adversarial = gan.discriminator_loss(judge(x_prev), judge(fake))
+    r1 = gan.r1_penalty(judge, x_prev)
+    loss = adversarial + 0.5 * config.weight_r1 * r1
+    return loss, {"adversarial": adversarial, "r1": r1}
+
+
+def generator_loss(
+    params: Params,
+    discriminator: Params,
+    key: Key,
+    windows: Frames,
+    *,
+    config: Config,
+    change: Scale = None,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """The generator's loss on the last frames of windows.
+
+    Args:
+      params: The generator's.
+      discriminator: The discriminator's.
+      key: Consumed.
+      windows: Frames of the data, at least three each; the last three are used.
+      config: The method.
+      change: Deviation of each channel's changes; for `target` "change" only.
+
+    Returns:
+      The loss, and nothing more.
+    """
+    previous, t, _, x_t, fake = _pairs(params, key, windows, config, change)
+    net = aamdm_model.discriminator(config)
+    logits = net.apply({"params": discriminator}, fake, x_t, t, previous)
+    return gan.generator_loss(logits), {}
+
+
+def _pairs(
+    generator: Params, key: Key, windows: Frames, config: Config, change: Scale
+) -> tuple[Array, ...]:
+    """Previous frame, step, real x_{t-1}, x_t, and generated x_{t-1}."""
+    aamdm_model.check_change(config, change)
+    table, size = config.table(), windows.shape[0]
+    names = ("own", "choice", "t", "pair", "latent", "posterior")
+    keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
+    before, previous, frame = (windows[:, i] for i in (-3, -2, -1))
+    if config.previous_noise:
+        keys["own"], key_shake = jax.random.split(keys["own"])
+        previous = _shaken(key_shake, previous, config, change)
+    own = _own(generator, keys["own"], before, previous, config, change)
+    choice = jax.random.bernoulli(keys["choice"], config.own_previous, (size, 1))
+    previous = jnp.where(choice, jax.lax.stop_gradient(own), previous)
+
+    t = jax.random.randint(keys["t"], (size,), 1, config.num_steps + 1)
+    x_0 = aamdm_model.to_target(frame, previous, change)
+    x_prev, x_t = gan.q_pair(table, keys["pair"], x_0, t)
+    prediction = aamdm_model.draft(generator, previous, config=config)(
+        keys["latent"], x_t, t
+    )
+    fake = gan.posterior_sample(table, keys["posterior"], prediction, x_t, t)
+    return previous, t, x_prev, x_t, fake
+
+
+def _own(
+    generator: Params,
+    key: Key,
+    before: Array,
+    frame: Array,
+    config: Config,
+    change: Scale,
+) -> Array:
+    """The generator's prediction of a frame from a noised one and the frame before."""
+    key_t, key_noise, key_latent = jax.random.split(key, 3)
+    t = jax.random.randint(key_t, frame.shape[:1], 1, config.num_steps + 1)
+    noise = jax.random.normal(key_noise, frame.shape)
+    x_0 = aamdm_model.to_target(frame, before, change)
+    x_t = schedule.q_sample(config.table(), x_0, t, noise)
+    found = aamdm_model.draft(generator, before, config=config)(key_latent, x_t, t)
+    return aamdm_model.from_target(found, before, change)

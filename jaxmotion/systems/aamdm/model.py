@@ -1,0 +1,293 @@
+"""AAMDM's transition: from one embedded frame to the next in a few steps of two kinds.
+
+One chain of T = drafts + polishes steps. A denoising-diffusion GAN takes its large
+first steps, a diffusion model its last ones; both see the previous frame:
+
+    x_p = reverse_chain(ancestral_step(table, draft), key, x_T, start=T, stop=p)
+    x_0 = reverse_chain(ancestral_step(table, polish), key, x_p, start=p)
+
+The frame is any vector: the learned 64-dimensional embedding of a pose, or a point of
+the toy problem. What the chain denoises is the frame itself, as in the paper, or its
+change: at 60 frames a second a frame is nearly the one before it, and beside the noise
+of the paper's last steps what is left to choose vanishes; a change, scaled to unit
+variance, does not.
+
+Source: Li et al. 2024, "AAMDM: Accelerated Auto-regressive Motion Diffusion Model",
+sections 3.2-3.5. Sizes and the schedule are ours, since the paper gives none.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.diffusion import chain, guidance
+from jaxmotion.diffusion import schedule as tables
+from jaxmotion.diffusion.schedule import Schedule
+from jaxmotion.networks import mlp
+from jaxmotion.typing import Denoiser, Key, Objective, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Networks and method of a transition.
+
+    The paper gives the numbers of steps, the window and the terms of the losses; the
+    rest is ours.
+
+    Attributes:
+      features: Channels of a frame.
+      drafts: Steps of the generator, the first of the chain (paper: 3).
+      polishes: Steps of the diffusion model, the last of the chain (paper: 2).
+      schedule: "cosine", or "vp" (which keeps less of the sample at each step).
+      target: What the chain denoises: the "frame" (paper), or its "change" since the
+        previous one divided by the deviation of changes (ours).
+      latent: Channels of the generator's latent.
+      width: Channels of a hidden layer.
+      depth: Hidden layers.
+      window: Frames that the diffusion model predicts in a row in training (paper).
+      weight_velocity: Weight of the differences of neighbouring frames.
+      previous_noise: Largest deviation of the noise that is added in training to the
+        previous frames of the data, in units of the target's scale; ours, so that a
+        rollout finds back when it has left the data. 0 for none.
+      own_previous: Probability that the GAN's previous frame in training is the
+        generator's own prediction of it.
+      weight_r1: Weight of the discriminator's gradient penalty, gamma.
+    """
+
+    features: int
+    drafts: int = 3
+    polishes: int = 2
+    schedule: Literal["cosine", "vp"] = "cosine"
+    target: Literal["frame", "change"] = "frame"
+    latent: int = 64
+    width: int = 512
+    depth: int = 4
+    window: int = 10
+    weight_velocity: float = 0.1
+    previous_noise: float = 0.0
+    own_previous: float = 0.5
+    weight_r1: float = 0.05
+
+    @property
+    def num_steps(self) -> int:
+        """T, the steps of the whole chain."""
+        return self.drafts + self.polishes
+
+    def table(self) -> Schedule:
+        """The noise schedule of the chain."""
+        make = {"cosine": tables.cosine_schedule, "vp": tables.vp_schedule}
+        return make[self.schedule](self.num_steps)
+
+
+def network(config: Config) -> mlp.ConditionedMlp:
+    """Module of the generator and of the diffusion model (which has no latent).
+
+    Args:
+      config: Its sizes.
+
+    Returns:
+      The module.
+    """
+    return mlp.ConditionedMlp(
+        features=config.features,
+        num_steps=config.num_steps,
+        width=config.width,
+        depth=config.depth,
+    )
+
+
+def discriminator(config: Config) -> mlp.PairDiscriminator:
+    """Module of the discriminator.
+
+    Args:
+      config: Its sizes.
+
+    Returns:
+      The module.
+    """
+    return mlp.PairDiscriminator(
+        num_steps=config.num_steps, width=config.width, depth=config.depth
+    )
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init(key: Key, config: Config) -> Params:
+    """Initial parameters of the three networks.
+
+    Args:
+      key: Consumed.
+      config: Their sizes.
+
+    Returns:
+      {"polisher", "generator", "discriminator"}.
+    """
+    key_p, key_g, key_d = jax.random.split(key, 3)
+    x = jnp.zeros(config.features)
+    z = jnp.zeros(config.latent)
+    t = jnp.ones((), jnp.int32)
+    net, judge = network(config), discriminator(config)
+    return {
+        "polisher": net.init(key_p, x, t, x)["params"],
+        "generator": net.init(key_g, x, t, x, z)["params"],
+        "discriminator": judge.init(key_d, x, x, t, x)["params"],
+    }
+
+
+def to_target(
+    frame: Float[Array, "*batch features"],
+    previous: Float[Array, "*batch features"],
+    change: Float[Array, " features"] | None,
+) -> Float[Array, "*batch features"]:
+    """What the chain denoises for a frame.
+
+    Args:
+      frame: The frame.
+      previous: The one before.
+      change: Deviation of each channel's changes; None for `target` "frame".
+
+    Returns:
+      The frame, or its scaled change.
+    """
+    if change is None:
+        return frame
+    return (frame - previous) / change.reshape((1,) * (frame.ndim - 1) + (-1,))
+
+
+def from_target(
+    x_0: Float[Array, "*batch features"],
+    previous: Float[Array, "*batch features"],
+    change: Float[Array, " features"] | None,
+) -> Float[Array, "*batch features"]:
+    """Inverse of `to_target`.
+
+    Args:
+      x_0: What the chain denoised.
+      previous: The frame before.
+      change: As in `to_target`.
+
+    Returns:
+      The frame.
+    """
+    if change is None:
+        return x_0
+    return previous + x_0 * change.reshape((1,) * (x_0.ndim - 1) + (-1,))
+
+
+def check_change(config: Config, change: Array | None) -> None:
+    """Raises unless the scale of changes is there exactly if it is needed.
+
+    Args:
+      config: The method.
+      change: Deviation of each channel's changes, or None.
+
+    Raises:
+      ValueError: if it is missing, or given for nothing.
+    """
+    if (change is None) != (config.target == "frame"):
+        found = "none" if change is None else f"shape {change.shape}"
+        raise ValueError(
+            f"target is {config.target!r}, but the scale of changes is {found}: "
+            "expected one for 'change' and none for 'frame'"
+        )
+
+
+def draft(
+    params: Params, previous: Float[Array, "*batch features"], *, config: Config
+) -> Denoiser:
+    """The generator as a denoiser; its latent comes from its key.
+
+    Args:
+      params: The generator's.
+      previous: The previous frame.
+      config: The method.
+
+    Returns:
+      The denoiser.
+    """
+
+    def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
+        latent = jax.random.normal(key, (*x_t.shape[:-1], config.latent), x_t.dtype)
+        return network(config).apply({"params": params}, x_t, t, previous, latent)
+
+    return denoise
+
+
+def polish(
+    params: Params, previous: Float[Array, "*batch features"], *, config: Config
+) -> Denoiser:
+    """The diffusion model as a denoiser.
+
+    Args:
+      params: Its parameters.
+      previous: The previous frame.
+      config: The method.
+
+    Returns:
+      The denoiser.
+    """
+
+    def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
+        del key  # deterministic
+        return network(config).apply({"params": params}, x_t, t, previous)
+
+    return denoise
+
+
+Transition = Callable[..., Float[Array, "*batch features"]]
+
+
+def transition(
+    params: Params, *, config: Config, change: Float[Array, " features"] | None = None
+) -> Transition:
+    """The sampler of the next frame.
+
+    Args:
+      params: Of the generator and the polisher; the discriminator's are not used, and
+        one that takes no steps may be missing.
+      config: The method.
+      change: Deviation of each channel's changes; for `target` "change" only.
+
+    Returns:
+      `step(key, previous, *, objective=None, scale=0.0) -> next`. With an objective
+      of the predicted frame every step is guided down its gradient (eq. 13).
+
+    Raises:
+      ValueError: if `change` does not fit the target.
+    """
+    check_change(config, change)
+    table = config.table()
+
+    def step(
+        key: Key,
+        previous: Float[Array, "*batch features"],
+        *,
+        objective: Objective | None = None,
+        scale: float | Float[Array, ""] = 0.0,
+    ) -> Float[Array, "*batch features"]:
+        def part(denoise: Denoiser, x: Array, start: int, stop: int) -> Array:
+            if objective is not None:
+                denoise = guidance.gradient_guidance(
+                    table,
+                    denoise,
+                    lambda x_0: objective(from_target(x_0, previous, change)),
+                    scale=scale,
+                )
+            step = chain.ancestral_step(table, denoise)
+            return chain.reverse_chain(step, key_chain, x, start=start, stop=stop)
+
+        key_start, key_chain = jax.random.split(key)
+        x = jax.random.normal(key_start, previous.shape, previous.dtype)
+        if config.drafts:
+            drafter = draft(params["generator"], previous, config=config)
+            x = part(drafter, x, config.num_steps, config.polishes)
+        if config.polishes:
+            polisher = polish(params["polisher"], previous, config=config)
+            x = part(polisher, x, config.polishes, 0)
+        return from_target(x, previous, change)
+
+    return step

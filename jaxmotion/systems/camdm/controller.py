@@ -1,0 +1,464 @@
+"""CAMDM's run-time: a character that plans, plays, and plans again when told.
+
+One tick (1/30 s) of one character:
+
+1. If the command changed, or M frames of the plan have been played, plan anew:
+   a. the path the user wants: springs from the desired velocity and facing;
+   b. the model's own path: the rest of the plan, extended by HFTE to its length;
+   c. the blend of both is the condition, with the last 10 *displayed* poses;
+   d. sample 45 poses; within the first plans after a change of style with
+      classifier-free guidance on the past, which frees the model from its old style;
+   e. an inertialised seam: the plan starts where the displayed motion is, with its
+      velocity, and takes up the model's motion within 0.2 s.
+2. Display the next pose of the plan, and move the springs on.
+
+Source: Chen et al. 2024 (CAMDM), section 3.2; the released Unity run-time for what the
+paper does not say (noted at each constant).
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.control import inertia
+from jaxmotion.control.rollout import Controller
+from jaxmotion.diffusion import schedule
+from jaxmotion.motion import features, skeleton, spring, trajectory
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Control:
+    """Constants of the run-time; the defaults are the paper's where it has them.
+
+    Attributes:
+      apply: M, frames of a plan to play while the command stays (paper 15).
+      replan_on_change: The lazy trigger of the paper; the release plans only every
+        M frames (False).
+      extend: Use HFTE; without it the user's path alone is the condition (ablation).
+      reuse: K of HFTE, points reflected at a time (paper 15, released code 23).
+      guidance_scale: Of the past after a change of style (paper 0.7, code 0.5).
+      guided_plans: Plans that are guided after a change of style (paper: "when the
+        style label has just changed", so 1; code 2).
+      guide_start: The first plans after the start are guided as those after a change of
+        style are (released code: its counter starts full).
+      half_life: Of the springs of velocity and facing, seconds (orangeduck 0.27).
+      bias_position: Exponent of the blend of positions (released scene 0.7, code
+        0.4).
+      bias_facing: Exponent of the blend of facings (released code 2.2).
+      seam: Duration of the inertialised seam, seconds (released code 0.2); 0 for none.
+      follow: Half-life, seconds, in which the wanted path returns to the commanded
+        one, the integral of the desired velocity; 0 to steer by velocity alone, as
+        the paper does. Ours: without it every rollout drifts off its course.
+    """
+
+    apply: int = 15
+    replan_on_change: bool = True
+    extend: bool = True
+    reuse: int = 15
+    guidance_scale: float = 0.7
+    guided_plans: int = 1
+    guide_start: bool = False
+    half_life: float = 0.27
+    bias_position: float = 0.7
+    bias_facing: float = 2.2
+    seam: float = 0.2
+    follow: float = 0.0
+
+
+# The released Unity run-time (its code; its scene has bias_position 0.7). It smooths
+# commands by a linear interpolation instead of springs, which is not offered here.
+RELEASED = Control(
+    replan_on_change=False,
+    reuse=23,
+    guidance_scale=0.5,
+    guided_plans=2,
+    guide_start=True,
+    bias_position=0.4,
+)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class CharacterState:
+    """A character between two ticks; everything in the world.
+
+    Attributes:
+      past: The last displayed poses.
+      plan: The poses being played.
+      cursor: Next pose of the plan.
+      velocity: Of the desired motion (the spring), metres a second.
+      acceleration: Of the desired motion, metres a second squared.
+      facing: Desired facing (the spring), unit.
+      turn_rate: Of the desired facing, radians a second.
+      anchor: Where the desired motion is, (x, z) metres: the commanded path's end.
+      command: The last command; its label is -1 before the first.
+      guided: Plans that are still to be guided.
+    """
+
+    past: skeleton.Motion
+    plan: skeleton.Motion
+    cursor: Int[Array, "*batch"]
+    velocity: Float[Array, "*batch 2"]
+    acceleration: Float[Array, "*batch 2"]
+    facing: Float[Array, "*batch 2"]
+    turn_rate: Float[Array, "*batch"]
+    anchor: Float[Array, "*batch 2"]
+    command: trajectory.Command
+    guided: Int[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """What one tick displays.
+
+    Attributes:
+      root_position: Of the displayed pose, metres, world.
+      joint_rotation: Of the displayed pose, two columns.
+      desired_velocity: What the user's springs ask for now, metres a second.
+      desired_facing: Likewise, unit.
+      planned: Whether this tick made a new plan.
+    """
+
+    root_position: Float[Array, "*batch 3"]
+    joint_rotation: Float[Array, "*batch joints 6"]
+    desired_velocity: Float[Array, "*batch 2"]
+    desired_facing: Float[Array, "*batch 2"]
+    planned: Bool[Array, "*batch"]
+
+
+def init_state(
+    bones: skeleton.Skeleton, past: skeleton.Motion, *, config: camdm_model.Config
+) -> CharacterState:
+    """State of a character that has shown `past` and has no plan yet.
+
+    Args:
+      bones: The skeleton.
+      past: At least `config.past` displayed poses of one character, world.
+      config: The method.
+
+    Returns:
+      The state; the springs start at the mean velocity of the poses.
+
+    Raises:
+      ValueError: if there are fewer poses.
+    """
+    frames = past.root_position.shape[-2]
+    if frames < config.past:
+        raise ValueError(f"past has {frames} frames, expected {config.past} or more")
+    past = jax.tree.map(lambda x: x[-config.past :], past)
+    position = past.root_position
+    step = (position[-1] - position[0]) / (config.past - 1)
+    ahead = jnp.arange(1, config.future + 1, dtype=position.dtype)[:, None]
+    level = step * jnp.array([1.0, 0.0, 1.0])
+    plan = skeleton.Motion(
+        root_position=position[-1:] + ahead * level[None],
+        joint_rotation=jnp.repeat(past.joint_rotation[-1:], config.future, axis=0),
+        fps=past.fps,
+    )
+    facing = trajectory.root_trajectory(bones, past).facing[-1]
+    velocity = level[::2] * config.fps
+    return CharacterState(
+        past=past,
+        plan=plan,
+        cursor=jnp.zeros((), jnp.int32),
+        velocity=velocity,
+        acceleration=jnp.zeros(2),
+        facing=facing,
+        turn_rate=jnp.zeros(()),
+        anchor=position[-1, ::2],
+        command=trajectory.Command(
+            velocity=velocity, facing=facing, label=jnp.full((), -1, jnp.int32)
+        ),
+        guided=jnp.zeros((), jnp.int32),
+    )
+
+
+def _changed(state: CharacterState, command: trajectory.Command) -> Bool[Array, ""]:
+    old = state.command
+    return (
+        jnp.any(jnp.abs(old.velocity - command.velocity) > 1e-3)
+        | jnp.any(jnp.abs(old.facing - command.facing) > 1e-3)
+        | (old.label != command.label)
+    )
+
+
+def is_new_style(
+    state: CharacterState, command: trajectory.Command, *, control: Control
+) -> Bool[Array, ""]:
+    """Whether a command changes the style; the first one does with `guide_start`."""
+    started = (state.command.label >= 0) | control.guide_start
+    return (state.command.label != command.label) & started
+
+
+def urgency(
+    state: CharacterState, command: trajectory.Command, *, control: Control
+) -> Int[Array, ""]:
+    """Which plan a tick needs.
+
+    Args:
+      state: The character's state.
+      command: What the user wants now.
+      control: Constants.
+
+    Returns:
+      0 for none, 1 for a plan, 2 for a guided one.
+    """
+    need = (state.command.label < 0) | (state.cursor >= control.apply)
+    if control.replan_on_change:
+        need = need | _changed(state, command)
+    new_style = is_new_style(state, command, control=control) & (
+        control.guided_plans > 0
+    )
+    guided = need & (new_style | (state.guided > 0))
+    return need.astype(jnp.int32) + guided.astype(jnp.int32)
+
+
+__all__ = [
+    "RELEASED",
+    "CharacterState",
+    "Control",
+    "Frame",
+    "advance",
+    "controller",
+    "init_state",
+    "plan_frame",
+    "replan",
+    "urgency",
+    "wanted_trajectory",
+]
+
+
+def plan_frame(
+    bones: skeleton.Skeleton, past: skeleton.Motion, *, config: camdm_model.Config
+) -> trajectory.PlanarFrame:
+    """Frame of the next plan: at the last displayed pose.
+
+    Args:
+      bones: The skeleton.
+      past: Displayed poses, world.
+      config: Says whether the frame turns with the character.
+
+    Returns:
+      The frame. With heading "random" its axes are the world's, as in the release.
+    """
+    last = jax.tree.map(lambda x: x[-1:], past)
+    here = trajectory.root_trajectory(bones, last)
+    facing = here.facing[0] if config.heading == "facing" else jnp.array([0.0, 1.0])
+    return trajectory.PlanarFrame(origin=here.position[0], facing=facing)
+
+
+def wanted_trajectory(
+    bones: skeleton.Skeleton,
+    state: CharacterState,
+    command: trajectory.Command,
+    *,
+    config: camdm_model.Config,
+    control: Control,
+) -> trajectory.Trajectory:
+    """Steps 1a to 1c: the user's path, blended with the model's own.
+
+    Args:
+      bones: The skeleton.
+      state: The character's state.
+      command: What the user wants.
+      config: The method.
+      control: Constants.
+
+    Returns:
+      The path of the next `config.future` frames, world.
+    """
+    here = trajectory.PlanarFrame(
+        origin=state.past.root_position[-1, ::2], facing=state.facing
+    )
+    desired = trajectory.desired_trajectory(
+        here,
+        state.velocity,
+        command,
+        num_frames=config.future,
+        fps=config.fps,
+        half_life=control.half_life,
+        acceleration=state.acceleration,
+        turn_rate=state.turn_rate,
+    )
+    if control.follow > 0:
+        ahead = jnp.arange(1, config.future + 1) / config.fps
+        returned = 1.0 - 0.5 ** (ahead / control.follow)
+        pull = returned[:, None] * (state.anchor - here.origin)[None]
+        desired = dataclasses.replace(desired, position=desired.position + pull)
+    if not control.extend:
+        return desired
+    own = trajectory.extend(
+        trajectory.root_trajectory(bones, state.plan),
+        control.apply,
+        reuse=control.reuse,
+    )
+    ahead = jax.tree.map(
+        lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, config.future), own
+    )
+    return trajectory.blend(
+        ahead,
+        desired,
+        bias_position=control.bias_position,
+        bias_facing=control.bias_facing,
+    )
+
+
+def replan(
+    sample: camdm_model.Plan,
+    key: Key,
+    bones: skeleton.Skeleton,
+    state: CharacterState,
+    command: trajectory.Command,
+    *,
+    config: camdm_model.Config,
+    control: Control,
+    guided: bool,
+) -> CharacterState:
+    """Step 1: a new plan.
+
+    Args:
+      sample: From `camdm.planner`.
+      key: Consumed.
+      bones: The skeleton.
+      state: The character's state.
+      command: What the user wants now.
+      config: The method.
+      control: Constants.
+      guided: Sample with guidance; a character that needs none gets the scale that
+        changes nothing (it may stand beside a guided one in a batch).
+
+    Returns:
+      The state with the plan, none of it displayed yet.
+    """
+    frame = plan_frame(bones, state.past, config=config)
+    wanted = wanted_trajectory(bones, state, command, config=config, control=control)
+    is_new = is_new_style(state, command, control=control)
+    left = jnp.where(is_new, control.guided_plans, state.guided)
+    condition = camdm_model.Condition(
+        past=camdm_model.to_features(
+            features.to_frame(state.past, frame), config=config
+        ),
+        trajectory=trajectory.to_local(wanted, frame),
+        label=command.label,
+        keep_past=jnp.ones((), bool),
+    )
+    scale = jnp.where(left > 0, control.guidance_scale, 1.0) if guided else None
+    poses = sample(key, condition, scale=scale)
+    chunk = features.from_frame(camdm_model.to_motion(poses, config=config), frame)
+    if control.seam > 0:
+        shown = jax.tree.map(lambda x: x[-2:], state.past)
+        chunk = inertia.inertialize(shown, chunk, duration=control.seam)
+    return dataclasses.replace(
+        state,
+        plan=chunk,
+        cursor=jnp.zeros_like(state.cursor),
+        guided=jnp.maximum(left - 1, 0),
+    )
+
+
+def advance(
+    state: CharacterState,
+    command: trajectory.Command,
+    *,
+    config: camdm_model.Config,
+    control: Control,
+) -> tuple[CharacterState, Frame]:
+    """Step 2: displays the next pose, and moves the springs on.
+
+    Args:
+      state: The character's state.
+      command: What the user wants now.
+      config: The method.
+      control: Constants.
+
+    Returns:
+      The next state, and what is displayed.
+    """
+    pose = jax.tree.map(
+        lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
+    )
+    past = jax.tree.map(
+        lambda old, new: jnp.concatenate([old[1:], new]), state.past, pose
+    )
+    times = {"half_life": control.half_life, "dt": 1.0 / config.fps}
+    anchor, velocity, acceleration = spring.velocity_spring(
+        state.anchor, state.velocity, state.acceleration, command.velocity, **times
+    )
+    facing, turn_rate = spring.facing_spring(
+        state.facing, state.turn_rate, command.facing, **times
+    )
+    frame = Frame(
+        root_position=pose.root_position[0],
+        joint_rotation=pose.joint_rotation[0],
+        desired_velocity=velocity,
+        desired_facing=facing,
+        planned=state.cursor == 0,
+    )
+    # A style that changes while the old plan still plays arms the next plans.
+    armed = is_new_style(state, command, control=control) & (state.cursor > 0)
+    return dataclasses.replace(
+        state,
+        past=past,
+        guided=jnp.where(armed, control.guided_plans, state.guided),
+        cursor=state.cursor + 1,
+        velocity=velocity,
+        acceleration=acceleration,
+        facing=facing,
+        turn_rate=turn_rate,
+        anchor=anchor,
+        command=command,
+    ), frame
+
+
+def controller(
+    params: Params,
+    bones: skeleton.Skeleton,
+    *,
+    config: camdm_model.Config,
+    control: Control | None = None,
+    table: schedule.Schedule | None = None,
+) -> Controller:
+    """The run-time of one character, for `rollout.tick` and `rollout.rollout`.
+
+    Args:
+      params: The network's parameters.
+      bones: The skeleton.
+      config: The method.
+      control: Constants; None for the defaults.
+      table: Schedule; None for the cosine one of `config.num_steps`.
+
+    Returns:
+      A controller whose frames are `Frame`s. Its second planner is the guided one.
+
+    Raises:
+      ValueError: if `control.apply` is not in 1..`config.future`.
+    """
+    control = Control() if control is None else control
+    if not 1 <= control.apply <= config.future:
+        raise ValueError(f"apply is {control.apply}, expected 1..{config.future}")
+    sample = camdm_model.planner(params, config=config, table=table)
+
+    def plan(guided: bool) -> Callable:
+        return lambda key, state, command: replan(
+            sample,
+            key,
+            bones,
+            state,
+            command,
+            config=config,
+            control=control,
+            guided=guided,
+        )
+
+    return Controller(
+        urgency=functools.partial(urgency, control=control),
+        plans=(plan(False), plan(True)),
+        advance=functools.partial(advance, config=config, control=control),
+    )

@@ -1,0 +1,588 @@
+"""Characters of a run, steered along a preset; and how they measure up."""
+
+import dataclasses
+import functools
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmotion import reporting
+from jaxmotion.evaluation import (
+    diversity,
+    frechet,
+    frechet_bias,
+    health,
+    locomotion,
+    table,
+)
+from jaxmotion.evaluators import frozen as evaluators
+from jaxmotion.evaluators import style as style_evaluator
+from jaxmotion.evaluators.style import Recognized, in_batches, recognized
+from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import release as camdm_release
+from jaxmotion.systems.camdm import steering as camdm_steering
+from jaxmotion.systems.camdm.steering import Windows
+from jaxmotion.systems.camdm.training import Run
+from jaxmotion.typing import Key
+
+
+def frechet_cell(
+    feature: np.ndarray,
+    reference: np.ndarray,
+    *,
+    count: int,
+    seed: int,
+    repeats: int = 5,
+) -> table.Cell:
+    """Fréchet distance to the reference, of random subsets of equal size.
+
+    Args:
+      feature: Features of the windows of a row.
+      reference: Features of the reference windows.
+      count: Windows of each subset, the same for all rows.
+      seed: Of the subsets.
+      repeats: Subsets.
+
+    Returns:
+      Mean, and interval over the subsets (not over clips); no interval where a subset
+      is all there is.
+    """
+    if count == len(feature):
+        repeats = 1
+    generator = np.random.default_rng(seed)
+    target = frechet.moments(jnp.asarray(reference))
+    found = []
+    for _ in range(repeats):
+        chosen = generator.choice(len(feature), count, replace=False)
+        own = frechet.moments(jnp.asarray(feature[chosen]))
+        found.append(frechet.frechet_distance(own, target))
+    return table.cell(jnp.stack(found))
+
+
+def unbiased_cells(
+    feature: np.ndarray, reference: np.ndarray, *, seed: int, sizes: int = 5
+) -> dict[str, table.Cell]:
+    """Fréchet distance to the reference, extrapolated to infinitely many windows.
+
+    Args:
+      feature: Features of all windows of a row.
+      reference: Features of the reference windows.
+      seed: Of the subsets.
+      sizes: Of the subsets, from as many windows as there are features to all.
+
+    Returns:
+      "fid_unbiased", without an interval; nothing if there are too few windows for
+      the extrapolation to hold.
+
+    Source: `frechet_bias`.
+    """
+    count, least = feature.shape
+    if count < least + sizes - 1:
+        return {}
+    found = frechet_bias.frechet_bias(
+        jax.random.key(seed),
+        jnp.asarray(feature),
+        frechet.moments(jnp.asarray(reference)),
+        sizes=frechet_bias.subset_sizes(count, number=sizes, least=least),
+        repeats=3,
+    )
+    return {"fid_unbiased": table.Cell(value=float(found.extrapolated), samples=count)}
+
+
+def frechet_cells(
+    feature: np.ndarray,
+    reference: np.ndarray,
+    *,
+    count: int,
+    seed: int,
+    repeats: int = 5,
+) -> dict[str, table.Cell]:
+    """Both distances to the reference.
+
+    Args:
+      feature: Features of the windows of a row.
+      reference: Features of the reference windows.
+      count: Windows of the subsets of `frechet_cell`.
+      seed: Of all subsets.
+      repeats: Subsets of `frechet_cell`.
+
+    Returns:
+      "fid", and "fid_unbiased" if there are enough windows.
+    """
+    fid = frechet_cell(feature, reference, count=count, seed=seed, repeats=repeats)
+    return {"fid": fid} | unbiased_cells(feature, reference, seed=seed)
+
+
+def random_half(clips: np.ndarray, labels: np.ndarray, seed: int) -> np.ndarray:
+    """Which windows are of a random half of each style's clips.
+
+    Args:
+      clips: Clip of each window.
+      labels: Style of each window.
+      seed: Of the choice.
+
+    Returns:
+      True for the windows of that half.
+
+    Raises:
+      ValueError: if there is one clip only.
+    """
+    different, first = np.unique(clips, return_index=True)
+    if len(different) < 2:
+        raise ValueError("one clip, expected at least two to compare halves")
+    shuffled = np.random.default_rng(seed).permutation(len(different))
+    # Sorted by style, every second one: both halves hold every style alike.
+    order = shuffled[np.argsort(labels[first][shuffled], kind="stable")]
+    return np.isin(clips, different[order][::2])
+
+
+TRUTH, ROLLOUTS = "held-out (ground truth)", "rollouts"
+_DEGREES = 180.0 / np.pi
+# Column: metric, metric that weights its windows, factor.
+_COLUMNS = {
+    "trajectory_error_deg": ("trajectory_error", "trajectory_used", _DEGREES),
+    "orientation_error_deg": ("orientation_error", None, _DEGREES),
+    "foot_slide_m/s": ("slide_speed", "slide_seconds", 1.0),
+    "skate_ratio": ("skate_ratio", None, 1.0),
+    "acceleration_m/s2": ("acceleration", None, 1.0),
+    "jerk_m/s3": ("jerk", None, 1.0),
+}
+
+
+@jax.jit
+def _metrics(bones: skeleton.Skeleton, height: Array, x: Windows) -> dict[str, Array]:
+    return locomotion.locomotion_metrics(
+        bones, x.motion, x.velocity, x.facing, contact_height=height
+    )
+
+
+def metric_row(
+    bones: skeleton.Skeleton,
+    found: Windows,
+    hits: np.ndarray | None,
+    *,
+    height: float,
+) -> dict[str, table.Cell]:
+    """All columns but the Fréchet distances, with intervals over clips or rollouts.
+
+    Args:
+      bones: The skeleton.
+      found: Windows.
+      hits: From `recognized`; None to leave style accuracy out.
+      height: Below it a foot joint should not move, metres.
+
+    Returns:
+      Columns; angles in degrees.
+    """
+    run = functools.partial(_metrics, bones, jnp.float32(height))
+    values = in_batches(run, found)
+    row = {}
+    if hits is not None:
+        means = table.group_means(hits, found.group)
+        row["style_accuracy_%"] = table.cell(means, scale=100.0, bounds=(0.0, 1.0))
+    for column, (name, weights, scale) in _COLUMNS.items():
+        weight = None if weights is None else values[weights]
+        means = table.group_means(values[name], found.group, weight)
+        bounds = (0.0, 1.0) if name == "skate_ratio" else (-np.inf, np.inf)
+        row[column] = table.cell(means, scale=scale, bounds=bounds)
+    return row
+
+
+def rollout_health(
+    bones: skeleton.Skeleton,
+    frames: camdm_controller.Frame,
+    *,
+    fps: float,
+    height: float,
+) -> dict[str, int]:
+    """How many rollouts diverged or froze; bounds as in `evaluation.health`.
+
+    Args:
+      bones: The skeleton.
+      frames: Displayed frames [characters, ticks, ...].
+      fps: Frames a second.
+      height: Root height of the standing character, metres; half of it and 1.5
+        times of it are the bounds.
+
+    Returns:
+      Counts by name, and the number of rollouts.
+    """
+
+    @jax.jit
+    def run(x: camdm_controller.Frame) -> tuple[Array, Array]:
+        motion = skeleton.Motion(
+            root_position=x.root_position, joint_rotation=x.joint_rotation, fps=fps
+        )
+        positions = skeleton.joint_positions(bones, motion)
+        diverged = health.has_diverged(
+            positions, fps=fps, min_root=0.5 * height, max_root=1.5 * height
+        )
+        return diverged, health.is_frozen(positions, x.desired_velocity, fps=fps)
+
+    diverged, frozen = in_batches(run, frames, size=10)
+    return {
+        "diverged": int(diverged.sum()),
+        "frozen": int(frozen.sum()),
+        "rollouts": int(frozen.size),
+    }
+
+
+def repeat_diversity(
+    bones: skeleton.Skeleton, found: Windows, *, repeats: int
+) -> table.Cell:
+    """Intra-style variance over characters of one style under one control.
+
+    Windows of the same time are compared in the frame of the root.
+
+    Args:
+      bones: The skeleton.
+      found: Windows of rollouts in which every `repeats` neighbouring characters
+        share style and commands.
+      repeats: Characters a style.
+
+    Returns:
+      Square metres, with an interval over styles.
+    """
+    local = in_batches(
+        jax.jit(functools.partial(style_evaluator.recognizer_input, bones)),
+        found.motion,
+    )
+    characters = int(found.group.max()) + 1
+    shape = (characters // repeats, repeats, -1, bones.num_joints, 3)
+    local = jnp.asarray(local).reshape(shape)
+    return table.cell(jax.vmap(diversity.intra_style_variance)(local))
+
+
+def contact_height(bones: skeleton.Skeleton, real: Windows) -> float:
+    """Height below which toes should not move.
+
+    Args:
+      bones: The skeleton.
+      real: Windows of real clips.
+
+    Returns:
+      Where toes rest (their first percentile), and one centimetre more, as the paper's
+      "below, e.g., 1 cm"; metres.
+    """
+    feet = jnp.array(bones.feet)
+    toes = in_batches(
+        jax.jit(lambda m: skeleton.joint_positions(bones, m)[..., feet, :]), real.motion
+    )
+    return float(np.percentile(toes[..., 1], 1)) + 0.01
+
+
+def evaluation_table(
+    bones: skeleton.Skeleton,
+    real: Windows,
+    dense: Windows,
+    made: Windows,
+    frames: camdm_controller.Frame,
+    recognizer: Recognized,
+    *,
+    repeats: int,
+    seed: int = 0,
+) -> tuple[dict[str, dict[str, table.Cell]], dict[str, Any]]:
+    """The table, and what belongs beside it.
+
+    Args:
+      bones: The skeleton.
+      real: Windows of held-out clips, one behind the other.
+      dense: Windows of training clips with a short stride: the reference.
+      made: Windows of the rollouts.
+      frames: The rollouts themselves.
+      recognizer: From `fit_recognizer`.
+      repeats: Neighbouring characters that share style and commands; with one there
+        is no column of diversity.
+      seed: Of the subsets for Fréchet distances.
+
+    Returns:
+      Rows "held-out (ground truth)", "training half vs half (noise floor)" and
+      "rollouts"; and the contact height, window counts and health of the rollouts.
+    """
+    height = contact_height(bones, real)
+    real_feature, real_hits = recognized(bones, real, recognizer)
+    made_feature, made_hits = recognized(bones, made, recognizer)
+    reference, _ = recognized(bones, dense, recognizer)
+    own = random_half(np.asarray(dense.group), np.asarray(dense.label), seed)
+    count = min(len(real_feature), len(made_feature), int(own.sum()), int((~own).sum()))
+    distances = functools.partial(frechet_cells, count=count, seed=seed)
+    rows = {
+        TRUTH: metric_row(bones, real, real_hits, height=height)
+        | distances(real_feature, reference),
+        "training half vs half (noise floor)": distances(
+            reference[own], reference[~own]
+        ),
+        ROLLOUTS: metric_row(bones, made, made_hits, height=height)
+        | distances(made_feature, reference),
+    }
+    if repeats > 1:
+        found = repeat_diversity(bones, made, repeats=repeats)
+        rows[ROLLOUTS]["diversity_m2"] = found
+    root = float(np.median(np.asarray(real.motion.root_position)[..., 1]))
+    return rows, {
+        "contact_height_m": height,
+        "windows": {"held_out": len(real_hits), "rollouts": len(made_hits)},
+        "fid_windows": count,
+        "fid_reference_windows": len(reference),
+        "health": rollout_health(bones, frames, fps=made.motion.fps, height=root),
+    }
+
+
+# Ticks to leave out at the start, where the data's own pose still shows.
+SKIP = 60
+
+
+def preset_of_run(
+    run: Run, preset: str, labels: np.ndarray, *, seconds: float, speed: float | None
+) -> tuple[np.ndarray, trajectory.Command]:
+    """Speed and commands of each character.
+
+    Args:
+      run: The run.
+      preset: Of `presets.PRESETS`.
+      labels: Style of each character.
+      seconds: Length.
+      speed: Metres a second; None for each style's own median speed.
+
+    Returns:
+      Speeds [characters], and commands [characters, ticks, ...].
+
+    Raises:
+      ValueError: if there is no such preset.
+    """
+    speeds = np.asarray(camdm_steering.style_speeds(run.train, field=run.field))[labels]
+    speeds = speeds if speed is None else np.full(labels.shape, speed)
+    return speeds, camdm_steering.preset_batch(
+        preset, labels, speeds, seconds=seconds, fps=run.model.config.fps
+    )
+
+
+def steer_one(
+    run: Run,
+    style: str,
+    *,
+    preset: str,
+    seconds: float,
+    to_style: str | None = None,
+    speed: float | None = None,
+    seed: int = 0,
+) -> tuple[skeleton.Motion, Float[Array, "frames 2"]]:
+    """Steers one character from a pose of the training clips.
+
+    Args:
+      run: The run.
+      style: Its style.
+      preset: Of `presets.PRESETS`.
+      seconds: Length.
+      to_style: Its style from half time on; None for the same.
+      speed: Metres a second; None for the first style's own median speed.
+      seed: Of the start pose and the noise.
+
+    Returns:
+      The motion, and the velocity asked for in each frame, metres a second.
+
+    Raises:
+      ValueError: if there is no such preset or style; names those there are.
+    """
+    model = run.model
+    label = np.array([model.label(style)])
+    end = label[0] if to_style is None else model.label(to_style)
+    _, commands = preset_of_run(run, preset, label, seconds=seconds, speed=speed)
+    half = commands.label.shape[1] // 2
+    changed = commands.label.at[:, half:].set(int(end))
+    commands = dataclasses.replace(commands, label=changed)
+    states = camdm_steering.start_states(
+        run.train, model, label, field=run.field, seed=seed
+    )
+    frames = camdm_steering.steered_rollouts(
+        run.params, jax.random.key(seed), states, commands, model=model
+    )
+    motion = skeleton.Motion(
+        root_position=frames.root_position[0],
+        joint_rotation=frames.joint_rotation[0],
+        fps=model.config.fps,
+    )
+    return motion, frames.desired_velocity[0]
+
+
+def own_starts(run: Run, *, number: int, seed: int = 0) -> skeleton.Motion:
+    """Poses that the model itself stands in: a start without any recorded frame.
+
+    Characters of each style stand still for twelve seconds; of sixteen the calmest are
+    taken.
+
+    Args:
+      run: The run.
+      number: Starts per style, 1 to 16.
+      seed: Of the recorded poses that the rollouts begin with, and the noise.
+
+    Returns:
+      `Model.starts`.
+
+    Raises:
+      ValueError: if a style has no clip to begin with.
+    """
+    model, many = run.model, 16
+    if not 1 <= number <= many:
+        raise ValueError(f"starts is {number}, expected 1 to {many}")
+    found = []
+    for label in range(len(model.labels)):
+        labels = np.full(many, label)
+        commands = camdm_steering.straight_batch(
+            0.0, labels, seconds=12.0, fps=model.config.fps
+        )
+        states = camdm_steering.start_states(
+            run.train, model, labels, field=run.field, seed=seed
+        )
+        frames = camdm_steering.steered_rollouts(
+            run.params, jax.random.key(seed), states, commands, model=model, chunk=4
+        )
+        past = skeleton.Motion(
+            root_position=frames.root_position[:, -model.config.past :],
+            joint_rotation=frames.joint_rotation[:, -model.config.past :],
+            fps=model.config.fps,
+        )
+        positions = skeleton.joint_positions(model.bones, past)
+        unrest = jnp.mean(jnp.abs(jnp.diff(positions, axis=1)), axis=(1, 2, 3))
+        calmest = jnp.argsort(unrest)[:number]
+        motions = jax.tree.map(lambda x, i=calmest: x[i], past)
+        found.append(jax.vmap(lambda m: camdm_steering.at_origin(model, m))(motions))
+    return jax.tree.map(lambda *x: jnp.stack(x), *found)
+
+
+def evaluate_run(
+    run: Run,
+    *,
+    preset: str,
+    rollouts: int,
+    seconds: float,
+    speed: float | None = None,
+    chunk: int | None = None,
+    recognizer_steps: int = 1500,
+    seed: int = 0,
+    evaluator: evaluators.Evaluator | None = None,
+) -> tuple[dict[str, dict[str, table.Cell]], dict[str, Any]]:
+    """Steers characters in every style, and measures them beside held-out clips.
+
+    Args:
+      run: The run.
+      preset: Of `presets.PRESETS`.
+      rollouts: Characters, spread evenly over the styles; at least one a style.
+      seconds: Length of each rollout.
+      speed: Metres a second; None for each style's own median speed.
+      chunk: Characters to run at a time, at most.
+      recognizer_steps: Updates of the style recogniser, if it is trained here.
+      seed: Of poses, noise, recogniser and subsets.
+      evaluator: A frozen style recogniser; None to train one.
+
+    Returns:
+      The table, and what belongs beside it: speeds, health, counts, versions.
+
+    Raises:
+      ValueError: before any training, if there is no such preset, rollouts are too
+        short, a style has no held-out clip, or the evaluator does not fit the run.
+    """
+    model, field, fps = run.model, run.field, run.model.config.fps
+    repeats = max(rollouts // len(model.labels), 1)
+    labels = np.repeat(np.arange(len(model.labels)), repeats)
+    speeds, commands = preset_of_run(run, preset, labels, seconds=seconds, speed=speed)
+    camdm_steering.check_ticks(commands.label.shape[1], fps=fps, skip=SKIP)
+    states = camdm_steering.start_states(
+        run.held_out, model, labels, field=field, seed=seed
+    )
+    key_fit, key_roll = jax.random.split(jax.random.key(seed))
+    judge = recognizer(key_fit, run, evaluator, num_steps=recognizer_steps)
+    frames = _timed_rollouts(run, key_roll, states, commands, chunk)
+    real = camdm_steering.data_windows(
+        run.held_out, stride=camdm_steering.WINDOW, field=field
+    )
+    dense = camdm_steering.data_windows(run.train, stride=10, field=field)
+    made = camdm_steering.rollout_windows(
+        frames, jnp.asarray(labels), fps=fps, skip=SKIP
+    )
+    rows, report = evaluation_table(
+        model.bones, real, dense, made, frames, judge, repeats=repeats
+    )
+    styles = camdm_release.style_features(model.bones, run.train, judge, field=field)
+    for name, whole in (
+        (TRUTH, camdm_release.of_clips(run.held_out, field=field)),
+        (ROLLOUTS, camdm_release.of_rollouts(frames, commands, fps=fps)),
+    ):
+        values = camdm_release.metrics(model.bones, whole)
+        fid = camdm_release.distances(model.bones, whole, judge, styles)
+        rows[name] |= camdm_release.row(values | {"fid": fid})
+    return rows, report | {
+        "source": model.source,
+        "evaluator": evaluators.describe(
+            judge.params,
+            evaluator,
+            reference=evaluators.clips_fingerprint(run.train, field),
+        ),
+        "speeds": dict(zip(model.labels, speeds[::repeats].tolist(), strict=True)),
+        **reporting.provenance(),
+    }
+
+
+def recognizer(
+    key: Key, run: Run, evaluator: evaluators.Evaluator | None, *, num_steps: int
+) -> style_evaluator.Recognized:
+    """The frozen recogniser if there is one, else one trained on the run's clips.
+
+    Args:
+      key: Consumed.
+      run: The run.
+      evaluator: A frozen style recogniser; None to train one.
+      num_steps: Updates of a training.
+
+    Returns:
+      The recogniser.
+
+    Raises:
+      ValueError: if the evaluator does not fit the run; names the field.
+    """
+    model = run.model
+    kind, labels, joints = "style", model.labels, model.bones.names
+    classes: tuple[int, ...] = ()
+    if evaluator is not None and evaluator.kind == "style_release":
+        style_evaluator.released_joints(model.bones)  # raises unless it has them
+        kind, joints = evaluator.kind, evaluator.joints
+        if set(labels) <= set(evaluator.labels):  # a run may have fewer styles
+            classes = tuple(evaluator.labels.index(name) for name in labels)
+            labels = evaluator.labels
+    frozen = evaluators.params_for(
+        evaluator,
+        kind=kind,
+        labels=labels,
+        joints=joints,
+        fps=model.config.fps,
+        frames=camdm_steering.WINDOW,
+    )
+    if frozen is not None:
+        return style_evaluator.Recognized(
+            params=frozen, config=evaluator.config, classes=classes
+        )
+    print(f"training the style recogniser for {num_steps} steps", flush=True)
+    return style_evaluator.fit_recognizer(
+        key, run.train, field=run.field, num_steps=num_steps
+    )
+
+
+def _timed_rollouts(
+    run: Run, key: Key, states: Any, commands: trajectory.Command, chunk: int | None
+) -> Any:
+    """Frames of the characters; says how many, and how long they took in all."""
+    number, ticks = commands.label.shape
+    print(f"{number} rollouts of {ticks} ticks, in one program", flush=True)
+    begun = time.perf_counter()
+    frames = camdm_steering.steered_rollouts(
+        run.params, key, states, commands, model=run.model, chunk=chunk
+    )
+    jax.block_until_ready(frames)
+    taken = time.perf_counter() - begun
+    print(f"rolled out in {taken:.0f} s, compilation included", flush=True)
+    return frames

@@ -1,0 +1,248 @@
+"""CAMDM's training: examples from windows of motion, and the five losses.
+
+Source: Chen et al. 2024 (CAMDM), eq. 2-4, and the released code.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.diffusion import schedule
+from jaxmotion.learning import losses
+from jaxmotion.motion import features, rotation, skeleton, trajectory
+from jaxmotion.systems.camdm.model import (
+    Condition,
+    Config,
+    network,
+    to_features,
+    to_motion,
+)
+from jaxmotion.typing import Key, Params
+
+
+def mean_rotations(
+    bones: skeleton.Skeleton, motion: skeleton.Motion, *, config: Config
+) -> tuple[float, ...]:
+    """Mean of the rotations' features over frames, each seen from its own facing.
+
+    Args:
+      bones: The skeleton.
+      motion: Frames of it, world.
+      config: Says how rotations are laid out.
+
+    Returns:
+      `Config.rotation_mean`.
+    """
+
+    def local(pose: skeleton.Motion) -> Array:
+        path = trajectory.root_trajectory(bones, pose)
+        frame = trajectory.PlanarFrame(origin=path.position[0], facing=path.facing[0])
+        return features.motion_features(
+            features.to_frame(pose, frame), rotation_layout=config.rotation_layout
+        )[0, :-6]
+
+    single = jax.tree.map(lambda x: x[:, None], motion)
+    mean = jnp.mean(jax.jit(jax.vmap(local))(single), axis=0)
+    return tuple(round(float(x), 5) for x in mean)
+
+
+def smoothing_matrices(
+    frames: int, sigmas: tuple[float, ...]
+) -> Float[Array, "sigmas {frames} {frames}"]:
+    """Gaussian filters along time as matrices; the border reflects.
+
+    Args:
+      frames: Length of the window.
+      sigmas: Standard deviations in frames; 0 gives the identity.
+
+    Returns:
+      One matrix each; rows sum to 1.
+    """
+    matrices = []
+    for sigma in sigmas:
+        radius = int(4 * sigma + 0.5)
+        offset = np.arange(-radius, radius + 1)
+        weight = np.exp(-0.5 * (offset / sigma) ** 2) if sigma else np.ones(1)
+        place = (np.arange(frames)[:, None] + offset) % (2 * frames)
+        place = np.where(place < frames, place, 2 * frames - 1 - place)
+        matrix = np.zeros((frames, frames))
+        np.add.at(matrix, (np.arange(frames)[:, None], place), weight / weight.sum())
+        matrices.append(matrix)
+    return jnp.asarray(np.stack(matrices), jnp.float32)
+
+
+def smooth_course(
+    key: Key, course: trajectory.Trajectory, *, last: int
+) -> trajectory.Trajectory:
+    """A recorded path as a user might have asked for it.
+
+    The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4,
+    1/4); the facings are smoothed with sigma 5 or 10.
+
+    Args:
+      key: Consumed.
+      course: Path of one window.
+      last: Frame in which the smoothed path stays where it was.
+
+    Returns:
+      The path.
+
+    Source: released code of CAMDM. Differs: facings are smoothed within the window,
+    there within the whole clip.
+    """
+    key_path, key_facing = jax.random.split(key)
+    filters = smoothing_matrices(course.position.shape[0], (0.0, 5.0, 10.0))
+    weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
+    path = filters[jax.random.categorical(key_path, weights)] @ course.position
+    path = path + (course.position[last] - path[last])[None]
+    facings = filters[1 + jax.random.bernoulli(key_facing).astype(int)] @ course.facing
+    facings = rotation.safe_normalize(facings, jnp.array([0.0, 1.0]))
+    return trajectory.Trajectory(position=path, facing=facings)
+
+
+def example(
+    key: Key,
+    bones: skeleton.Skeleton,
+    window: skeleton.Motion,
+    label: Int[Array, ""],
+    *,
+    config: Config,
+) -> tuple[Condition, Float[Array, "future features"]]:
+    """One training example from one window of motion.
+
+    Args:
+      key: Consumed.
+      bones: The skeleton.
+      window: Past and future frames, in the world.
+      label: Style.
+      config: The method.
+
+    Returns:
+      The condition, and the features of the future.
+
+    Source: released code of CAMDM.
+    """
+    key_turn, key_course, key_keep = jax.random.split(key, 3)
+    last = config.past - 1
+    course = trajectory.root_trajectory(bones, window)
+    if config.heading == "facing":
+        facing = course.facing[last]
+    else:
+        yaw = jax.random.uniform(key_turn, (), maxval=2 * jnp.pi)
+        facing = jnp.stack([jnp.sin(yaw), jnp.cos(yaw)])
+    frame = trajectory.PlanarFrame(origin=course.position[last], facing=facing)
+
+    smoothed = smooth_course(key_course, course, last=last)
+    wanted = trajectory.to_local(smoothed, frame)
+    poses = to_features(features.to_frame(window, frame), config=config)
+    keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_past)
+    condition = Condition(
+        past=poses[: config.past],
+        trajectory=jax.tree.map(lambda x: x[config.past :], wanted),
+        label=label,
+        keep_past=keep,
+    )
+    return condition, poses[config.past :]
+
+
+def loss(
+    params: Params,
+    key: Key,
+    batch: tuple[skeleton.Motion, Int[Array, " batch"]],
+    *,
+    bones: skeleton.Skeleton,
+    config: Config,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """The training loss of a batch of windows.
+
+    Args:
+      params: The network's parameters.
+      key: Consumed.
+      batch: Windows of `config.window` frames, and their styles.
+      bones: The skeleton.
+      config: The method.
+
+    Returns:
+      The weighted sum, and its five terms by name, unweighted.
+
+    Source: Chen et al. 2024 (CAMDM), eq. 2-4, and the released code's fifth term.
+    """
+    windows, labels = batch
+    size = labels.shape[0]
+    key_example, key_t, key_noise, key_drop = jax.random.split(key, 4)
+    keys = jax.random.split(key_example, size)
+    condition, x_0 = jax.vmap(lambda k, w, c: example(k, bones, w, c, config=config))(
+        keys, windows, labels
+    )
+    table = schedule.cosine_schedule(config.num_steps)
+    t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
+    noise = jax.random.normal(key_noise, x_0.shape)
+    x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
+    prediction = network(config).apply(
+        {"params": params},
+        x_t,
+        t,
+        *condition.arguments(config),
+        train=config.dropout > 0,
+        rngs={"dropout": key_drop},
+    )
+    terms = loss_terms(bones, prediction, x_0, config=config)
+    weights = {
+        "data": config.weight_data,
+        "velocity": config.weight_velocity,
+        "position": config.weight_position,
+        "position_velocity": config.weight_position_velocity,
+        "foot": config.weight_foot,
+    }
+    return sum(weights[name] * value for name, value in terms.items()), terms
+
+
+def loss_terms(
+    bones: skeleton.Skeleton,
+    prediction: Float[Array, "*batch frames features"],
+    target: Float[Array, "*batch frames features"],
+    *,
+    config: Config,
+) -> dict[str, Float[Array, ""]]:
+    """The five losses: data, velocity, position, position_velocity, foot.
+
+    Positions and foot displacements are in the world, with the predicted root. A foot
+    stands where the target's is slower than `config.contact_speed`, at any height.
+
+    Args:
+      bones: The skeleton.
+      prediction: Predicted features.
+      target: True features.
+      config: The method.
+
+    Returns:
+      Each unweighted mean.
+    """
+    every = jnp.ones(target.shape[:-1], bool)
+    predicted, wanted = (
+        skeleton.joint_positions(bones, to_motion(x, config=config))
+        for x in (prediction, target)
+    )
+    unit = jnp.full(config.num_features, 1.0 / config.rotation_scale)
+    unit = jnp.broadcast_to(unit.at[-6:].set(1.0), target.shape)
+    prediction, target = prediction * unit, target * unit
+    flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
+    feet = jnp.array(bones.feet)
+    speed = jnp.linalg.norm(
+        skeleton.joint_velocities(wanted[..., feet, :], config.fps), axis=-1
+    )
+    stands = jnp.pad(
+        speed <= config.contact_speed, [(0, 0)] * (speed.ndim - 2) + [(0, 1), (0, 0)]
+    )
+    without_root = slice(0, -6)
+    return {
+        "data": losses.masked_mse(prediction, target, every),
+        "velocity": losses.velocity_loss(
+            prediction[..., without_root], target[..., without_root], every
+        ),
+        # As in MDM, the mean runs over x, y and z as well.
+        "position": losses.masked_mse(flat(predicted), flat(wanted), every),
+        "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
+        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands, every),
+    }

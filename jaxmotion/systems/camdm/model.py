@@ -1,0 +1,483 @@
+"""CAMDM: a transformer diffusion model that continues a motion along a trajectory.
+
+A pose is one 6D rotation a joint and a last pseudo-joint (x, y, z, 0, 0, 0) for the
+root; a sample is the next 45 poses. The condition is the last 10 poses, the ground path
+and facings wanted for the 45, and a style. Eight steps of the cosine schedule:
+
+    plan = reverse_chain(ancestral_step(schedule, net), key, x_8, start=8)
+
+No feature is normalised: values are metres and entries of rotation matrices.
+
+Source: Chen et al. 2024, "Taming Diffusion Probabilistic Models for Character Control";
+what the paper leaves open is as in the released code, and said where it is used.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.diffusion import chain, guidance, schedule
+from jaxmotion.learning import checkpoint, runs
+from jaxmotion.motion import features, rotation, skeleton, trajectory
+from jaxmotion.motion.skeleton import MAX_METRES, Motion, Skeleton
+from jaxmotion.networks import transformer
+from jaxmotion.systems.camdm import network as camdm_network
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Architecture and method; the defaults are the paper's.
+
+    Attributes:
+      num_joints: Joints of the skeleton.
+      num_labels: Styles.
+      past: Past poses of the condition, frames.
+      future: Poses of a sample, frames.
+      fps: Frames a second.
+      num_steps: T of the cosine schedule (paper 8, released weights 4).
+      network: "transformer", or the ablation's "mlp" or "single_token".
+      width: Channels of a token (released code; the paper does not say).
+      depth: Layers (released code 4; the ablation's MLP 8).
+      heads: Attention heads.
+      hidden: Channels of the feed-forward layers.
+      dropout: Rate.
+      frames_per_token: Frames of one token; ours, 1 in the paper.
+      token_margin: Frames beyond its own, on either side, that an output token predicts
+        and shares with its neighbors; ours, 0 in the paper.
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
+      norm: Layer norms of the transformer behind each sum ("post", the paper's) or
+        before each branch ("pre", ours: learns the legs' phase in a tenth of the
+        steps).
+      rotation_layout: 6D as two rows (released code) or two columns.
+      heading: Frame of a sample. "random": axes turned by a random yaw (released
+        code). "facing": +z is where the character faces in the last past pose (ours:
+        the network need not learn that turning the world changes nothing).
+      rotation_scale: Factor on the 6D rotations of a sample, after their mean is taken
+        off; ours, 1 in the paper. Entries vary by about 0.2, the noise of the last
+        step alone has that size, and a short training then learns to ignore the
+        noisy sample; 4 gives both about unit variance, as standardising would.
+      rotation_mean: Mean of those features (`camdm_loss.mean_rotations`); ours, empty
+        for none in the paper.
+      drop_past: Probability that the past is zeroed in training.
+      weight_data: Weight of the mean squared error of features (eq. 2).
+      weight_velocity: Of the displacements of rotations.
+      weight_position: Of the joint positions (eq. 3).
+      weight_position_velocity: Of the displacements of joint positions (released
+        code; not in the paper's eq. 4).
+      weight_foot: Of foot sliding.
+      contact_speed: A foot slower than this stands, metres a second.
+    """
+
+    num_joints: int
+    num_labels: int
+    past: int = 10
+    future: int = 45
+    fps: float = 30.0
+    num_steps: int = 8
+    network: Literal["transformer", "mlp", "single_token"] = "transformer"
+    width: int = 256
+    depth: int = 4
+    heads: int = 4
+    hidden: int = 1024
+    dropout: float = 0.2
+    frames_per_token: int = 1
+    token_margin: int = 0
+    token_window: Literal["hann", "trapezoid"] = "hann"
+    norm: Literal["post", "pre"] = "post"
+    rotation_layout: Literal["rows", "columns"] = "rows"
+    heading: Literal["random", "facing"] = "random"
+    rotation_scale: float = 1.0
+    rotation_mean: tuple[float, ...] = ()
+    drop_past: float = 0.15
+    weight_data: float = 1.0
+    weight_velocity: float = 1.0
+    weight_position: float = 1.0
+    weight_position_velocity: float = 1.0
+    weight_foot: float = 1.0
+    contact_speed: float = 0.3
+
+    @property
+    def window(self) -> int:
+        """Frames of a training window."""
+        return self.past + self.future
+
+    @property
+    def num_features(self) -> int:
+        """Channels of a pose."""
+        return (self.num_joints + 1) * 6
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Condition:
+    """What a plan is made for, in the frame of the plan.
+
+    Attributes:
+      past: Features of the last displayed poses.
+      trajectory: Ground positions (x, z), metres, and facings wanted for the future.
+      label: Style.
+      keep_past: False for the null condition of classifier-free guidance.
+    """
+
+    past: Float[Array, "*batch past features"]
+    trajectory: trajectory.Trajectory
+    label: Int[Array, "*batch"]
+    keep_past: Bool[Array, "*batch"]
+
+    def arguments(self, config: Config) -> tuple[Array, ...]:
+        """The network's arguments behind x_t and t.
+
+        Args:
+          config: Says how facings are laid out.
+
+        Returns:
+          past, path, facing (6D), label, keep_past.
+        """
+        facing = rotation.rot6d_from_matrix(
+            rotation.matrix_from_facing(self.trajectory.facing)
+        )
+        if config.rotation_layout == "rows":
+            facing = rotation.rot6d_rows_to_columns(facing)
+        return (
+            self.past,
+            self.trajectory.position,
+            facing,
+            self.label,
+            self.keep_past,
+        )
+
+
+Network = (
+    transformer.CamdmTransformer
+    | camdm_network.CamdmMlp
+    | camdm_network.SingleTokenTransformer
+)
+
+
+def network(config: Config) -> Network:
+    """The denoiser's Flax module.
+
+    Args:
+      config: Its sizes.
+
+    Returns:
+      A module with methods `encode`, `denoise` and their composition.
+    """
+    kind = {
+        "transformer": transformer.CamdmTransformer,
+        "mlp": camdm_network.CamdmMlp,
+        "single_token": camdm_network.SingleTokenTransformer,
+    }[config.network]
+    names = {field.name for field in dataclasses.fields(kind)} - {"parent", "name"}
+    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
+    return kind(features=config.num_features, **sizes)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init(key: Key, config: Config) -> Params:
+    """Initial parameters.
+
+    Args:
+      key: Consumed.
+      config: The architecture.
+
+    Returns:
+      Parameters of `network(config)`.
+    """
+    past = jnp.zeros((config.past, config.num_features))
+    x_t = jnp.zeros((config.future, config.num_features))
+    path, facing = jnp.zeros((config.future, 2)), jnp.zeros((config.future, 6))
+    label, keep = jnp.zeros((), jnp.int32), jnp.ones((), bool)
+    t = jnp.ones((), jnp.int32)
+    return network(config).init(key, x_t, t, past, path, facing, label, keep)["params"]
+
+
+def to_features(
+    motion: skeleton.Motion, *, config: Config
+) -> Float[Array, "*batch frames features"]:
+    """Features of a motion in the frame of a plan.
+
+    Args:
+      motion: In that frame.
+      config: The layout and scale of rotations.
+
+    Returns:
+      One 6D rotation a joint, and the root's (x, y, z, 0, 0, 0).
+    """
+    poses = features.motion_features(motion, rotation_layout=config.rotation_layout)
+    rotations, root = poses[..., :-6], poses[..., -6:]
+    scaled = (rotations - _mean(config, rotations)) * config.rotation_scale
+    return jnp.concatenate([scaled, root], axis=-1)
+
+
+def _mean(config: Config, rotations: Array) -> Array:
+    mean = jnp.asarray(config.rotation_mean or 0.0, rotations.dtype)
+    return jnp.broadcast_to(mean, rotations.shape)
+
+
+def to_motion(
+    poses: Float[Array, "*batch frames features"], *, config: Config
+) -> skeleton.Motion:
+    """Inverse of `to_features`; rotations are made orthonormal.
+
+    Args:
+      poses: Features, perhaps from a network.
+      config: The layout and scale of rotations.
+
+    Returns:
+      The motion, in the frame of the plan.
+    """
+    rotations, root = poses[..., :-6], poses[..., -6:]
+    plain = rotations / config.rotation_scale + _mean(config, rotations)
+    return features.motion_from_features(
+        jnp.concatenate([plain, root], axis=-1),
+        config.fps,
+        rotation_layout=config.rotation_layout,
+    )
+
+
+Plan = Callable[..., Float[Array, "future features"]]
+
+
+def planner(
+    params: Params,
+    *,
+    config: Config,
+    table: schedule.Schedule | None = None,
+    step: Literal["ancestral", "ddim"] = "ancestral",
+) -> Plan:
+    """The sampler, with everything that the steps share computed once.
+
+    Inside a jitted function that closes over concrete parameters they are constants,
+    which the compiler lays out once: fastest at batch 1, one program a model.
+
+    Args:
+      params: The network's parameters.
+      config: The method.
+      table: Schedule; None for the cosine one of `config.num_steps`.
+      step: "ancestral" (the paper's), or "ddim" for comparisons.
+
+    Returns:
+      `plan(key, condition, *, scale=None) -> [future, features]`. With a scale, the
+      prediction is null + scale (full - null), where null has no past (eq. 5);
+      without, the network is called once a step.
+    """
+    net = network(config)
+    make_step = {"ancestral": chain.ancestral_step, "ddim": chain.ddim_step}[step]
+
+    def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
+        del key  # deterministic
+        return net.apply({"params": params}, context, x_t, t, method="denoise")
+
+    def encode(condition: Condition):
+        arguments = condition.arguments(config)
+        return net.apply({"params": params}, *arguments, method="encode")
+
+    def plan(key: Key, condition: Condition, *, scale=None) -> Array:
+        noise_table = schedule.cosine_schedule(config.num_steps)
+        noise_table = noise_table if table is None else table
+        context = encode(condition)
+        if scale is None:
+            denoiser = lambda k, x, t: denoise(k, x, t, context)  # noqa: E731
+        else:
+            off = jnp.zeros_like(condition.keep_past)
+            null = encode(dataclasses.replace(condition, keep_past=off))
+            denoiser = guidance.classifier_free(denoise, context, null, scale)
+        return chain.sample(
+            make_step(noise_table, denoiser),
+            key,
+            (config.future, config.num_features),
+            num_steps=noise_table.num_steps,
+        )
+
+    return plan
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Model:
+    """Everything but the parameters.
+
+    Attributes:
+      config: The method.
+      bones: The skeleton that it was trained on.
+      labels: Names of the styles.
+      source: The data, and its licence.
+      starts: Poses to start from, [labels, number, past, ...], at the origin facing +z;
+        None where characters start from clips. A shipped model has its own, which it
+        made itself.
+    """
+
+    config: Config
+    bones: Skeleton
+    labels: tuple[str, ...]
+    source: str
+    starts: Motion | None = None
+
+    def label(self, name: str) -> int:
+        """Number of a style.
+
+        Args:
+          name: Its name.
+
+        Returns:
+          The number.
+
+        Raises:
+          ValueError: if the model has no such style; names those it has.
+        """
+        if name not in self.labels:
+            raise ValueError(
+                f"unknown style {name!r}: the model has {', '.join(self.labels)}"
+            )
+        return self.labels.index(name)
+
+
+def to_json(model: Model) -> dict[str, Any]:
+    """JSON of a model.
+
+    Args:
+      model: The model.
+
+    Returns:
+      A JSON object.
+    """
+    value = {
+        "system": "camdm",
+        "config": dataclasses.asdict(model.config),
+        "skeleton": runs.skeleton_to_json(model.bones),
+        "labels": list(model.labels),
+        "source": model.source,
+    }
+    if model.starts is not None:
+        value["starts"] = {
+            name: np.asarray(getattr(model.starts, name), np.float64).round(5).tolist()
+            for name in ("root_position", "joint_rotation")
+        }
+    return value
+
+
+def _starts_from_json(value: Any, config: Config, where: str) -> Motion | None:
+    if value is None:
+        return None
+    try:
+        root, joints = (
+            np.asarray(value[name], np.float64)
+            for name in ("root_position", "joint_rotation")
+        )
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{where}: field 'starts' is wrong: {error}") from None
+    number = root.shape[1] if root.ndim > 1 else 0
+    lead = (config.num_labels, number, config.past)
+    expected = ((*lead, 3), (*lead, config.num_joints, 6))
+    if number < 1 or (root.shape, joints.shape) != expected:
+        raise ValueError(
+            f"{where}: field 'starts' has shapes {root.shape} and {joints.shape}, "
+            f"expected {expected[0]} and {expected[1]} of at least one start per label"
+        )
+    if not all((np.abs(x) <= MAX_METRES).all() for x in (root, joints)):
+        raise ValueError(
+            f"{where}: field 'starts' has numbers that are not within {MAX_METRES:g}"
+        )
+    return Motion(
+        root_position=jnp.asarray(root, jnp.float32),
+        joint_rotation=jnp.asarray(joints, jnp.float32),
+        fps=config.fps,
+    )
+
+
+def from_json(value: dict[str, Any], *, where: str) -> Model:
+    """Inverse of `to_json`.
+
+    Args:
+      value: The JSON object.
+      where: The file, for error messages.
+
+    Returns:
+      The model.
+
+    Raises:
+      ValueError: names the file and the field that is missing or wrong.
+    """
+    if value.get("system") != "camdm":
+        raise ValueError(
+            f"{where}: field 'system' is {value.get('system')!r}, expected 'camdm'"
+        )
+    parts = {
+        "config": lambda x: runs.config_from_json(Config, x),
+        "skeleton": runs.skeleton_from_json,
+        "labels": runs.names_from_json,
+        "source": lambda x: runs.names_from_json([x])[0],
+    }
+    made = {}
+    for field, make in parts.items():
+        if field not in value:
+            raise ValueError(f"{where}: field {field!r} is missing")
+        try:
+            made[field] = make(value[field])
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"{where}: field {field!r}: {error}") from error
+    model = Model(bones=made.pop("skeleton"), **made)
+    config = model.config
+    for name, found, expected in (
+        ("skeleton", model.bones.num_joints, config.num_joints),
+        ("labels", len(model.labels), config.num_labels),
+    ):
+        if found != expected:
+            raise ValueError(
+                f"{where}: field {name!r} has {found} entries, the config {expected}"
+            )
+    starts = _starts_from_json(value.get("starts"), config, where)
+    return dataclasses.replace(model, starts=starts)
+
+
+def _shapes(model: Model, where: Path) -> Params:
+    try:
+        return jax.eval_shape(lambda: init(jax.random.key(0), model.config))
+    except Exception as error:  # whatever a network makes of sizes that do not fit
+        line = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{where}: field 'config' is of no network: {line}") from error
+
+
+# Models that come with the package, by name; each has a card beside it.
+SHIPPED = {
+    path.stem: path
+    for path in sorted((Path(__file__).parents[2] / "assets").glob("*.npz"))
+}
+
+
+def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
+    """Model and averaged parameters (EMA) of a run folder or an exported file.
+
+    Args:
+      folder: Name of a shipped model ("locomotion"), run folder that
+        `experiments/camdm.py train` made, or npz file that `camdm.py export` wrote.
+
+    Returns:
+      The model, its parameters, and the whole JSON that was stored with it.
+
+    Raises:
+      CheckpointError: if there is no checkpoint, or it is corrupt or foreign.
+      ValueError: if its JSON is not that of a CAMDM model.
+    """
+    path = Path(folder)
+    if not path.exists():
+        path = SHIPPED.get(str(folder), path)
+    if path.is_file():
+        _, value = checkpoint.import_params(path)
+        model = from_json(value, where=str(path))
+        params, _ = checkpoint.import_params(path, like=_shapes(model, path))
+        return model, params, value
+    steps = path / "checkpoints"
+    value = checkpoint.load_config(steps)
+    model = from_json(value, where=str(steps))
+    shapes = _shapes(model, path)
+    found = checkpoint.restore_part(steps, {"ema_params": shapes})
+    return model, found["ema_params"], value

@@ -1,0 +1,319 @@
+"""The columns of CAMDM's released evaluation: whole clips, and what was told as told.
+
+Source: released code of CAMDM (Chen et al. 2024), Evaluation/; see
+`evaluation.camdm_release` for what the columns are.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.data.clips import Clips
+from jaxmotion.evaluation import frechet, table
+from jaxmotion.evaluators.style import Recognized, in_batches, recognized
+from jaxmotion.motion import facing, skeleton, trajectory
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import steering as camdm_steering
+
+Count = int | Int[Array, ""]
+
+LOW = 0.01  # metres above the clip's lowest toe, exclusive
+_TOES = ("lefttoebase", "righttoebase", "lefttoe", "righttoe")
+
+
+def toe_joints(bones: skeleton.Skeleton) -> tuple[int, ...]:
+    """ToeBase and Toe of both sides, which the scripts look for; else the feet."""
+    plain = facing.plain_names(bones)
+    return tuple(plain.index(name) for name in _TOES if name in plain) or bones.feet
+
+
+def _is_own(frames: Count, number: int) -> Bool[Array, " number"]:
+    return jnp.arange(number) < frames
+
+
+def _steps(positions: Float[Array, "frames *joints n"]) -> Float[Array, "..."]:
+    return jnp.linalg.norm(jnp.diff(positions, axis=0), axis=-1)
+
+
+def _pace(root: Float[Array, "frames 3"], frames: Count) -> Float[Array, ""]:
+    """Mean horizontal step, metres a frame; the scripts' 1 cm for one at rest."""
+    step = _steps(root[:, ::2])
+    pace = jnp.mean(step, where=_is_own(frames - 1, len(step)))
+    return jnp.where(pace == 0, 0.01, pace)
+
+
+def foot_slide(
+    toes: Float[Array, "frames toes 3"],
+    root: Float[Array, "frames 3"],
+    frames: Count | None = None,
+) -> Float[Array, ""]:
+    """Ratio without unit; a low toe in the last frame adds a step of zero."""
+    frames = len(toes) if frames is None else frames
+    own = _is_own(frames, len(toes))[:, None]
+    height = jnp.where(own, toes[..., 1], jnp.inf)
+    step = jnp.pad(_steps(toes[..., ::2]), ((0, 1), (0, 0)))
+    step = jnp.where(_is_own(frames - 1, len(toes))[:, None], step, 0.0)
+    slid = jnp.mean(step, where=height - jnp.min(height) < LOW)
+    return slid / _pace(root, frames)
+
+
+def coherence(
+    positions: Float[Array, "frames joints 3"], frames: Count | None = None
+) -> Float[Array, ""]:
+    """Ratio without unit, near 1 for walking; joint 0 is the root."""
+    frames = len(positions) if frames is None else frames
+    step = _steps(positions)
+    own = _is_own(frames - 1, len(step))[:, None]
+    return jnp.mean(step, where=own) / _pace(positions[:, 0], frames)
+
+
+def _mean_turn(a: Array, b: Array, frames: Count) -> Float[Array, ""]:
+    """Size of the mean difference of the polar angles of vectors (x, z)."""
+    polar = jnp.arctan2(a[:, 1], a[:, 0]) - jnp.arctan2(b[:, 1], b[:, 0])
+    return jnp.abs(jnp.mean(polar, where=_is_own(frames, len(polar))))
+
+
+def trajectory_error(
+    told: Float[Array, "frames 2"],
+    position: Float[Array, "frames 2"],
+    frames: Count | None = None,
+) -> Float[Array, ""]:
+    """Of the steps of a root (x, z) against commanded velocities of any length.
+
+    Radians; frames at rest count, with the polar angle 0. The last command is not used.
+    """
+    frames = len(told) if frames is None else frames
+    step = jnp.diff(position, axis=0)
+    return _mean_turn(_mirrored(told[:-1]), _mirrored(step), frames - 1)
+
+
+def _mirrored(vector: Float[Array, "frames 2"]) -> Float[Array, "frames 2"]:
+    # Zero stays positive, for it decides between the angles 0 and pi.
+    x, z = vector[:, 0], vector[:, 1]
+    return jnp.stack([jnp.where(x == 0, 0.0, -x), z], axis=-1)
+
+
+def orientation_error(
+    told: Float[Array, "frames 2"],
+    facing: Float[Array, "frames 2"],
+    frames: Count | None = None,
+) -> Float[Array, ""]:
+    """Of facings (x, z) of any length against the commanded ones; radians."""
+    return _mean_turn(told, facing, len(told) if frames is None else frames)
+
+
+def clip_metrics(
+    bones: skeleton.Skeleton,
+    motion: skeleton.Motion,
+    frames: Count | None = None,
+    command: trajectory.Command | None = None,
+) -> dict[str, Float[Array, ""]]:
+    """All of one clip, which `jax.vmap` maps over padded ones.
+
+    Args:
+      bones: Its shoulders are found by name.
+      motion: [frames, ...], world, metres.
+      frames: That are the clip's own; None for all.
+      command: Told in each frame, unsmoothed; None for clips that nobody steered.
+
+    Returns:
+      slide and coherence, and with a command trajectory, and orientation if the
+      skeleton has shoulders; radians.
+    """
+    positions = skeleton.joint_positions(bones, motion)
+    root, toes = positions[:, 0], positions[:, jnp.array(toe_joints(bones))]
+    found = {
+        "slide": foot_slide(toes, root, frames),
+        "coherence": coherence(positions, frames),
+    }
+    if command is None:
+        return found
+    found["trajectory"] = trajectory_error(command.velocity, root[:, ::2], frames)
+    if facing.shoulder_joints(bones) is not None:
+        faced = facing.body_facing(bones, positions)
+        found["orientation"] = orientation_error(command.facing, faced, frames)
+    return found
+
+
+class Groups(NamedTuple):
+    """Rows of groups, padded to the most; `count` says how many are a group's own."""
+
+    rows: Float[Array, "groups most features"]
+    count: Int[Array, " groups"]
+
+
+def in_groups(
+    features: Float[np.ndarray, "rows features"],
+    groups: Int[np.ndarray, " rows"],
+    number: int,
+) -> Groups:
+    """Sorts rows into groups 0 .. number - 1; on the host."""
+    groups = np.asarray(groups)
+    count = np.bincount(groups, minlength=number)
+    rows = np.zeros((number, count.max(), features.shape[-1]), np.float32)
+    for group in range(number):
+        rows[group, : count[group]] = features[groups == group]
+    return Groups(rows=jnp.asarray(rows), count=jnp.asarray(count))
+
+
+@jax.jit
+def frechet_distances(
+    clips: Groups, styles: Groups, label: Int[Array, " clips"]
+) -> Float[Array, " clips"]:
+    """Fréchet distance of each clip to its style, divided by the features' number.
+
+    A clip has few windows, which makes its distance large: compare clips of one length.
+
+    Args:
+      clips: Features of windows, by clip.
+      styles: The same of the reference, by style.
+      label: Style of each clip.
+
+    Returns:
+      Squared units of the features; NaN where either has fewer than two windows.
+    """
+
+    def of_one(x: tuple[Groups, Array]) -> Array:
+        clip, label = x
+        style = Groups(rows=styles.rows[label], count=styles.count[label])
+        return frechet.frechet_distance_of_rows(*clip, *style)
+
+    return jax.lax.map(of_one, (clips, label)) / clips.rows.shape[-1]
+
+
+COLUMNS = {
+    "slide": ("slide_camdm_release", 1.0),
+    "coherence": ("coherence_camdm_release", 1.0),
+    "trajectory": ("trajectory_camdm_release_deg", 180.0 / np.pi),
+    "orientation": ("orientation_camdm_release_deg", 180.0 / np.pi),
+    "fid": ("fid_camdm_release", 1.0),
+}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Recordings:
+    """Whole clips, padded with their last pose to the length of the longest.
+
+    Attributes:
+      motion: [recordings, frames, ...], world.
+      frames: That are each one's own.
+      label: Style of each.
+      command: Told in each frame; None where nobody steered.
+      windows: Of 60 frames, one behind the other from the first on; `group` is the
+        recording.
+    """
+
+    motion: skeleton.Motion
+    frames: Int[Array, " recordings"]
+    label: Int[Array, " recordings"]
+    command: trajectory.Command | None
+    windows: camdm_steering.Windows
+
+
+def of_clips(clips: Clips, *, field: str) -> Recordings:
+    """Real clips, whose style is the label `field`."""
+    offsets = np.asarray(clips.offsets)
+    frames = np.diff(offsets)
+    place = np.minimum(np.arange(frames.max()), frames[:, None] - 1)
+    place = offsets[:-1, None] + place
+    return Recordings(
+        motion=skeleton.Motion(
+            root_position=clips.root_position[place],
+            joint_rotation=clips.joint_rotation[place],
+            fps=clips.fps,
+        ),
+        frames=jnp.asarray(frames),
+        label=clips.labels[field],
+        command=None,
+        windows=camdm_steering.data_windows(
+            clips, stride=camdm_steering.WINDOW, field=field
+        ),
+    )
+
+
+def of_rollouts(
+    frames: camdm_controller.Frame, commands: trajectory.Command, *, fps: float
+) -> Recordings:
+    """Rollouts from their first frame on, with the commands that steered them.
+
+    Each one's style is that of its first command.
+    """
+    characters, ticks = commands.label.shape
+    label = commands.label[:, 0]
+    return Recordings(
+        motion=skeleton.Motion(
+            root_position=frames.root_position,
+            joint_rotation=frames.joint_rotation,
+            fps=fps,
+        ),
+        frames=jnp.full(characters, ticks),
+        label=label,
+        command=commands,
+        windows=camdm_steering.rollout_windows(frames, label, fps=fps, skip=0),
+    )
+
+
+def style_features(
+    bones: skeleton.Skeleton, clips: Clips, recognizer: Recognized, *, field: str
+) -> Groups:
+    """Features of the training clips by style: what Fréchet distances are taken to."""
+    found = camdm_steering.data_windows(
+        clips, stride=camdm_steering.WINDOW, field=field
+    )
+    features, _ = recognized(bones, found, recognizer)
+    number = len(clips.names(field))
+    return in_groups(features, np.asarray(found.label), number)
+
+
+@jax.jit
+def _metrics(bones: skeleton.Skeleton, x: tuple) -> dict[str, Array]:
+    return jax.vmap(functools.partial(clip_metrics, bones))(*x)
+
+
+def metrics(bones: skeleton.Skeleton, found: Recordings) -> dict[str, np.ndarray]:
+    """`camdm_release.clip_metrics` of each recording."""
+    run = functools.partial(_metrics, bones)
+    return in_batches(run, (found.motion, found.frames, found.command), size=16)
+
+
+def distances(
+    bones: skeleton.Skeleton,
+    found: Recordings,
+    recognizer: Recognized,
+    styles: Groups,
+) -> np.ndarray:
+    """Fréchet distance of each recording to its style; NaN for a single window."""
+    features, _ = recognized(bones, found.windows, recognizer)
+    groups = in_groups(features, np.asarray(found.windows.group), found.label.size)
+    return np.asarray(frechet_distances(groups, styles, found.label))
+
+
+def row(
+    values: dict[str, np.ndarray], group: np.ndarray | None = None
+) -> dict[str, table.Cell]:
+    """Columns of the table, with intervals over recordings or groups of them.
+
+    Args:
+      values: From `metrics`, and "fid" from `distances`; those that are not numbers
+        are left out, as the scripts do.
+      group: Of each recording, such as its replication; None for each on its own.
+
+    Returns:
+      Columns; angles in degrees.
+    """
+    found = {}
+    for name, (column, scale) in COLUMNS.items():
+        if name in values:
+            known = np.isfinite(values[name])
+            own = np.arange(known.size) if group is None else group
+            means = jnp.zeros(0)
+            if known.any():
+                means = table.group_means(values[name][known], own[known])
+            found[column] = table.cell(means, scale=scale)
+    return found

@@ -1,0 +1,174 @@
+"""Characters told to walk straight on at several speeds, beside data at those speeds.
+
+A mean over a course hides which speed is at fault. Here each speed has a row of
+rollouts, and rows of real windows whose own speed is near it.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion import reporting
+from jaxmotion.evaluation import by_frame, locomotion, table
+from jaxmotion.evaluators.style import in_batches
+from jaxmotion.motion import skeleton
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import steering as camdm_steering
+from jaxmotion.systems.camdm.training import Run
+
+# Ticks to leave out at the start: characters begin with other speeds.
+SKIP = 90
+# Real windows count for a told speed if their own is within 15 %, or 0.1 m/s.
+_NEAR, _STILL = 0.15, 0.1
+
+
+def _row(
+    run: Run, found: camdm_steering.Windows, *, height: float, rest: float
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Metrics of windows and their clip or rollout."""
+    # Over half a second, so that the sway of the hips does not count.
+    half = round(0.5 * run.model.config.fps)
+    feet = jnp.array(run.model.bones.feet)
+
+    @jax.jit
+    def measure(x: camdm_steering.Windows) -> dict[str, jax.Array]:
+        positions = skeleton.joint_positions(run.model.bones, x.motion)
+        path = positions[..., 0, ::2]
+        way = jnp.linalg.norm(path[..., half:, :] - path[..., :-half, :], axis=-1)
+        metrics = locomotion.locomotion_metrics(
+            run.model.bones, x.motion, x.velocity, x.facing, contact_height=height
+        )
+        names = ("slide_speed", "slide_seconds", "skate_ratio", "jerk")
+        return {name: metrics[name] for name in names} | {
+            "speed": jnp.mean(way, axis=-1) * x.motion.fps / half,
+            "sink": rest - jnp.min(positions[..., feet, 1], axis=(-2, -1)),
+        }
+
+    return in_batches(measure, found), np.asarray(found.group)
+
+
+def _cells(values: dict[str, np.ndarray], groups: np.ndarray) -> dict[str, table.Cell]:
+    columns = {
+        "speed_m/s": ("speed", None, 1.0),
+        "foot_slide_m/s": ("slide_speed", "slide_seconds", 1.0),
+        "skate_ratio": ("skate_ratio", None, 1.0),
+        "jerk_m/s3": ("jerk", None, 1.0),
+        "lowest_toe_below_rest_cm": ("sink", None, 100.0),
+    }
+    if groups.size == 0:
+        return {c: table.cell(jnp.zeros(0)) for c in columns} | {
+            "windows": table.Cell(value=0.0, samples=0)
+        }
+    row = {}
+    for column, (name, weights, scale) in columns.items():
+        weight = None if weights is None else values[weights]
+        means = table.group_means(values[name], groups, weight)
+        row[column] = table.cell(means, scale=scale)
+    return row | {"windows": table.Cell(value=float(groups.size), samples=groups.size)}
+
+
+def speed_table(
+    run: Run,
+    speeds: Sequence[float],
+    *,
+    style: str,
+    rollouts: int = 16,
+    seconds: float = 20.0,
+    control: camdm_controller.Control | None = None,
+    seed: int = 0,
+) -> tuple[dict[str, dict[str, table.Cell]], dict[str, by_frame.ByFrame], dict]:
+    """Rows by speed, the same rollouts by frame of the plan, and what belongs beside.
+
+    Args:
+      run: The run.
+      speeds: What characters are told, m/s; 0 to stand.
+      style: Their style.
+      rollouts: Characters per speed.
+      seconds: Of each rollout; the first three are left out.
+      control: Constants of the run-time; None for the defaults.
+      seed: Of start poses and noise.
+
+    Returns:
+      The table: for each speed rollouts, held-out and training windows; creep_cm is how
+      far the root strays in ten seconds. Then jerk and slide by frame of the plan, of
+      the fastest of `speeds` up to 1.5 m/s. Then a report.
+
+    Raises:
+      ValueError: if rollouts are too short to measure, or there is no such style.
+    """
+    model, fps = run.model, run.model.config.fps
+    camdm_steering.check_ticks(round(seconds * fps), fps=fps, skip=SKIP)
+    label = model.label(style)
+    labels = np.full(rollouts, label)
+    real = {
+        name: camdm_steering.data_windows(
+            clips, stride=camdm_steering.WINDOW // 2, field=run.field
+        )
+        for name, clips in (("held-out", run.held_out), ("training", run.train))
+    }
+    height = camdm_evaluation.contact_height(model.bones, real["held-out"])
+    rest = height - 0.01
+    measured = {
+        name: (*_row(run, found, height=height, rest=rest), np.asarray(found.label))
+        for name, found in real.items()
+    }
+    states = camdm_steering.start_states(
+        run.held_out, model, labels, field=run.field, seed=seed
+    )
+    rows: dict[str, dict[str, table.Cell]] = {}
+    plans: dict[str, by_frame.ByFrame] = {}
+    for speed in speeds:
+        commands = camdm_steering.straight_batch(
+            speed, labels, seconds=seconds, fps=fps
+        )
+        frames = camdm_steering.steered_rollouts(
+            run.params,
+            jax.random.key(seed),
+            states,
+            commands,
+            model=model,
+            control=control,
+            chunk=4,
+        )
+        made = camdm_steering.rollout_windows(
+            frames, jnp.asarray(labels), fps=fps, skip=SKIP
+        )
+        row = _cells(*_row(run, made, height=height, rest=rest))
+        if speed == 0:
+            root = np.asarray(frames.root_position)[:, SKIP:, ::2]
+            ten = np.linalg.norm(root - root[:, :1], axis=-1)[:, : round(10 * fps)]
+            row["creep_cm"] = table.cell(jnp.asarray(ten.max(axis=1)), scale=100.0)
+        rows[f"told {speed:g} m/s"] = row
+        for name, (values, groups, style_of) in measured.items():
+            off = np.abs(values["speed"] - speed)
+            near = off < (_NEAR * speed if speed else _STILL)
+            near &= style_of == label
+            part = {k: v[near] for k, v in values.items()}
+            rows[f"{name}, about {speed:g} m/s"] = _cells(part, groups[near])
+        motion = skeleton.Motion(
+            root_position=frames.root_position[:, SKIP:],
+            joint_rotation=frames.joint_rotation[:, SKIP:],
+            fps=fps,
+        )
+        plans[f"told {speed:g} m/s"] = by_frame.by_frame(
+            skeleton.joint_positions(model.bones, motion),
+            model.bones.feet,
+            by_frame.frames_since(frames.planned)[:, SKIP:],
+            fps,
+            num_places=(control or camdm_controller.Control()).apply,
+            contact_height=height,
+        )
+    report: dict[str, Any] = {
+        "source": model.source,
+        "style": style,
+        "rollouts": rollouts,
+        "seconds": seconds,
+        "contact_height_m": height,
+        "by_frame_of_the_plan": by_frame.to_json(plans),
+        **reporting.provenance(),
+    }
+    return rows, plans, report

@@ -1,0 +1,287 @@
+"""Changes of style: how often they come, how soon, and what the motion is meanwhile.
+
+Every ordered pair of styles is one change. A replication has one rollout of each, with
+noise and start poses of its own; all rows have the same. A recogniser decides in
+windows of two seconds whether the new style is there, and the change is dated to the
+centre of the first window that shows it: up to half of that window may be from before.
+
+Source: Chen et al. 2024 (CAMDM), section 4.1, tables 2 and 4, where people judged.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxmotion.evaluation import table
+from jaxmotion.evaluation.transitions import transition
+from jaxmotion.evaluators import style as style_evaluator
+from jaxmotion.evaluators.style import Recognized
+from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import release as camdm_release
+from jaxmotion.systems.camdm import steering as camdm_steering
+from jaxmotion.systems.camdm.training import Run
+
+# Frames between the windows in which the new style is looked for.
+STRIDE = 3
+HALF = camdm_steering.WINDOW // 2
+# Seconds behind the command whose motion is measured; the paper's 120 frames.
+MEASURED = 4.0
+MOTION = ("foot_slide_m/s", "jerk_m/s3")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Changes:
+    """Rollouts to be made, and when and into what their style changes.
+
+    Attributes:
+      states: Where characters start, in poses of their first style.
+      commands: [characters, ticks]; each style goes at its own speed.
+      old: First style of each character.
+      new: Style commanded from `tick` on.
+      replication: That each character belongs to.
+      tick: Of the change.
+      limit: Seconds behind it in which it must have come.
+    """
+
+    states: camdm_controller.CharacterState
+    commands: trajectory.Command
+    old: np.ndarray
+    new: np.ndarray
+    replication: np.ndarray
+    tick: int
+    limit: float
+
+
+def make_changes(
+    run: Run,
+    *,
+    preset: str,
+    before: float,
+    limit: float = 4.0,
+    replications: int,
+    seed: int,
+) -> Changes:
+    """Every ordered pair of styles, in each replication.
+
+    Args:
+      run: The run.
+      preset: Of `presets.PRESETS`.
+      before: Seconds in the first style, at least half a window.
+      limit: Seconds behind the command in which the change must have come.
+      replications: Of all pairs, with start poses of their own.
+      seed: Of the start poses.
+
+    Returns:
+      The changes; their rollouts last so long that the last window is whole.
+
+    Raises:
+      ValueError: if there are fewer than two styles or replications, no such preset,
+        or no time.
+    """
+    number, fps = len(run.model.labels), run.model.config.fps
+    least = {"styles": (number, 2), "replications": (replications, 2)}
+    for name, (found, expected) in least.items():
+        if found < expected:
+            raise ValueError(f"{name}: {found}, expected at least {expected}")
+    for name, seconds, shortest in (
+        ("before", before, HALF / fps),
+        ("limit", limit, 0),
+    ):
+        if not (seconds >= shortest and seconds > 0):
+            what = f"at least {shortest:g}" if shortest else "more than 0"
+            raise ValueError(f"{name}: {seconds} s, expected {what}")
+    pairs = np.array([(a, b) for a in range(number) for b in range(number) if a != b])
+    old, new = np.tile(pairs, (replications, 1)).T
+    tick = round(before * fps)
+    ticks = tick + max(round(limit * fps) + HALF, round(MEASURED * fps))
+    of_style = functools.partial(
+        camdm_evaluation.preset_of_run, run, preset, seconds=ticks / fps, speed=None
+    )
+    commands = jax.tree.map(
+        lambda a, b: jnp.concatenate([a[:, :tick], b[:, tick:]], axis=1),
+        of_style(old)[1],
+        of_style(new)[1],
+    )
+    return Changes(
+        states=camdm_steering.start_states(
+            run.held_out, run.model, old, field=run.field, seed=seed
+        ),
+        commands=commands,
+        old=old,
+        new=new,
+        replication=np.repeat(np.arange(replications), len(pairs)),
+        tick=tick,
+        limit=limit,
+    )
+
+
+def without(changes: Changes) -> Changes:
+    """The same characters, who keep their first style: what finds a change is wrong.
+
+    Args:
+      changes: The changes.
+
+    Returns:
+      Changes whose commands keep label and speed, judged by the same new styles.
+    """
+    first = changes.commands.label[:, :1]
+    label = jnp.broadcast_to(first, changes.commands.label.shape)
+    commands = dataclasses.replace(changes.commands, label=label)
+    return dataclasses.replace(changes, commands=commands)
+
+
+def find_changes(
+    bones: skeleton.Skeleton,
+    frames: camdm_controller.Frame,
+    changes: Changes,
+    recognizer: Recognized,
+    *,
+    fps: float,
+) -> tuple[Bool[np.ndarray, "characters windows"], np.ndarray]:
+    """Whether each window about or behind the command shows the new style.
+
+    Args:
+      bones: The skeleton.
+      frames: Displayed frames [characters, ticks, ...].
+      changes: That they were made for.
+      recognizer: Of styles.
+      fps: Ticks a second.
+
+    Returns:
+      Decisions, and the windows' centres in seconds behind the command, from 0 on.
+    """
+    centres = np.arange(0, round(changes.limit * fps) + 1, STRIDE)
+    found = []
+    for centre in centres:
+        first = changes.tick + int(centre) - HALF
+        last = first + camdm_steering.WINDOW
+        cut = jax.tree.map(lambda x: x[:, first:last], frames)  # noqa: B023
+        label = jnp.asarray(changes.new)
+        made = camdm_steering.rollout_windows(cut, label, fps=fps, skip=0)
+        found.append(style_evaluator.recognized(bones, made, recognizer)[1] > 0.5)
+    return np.stack(found, axis=1), centres / fps
+
+
+def transition_row(
+    run: Run,
+    frames: camdm_controller.Frame,
+    changes: Changes,
+    recognizer: Recognized,
+    *,
+    height: float,
+) -> dict[str, table.Cell]:
+    """Success, duration and quality of motion, over replications.
+
+    Args:
+      run: The run.
+      frames: Of all characters.
+      changes: That they were made for.
+      recognizer: Of styles.
+      height: Below it a foot joint should not move, metres.
+
+    Returns:
+      Success in per cent; duration in seconds and frames, failures counted as the
+      limit; of the four seconds behind the command what `metric_row` measures; and of
+      the whole rollout slide and coherence of CAMDM's release.
+    """
+    bones, fps = run.model.bones, run.model.config.fps
+    found, centres = find_changes(bones, frames, changes, recognizer, fps=fps)
+    done = transition(
+        jnp.asarray(found), jnp.asarray(centres, jnp.float32), limit=changes.limit
+    )
+
+    def cell(values: Array, **options) -> table.Cell:
+        return table.cell(table.group_means(values, changes.replication), **options)
+
+    row = {
+        "success_%": cell(1.0 * done.succeeded, scale=100.0, bounds=(0.0, 1.0)),
+        "transition_s": cell(done.seconds),
+        "transition_frames": cell(fps * done.seconds),
+    }
+    behind = slice(changes.tick, changes.tick + round(MEASURED * fps))
+    cut = jax.tree.map(lambda x: x[:, behind], frames)
+    made = camdm_steering.rollout_windows(
+        cut, jnp.asarray(changes.new), fps=fps, skip=0
+    )
+    owner = changes.replication[np.asarray(made.group)]
+    grouped = dataclasses.replace(made, group=jnp.asarray(owner))
+    motion = camdm_evaluation.metric_row(bones, grouped, None, height=height)
+    row |= {name: motion[name] for name in MOTION}
+    # Of its changes of style the release measures neither direction nor facing.
+    whole = camdm_release.of_rollouts(frames, changes.commands, fps=fps)
+    values = camdm_release.metrics(bones, dataclasses.replace(whole, command=None))
+    return row | camdm_release.row(values, changes.replication)
+
+
+def evaluate_transitions(
+    run: Run,
+    changes: Changes,
+    controls: dict[str, camdm_controller.Control],
+    recognizer: Recognized,
+    *,
+    chunk: int | None = None,
+    seed: int = 0,
+    report: Callable[[str], None] = print,
+) -> dict[str, dict[str, table.Cell]]:
+    """One row for each run-time, and one of characters who keep their style.
+
+    Args:
+      run: The run.
+      changes: What characters are told.
+      controls: Constants of the run-time, by row; the last row's serve for those who
+        keep their style.
+      recognizer: Of styles.
+      chunk: Characters to run at a time, at most.
+      seed: Of the noise, the same for all rows.
+      report: Called with each row's name when it is measured.
+
+    Returns:
+      The table.
+    """
+    real = camdm_steering.data_windows(
+        run.held_out, stride=camdm_steering.WINDOW, field=run.field
+    )
+    height = camdm_evaluation.contact_height(run.model.bones, real)
+
+    def row(own: Changes, control: camdm_controller.Control) -> dict[str, table.Cell]:
+        frames = camdm_steering.steered_rollouts(
+            run.params,
+            jax.random.key(seed),
+            own.states,
+            own.commands,
+            model=run.model,
+            control=control,
+            chunk=chunk,
+        )
+        return transition_row(run, frames, own, recognizer, height=height)
+
+    rows = {}
+    for name, control in controls.items():
+        rows[name] = row(changes, control)
+        report(name)
+    rows["style kept (changes found by mistake)"] = row(without(changes), control)
+    return rows
+
+
+def clip_accuracy(run: Run, recognizer: Recognized) -> table.Cell:
+    """How often the recogniser is right on held-out clips: a bound on success.
+
+    Args:
+      run: The run.
+      recognizer: Of styles.
+
+    Returns:
+      Per cent, over clips.
+    """
+    real = camdm_steering.data_windows(run.held_out, stride=STRIDE, field=run.field)
+    _, hits = style_evaluator.recognized(run.model.bones, real, recognizer)
+    return table.cell(
+        table.group_means(hits, real.group), scale=100.0, bounds=(0.0, 1.0)
+    )

@@ -1,0 +1,232 @@
+"""What EMDM's motions from actions, or from nothing, are scored with.
+
+Every set that is scored, real or generated, has the same number of motions with actions
+drawn uniformly, and goes through one recogniser that was trained on real motions only.
+
+Source: Zhou et al. 2024 (EMDM), section 4.3; the evaluation of Guo et al. 2020
+(Action2Motion) with uniform actions.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.evaluation import contact, diversity, frechet, plausibility, smoothness
+from jaxmotion.evaluators import action as action_evaluator
+from jaxmotion.evaluators import frozen as evaluators
+from jaxmotion.learning import checkpoint, runs
+from jaxmotion.motion import skeleton
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm.data import ActionArrays, ActionRun
+from jaxmotion.typing import Key, Params
+
+# Motions that the recogniser is trained on: most windows of the clips.
+_RECOGNIZED = 12288
+
+
+def recognizer_config(run: ActionRun) -> action_evaluator.ActionRecognizerConfig:
+    """Size of a run's recogniser.
+
+    Args:
+      run: The run.
+
+    Returns:
+      The size.
+    """
+    return action_evaluator.ActionRecognizerConfig(
+        num_classes=len(run.actions), num_joints=run.clips.skeleton.num_joints
+    )
+
+
+def fit_recognizer(
+    train: ActionArrays, *, num_steps: int, seed: int
+) -> tuple[action_evaluator.ActionRecognizerConfig, Params]:
+    """Trains a recogniser on motions with actions drawn uniformly.
+
+    Args:
+      train: Training clips.
+      num_steps: Updates.
+      seed: Of parameters, batches and motions.
+
+    Returns:
+      Its size, and its parameters.
+    """
+    config = action_evaluator.ActionRecognizerConfig(
+        num_classes=train.counts.shape[0], num_joints=train.clips.skeleton.num_joints
+    )
+    key_data, key_train = jax.random.split(jax.random.key(seed))
+    actions = jnp.arange(_RECOGNIZED) % config.num_classes
+    x = _flat(real_positions(key_data, actions, train))
+    params, _ = action_evaluator.train_action_recognizer(
+        key_train, x, actions, config=config, num_steps=num_steps
+    )
+    return config, params
+
+
+def load_recognizer(
+    run: ActionRun,
+    *,
+    num_steps: int,
+    seed: int,
+    evaluator: evaluators.Evaluator | None = None,
+) -> Params:
+    """The run's recogniser, trained on its training clips if it is not there yet.
+
+    Args:
+      run: The run.
+      num_steps: Updates.
+      seed: Of parameters and batches.
+      evaluator: A frozen recogniser to use in its place; None for none.
+
+    Returns:
+      Its parameters.
+
+    Raises:
+      ValueError: if the folder's was trained otherwise, or the evaluator does not fit
+        the run; names the field.
+    """
+    frozen = evaluators.params_for(
+        evaluator,
+        kind="action",
+        labels=run.actions,
+        joints=run.clips.skeleton.names,
+        fps=run.clips.fps,
+        frames=run.train.frames,
+    )
+    if frozen is not None:
+        return frozen
+    folder = run.folder / "recognizer"
+    config = recognizer_config(run)
+    value = {
+        "system": "emdm",
+        "stage": "recognizer",
+        "steps": num_steps,
+        "seed": seed,
+        "actions": list(run.actions),
+        "source": run.clips.source,
+    }
+    if checkpoint.latest_step(folder) is None:
+        _, params = fit_recognizer(run.train, num_steps=num_steps, seed=seed)
+        checkpoint.save(folder, num_steps, {"params": params}, value)
+    return runs.restore_evaluator(
+        folder,
+        value,
+        lambda: action_evaluator.init_action_recognizer(jax.random.key(0), config),
+    )
+
+
+def _flat(positions: Array) -> Array:
+    """What the recogniser sees of motions that start at the origin facing +z."""
+    return positions.reshape(*positions.shape[:-2], -1)
+
+
+@jax.jit
+def real_positions(
+    key: Key, actions: Int[Array, " batch"], part: ActionArrays
+) -> Float[Array, "batch frames joints 3"]:
+    """Joint positions of recorded motions.
+
+    Args:
+      key: Consumed.
+      actions: Wanted actions.
+      part: Training or held-out clips.
+
+    Returns:
+      Positions, metres.
+    """
+    motions = emdm_data.sample_motions(key, part, actions)
+    return skeleton.joint_positions(part.clips.skeleton, motions)
+
+
+def moments(params: Params, run: ActionRun) -> Callable[[Key, Array], frechet.Moments]:
+    """Moments of the recogniser's features of a set of motions.
+
+    Args:
+      params: The recogniser's.
+      run: The run.
+
+    Returns:
+      `(key, positions) -> moments`, jitted.
+    """
+    config = recognizer_config(run)
+
+    @jax.jit
+    def of(key: Key, positions: Array) -> frechet.Moments:
+        features, _ = action_evaluator.recognize_actions(
+            params, key, _flat(positions), config=config
+        )
+        return frechet.moments(features)
+
+    return of
+
+
+def scorer(
+    params: Params, run: ActionRun, reference: frechet.Moments, *, ground: float
+) -> Callable[[Key, Array, Int[Array, " batch"]], dict[str, Array]]:
+    """Scores of a set of motions, as one compiled program.
+
+    Args:
+      params: The recogniser's.
+      run: The run.
+      reference: Moments of the real features.
+      ground: Height of the lowest joint of a person who stands, metres.
+
+    Returns:
+      `score(key, positions, actions) -> scores`. The actions are in ascending order,
+      each as often as the others.
+    """
+    config, bones = recognizer_config(run), run.clips.skeleton
+    feet = jnp.asarray(bones.feet)
+
+    @jax.jit
+    def score(
+        key: Key, positions: Array, actions: Int[Array, " batch"]
+    ) -> dict[str, Array]:
+        key_state, key_pairs, key_modes = jax.random.split(key, 3)
+        features, logits = action_evaluator.recognize_actions(
+            params, key_state, _flat(positions), config=config
+        )
+        by_action = features.reshape(config.num_classes, -1, features.shape[-1])
+        fps = run.clips.fps
+        toes = positions[..., feet, :]
+        return {
+            "FID": frechet.frechet_distance(frechet.moments(features), reference),
+            "accuracy": jnp.mean(jnp.argmax(logits, -1) == actions),
+            "diversity": diversity.diversity(key_pairs, features, num_pairs=200),
+            "multimodality": diversity.multimodality(
+                key_modes, by_action, num_pairs=20
+            ),
+            "penetration mm": jnp.mean(
+                plausibility.penetration(positions, ground=ground)
+            ),
+            "float mm": jnp.mean(plausibility.floating(positions, ground=ground)),
+            "skate mm": jnp.mean(plausibility.skating(toes, ground=ground)),
+            "skate ratio": jnp.mean(
+                contact.skate_ratio(toes, fps, max_height=ground + 0.05)
+            ),
+            "jerk m/s^3": jnp.mean(smoothness.jerk(positions, fps)),
+        }
+
+    return score
+
+
+def ground_height(run: ActionRun) -> float:
+    """Height of the lowest joint of a person who stands in the run's clips, metres.
+
+    The median over frames of the height of the lowest joint.
+
+    Args:
+      run: The run.
+
+    Returns:
+      The height.
+    """
+    motion = skeleton.Motion(
+        root_position=run.clips.root_position,
+        joint_rotation=run.clips.joint_rotation,
+        fps=run.clips.fps,
+    )
+    positions = skeleton.joint_positions(run.clips.skeleton, motion)
+    return float(jnp.median(jnp.min(positions[..., 1], axis=-1)))

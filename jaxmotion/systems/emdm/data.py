@@ -1,0 +1,381 @@
+"""Motions with actions for EMDM: choice of labels, splits, and batches on the device.
+
+Actions are drawn uniformly, then a clip of the action, then where it is cut: sets with
+rare actions train and score all of them alike. A clip shorter than a sample stays in
+its last pose, as in the released code.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.data import captions, clips_io, resample, selection, text_motion
+from jaxmotion.data.clips import Clips
+from jaxmotion.data.text_motion import TextMotions
+from jaxmotion.motion import features, humanml, humanml_skeleton, skeleton
+from jaxmotion.motion.humanml import HUMANML3D
+from jaxmotion.systems.emdm import features as emdm_features
+from jaxmotion.systems.emdm import loss as emdm_loss
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
+from jaxmotion.systems.emdm.features import Representation
+from jaxmotion.typing import Key
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class ActionArrays:
+    """Clips by action, on the device.
+
+    Attributes:
+      clips: The clips.
+      members: Clips of each action, filled up with -1.
+      counts: Clips of each action.
+      frames: Frames of a sample.
+    """
+
+    clips: Clips
+    members: Int[Array, "actions most"]
+    counts: Int[Array, " actions"]
+    frames: int = jax.tree.static()
+
+
+def prepare_clips(
+    paths: tuple[Path, ...],
+    *,
+    field: str,
+    merge: Mapping[str, str],
+    least: int,
+    fps: float,
+) -> tuple[Clips, tuple[str, ...]]:
+    """Clips of all files at one rate, with the labels that are frequent enough.
+
+    Args:
+      paths: Files of clips of one skeleton.
+      field: Label field that is the action.
+      merge: Labels that are the same action as others, and those others.
+      least: Fewest clips of an action.
+      fps: Frames a second.
+
+    Returns:
+      The clips, and the labels that were left out.
+
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if the files or labels do not fit, or nothing is left.
+    """
+    if not paths:
+        raise ValueError("no files of clips: at least one is needed")
+    clips = selection.concatenate([clips_io.load_clips(path) for path in paths])
+    clips = selection.merge_labels(clips, field, merge)
+    kept = selection.frequent_labels(clips, field, least=least)
+    left_out = tuple(word for word in clips.names(field) if word not in kept)
+    if not kept:
+        raise ValueError(f"no {field} has {least} clips")
+    clips = selection.relabel(selection.select(clips, field, kept), field)
+    return resample.resample_clips(clips, fps), left_out
+
+
+def action_arrays(clips: Clips, *, field: str, frames: int) -> ActionArrays:
+    """Puts clips on the device, listed by action.
+
+    Args:
+      clips: The clips; every label has some.
+      field: Label field that is the action.
+      frames: Frames of a sample.
+
+    Returns:
+      The arrays.
+
+    Raises:
+      ValueError: if an action has no clip; names it.
+    """
+    names = clips.names(field)
+    labels = np.asarray(clips.labels[field])
+    counts = np.bincount(labels, minlength=len(names))
+    if not counts.all():
+        raise ValueError(f"{field} {names[int(counts.argmin())]!r} has no clip")
+    members = np.full((len(names), counts.max()), -1)
+    for action in range(len(names)):
+        own = np.flatnonzero(labels == action)
+        members[action, : own.size] = own
+    return ActionArrays(
+        clips=clips,
+        members=jnp.asarray(members, jnp.int32),
+        counts=jnp.asarray(counts, jnp.int32),
+        frames=frames,
+    )
+
+
+def sample_motions(
+    key: Key, arrays: ActionArrays, action: Int[Array, " batch"]
+) -> skeleton.Motion:
+    """Draws a motion of each action, from the ground's origin and facing +z.
+
+    Args:
+      key: Consumed.
+      arrays: The clips.
+      action: Wanted actions.
+
+    Returns:
+      The motions.
+    """
+    key_clip, key_start = jax.random.split(key)
+    clips, frames = arrays.clips, arrays.frames
+    place = jax.random.randint(key_clip, action.shape, 0, arrays.counts[action])
+    clip = arrays.members[action, place]
+    first, stop = clips.offsets[clip], clips.offsets[clip + 1]
+    latest = jnp.maximum(stop - first - frames, 0)
+    start = first + jax.random.randint(key_start, action.shape, 0, latest + 1)
+    rows = jnp.add.outer(start, jnp.arange(frames))
+    rows = jnp.minimum(rows, jnp.broadcast_to(stop[:, None] - 1, rows.shape))
+    motions = skeleton.Motion(
+        root_position=clips.root_position[rows],
+        joint_rotation=clips.joint_rotation[rows],
+        fps=clips.fps,
+    )
+    return features.to_first_pose(clips.skeleton, motions)
+
+
+# Motions from which means and deviations of features are taken.
+_FIT = 2048
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ActionRun:
+    """Data of a run folder.
+
+    Attributes:
+      folder: The folder.
+      config: JSON of how the data were made.
+      clips: All clips, at the run's rate.
+      train: Training clips on the device.
+      held_out: Clips that no network saw.
+      representation: Features of the skeleton's motions.
+      field: Label field that is the action.
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    clips: Clips
+    train: ActionArrays
+    held_out: ActionArrays
+    representation: Representation
+    field: str
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Names of the actions."""
+        return self.clips.names(self.field)
+
+
+def load_run(folder: Path) -> ActionRun:
+    """Loads the data of a run folder.
+
+    Args:
+      folder: Its path.
+
+    Returns:
+      The run.
+
+    Raises:
+      OSError: if the clips cannot be read.
+      ValueError: if it is no run folder of EMDM with actions; names the field.
+    """
+    value = emdm_training.read_config(folder)
+    try:
+        field, frames = value["field"], value["frames"]
+        clips = clips_io.load_clips(folder / "data.npz")
+        parts = selection.split_clips(
+            clips, fraction=value["held_out"], seed=0, field=field
+        )
+        train, held_out = (
+            action_arrays(part, field=field, frames=frames) for part in parts
+        )
+    except KeyError as error:
+        raise ValueError(
+            f"{folder / 'config.json'}: field {error} is missing: no run of actions"
+        ) from error
+    actions = jnp.arange(_FIT) % train.counts.shape[0]
+    motions = sample_motions(jax.random.key(0), train, actions)
+    return ActionRun(
+        folder=folder,
+        config=value,
+        clips=clips,
+        train=train,
+        held_out=held_out,
+        representation=emdm_features.fit(clips.skeleton, motions),
+        field=field,
+    )
+
+
+def make_task(
+    run: ActionRun, base: emdm_model.Config, *, conditional: bool
+) -> emdm_training.Task:
+    """What models of a run are trained on.
+
+    Args:
+      run: The run.
+      base: Sizes and weights; features, frames and condition are set here.
+      conditional: Motions from actions; else from nothing.
+
+    Returns:
+      The task.
+    """
+    number = len(run.actions) if conditional else 0
+    representation = run.representation
+    base = dataclasses.replace(
+        base,
+        features=representation.num_features,
+        frames=run.train.frames,
+        condition="action" if conditional else "none",
+        condition_size=number,
+    )
+
+    def batch(key: Key, data: ActionArrays, size: int) -> emdm_loss.Batch:
+        key_action, key_motion = jax.random.split(key)
+        actions = jax.random.randint(key_action, (size,), 0, data.counts.shape[0])
+        motions = sample_motions(key_motion, data, actions)
+        return emdm_loss.Batch(
+            x_0=emdm_features.to_features(motions, representation),
+            vector=emdm_model.action_vectors(actions, number),
+            mask=jnp.ones((size, data.frames), bool),
+        )
+
+    return emdm_training.Task(
+        base=base,
+        data=run.train,
+        batch=batch,
+        geometry=emdm_features.geometry(
+            representation, relative=base.geometry == "root"
+        ),
+        source=run.folder / "data.npz",
+        describe={
+            "task": base.condition,
+            "actions": list(run.actions),
+            "source": run.clips.source,
+            "fps": run.clips.fps,
+        },
+    )
+
+
+# Clips are padded to multiples of so many frames, and made so many at a time: one
+# compilation for each length.
+_BUCKET, _CHUNK = 64, 64
+_PER_CLIP = 4
+
+
+def clip_features(
+    clips: Clips,
+) -> tuple[list[Float[np.ndarray, "_ features"]], float]:
+    """HumanML3D's features of every clip, and how well they give its joints back.
+
+    Args:
+      clips: Of a skeleton that `humanml_skeleton.joint_mapping` knows, at the rate of
+        the features.
+
+    Returns:
+      One array a clip, of one frame less than the clip; and the largest error of joints
+      to features to joints, metres.
+
+    Raises:
+      ValueError: if the skeleton is unknown.
+    """
+    mapping = humanml_skeleton.joint_mapping(clips.skeleton)
+    offsets = np.asarray(clips.offsets)
+    lengths = np.diff(offsets)
+    root, turns = np.asarray(clips.root_position), np.asarray(clips.joint_rotation)
+
+    @jax.jit
+    def make(root: Array, turns: Array) -> tuple[Array, Array]:
+        motion = skeleton.Motion(
+            root_position=root, joint_rotation=turns, fps=clips.fps
+        )
+        joints = skeleton.joint_positions(clips.skeleton, motion)
+        joints = humanml_skeleton.mapped_joints(mapping, joints)
+        features = humanml.features_from_joints(joints, HUMANML3D)
+        truth = humanml.canonical_joints(joints, HUMANML3D)[..., :-1, :, :]
+        error = humanml.joints_from_features(features, HUMANML3D) - truth
+        return features, jnp.max(jnp.abs(error))
+
+    found: list[Any] = [None] * clips.num_clips
+    worst = 0.0
+    padded = -(-lengths // _BUCKET) * _BUCKET
+    for size in np.unique(padded):
+        own = np.flatnonzero(padded == size)
+        for chunk in np.array_split(own, -(-len(own) // _CHUNK)):
+            # Standing still at the end changes neither floor nor smoothed facings.
+            rows = offsets[chunk][:, None] + np.minimum(
+                np.arange(size)[None], lengths[chunk][:, None] - 1
+            )
+            rows = np.pad(rows, ((0, _CHUNK - len(chunk)), (0, 0)), mode="edge")
+            made, error = make(jnp.asarray(root[rows]), jnp.asarray(turns[rows]))
+            worst = max(worst, float(error))
+            for clip, row in zip(chunk, np.asarray(made), strict=False):
+                found[clip] = row[: lengths[clip] - 1].copy()
+    return found, worst
+
+
+def from_labels(
+    clips: Clips,
+    *,
+    unseen: Sequence[str],
+    held_out: float,
+    least: int,
+    fps: float,
+    seed: int,
+) -> tuple[TextMotions, float]:
+    """Text motions from clips whose contents and styles the grammar of captions knows.
+
+    Clips of unseen pairs are the split "val": nothing is trained on them. A part of the
+    others is the split "test".
+
+    Args:
+      clips: With label fields "content" and "style".
+      unseen: Pairs "content/style".
+      held_out: Part of the other clips in "test".
+      least: Shortest clip, frames at the new rate.
+      fps: Frames a second of the features.
+      seed: Of captions and of the split.
+
+    Returns:
+      The text motions, and the largest error of joints to features to joints, metres.
+
+    Raises:
+      ValueError: if a label or the skeleton is unknown, or no clip has an unseen pair.
+    """
+    words = [
+        np.array(clips.names(field))[np.asarray(clips.labels[field])]
+        for field in ("content", "style")
+    ]
+    pairs = [f"{content}/{style}" for content, style in zip(*words, strict=True)]
+    for pair in unseen:
+        if pair not in pairs:
+            raise ValueError(f"no clip is of the unseen pair {pair!r}")
+    clips = resample.resample_clips(clips, fps)
+    features, error = clip_features(clips)
+    drawn = np.random.default_rng(seed).random(clips.num_clips) < held_out
+    kept = [i for i, x in enumerate(features) if len(x) >= least]
+    splits = [
+        "val" if pairs[i] in unseen else "test" if drawn[i] else "train" for i in kept
+    ]
+    motions = text_motion.text_motions(
+        [features[i] for i in kept],
+        [
+            captions.captions_for(
+                str(words[0][i]), str(words[1][i]), seed=seed, index=i, count=_PER_CLIP
+            )
+            for i in kept
+        ],
+        splits,
+        [clips.clip_names[i] for i in kept],
+        fps=fps,
+        source=f"{clips.source}; captions made from labels",
+    )
+    return motions, error

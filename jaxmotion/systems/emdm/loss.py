@@ -1,0 +1,266 @@
+"""EMDM's training: geometric and adversarial losses, lazy R1, and MDM's loss.
+
+    L_D = E softplus(-D(x_{t-1}, x_t, t, c)) + E softplus(D(x'_{t-1}, x_t, t, c))
+          [+ gamma / 2 |grad D(x_{t-1})|^2 every k updates]
+    L_G = E softplus(-D(x'_{t-1}, x_t, t, c))
+          + R |x_0 - x'_0|^2 + l_pos |p - p'|^2 + l_vel |dx_0 - dx'_0|^2 + l_foot foot
+
+Differs from the released code: both terms of L_G come from one forward pass with the
+same t, noise and latent; there from two with fresh ones. The expectation of the
+gradient is the same, and a pass is saved. `Config.mask_frames` says how motions of
+different lengths are averaged.
+
+Source: Zhou et al. 2024 (EMDM), eq. 5-12; released code.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxmotion.diffusion import gan, schedule
+from jaxmotion.learning import losses
+from jaxmotion.motion import contact
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm.model import Config
+from jaxmotion.typing import Key, Params
+
+Info = dict[str, Array]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Batch:
+    """Motions and what they are made from.
+
+    Attributes:
+      x_0: Features in the network's units; zero behind a motion's end.
+      vector: One-hot actions or text vectors.
+      mask: Frames that a motion has.
+    """
+
+    x_0: Float[Array, "batch frames features"]
+    vector: Float[Array, "batch condition"]
+    mask: Bool[Array, "batch frames"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Geometry:
+    """How features become joints; only for the geometric losses.
+
+    Attributes:
+      positions: Features (network's units) to joint positions, metres, relative to the
+        root or in the world.
+      feet: Joints that may stand.
+      channels: Channels of whose frame differences the velocity loss is made.
+      fps: Frames a second.
+      contact_speed: A foot slower than this stands, metres per second (released: 0.01
+        metres per frame at any rate, which is 0.2 at HumanML3D's 20 frames per second).
+    """
+
+    positions: Callable[[Array], Array]
+    feet: tuple[int, ...]
+    channels: slice
+    fps: float
+    contact_speed: float = 0.2
+
+
+def geometric_loss(
+    prediction: Float[Array, "batch frames features"],
+    batch: Batch,
+    *,
+    config: Config,
+    geometry: Geometry | None,
+) -> tuple[Float[Array, ""], Info]:
+    """Weighted errors of features, joint positions, frame differences and feet.
+
+    Args:
+      prediction: Predicted x_0.
+      batch: The motions.
+      config: The weights.
+      geometry: None if the three last weights are 0.
+
+    Returns:
+      The loss, and its terms, unweighted.
+
+    Source: EMDM, eq. 11-12; MDM, eq. 3-5.
+    """
+    mask = batch.mask
+    average = "frames" if config.mask_frames else "samples"
+    error = losses.masked_mse(prediction, batch.x_0, mask, average=average)
+    terms = {"recon": error}
+    weights = {"recon": config.weight_recon}
+    if geometry is not None:
+        weights["position"] = config.weight_position
+        weights["velocity"] = config.weight_velocity
+        weights["foot"] = config.weight_foot
+        found, truth = geometry.positions(prediction), geometry.positions(batch.x_0)
+        flat = lambda p: p.reshape(*p.shape[:-2], -1)  # noqa: E731
+        terms["position"] = losses.masked_mse(
+            flat(found), flat(truth), mask, average=average
+        )
+        terms["velocity"] = losses.velocity_loss(
+            prediction[..., geometry.channels],
+            batch.x_0[..., geometry.channels],
+            mask,
+            average=average,
+        )
+        feet = jnp.asarray(geometry.feet)
+        stands = contact.foot_contacts(
+            truth[..., feet, :], geometry.fps, max_speed=geometry.contact_speed
+        )
+        terms["foot"] = losses.foot_slide_loss(
+            found[..., feet, :], stands, mask, average=average
+        )
+    total = sum(weights[name] * value for name, value in terms.items())
+    return total, terms
+
+
+def _visible(x: Array, batch: Batch, config: Config) -> Array:
+    """Motion as the discriminator sees it: nothing behind its end."""
+    return x * batch.mask[..., None] if config.mask_frames else x
+
+
+def _generated(
+    params: Params, key: Key, batch: Batch, config: Config
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Step, real x_{t-1}, x_t, predicted x_0, generated x_{t-1}."""
+    names = ("t", "pair", "keep", "latent", "dropout", "posterior")
+    keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
+    table, size = config.table(), batch.x_0.shape[0]
+    t = jax.random.randint(keys["t"], (size,), 1, config.num_steps + 1)
+    x_prev, x_t = gan.q_pair(table, keys["pair"], batch.x_0, t)
+    keep = jax.random.bernoulli(keys["keep"], 1.0 - config.drop_condition, (size,))
+    prediction = emdm_model.generator(config).apply(
+        {"params": params},
+        x_t,
+        t,
+        batch.vector,
+        keep,
+        batch.mask | (not config.mask_frames),
+        jax.random.normal(keys["latent"], (size, config.latent)),
+        train=True,
+        rngs={"dropout": keys["dropout"]},
+    )
+    fake = gan.posterior_sample(table, keys["posterior"], prediction, x_t, t)
+    visible = lambda x: _visible(x, batch, config)  # noqa: E731
+    return t, visible(x_prev), visible(x_t), prediction, visible(fake)
+
+
+def discriminator_loss(
+    params: Params,
+    generator: Params,
+    key: Key,
+    batch: Batch,
+    *,
+    config: Config,
+    penalized: Bool[Array, ""],
+) -> tuple[Float[Array, ""], Info]:
+    """The discriminator's loss, with its R1 penalty when it is due.
+
+    Args:
+      params: The discriminator's.
+      generator: The generator's.
+      key: Consumed.
+      batch: The motions.
+      config: The method.
+      penalized: Whether this update has the penalty.
+
+    Returns:
+      The loss, and "adversarial" and "r1" (0 in updates without).
+    """
+    t, x_prev, x_t, _, fake = _generated(generator, key, batch, config)
+    net = emdm_model.discriminator(config)
+    judged = emdm_model.judged_condition(batch.vector, config=config)
+
+    def judge(x: Array) -> Array:
+        return net.apply({"params": params}, x, x_t, t, judged)
+
+    adversarial = gan.discriminator_loss(
+        judge(x_prev), judge(jax.lax.stop_gradient(fake))
+    )
+    r1 = jnp.zeros(())
+    if config.weight_r1:
+        r1 = jax.lax.cond(
+            penalized, lambda x: gan.r1_penalty(judge, x), lambda x: r1, x_prev
+        )
+    loss = adversarial + 0.5 * config.weight_r1 * r1
+    return loss, {"adversarial": adversarial, "r1": r1}
+
+
+def generator_loss(
+    params: Params,
+    discriminator: Params,
+    key: Key,
+    batch: Batch,
+    *,
+    config: Config,
+    geometry: Geometry | None,
+) -> tuple[Float[Array, ""], Info]:
+    """The generator's loss.
+
+    Args:
+      params: The generator's.
+      discriminator: The discriminator's.
+      key: Consumed.
+      batch: The motions.
+      config: The method.
+      geometry: None if the weights of positions, velocities and feet are 0.
+
+    Returns:
+      The loss, "adversarial" and the geometric terms.
+    """
+    t, _, x_t, prediction, fake = _generated(params, key, batch, config)
+    judged = emdm_model.judged_condition(batch.vector, config=config)
+    logits = emdm_model.discriminator(config).apply(
+        {"params": discriminator}, fake, x_t, t, judged
+    )
+    adversarial = gan.generator_loss(logits)
+    geometric, terms = geometric_loss(
+        prediction, batch, config=config, geometry=geometry
+    )
+    return adversarial + geometric, {"adversarial": adversarial, **terms}
+
+
+def diffusion_loss(
+    params: Params,
+    key: Key,
+    batch: Batch,
+    *,
+    config: Config,
+    geometry: Geometry | None,
+) -> tuple[Float[Array, ""], Info]:
+    """MDM's loss: the geometric one of a deterministic denoiser.
+
+    Args:
+      params: The generator's, without latent.
+      key: Consumed.
+      batch: The motions.
+      config: The method, with `latent` 0.
+      geometry: None if the weights of positions, velocities and feet are 0.
+
+    Returns:
+      The loss, and its terms.
+
+    Source: Tevet et al. 2023 (MDM), eq. 2-6.
+    """
+    key_t, key_noise, key_keep, key_dropout = jax.random.split(key, 4)
+    size = batch.x_0.shape[0]
+    t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
+    noise = jax.random.normal(key_noise, batch.x_0.shape)
+    x_t = schedule.q_sample(config.table(), batch.x_0, t, noise)
+    keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_condition, (size,))
+    prediction = emdm_model.generator(config).apply(
+        {"params": params},
+        x_t,
+        t,
+        batch.vector,
+        keep,
+        batch.mask | (not config.mask_frames),
+        None,
+        train=True,
+        rngs={"dropout": key_dropout},
+    )
+    return geometric_loss(prediction, batch, config=config, geometry=geometry)

@@ -1,0 +1,223 @@
+"""EMDM from texts: the data of a run, and its task.
+
+A caption's vector comes from a text encoder once and is data from then on.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmotion.data import text_motion_io
+from jaxmotion.data.text_motion import TextMotions
+from jaxmotion.data.text_sampling import TextArrays, sample_text_batch, text_arrays
+from jaxmotion.motion import humanml
+from jaxmotion.motion.humanml import HUMANML3D, KIT_ML
+from jaxmotion.systems.emdm import loss as emdm_loss
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
+from jaxmotion.text import encoder as text_encoder
+from jaxmotion.typing import Key
+
+# CLIP reads 77 tokens; no caption of the published sets comes near so many words.
+MAX_WORDS = 75
+# "released": CLIP's vectors as they are, of a text's first 20 tokens and its two ends.
+# "unit" (ours): of whole texts, scaled to mean square 1 over the captions of a run.
+TextForm = Literal["released", "unit"]
+_RELEASED_TOKENS = 22
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TextRun:
+    """Data of a run folder.
+
+    Attributes:
+      folder: The folder.
+      config: JSON of how the data were made.
+      motions: Clips with captions.
+      encoder: Of sentences.
+      vectors: Of the captions' distinct sentences, as the networks take them.
+      index: Vector of each caption.
+      scale: What the encoder's vectors were multiplied with; 1 as released.
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    motions: TextMotions
+    encoder: text_encoder.TextEncoder
+    vectors: Float[np.ndarray, "sentences channels"]
+    index: np.ndarray
+    scale: float
+
+    @property
+    def layout(self) -> humanml.Layout:
+        """Which of the two published skeletons the features describe."""
+        layouts = {layout.num_features: layout for layout in (HUMANML3D, KIT_ML)}
+        return layouts[self.motions.num_features]
+
+
+def default_form(encoder: str) -> TextForm:
+    """As released for CLIP; "unit" for the other encoders, which no release has."""
+    return "unit" if encoder in text_encoder.OWN else "released"
+
+
+def make_encoder(name: str, form: TextForm) -> text_encoder.TextEncoder:
+    """The encoder that a user asks for, reading as much of a text as the form says.
+
+    Raises:
+      ModuleNotFoundError: if a package is missing; says how to install it.
+      ValueError: if there is no such encoder, or it is not CLIP and the form is
+        "released"; names it.
+    """
+    if form == "released" and name in text_encoder.OWN:
+        raise ValueError(
+            f"text form is 'released', which is of CLIP's vectors, but encoder is "
+            f"{name!r}: expected 'unit', or a folder with CLIP's weights"
+        )
+    limit = _RELEASED_TOKENS if form == "released" else None
+    return text_encoder.make_encoder(name, max_tokens=limit)
+
+
+def check_words(texts: Sequence[str]) -> None:
+    """Raises if a text is too long.
+
+    Args:
+      texts: Sentences.
+
+    Raises:
+      ValueError: names the text's number and length.
+    """
+    for i, text in enumerate(texts):
+        if (found := len(text.split())) > MAX_WORDS:
+            raise ValueError(
+                f"text {i} has {found} words, expected at most {MAX_WORDS}"
+            )
+
+
+def load_run(folder: Path) -> TextRun:
+    """Loads the data of a run folder; captions are encoded once and kept there.
+
+    Args:
+      folder: Its path.
+
+    Returns:
+      The run.
+
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if it is no run folder of EMDM with texts; names the field.
+    """
+    value = emdm_training.read_config(folder)
+    if value.get("task") != "text":
+        raise ValueError(
+            f"{folder / 'config.json'}: field 'task' is {value.get('task')!r}, "
+            "expected 'text'"
+        )
+    motions = text_motion_io.load_text_motions(folder / "data.npz")
+    form = value["text_form"]
+    encoder = make_encoder(value["encoder"], form)
+    cache = folder / "texts.npz"
+    unique = text_encoder.encode_unique(encoder, motions.captions, cache=cache)
+    vectors = np.asarray(unique.vectors)
+    scale = 1.0 if form == "released" else float(np.mean(vectors**2) ** -0.5)
+    return TextRun(
+        folder=folder,
+        config=value,
+        motions=motions,
+        encoder=encoder,
+        vectors=vectors * scale,
+        index=np.asarray(unique.index),
+        scale=scale,
+    )
+
+
+def encode(run: TextRun, texts: Sequence[str]) -> Float[Array, "texts channels"]:
+    """Vectors of new sentences as the networks of a run know them.
+
+    Args:
+      run: The run.
+      texts: Sentences.
+
+    Returns:
+      One row each.
+
+    Raises:
+      ValueError: if a text is empty or too long; names its number.
+    """
+    check_words(texts)
+    return jnp.asarray(run.encoder.encode(texts) * run.scale, jnp.float32)
+
+
+def make_task(
+    run: TextRun, base: emdm_model.Config, *, frames: int
+) -> emdm_training.Task:
+    """What models of a run are trained on: features only, no joints (as in the paper).
+
+    Args:
+      run: The run.
+      base: Sizes and weights; features, frames and condition are set here.
+      frames: Longest motion.
+
+    Returns:
+      The task.
+    """
+    base = dataclasses.replace(
+        base,
+        features=run.motions.num_features,
+        frames=frames,
+        condition="text",
+        condition_size=run.vectors.shape[-1],
+        weight_position=0.0,
+        weight_velocity=0.0,
+        weight_foot=0.0,
+    )
+    Data = tuple[TextArrays, Array, Array]
+    data: Data = (
+        text_arrays(run.motions, split="train", max_frames=frames),
+        jnp.asarray(run.vectors, jnp.float32),
+        jnp.asarray(run.index, jnp.int32),
+    )
+
+    def batch(key: Key, data: Data, size: int) -> emdm_loss.Batch:
+        arrays, vectors, index = data
+        x_0, length, caption = sample_text_batch(key, arrays, batch=size)
+        return emdm_loss.Batch(
+            x_0=x_0,
+            vector=vectors[index[caption]],
+            mask=jnp.arange(frames)[None] < length[:, None],
+        )
+
+    return emdm_training.Task(
+        base=base,
+        data=data,
+        batch=batch,
+        geometry=None,
+        source=run.folder / "data.npz",
+        describe={
+            "task": "text",
+            "encoder": run.encoder.name,
+            "source": run.motions.source,
+            "fps": run.motions.fps,
+        },
+    )
+
+
+def joints(
+    run: TextRun, x: Float[Array, "*batch frames features"]
+) -> Float[Array, "*batch frames joints 3"]:
+    """Joint positions of features in the network's units.
+
+    Args:
+      run: The run.
+      x: Z-scored features.
+
+    Returns:
+      Positions, metres (as published: KIT-ML's unit is its own).
+    """
+    like = lambda v: jnp.asarray(v).reshape((1,) * (x.ndim - 1) + (-1,))  # noqa: E731
+    raw = x * like(run.motions.std) + like(run.motions.mean)
+    return humanml.joints_from_features(raw, run.layout)

@@ -1,0 +1,367 @@
+"""Scores of motions made from texts: R-precision, FID, MM-Dist and the rest.
+
+The evaluator embeds sentences and motions into one space. Trained here it is a small
+one of the documented recipe; published weights have the published sizes. Real motions
+go through the same sets: as many, of the same sentences.
+
+Source: Guo et al. 2022 (T2M); Zhou et al. 2024 (EMDM), section 4.2.
+"""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.data.plain_pickle import read_plain_pickle
+from jaxmotion.data.text_files import read_array
+from jaxmotion.data.text_motion import check_statistics
+from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
+from jaxmotion.evaluation import diversity, frechet, matching
+from jaxmotion.evaluators import published
+from jaxmotion.evaluators import text_motion as text_motion_evaluator
+from jaxmotion.learning import checkpoint, runs, training
+from jaxmotion.systems.emdm.text import TextRun
+from jaxmotion.typing import Key, Params
+
+# Of the evaluator that is trained here, on a CPU.
+SMALL = dict(movement_width=192, motion_width=192, text_width=128, embedding=128)
+_CONTACTS = 4
+# Statistics of the published evaluators, as their releases name them.
+_STATISTICS = (
+    ("mean.npy", "std.npy"),
+    ("t2m_mean.npy", "t2m_std.npy"),
+    ("kit_mean.npy", "kit_std.npy"),
+    ("Mean.npy", "Std.npy"),
+)
+_MARKS = ("sos", "eos", "unk")
+GLOVE = ("our_vab_data.npy", "our_vab_words.pkl", "our_vab_idx.pkl")
+# Deviations of the root and of contact labels were divided twice by 5 there.
+_SHRUNK = 1 / 25
+Vocabulary = Mapping[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluator:
+    """A text-motion evaluator and how it reads features.
+
+    Attributes:
+      params: Its parameters.
+      config: Its size.
+      mean: Of the features as it was trained on them.
+      std: Likewise.
+      name: What it is, for tables.
+      vocabulary: Vectors of the words that it knows; None for hashed ones.
+    """
+
+    params: Params
+    config: text_motion_evaluator.MatcherConfig
+    mean: Float[np.ndarray, " features"]
+    std: Float[np.ndarray, " features"]
+    name: str
+    vocabulary: Vocabulary | None = None
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Sentences:
+    """All captions of a run as an evaluator reads them.
+
+    Attributes:
+      vectors: Word vectors of the distinct captions.
+      tags: One-hot parts of speech.
+      words: Of each, with the marks of start and end.
+      index: Distinct caption of each caption.
+    """
+
+    vectors: Float[Array, "sentences slots word"]
+    tags: Float[Array, "sentences slots classes"]
+    words: Int[Array, " sentences"]
+    index: Int[Array, " captions"]
+
+
+def sentences(run: TextRun, vocabulary: Vocabulary | None = None) -> Sentences:
+    """Encodes the captions of a run as `matching.encode_tokens` does."""
+    distinct, index = np.unique(np.array(run.motions.tokens), return_inverse=True)
+    coded = [
+        text_motion_evaluator.encode_tokens(str(tokens).split(), vocabulary)
+        for tokens in distinct
+    ]
+    return Sentences(
+        vectors=jnp.asarray(np.stack([vectors for vectors, _, _ in coded])),
+        tags=jnp.asarray(np.stack([tags for _, tags, _ in coded])),
+        words=jnp.asarray([words for _, _, words in coded], jnp.int32),
+        index=jnp.asarray(index, jnp.int32),
+    )
+
+
+def train_evaluator(
+    run: TextRun, *, frames: int, num_steps: int, seed: int
+) -> Evaluator:
+    """The run's evaluator, trained on its training clips if it is not there yet.
+
+    Args:
+      run: The run.
+      frames: Longest motion.
+      num_steps: Updates.
+      seed: Of parameters and batches.
+
+    Returns:
+      The evaluator.
+
+    Raises:
+      ValueError: if the folder's was trained otherwise; names the field.
+    """
+    folder = run.folder / "matcher"
+    config = text_motion_evaluator.MatcherConfig(
+        num_features=run.motions.num_features - _CONTACTS, **SMALL
+    )
+    value = {
+        "system": "emdm",
+        "stage": "matcher",
+        "steps": num_steps,
+        "seed": seed,
+        "frames": frames,
+        "source": run.motions.source,
+        "special_words": "released",
+    }
+    if checkpoint.latest_step(folder) is None:
+        data = (
+            text_arrays(run.motions, split="train", max_frames=frames),
+            sentences(run),
+        )
+        params, _ = text_motion_evaluator.train_matcher(
+            jax.random.key(seed),
+            _pairs,
+            data,
+            config=config,
+            num_steps=num_steps,
+            optimizer=training.adamw_cosine(
+                learning_rate=1e-3, num_steps=num_steps, max_norm=0.5
+            ),
+        )
+        checkpoint.save(folder, num_steps, {"params": params}, value)
+    params = runs.restore_evaluator(
+        folder,
+        value,
+        lambda: text_motion_evaluator.init_matcher(jax.random.key(0), config),
+    )
+    return Evaluator(
+        params=params,
+        config=config,
+        mean=run.motions.mean,
+        std=run.motions.std,
+        name=f"trained here, {num_steps} updates, hashed word vectors (no GloVe)",
+    )
+
+
+def _pairs(key: Key, data: Any) -> text_motion_evaluator.Pairs:
+    arrays, coded = data
+    features, frames, caption = sample_text_batch(key, arrays, batch=32)
+    row = coded.index[caption]
+    return text_motion_evaluator.Pairs(
+        features=features[..., :-_CONTACTS],
+        frames=frames,
+        vectors=coded.vectors[row],
+        tags=coded.tags[row],
+        words=coded.words[row],
+    )
+
+
+def load_glove(folder: Path) -> dict[str, np.ndarray]:
+    """Reads the word vectors that published weights were trained with.
+
+    Args:
+      folder: Has our_vab_data.npy [words, 300], our_vab_words.pkl (the words) and
+        our_vab_idx.pkl (row of each); nothing in the pickles is run.
+
+    Returns:
+      Vectors by word, for `matching.encode_tokens`.
+
+    Raises:
+      ValueError: if a file is missing, damaged or does not fit the others; names it.
+    """
+    data, listed, rows = (folder / name for name in GLOVE)
+    vectors = read_array(data)
+    words, index = (_read_pickle(path) for path in (listed, rows))
+    if vectors.ndim != 2 or vectors.shape[1] != text_motion_evaluator.WORD_SIZE:
+        raise ValueError(
+            f"{data}: expected rows of {text_motion_evaluator.WORD_SIZE} numbers, "
+            f"found shape {vectors.shape}"
+        )
+    if not np.isfinite(vectors).all():
+        row = int(np.argwhere(~np.isfinite(vectors))[0, 0])
+        raise ValueError(f"{data}: row {row} is not finite")
+    if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
+        raise ValueError(f"{listed}: expected a list of words")
+    if not isinstance(index, dict):
+        raise ValueError(f"{rows}: expected a row for each word")
+    for word in (*_MARKS, *words):
+        row = index.get(word)
+        if type(row) is not int or not 0 <= row < len(vectors):
+            raise ValueError(
+                f"{rows}: the row of {word!r} is {row!r}, expected one of the "
+                f"{len(vectors)} in {data.name}"
+            )
+    if missing := [mark for mark in _MARKS if mark not in words]:
+        raise ValueError(f"{listed}: no {', '.join(missing)} among the words")
+    return {word: vectors[index[word]] for word in words}
+
+
+def _read_pickle(path: Path) -> Any:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from None
+    return read_plain_pickle(data, name=str(path))
+
+
+def read_statistics(
+    folder: Path, num_features: int
+) -> tuple[Float[np.ndarray, " features"], Float[np.ndarray, " features"]]:
+    """Mean and deviations of a published evaluator, told apart from a data set's.
+
+    A contact label is 0 or 1, so that its deviation follows from its mean p: it is
+    sqrt(p (1 - p)). In both published evaluators (HumanML3D's and KIT-ML's) it is a
+    25th of that, in the statistics of a data set once that.
+
+    Args:
+      folder: Has mean.npy and std.npy, as in the evaluator's meta folder, or the same
+        under another of the released names.
+      num_features: Of a frame, with the 4 contact labels at its end.
+
+    Raises:
+      ValueError: if there are none, they are no statistics of so many features, or not
+        an evaluator's; names the file.
+    """
+    for names in _STATISTICS:
+        paths = [folder / name for name in names]
+        if all(path.exists() for path in paths):
+            break
+    else:
+        raise ValueError(
+            f"{folder}: expected mean.npy and std.npy of the evaluator's meta folder "
+            "beside its weights, found neither they nor t2m_mean.npy, kit_mean.npy or "
+            "Mean.npy with their deviations"
+        )
+    mean, std = (read_array(path) for path in paths)
+    check_statistics(mean, std, num_features, names=(str(paths[0]), str(paths[1])))
+    share = mean[-_CONTACTS:]
+    if not ((share > 0) & (share < 1)).all():
+        raise ValueError(
+            f"{paths[0]}: the last {_CONTACTS} numbers, means of contact labels, "
+            f"should be between 0 and 1, found {share.tolist()}"
+        )
+    ratio = float(std[-_CONTACTS:].mean() / np.sqrt(share * (1 - share)).mean())
+    if not abs(ratio / _SHRUNK - 1) < 0.05:
+        raise ValueError(
+            f"{paths[1]}: contact labels deviate {ratio:.3g} times as much as their "
+            f"mean implies, expected {_SHRUNK:.3g}: not the evaluator's own statistics "
+            "(of its meta folder) but those of a data set or of other features"
+        )
+    return mean, std
+
+
+def published_evaluator(run: TextRun, path: Path, *, glove: Path) -> Evaluator:
+    """An evaluator with published weights; its statistics lie beside them.
+
+    Args:
+      run: Of HumanML3D's features, or KIT-ML's for its evaluator.
+      path: File of the weights (finest.tar or safetensors).
+      glove: Folder of its word vectors, for `load_glove`.
+
+    Raises:
+      OSError: if the weights are missing.
+      ValueError: if weights, statistics or word vectors do not fit; names them.
+    """
+    width = run.motions.num_features
+    config = text_motion_evaluator.MatcherConfig(num_features=width - _CONTACTS)
+    mean, std = read_statistics(path.parent, width)
+    vocabulary = load_glove(glove)
+    return Evaluator(
+        params=published.load_matcher(path, config=config),
+        config=config,
+        mean=mean,
+        std=std,
+        name=f"published weights {path.name}, {len(vocabulary)} words of GloVe",
+        vocabulary=vocabulary,
+    )
+
+
+def embed(
+    run: TextRun,
+    judge: Evaluator,
+    x: Float[Array, "batch frames features"],
+    frames: Int[Array, " batch"],
+    *,
+    padding: text_motion_evaluator.Padding = "zeros",
+) -> Float[Array, "batch embedding"]:
+    """Embeds motions, normalised anew as the evaluator expects.
+
+    Args:
+      run: The run.
+      judge: The evaluator.
+      x: Z-scored features of the run.
+      frames: Of each motion.
+      padding: What the evaluator sees beyond a motion's end: "zeros", as beyond that
+        of real motions, or "kept", what is there, as the release does with generated
+        motions.
+
+    Returns:
+      One row each.
+    """
+    # At once, and not by way of the raw features, which would lose digits.
+    wide = lambda v: np.asarray(v, np.float64)  # noqa: E731
+    scale = wide(run.motions.std) / judge.std
+    shift = (wide(run.motions.mean) - judge.mean) / judge.std
+    row = lambda v: jnp.asarray(v, jnp.float32)[None, None]  # noqa: E731
+    scored = (x * row(scale) + row(shift))[..., :-_CONTACTS]
+    return text_motion_evaluator.embed_motion(
+        judge.params, scored, frames, config=judge.config, padding=padding
+    )
+
+
+def make_scorer(
+    run: TextRun, judge: Evaluator, *, padding: text_motion_evaluator.Padding = "zeros"
+) -> Callable[[Key, Array, Array, Array, frechet.Moments], dict[str, Array]]:
+    """Scores of a set of motions, as one compiled program.
+
+    Args:
+      run: The run.
+      judge: The evaluator.
+      padding: As in `embed`.
+
+    Returns:
+      `score(key, x, frames, caption, reference) -> scores`: z-scored features, frames
+      and caption of each motion, and moments of the real motions' embeddings.
+    """
+    coded = sentences(run, judge.vocabulary)
+
+    @jax.jit
+    def score(
+        key: Key, x: Array, frames: Array, caption: Array, reference: frechet.Moments
+    ) -> dict[str, Array]:
+        row = coded.index[caption]
+        text = text_motion_evaluator.embed_text(
+            judge.params,
+            coded.vectors[row],
+            coded.tags[row],
+            coded.words[row],
+            config=judge.config,
+        )
+        motion = embed(run, judge, x, frames, padding=padding)
+        precision = matching.r_precision(text, motion)
+        return {
+            "R-precision 1": precision[0],
+            "R-precision 2": precision[1],
+            "R-precision 3": precision[2],
+            "FID": frechet.frechet_distance(frechet.moments(motion), reference),
+            "MM-Dist": matching.matching_distance(text, motion),
+            "diversity": diversity.diversity(key, motion, num_pairs=300),
+        }
+
+    return score

@@ -1,0 +1,1 @@
+"""SMGDiff: a soccer player and his ball, guided to touch each other."""

@@ -1,0 +1,349 @@
+"""SMGDiff's run-time: a player and a ball that are steered.
+
+One tick (1/30 s) of one player:
+
+1. If the command changed, or M frames of the plan have been played, plan anew:
+   a. the trajectory generator turns the wish (a target point and a skill) into a path;
+   b. the rest of the plan's own path, extended by HFTE, is blended into it;
+   c. the motion model makes 45 frames of body, ball and contacts for that path, with
+      contact guidance in some of its steps;
+   d. an inertialised seam: body and ball start where they are displayed.
+2. Display the next frame of the plan.
+
+The paper blends when the control changes; here at every plan, as CAMDM does, since a
+path that jumps at a regular plan would be no better.
+
+Source: SMGDiff, section 3; Chen et al. 2024 (CAMDM) for HFTE and the seam.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.control import inertia
+from jaxmotion.control.rollout import Controller
+from jaxmotion.motion import ground, skeleton, trajectory
+from jaxmotion.motion.ball import Scene
+from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.systems.smgdiff.guidance import Plan
+from jaxmotion.systems.smgdiff.model import Condition, Config
+from jaxmotion.systems.smgdiff.scene import Representation
+from jaxmotion.systems.smgdiff.trajectory import Generate, Wish
+from jaxmotion.typing import Key
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Control:
+    """Constants of the run-time.
+
+    Attributes:
+      apply: M, frames of a plan to play while the command stays (CAMDM's 15).
+      reuse: K of HFTE, points reflected at a time.
+      bias_position: Exponent of the blend of positions (CAMDM's).
+      bias_facing: Exponent of the blend of facings (CAMDM's).
+      seam: Duration of the inertialised seam, seconds; 0 for none.
+    """
+
+    apply: int = 15
+    reuse: int = 15
+    bias_position: float = 0.7
+    bias_facing: float = 2.2
+    seam: float = 0.2
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PlayerState:
+    """A player and a ball between two ticks; everything in the world.
+
+    Attributes:
+      past: The last displayed frames.
+      plan: The frames being played.
+      cursor: Next frame of the plan.
+      command: The last command; its label is -1 before the first.
+    """
+
+    past: Scene
+    plan: Scene
+    cursor: Int[Array, "*batch"]
+    command: trajectory.Command
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """What one tick displays.
+
+    Attributes:
+      root_position: Of the displayed pose, metres, world.
+      joint_rotation: Of the displayed pose, two columns.
+      ball: Centre of the displayed ball, metres, world.
+      touch: How sure the model is that each joint touches the ball, 0..1.
+      desired_velocity: What the user asks for now, metres a second.
+      desired_facing: Likewise, unit.
+      planned: Whether this tick made a new plan.
+    """
+
+    root_position: Float[Array, "*batch 3"]
+    joint_rotation: Float[Array, "*batch joints 6"]
+    ball: Float[Array, "*batch 3"]
+    touch: Float[Array, "*batch touching"]
+    desired_velocity: Float[Array, "*batch 2"]
+    desired_facing: Float[Array, "*batch 2"]
+    planned: Bool[Array, "*batch"]
+
+
+def init_state(bones: skeleton.Skeleton, past: Scene, *, config: Config) -> PlayerState:
+    """State of a player that has shown `past` and has no plan yet.
+
+    Args:
+      bones: The skeleton.
+      past: At least `config.past` displayed frames, world.
+      config: The method.
+
+    Returns:
+      The state; until the first plan it would go on with its mean velocity.
+
+    Raises:
+      ValueError: if there are fewer frames.
+    """
+    frames = past.ball.shape[-2]
+    if frames < config.past:
+        raise ValueError(f"past has {frames} frames, expected {config.past} or more")
+    past = jax.tree.map(lambda x: x[-config.past :], past)
+    root = past.motion.root_position
+    step = (root[-1] - root[0]) / (config.past - 1) * jnp.array([1.0, 0.0, 1.0])
+    ahead = jnp.arange(1, config.future + 1, dtype=root.dtype)[:, None] * step[None]
+    held = jax.tree.map(lambda x: jnp.repeat(x[-1:], config.future, axis=0), past)
+    motion = dataclasses.replace(
+        held.motion, root_position=held.motion.root_position + ahead
+    )
+    return PlayerState(
+        past=past,
+        plan=dataclasses.replace(held, motion=motion),
+        cursor=jnp.zeros((), jnp.int32),
+        command=trajectory.Command(
+            velocity=step[::2] * config.fps,
+            facing=trajectory.root_trajectory(bones, past.motion).facing[-1],
+            label=jnp.full((), -1, jnp.int32),
+        ),
+    )
+
+
+def urgency(
+    state: PlayerState, command: trajectory.Command, *, control: Control
+) -> Int[Array, ""]:
+    """Whether a tick needs a plan.
+
+    Args:
+      state: The player's state.
+      command: What the user wants now.
+      control: Constants.
+
+    Returns:
+      0 for none, 1 for a plan.
+    """
+    old = state.command
+    changed = jnp.any(jnp.abs(old.velocity - command.velocity) > 1e-3)
+    changed = changed | (old.label != command.label)
+    return (changed | (state.cursor >= control.apply)).astype(jnp.int32)
+
+
+__all__ = [
+    "Control",
+    "Frame",
+    "PlayerState",
+    "advance",
+    "controller",
+    "init_state",
+    "replan",
+    "urgency",
+    "wanted_trajectory",
+]
+
+
+def wanted_trajectory(
+    generate: Generate,
+    key: Key,
+    bones: skeleton.Skeleton,
+    state: PlayerState,
+    command: trajectory.Command,
+    *,
+    config: Config,
+    control: Control,
+) -> trajectory.Trajectory:
+    """Steps 1a and 1b: the generated path, blended with the plan's own.
+
+    Args:
+      generate: From `smgdiff_trajectory`.
+      key: Consumed.
+      bones: The skeleton.
+      state: The player's state.
+      command: What the user wants.
+      config: The method.
+      control: Constants.
+
+    Returns:
+      The path of the next `config.future` frames, in the frame of the plan.
+    """
+    frame = smgdiff_scene.plan_frame(bones, state.past.motion)
+    past = trajectory.root_trajectory(bones, state.past.motion)
+    wish = Wish(
+        past=trajectory.to_local(past, frame),
+        velocity=ground.into_frame(command.velocity, frame.facing),
+        label=command.label,
+    )
+    wanted = generate(key, wish)
+    own = trajectory.extend(
+        trajectory.root_trajectory(bones, state.plan.motion),
+        control.apply,
+        reuse=control.reuse,
+    )
+    ahead = jax.tree.map(
+        lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, config.future), own
+    )
+    return trajectory.blend(
+        trajectory.to_local(ahead, frame),
+        wanted,
+        bias_position=control.bias_position,
+        bias_facing=control.bias_facing,
+    )
+
+
+def replan(
+    generate: Generate,
+    sample: Plan,
+    key: Key,
+    state: PlayerState,
+    command: trajectory.Command,
+    *,
+    representation: Representation,
+    config: Config,
+    control: Control,
+) -> PlayerState:
+    """Step 1: a new plan.
+
+    Args:
+      generate: From `smgdiff_trajectory`.
+      sample: From `smgdiff_guidance.planner`.
+      key: Consumed.
+      state: The player's state.
+      command: What the user wants now.
+      representation: What features mean.
+      config: The method.
+      control: Constants.
+
+    Returns:
+      The state with the plan, none of it displayed yet.
+    """
+    key_path, key_motion = jax.random.split(key)
+    bones = representation.bones
+    wanted = wanted_trajectory(
+        generate, key_path, bones, state, command, config=config, control=control
+    )
+    frame = smgdiff_scene.plan_frame(bones, state.past.motion)
+    past = smgdiff_scene.to_frame(state.past, frame)
+    condition = Condition(
+        past=smgdiff_scene.to_features(past, representation),
+        trajectory=wanted,
+        label=command.label,
+        ball=past.ball[-1],
+    )
+    x = sample(key_motion, condition)
+    scene, _ = smgdiff_scene.to_scene(x, past.ball[-1], representation)
+    chunk = smgdiff_scene.from_frame(scene, frame)
+    if control.seam > 0:
+        chunk = _seam(state.past, chunk, duration=control.seam)
+    return dataclasses.replace(state, plan=chunk, cursor=jnp.zeros_like(state.cursor))
+
+
+def _seam(past: Scene, chunk: Scene, *, duration: float) -> Scene:
+    """A chunk that starts where body and ball are displayed."""
+    fps = chunk.motion.fps
+    shown = jax.tree.map(lambda x: x[-2:], past.motion)
+    motion = inertia.inertialize(shown, chunk.motion, duration=duration)
+    # The ball's offset alone: its velocity jumps at touches, which is no error.
+    step = chunk.ball[1] - chunk.ball[0]
+    offset = past.ball[-1] - (chunk.ball[0] - step)
+    times = jnp.arange(1, chunk.ball.shape[0] + 1, dtype=offset.dtype) / fps
+    fade = inertia.decay(offset, jnp.zeros_like(offset), times, duration=duration)
+    return dataclasses.replace(chunk, motion=motion, ball=chunk.ball + fade)
+
+
+def advance(
+    state: PlayerState, command: trajectory.Command
+) -> tuple[PlayerState, Frame]:
+    """Step 2: displays the next frame.
+
+    Args:
+      state: The player's state.
+      command: What the user wants now.
+
+    Returns:
+      The next state, and what is displayed.
+    """
+    shown = jax.tree.map(
+        lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
+    )
+    past = jax.tree.map(
+        lambda old, new: jnp.concatenate([old[1:], new]), state.past, shown
+    )
+    frame = Frame(
+        root_position=shown.motion.root_position[0],
+        joint_rotation=shown.motion.joint_rotation[0],
+        ball=shown.ball[0],
+        touch=shown.touch[0],
+        desired_velocity=command.velocity,
+        desired_facing=command.facing,
+        planned=state.cursor == 0,
+    )
+    return dataclasses.replace(
+        state, past=past, cursor=state.cursor + 1, command=command
+    ), frame
+
+
+def controller(
+    generate: Generate,
+    sample: Plan,
+    *,
+    representation: Representation,
+    config: Config,
+    control: Control | None = None,
+) -> Controller:
+    """The run-time of one player, for `rollout.tick` and `rollout.rollout`.
+
+    Args:
+      generate: Paths: `smgdiff_trajectory.generator`, or `straight`.
+      sample: Plans: `smgdiff_guidance.planner`.
+      representation: What features mean.
+      config: The method.
+      control: Constants; None for the defaults.
+
+    Returns:
+      A controller whose frames are `Frame`s.
+
+    Raises:
+      ValueError: if `control.apply` is not in 1..`config.future`.
+    """
+    control = Control() if control is None else control
+    if not 1 <= control.apply <= config.future:
+        raise ValueError(f"apply is {control.apply}, expected 1..{config.future}")
+    plan: Callable = lambda key, state, command: replan(  # noqa: E731
+        generate,
+        sample,
+        key,
+        state,
+        command,
+        representation=representation,
+        config=config,
+        control=control,
+    )
+    return Controller(
+        urgency=functools.partial(urgency, control=control),
+        plans=(plan,),
+        advance=advance,
+    )

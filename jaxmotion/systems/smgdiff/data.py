@@ -1,0 +1,167 @@
+"""Clips with a ball for SMGDiff: splits, and windows on the device."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.data import windows
+from jaxmotion.data.ball_clips import BallClips, cut_scene, take_ball_clips
+from jaxmotion.motion.ball import Scene
+from jaxmotion.systems.camdm.steering import style_speeds
+from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.typing import Key
+
+FIELD = "skill"
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class SceneArrays:
+    """Clips with a ball, and where windows of them may start.
+
+    Attributes:
+      data: The clips.
+      index: The windows.
+    """
+
+    data: BallClips
+    index: windows.WindowIndex
+
+
+def split(
+    data: BallClips, *, fraction: float, seed: int = 0
+) -> tuple[BallClips, BallClips]:
+    """Training and held-out clips; pieces of one recording stay together.
+
+    Recordings are grouped by their first piece's skill, so that every skill with two
+    recordings has one on either side.
+
+    Args:
+      data: The clips; what stands before "@" in a name is its recording.
+      fraction: Part of the recordings to hold out, in (0, 1).
+      seed: Of the choice.
+
+    Returns:
+      Both parts.
+
+    Raises:
+      ValueError: if the fraction is out of range, or a part would be empty.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise ValueError(f"fraction should be between 0 and 1, found {fraction}")
+    recordings = np.array([n.partition("@")[0] for n in data.clips.clip_names])
+    names, first = np.unique(recordings, return_index=True)
+    skills = np.asarray(data.clips.labels[FIELD])[first]
+    generator = np.random.default_rng(seed)
+    held: list[str] = []
+    for skill in np.unique(skills):
+        own = generator.permutation(names[skills == skill])
+        number = min(max(round(fraction * own.size), 1), own.size - 1)
+        held += own[:number].tolist()
+    is_held = np.isin(recordings, held)
+    if not is_held.any() or is_held.all():
+        raise ValueError("the clips come from one recording of each skill, expected 2")
+    return tuple(
+        take_ball_clips(data, np.flatnonzero(which)) for which in (~is_held, is_held)
+    )
+
+
+def scene_arrays(data: BallClips, length: int, *, stride: int = 1) -> SceneArrays:
+    """Lists the windows of clips; clips that are too short are left out.
+
+    Args:
+      data: The clips.
+      length: Frames of a window.
+      stride: Frames between the starts of windows of one clip.
+
+    Returns:
+      The clips with their windows.
+
+    Raises:
+      ValueError: if no clip is long enough.
+    """
+    index = windows.window_index(data.clips, length, stride=stride, short="skip")
+    return SceneArrays(data=data, index=index)
+
+
+def sample_scenes(
+    key: Key, arrays: SceneArrays, *, batch: int
+) -> tuple[Scene, Int[Array, "{batch}"]]:
+    """Draws windows, uniformly over all starts.
+
+    Args:
+      key: Consumed.
+      arrays: The clips.
+      batch: Windows to draw.
+
+    Returns:
+      Windows, world, and their skills.
+    """
+    index = arrays.index
+    chosen = jax.random.randint(key, (batch,), 0, index.starts.shape[0])
+    return all_scenes(arrays, chosen)
+
+
+@jax.jit
+def all_scenes(
+    arrays: SceneArrays, chosen: Int[Array, " windows"]
+) -> tuple[Scene, Int[Array, " windows"]]:
+    """Windows by number.
+
+    Args:
+      arrays: The clips.
+      chosen: Numbers of windows.
+
+    Returns:
+      Windows, world, and their skills.
+    """
+    index, data = arrays.index, arrays.data
+    cut = jax.vmap(lambda start: cut_scene(data, start, index.length))
+    labels = data.clips.labels[FIELD][index.clips[chosen]]
+    return cut(index.starts[chosen]), labels
+
+
+def fit_representation(
+    arrays: SceneArrays, *, past: int, windows_used: int = 2000
+) -> smgdiff_scene.Representation:
+    """Fits the features' mean and deviation to windows spread over the clips.
+
+    Args:
+      arrays: Training clips and windows of past and future frames.
+      past: Frames before the plan.
+      windows_used: Windows to look at, at most.
+
+    Returns:
+      The representation.
+    """
+    number = arrays.index.starts.shape[0]
+    chosen = np.unique(np.linspace(0, number - 1, windows_used).astype(int))
+    scenes, _ = all_scenes(arrays, jnp.asarray(chosen))
+    data, bones = arrays.data, arrays.data.clips.skeleton
+
+    @jax.jit
+    @jax.vmap
+    def local(scene: Scene) -> Scene:
+        frame = smgdiff_scene.plan_frame(
+            bones, jax.tree.map(lambda x: x[:past], scene.motion)
+        )
+        return smgdiff_scene.to_frame(scene, frame)
+
+    return smgdiff_scene.fit(
+        bones, local(scenes), joints=data.joints, radius=data.radius
+    )
+
+
+def skill_speeds(data: BallClips) -> Float[np.ndarray, " skills"]:
+    """Median speed of the root in each skill: the speed to command it at.
+
+    Args:
+      data: The clips.
+
+    Returns:
+      Metres a second; 0 for a skill without clips.
+    """
+    return np.asarray(style_speeds(data.clips, field=FIELD))

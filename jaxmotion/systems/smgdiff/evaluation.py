@@ -1,0 +1,504 @@
+"""Evaluation of SMGDiff: plans for held-out recordings, and steered players.
+
+Tables 1, 3 and 4 of the paper take the trajectories of the test set: a plan continues
+10 held-out frames along the path that was then walked (smoothed, as in training).
+Every row sees the same windows and noise. A replication is a random half of the windows
+with noise of its own; intervals run over replications.
+
+Source: SMGDiff, section 5.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.data.ball_clips import BallClips
+from jaxmotion.evaluation import ball, frechet, locomotion
+from jaxmotion.evaluators import frozen as evaluators
+from jaxmotion.evaluators import style as style_evaluator
+from jaxmotion.motion import ground, rotation, skeleton, trajectory
+from jaxmotion.motion.ball import Scene
+from jaxmotion.systems.camdm import loss as camdm_loss
+from jaxmotion.systems.smgdiff import data as smgdiff_data
+from jaxmotion.systems.smgdiff import loss as smgdiff_loss
+from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.systems.smgdiff.guidance import Plan
+from jaxmotion.systems.smgdiff.model import Condition, Model
+from jaxmotion.systems.smgdiff.scene import Representation
+from jaxmotion.typing import Key, Params
+
+_DEGREES = 180.0 / np.pi
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """Where a touch begins; the same for all rows of a table.
+
+    Attributes:
+      acceleration: A ball that accelerates more is being pushed, metres a second
+        squared. Half of the weakest push of the synthetic dribble.
+      distance: From a joint to the ball's centre up to which it pushes, metres: the
+        ball's radius, half a foot, and 2 cm.
+      foot_height: Below it a foot joint should not move, metres.
+    """
+
+    acceleration: float
+    distance: float
+    foot_height: float
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Judge:
+    """A trained recogniser, and what real windows look like to it.
+
+    Attributes:
+      params: Of the recogniser.
+      reference: Moments of its features over windows of training clips.
+      representation: Says what the skeleton and the ball are.
+      config: Size of the recogniser.
+    """
+
+    params: Params
+    reference: frechet.Moments
+    representation: Representation
+    config: style_evaluator.RecognizerConfig = jax.tree.static()
+
+
+def recognizer_input(
+    scene: Scene, representation: Representation
+) -> Float[Array, "*batch frames channels"]:
+    """Joints and ball relative to the root, turned to face +z, in each frame.
+
+    Args:
+      scene: Frames.
+      representation: Of their skeleton.
+
+    Returns:
+      Metres; three channels a joint, and three of the ball, no longer than the reach.
+    """
+    bones = representation.bones
+    joints = style_evaluator.recognizer_input(bones, scene.motion)
+    facing = trajectory.root_trajectory(bones, scene.motion).facing
+    away = scene.ball - scene.motion.root_position
+    away = away.at[..., ::2].set(ground.into_frame(away[..., ::2], facing))
+    length = jnp.linalg.norm(away, axis=-1, keepdims=True)
+    away = away * jnp.minimum(1.0, representation.reach / jnp.maximum(length, 1e-6))
+    return jnp.concatenate([joints, away], axis=-1)
+
+
+def make_judge(
+    key: Key,
+    scenes: Scene,
+    labels: Int[Array, " windows"],
+    *,
+    representation: Representation,
+    num_labels: int,
+    num_steps: int,
+    frozen: Params | None = None,
+) -> Judge:
+    """Trains the recogniser of skills on real windows.
+
+    Args:
+      key: Consumed.
+      scenes: Windows of training clips, as long as those that are to be judged.
+      labels: Their skills.
+      representation: Of their skeleton.
+      num_labels: Skills.
+      num_steps: Updates.
+      frozen: Parameters of a recogniser that was trained before; None to train one.
+
+    Returns:
+      The judge; the same windows are its reference.
+    """
+    config = style_evaluator.RecognizerConfig(
+        num_classes=num_labels,
+        num_joints=representation.bones.num_joints + 1,
+        frames=scenes.ball.shape[-2],
+    )
+    x = jax.jit(recognizer_input)(scenes, representation)
+    params = frozen
+    if params is None:
+        params, _ = style_evaluator.train_recognizer(
+            key, x, labels, config=config, num_steps=num_steps
+        )
+    features, _ = jax.jit(functools.partial(style_evaluator.recognize, config=config))(
+        params, x
+    )
+    return Judge(
+        params=params,
+        reference=frechet.moments(features),
+        representation=representation,
+        config=config,
+    )
+
+
+Score = Callable[..., dict[str, Float[Array, ""]]]
+
+
+def scorer(judge: Judge, limits: Thresholds) -> Score:
+    """Scores of a set of windows, as one compiled program.
+
+    Args:
+      judge: From `make_judge`.
+      limits: Where a touch begins.
+
+    Returns:
+      `score(scenes, wanted, labels) -> scores`: wanted is a path (world or frame of the
+      plan, as the scenes), labels the skills.
+    """
+    representation = judge.representation
+    bones = representation.bones
+
+    @jax.jit
+    def score(
+        scenes: Scene, wanted: trajectory.Trajectory, labels: Int[Array, " windows"]
+    ) -> dict[str, Array]:
+        x = recognizer_input(scenes, representation)
+        features, logits = style_evaluator.recognize(
+            judge.params, x, config=judge.config
+        )
+        moments = frechet.moments(features)
+        velocity = jnp.gradient(wanted.position, axis=-2) * representation.fps
+        body = locomotion.locomotion_metrics(
+            bones,
+            scenes.motion,
+            velocity,
+            wanted.facing,
+            contact_height=limits.foot_height,
+        )
+        return {
+            "FID": frechet.frechet_distance(moments, judge.reference),
+            "foot slide m/s": _weighted(body["slide_speed"], body["slide_seconds"]),
+            "skate ratio": jnp.mean(body["skate_ratio"]),
+            "acceleration m/s2": jnp.mean(body["acceleration"]),
+            "jerk m/s3": jnp.mean(body["jerk"]),
+            "trajectory error deg": _DEGREES
+            * _weighted(body["trajectory_error"], body["trajectory_used"]),
+            "orientation error deg": _DEGREES * jnp.mean(body["orientation_error"]),
+            "skill accuracy": jnp.mean(jnp.argmax(logits, axis=-1) == labels),
+        } | contact_scores(scenes, representation, limits)
+
+    return score
+
+
+def _weighted(values: Array, weights: Array) -> Array:
+    # A window without weight has no value (0 of 0).
+    used = jnp.where(weights > 0, values, 0.0)
+    return jnp.sum(used * weights) / jnp.maximum(jnp.sum(weights), 1e-9)
+
+
+def contact_scores(
+    scenes: Scene, representation: Representation, limits: Thresholds
+) -> dict[str, Float[Array, ""]]:
+    """How well foot and ball go together.
+
+    Args:
+      scenes: Windows.
+      representation: Of their skeleton.
+      limits: Where a touch begins.
+
+    Returns:
+      Touches and missed ones a minute, missed part of the touches, distance at touches,
+      penetration of the ground and of the ball, acceleration without a touch.
+    """
+    bones, fps = representation.bones, representation.fps
+    joints = jnp.array(representation.joints)
+    places = skeleton.joint_positions(bones, scenes.motion)[..., joints, :]
+    at = dict(threshold=limits.acceleration)
+    count = ball.touch_count(
+        scenes.ball, places, fps, max_distance=limits.distance, **at
+    )
+    near = ball.foot_ball_distance(scenes.ball, places, fps, **at)
+    free = ball.untouched_acceleration(
+        scenes.ball, places, fps, max_distance=limits.distance
+    )
+    minutes, touches = jnp.sum(count.minutes), jnp.sum(count.touches)
+    sunk = ball.ground_penetration(scenes.ball, radius=representation.radius)
+    inside = ball.joint_penetration(scenes.ball, places, radius=representation.radius)
+    ratio = lambda a, b: jnp.sum(a) / jnp.maximum(jnp.sum(b), 1.0)  # noqa: E731
+    return {
+        "touches /min": touches / minutes,
+        "missed /min": jnp.sum(count.missed) / minutes,
+        "missed part": ratio(count.missed, count.touches),
+        "touch distance cm": 100.0 * ratio(near.total, near.count),
+        "ball in ground mm": jnp.mean(sunk.mean),
+        "foot in ball mm": jnp.mean(inside.mean),
+        "free acceleration m/s2": ratio(free.total, free.count),
+    }
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Situations:
+    """Moments of recordings: what is known, and what then happened.
+
+    Attributes:
+      condition: Of the plans.
+      future: What then happened, in the frame of the plan.
+      past: The frames before, likewise.
+      label: Skill.
+    """
+
+    condition: Condition
+    future: Scene
+    past: Scene
+    label: Int[Array, "*batch"]
+
+
+def situations(data: BallClips, model: Model, *, number: int, seed: int) -> Situations:
+    """Moments spread at random over clips.
+
+    Args:
+      data: The clips.
+      model: The model; windows have its lengths.
+      number: How many, at most.
+      seed: Of the choice.
+
+    Returns:
+      The moments.
+
+    Raises:
+      ValueError: if no clip is long enough, or there are fewer than 4 moments.
+    """
+    config = model.config
+    arrays = smgdiff_data.scene_arrays(data, config.window, stride=config.past)
+    total = arrays.index.starts.shape[0]
+    if min(total, number) < 4:
+        raise ValueError(f"{total} windows of {config.window} frames, expected 4")
+    order = np.random.default_rng(seed).permutation(total)[:number]
+    scenes, labels = smgdiff_data.all_scenes(arrays, jnp.asarray(order))
+    return _situations(scenes, labels, model.representation, config)
+
+
+@functools.partial(jax.jit, static_argnames=("config",))
+def _situations(scenes: Scene, labels: Array, representation, config) -> Situations:
+    matrix = camdm_loss.smoothing_matrices(config.window, (10.0,))[0]
+    last, bones = config.past - 1, representation.bones
+
+    @jax.vmap
+    def one(scene: Scene, label: Array) -> Situations:
+        course = trajectory.root_trajectory(bones, scene.motion)
+        path = locomotion.smooth(course.position, matrix)
+        path = path + (course.position[last] - path[last])[None]
+        facing = locomotion.smooth(course.facing, matrix)
+        facing = rotation.safe_normalize(facing, jnp.array([0.0, 1.0]))
+        wanted = trajectory.Trajectory(position=path, facing=facing)
+        condition, _ = smgdiff_loss.situation(
+            scene, wanted, label, representation=representation, config=config
+        )
+        past = jax.tree.map(lambda x: x[: config.past], scene.motion)
+        frame = smgdiff_scene.plan_frame(bones, past)
+        local = smgdiff_scene.to_frame(scene, frame)
+        return Situations(
+            condition=condition,
+            future=jax.tree.map(lambda x: x[config.past :], local),
+            past=jax.tree.map(lambda x: x[: config.past], local),
+            label=label,
+        )
+
+    return one(scenes, labels)
+
+
+def plan_many(
+    plan: Plan, model: Model, *, chunk: int
+) -> Callable[[Key, Condition], Scene]:
+    """Plans for many conditions, as one compiled program.
+
+    Args:
+      plan: From `smgdiff_guidance.planner`.
+      model: Says what features mean.
+      chunk: Plans at a time.
+
+    Returns:
+      `run(key, conditions) -> scenes` in the frames of the plans; condition i draws
+      from `fold_in(key, i)`.
+    """
+
+    @jax.jit
+    def run(key: Key, conditions: Condition) -> Scene:
+        number = conditions.label.shape[0]
+
+        def one(i: Array) -> Scene:
+            condition = jax.tree.map(lambda x: x[i], conditions)
+            x = plan(jax.random.fold_in(key, i), condition)
+            scene, _ = smgdiff_scene.to_scene(x, condition.ball, model.representation)
+            return scene
+
+        return jax.lax.map(one, jnp.arange(number), batch_size=chunk)
+
+    return run
+
+
+def limits(data: BallClips, model: Model) -> Thresholds:
+    """Thresholds of the figures, from real clips.
+
+    Args:
+      data: Training clips.
+      model: The model.
+
+    Returns:
+      Feet: where toes rest (their first percentile) and one centimetre more. Touches:
+      the ball's radius and 7 cm (half a foot, and 2 cm); and an acceleration of 12
+      metres a second squared, a change of 0.4 m/s within a frame of 1/30 s.
+    """
+    feet = jnp.array(model.representation.bones.feet)
+    motion = skeleton.Motion(
+        root_position=data.clips.root_position[::10],
+        joint_rotation=data.clips.joint_rotation[::10],
+        fps=data.clips.fps,
+    )
+    places = jax.jit(skeleton.joint_positions)(data.clips.skeleton, motion)
+    heights = np.asarray(places[:, feet, 1])
+    return Thresholds(
+        acceleration=12.0,
+        distance=data.radius + 0.07,
+        foot_height=float(np.percentile(heights, 1)) + 0.01,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Setting:
+    """What all rows of a table share.
+
+    Attributes:
+      judge: The recogniser.
+      score: From `smgdiff_scores.scorer`.
+      known: Held-out moments.
+      replications: Sets of windows and noise.
+      seed: Of both.
+    """
+
+    judge: Judge
+    score: Score
+    known: Situations
+    replications: int
+    seed: int
+
+    @property
+    def halves(self) -> list[Int[np.ndarray, " half"]]:
+        """Windows of each replication."""
+        number = self.known.label.shape[0]
+        generator = np.random.default_rng(self.seed)
+        return [
+            generator.permutation(number)[: number // 2]
+            for _ in range(self.replications)
+        ]
+
+
+def make_setting(
+    train: BallClips,
+    held_out: BallClips,
+    model: Model,
+    *,
+    number: int,
+    replications: int,
+    recognizer_steps: int,
+    seed: int,
+    evaluator: evaluators.Evaluator | None = None,
+) -> Setting:
+    """Trains the judge and draws the windows.
+
+    Args:
+      train: Training clips.
+      held_out: Held-out clips.
+      model: The model.
+      number: Windows of either part, at most.
+      replications: Sets of half of the held-out windows.
+      recognizer_steps: Updates of the recogniser.
+      seed: Of everything random.
+      evaluator: A frozen recogniser; None to train one.
+
+    Returns:
+      The setting.
+
+    Raises:
+      ValueError: if clips are too short or few, or the evaluator does not fit.
+    """
+    frozen = evaluators.params_for(
+        evaluator,
+        kind="ball",
+        labels=model.labels,
+        joints=model.representation.bones.names,
+        fps=model.config.fps,
+        frames=model.config.future,
+    )
+    reference = situations(train, model, number=2 * number, seed=seed)
+    judge = make_judge(
+        jax.random.key(seed),
+        reference.future,
+        reference.label,
+        representation=model.representation,
+        num_labels=len(model.labels),
+        num_steps=recognizer_steps,
+        frozen=frozen,
+    )
+    return Setting(
+        judge=judge,
+        score=scorer(judge, limits(train, model)),
+        known=situations(held_out, model, number=number, seed=seed + 1),
+        replications=replications,
+        seed=seed,
+    )
+
+
+def score_scenes(
+    setting: Setting, scenes_of: Callable[[int, Array], Scene]
+) -> list[dict[str, Float[Array, ""]]]:
+    """Scores of each replication.
+
+    Args:
+      setting: Of the table.
+      scenes_of: `(replication, windows) -> scenes` of those held-out windows.
+
+    Returns:
+      One dictionary a replication.
+    """
+    found = []
+    for number, half in enumerate(setting.halves):
+        chosen = jnp.asarray(half)
+        known = jax.tree.map(lambda x: x[chosen], setting.known)  # noqa: B023
+        wanted = known.condition.trajectory
+        found.append(setting.score(scenes_of(number, chosen), wanted, known.label))
+    return found
+
+
+def score_real(setting: Setting) -> list[dict[str, Float[Array, ""]]]:
+    """Scores of what really happened.
+
+    Args:
+      setting: Of the table.
+
+    Returns:
+      One dictionary a replication.
+    """
+    future = setting.known.future
+    return score_scenes(
+        setting, lambda _, chosen: jax.tree.map(lambda x: x[chosen], future)
+    )
+
+
+def score_plans(
+    setting: Setting, run: Callable[[Key, Condition], Scene]
+) -> list[dict[str, Float[Array, ""]]]:
+    """Scores of plans.
+
+    Args:
+      setting: Of the table.
+      run: From `plan_many`.
+
+    Returns:
+      One dictionary a replication.
+    """
+    key = jax.random.key(setting.seed + 2)
+
+    def scenes_of(number: int, chosen: Array) -> Scene:
+        conditions = jax.tree.map(lambda x: x[chosen], setting.known.condition)
+        return run(jax.random.fold_in(key, number), conditions)
+
+    return score_scenes(setting, scenes_of)

@@ -1,0 +1,195 @@
+"""SMGDiff's training: examples from windows of a person and a ball, and the losses.
+
+Source: SMGDiff, section 3.2, eq. 4-9; what it leaves open is as in CAMDM.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.diffusion import schedule
+from jaxmotion.learning import losses
+from jaxmotion.motion import ball, features, skeleton, trajectory
+from jaxmotion.motion.ball import Scene
+from jaxmotion.systems.camdm.loss import smooth_course
+from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.systems.smgdiff.model import Condition, Config, network
+from jaxmotion.systems.smgdiff.scene import Representation
+from jaxmotion.typing import Key, Params
+
+# Control weight from which on the ball is near: 1.6 m away at a reach of 2 m.
+NEAR = 0.2
+
+
+def situation(
+    window: Scene,
+    course: trajectory.Trajectory,
+    label: Int[Array, ""],
+    *,
+    representation: Representation,
+    config: Config,
+) -> tuple[Condition, Float[Array, "future features"]]:
+    """What a plan is made for at a moment of a recording, and what then happened.
+
+    Args:
+      window: Past and future frames, world.
+      course: Path that is wanted in each of them, world.
+      label: Skill.
+      representation: What features mean.
+      config: The method.
+
+    Returns:
+      The condition, and the features of the future.
+    """
+    last = config.past - 1
+    past = jax.tree.map(lambda x: x[: config.past], window)
+    frame = smgdiff_scene.plan_frame(representation.bones, past.motion)
+    wanted = trajectory.to_local(course, frame)
+    local = smgdiff_scene.to_frame(window, frame)
+    past = jax.tree.map(lambda x: x[: config.past], local)
+    condition = Condition(
+        past=smgdiff_scene.to_features(past, representation),
+        trajectory=jax.tree.map(lambda x: x[config.past :], wanted),
+        label=label,
+        ball=local.ball[last],
+    )
+    return condition, smgdiff_scene.to_features(local, representation)[config.past :]
+
+
+def example(
+    key: Key,
+    window: Scene,
+    label: Int[Array, ""],
+    *,
+    representation: Representation,
+    config: Config,
+) -> tuple[Condition, Float[Array, "future features"]]:
+    """One training example from one window: its path as a user might have asked for it.
+
+    Args:
+      key: Consumed.
+      window: Past and future frames, world.
+      label: Skill.
+      representation: What features mean.
+      config: The method.
+
+    Returns:
+      The condition, and the features of the future.
+    """
+    course = trajectory.root_trajectory(representation.bones, window.motion)
+    wanted = smooth_course(key, course, last=config.past - 1)
+    return situation(
+        window, wanted, label, representation=representation, config=config
+    )
+
+
+def loss(
+    params: Params,
+    key: Key,
+    batch: tuple[Scene, Int[Array, " batch"]],
+    *,
+    representation: Representation,
+    config: Config,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """The training loss of a batch of windows.
+
+    Args:
+      params: The network's parameters.
+      key: Consumed.
+      batch: Windows of `config.window` frames, and their skills.
+      representation: What features mean.
+      config: The method.
+
+    Returns:
+      The weighted sum, and its terms by name, unweighted.
+
+    Source: SMGDiff, eq. 4-9.
+    """
+    windows, labels = batch
+    size = labels.shape[0]
+    key_example, key_t, key_noise, key_drop = jax.random.split(key, 4)
+    keys = jax.random.split(key_example, size)
+    condition, x_0 = jax.vmap(
+        lambda k, w, c: example(k, w, c, representation=representation, config=config)
+    )(keys, windows, labels)
+    table = schedule.cosine_schedule(config.num_steps)
+    t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
+    noise = jax.random.normal(key_noise, x_0.shape)
+    x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
+    prediction = network(config).apply(
+        {"params": params},
+        x_t,
+        t,
+        *condition.arguments(),
+        train=config.dropout > 0,
+        rngs={"dropout": key_drop},
+    )
+    terms = loss_terms(prediction, x_0, representation=representation)
+    weights = {
+        "data": config.weight_data,
+        "velocity": config.weight_velocity,
+        "position": config.weight_position,
+        "position_velocity": config.weight_position_velocity,
+        "foot": config.weight_foot,
+        "ball": config.weight_ball,
+        "ball_acceleration": config.weight_ball_acceleration,
+    }
+    return sum(weights[name] * value for name, value in terms.items()), terms
+
+
+def loss_terms(
+    prediction: Float[Array, "*batch frames features"],
+    target: Float[Array, "*batch frames features"],
+    *,
+    representation: Representation,
+) -> dict[str, Float[Array, ""]]:
+    """The losses: data, velocity, position, position_velocity, foot, and of the ball.
+
+    A foot stands where the data say so. The ball's place is a quotient whose error
+    grows without bound at the reach: it counts while the ball is nearer than that.
+
+    Args:
+      prediction: Predicted features.
+      target: True features.
+      representation: What features mean.
+
+    Returns:
+      Each unweighted mean.
+
+    Source: SMGDiff, eq. 6-9; position_velocity from CAMDM; those of the ball are ours.
+    """
+    every = jnp.ones(target.shape[:-1], bool)
+    bones = representation.bones
+
+    predicted, wanted = (
+        skeleton.joint_positions(bones, smgdiff_scene.to_motion(x, representation))
+        for x in (prediction, target)
+    )
+    names = smgdiff_scene.feature_layout(bones, representation.joints)
+    guess, truth = (
+        features.unpack(names, features.denormalize(representation.normalizer, x))
+        for x in (prediction, target)
+    )
+    stands = truth["ground"] > 0.5
+    is_near = truth["ball"][..., -1] >= NEAR
+    ball_error = _ball_place(guess) - _ball_place(truth)
+    none = jnp.zeros_like(ball_error)
+    flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
+    feet = jnp.array(bones.feet)
+    return {
+        "data": losses.masked_mse(prediction, target, every),
+        "velocity": losses.velocity_loss(prediction, target, every),
+        "position": losses.masked_mse(flat(predicted), flat(wanted), every),
+        "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
+        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands, every),
+        "ball": losses.masked_mse(ball_error, none, is_near),
+        "ball_acceleration": losses.velocity_loss(
+            losses.displacement(ball_error),
+            none[..., 1:, :],
+            is_near[..., 1:] & is_near[..., :-1],
+        ),
+    }
+
+
+def _ball_place(parts: dict[str, Array]) -> Float[Array, "*batch frames 3"]:
+    return ball.place_ball(parts["ball"], parts["root"], least_weight=NEAR)

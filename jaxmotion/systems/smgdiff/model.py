@@ -1,0 +1,321 @@
+"""SMGDiff: a transformer diffusion model of a person and a ball.
+
+A sample is the next 45 frames of body, ball and contacts (`smgdiff_scene`), seen from
+the last displayed pose; the condition is the last 10 frames, a ground path with
+facings, and a skill. The network is CAMDM's. Eight steps of the cosine schedule; in
+some of them, by default the last two, contact guidance pulls foot and ball together:
+
+    x = reverse_chain(ancestral_step(schedule, net), key, x_8, start=8, stop=2)
+    x = reverse_chain(dsg_step(schedule, net, contact_objective), key, x, start=2)
+
+Source: SMGDiff, section 3; sizes, which its missing supplement has, are CAMDM's.
+"""
+
+import dataclasses
+import functools
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.learning import runs
+from jaxmotion.motion import rotation
+from jaxmotion.motion.features import Normalizer
+from jaxmotion.motion.trajectory import Trajectory
+from jaxmotion.networks import transformer
+from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
+from jaxmotion.systems.smgdiff.scene import Representation, feature_layout
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Architecture and method; the defaults are the paper's where it has them.
+
+    Attributes:
+      num_features: Channels of a frame, from `feature_layout`.
+      num_labels: Skills.
+      past: Past frames of the condition.
+      future: Frames of a sample.
+      fps: Frames a second.
+      num_steps: T of the cosine schedule.
+      width: Channels of a token (CAMDM's).
+      depth: Layers.
+      heads: Attention heads.
+      hidden: Channels of the feed-forward layers.
+      dropout: Rate.
+      frames_per_token: Frames of one token; ours, 1 in CAMDM.
+      token_margin: Frames beyond its own, on either side, that an output token predicts
+        and shares with its neighbors; ours, 0 in the paper.
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
+      norm: Layer norms behind each sum ("post") or before each branch ("pre", ours).
+      weight_data: Weight of the mean squared error of features.
+      weight_velocity: Of the displacements of features.
+      weight_position: Of the joint positions.
+      weight_position_velocity: Of the displacements of joint positions (CAMDM's; not
+        in the paper).
+      weight_foot: Of feet that slide while they stand.
+      weight_ball: Of the ball's place while it is near (not in the paper).
+      weight_ball_acceleration: Of the second differences of its place, by which contact
+        guidance tells touches (not in the paper).
+    """
+
+    num_features: int
+    num_labels: int
+    past: int = 10
+    future: int = 45
+    fps: float = 30.0
+    num_steps: int = 8
+    width: int = 256
+    depth: int = 4
+    heads: int = 4
+    hidden: int = 1024
+    dropout: float = 0.1
+    frames_per_token: int = 1
+    token_margin: int = 0
+    token_window: Literal["hann", "trapezoid"] = "hann"
+    norm: Literal["post", "pre"] = "post"
+    weight_data: float = 1.0
+    weight_velocity: float = 1.0
+    weight_position: float = 1.0
+    weight_position_velocity: float = 0.0
+    weight_foot: float = 1.0
+    weight_ball: float = 0.0
+    weight_ball_acceleration: float = 0.0
+
+    @property
+    def window(self) -> int:
+        """Frames of a training window."""
+        return self.past + self.future
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Condition:
+    """What a plan is made for, in the frame of the plan.
+
+    Attributes:
+      past: Features of the last displayed frames.
+      trajectory: Ground path and facings wanted for the future.
+      label: Skill.
+      ball: Where the ball was displayed last, metres.
+    """
+
+    past: Float[Array, "*batch past features"]
+    trajectory: Trajectory
+    label: Int[Array, "*batch"]
+    ball: Float[Array, "*batch 3"]
+
+    def arguments(self) -> tuple[Array, ...]:
+        """The network's arguments behind x_t and t.
+
+        Returns:
+          past, path, facing (6D), label, and that the past is kept.
+        """
+        facing = rotation.rot6d_from_matrix(
+            rotation.matrix_from_facing(self.trajectory.facing)
+        )
+        keep = jnp.ones(self.label.shape, bool)
+        return self.past, self.trajectory.position, facing, self.label, keep
+
+
+def network(config: Config) -> transformer.CamdmTransformer:
+    """The denoiser's Flax module: CAMDM's.
+
+    Args:
+      config: Its sizes.
+
+    Returns:
+      A module with methods `encode`, `denoise` and their composition.
+    """
+    names = {field.name for field in dataclasses.fields(transformer.CamdmTransformer)}
+    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
+    return transformer.CamdmTransformer(features=config.num_features, **sizes)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init(key: Key, config: Config) -> Params:
+    """Initial parameters.
+
+    Args:
+      key: Consumed.
+      config: The architecture.
+
+    Returns:
+      Parameters of `network(config)`.
+    """
+    line = Trajectory(
+        position=jnp.zeros((config.future, 2)), facing=jnp.ones((config.future, 2))
+    )
+    condition = Condition(
+        past=jnp.zeros((config.past, config.num_features)),
+        trajectory=line,
+        label=jnp.zeros((), jnp.int32),
+        ball=jnp.zeros(3),
+    )
+    x_t = jnp.zeros((config.future, config.num_features))
+    t = jnp.ones((), jnp.int32)
+    return network(config).init(key, x_t, t, *condition.arguments())["params"]
+
+
+SYSTEM = "smgdiff"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Model:
+    """Everything but the parameters.
+
+    Attributes:
+      config: Of the motion model.
+      paths: Of the trajectory generator.
+      representation: What features mean.
+      labels: Names of the skills.
+      speeds: Median speed of the root in each skill, metres a second.
+      source: The data, and its licence.
+    """
+
+    config: Config
+    paths: smgdiff_trajectory.Config
+    representation: Representation
+    labels: tuple[str, ...]
+    speeds: tuple[float, ...]
+    source: str
+
+    def label(self, name: str) -> int:
+        """Number of a skill.
+
+        Args:
+          name: Its name.
+
+        Returns:
+          The number.
+
+        Raises:
+          ValueError: if the model has no such skill; names those it has.
+        """
+        if name not in self.labels:
+            raise ValueError(
+                f"unknown skill {name!r}: the model has {', '.join(self.labels)}"
+            )
+        return self.labels.index(name)
+
+
+def to_json(model: Model) -> dict[str, Any]:
+    """JSON of a model.
+
+    Args:
+      model: The model.
+
+    Returns:
+      A JSON object.
+    """
+    features = model.representation
+    numbers = lambda x: np.asarray(x, np.float64).tolist()  # noqa: E731
+    return {
+        "system": SYSTEM,
+        "config": dataclasses.asdict(model.config),
+        "paths": dataclasses.asdict(model.paths),
+        "representation": {
+            "skeleton": runs.skeleton_to_json(features.bones),
+            "mean": numbers(features.normalizer.mean),
+            "std": numbers(features.normalizer.std),
+            "joints": list(features.joints),
+            "fps": features.fps,
+            "radius": features.radius,
+            "reach": features.reach,
+            "contact_speed": features.contact_speed,
+        },
+        "labels": list(model.labels),
+        "speeds": list(model.speeds),
+        "source": model.source,
+    }
+
+
+def _numbers(name: str, value: Any, *, least: float) -> list[int | float]:
+    """A list of finite numbers; raises if it is none."""
+    if not isinstance(value, list):
+        raise ValueError(f"{name} is {value!r:.60}, expected a list of numbers")
+    for x in value:
+        right = isinstance(x, int | float) and not isinstance(x, bool)
+        if not (right and least <= x <= 1e6):
+            raise ValueError(f"{name} has {x!r:.60}, expected {least:g} to 1e+06")
+    return value
+
+
+def _representation(value: Any) -> Representation:
+    if not isinstance(value, dict):
+        raise ValueError(f"a JSON {type(value).__name__}, expected an object")
+    bones = runs.skeleton_from_json(value["skeleton"])
+    joints = value["joints"]
+    right = isinstance(joints, list) and all(type(x) is int for x in joints)
+    if not right or not all(0 <= x < bones.num_joints for x in joints):
+        raise ValueError(
+            f"joints is {joints!r:.60}, expected numbers below {bones.num_joints}"
+        )
+    size = feature_layout(bones, tuple(joints)).size
+    # A feature that never varies has a tiny deviation, but not none.
+    for name, least in (("mean", -1e6), ("std", 1e-12)):
+        if len(_numbers(name, value[name], least=least)) != size:
+            raise ValueError(f"{name} has {len(value[name])} numbers, expected {size}")
+    scalars = ("fps", "radius", "reach", "contact_speed")
+    for name in scalars:
+        _numbers(name, [value[name]], least=1e-6)
+    return Representation(
+        bones=bones,
+        normalizer=Normalizer(
+            mean=jnp.asarray(value["mean"], jnp.float32),
+            std=jnp.asarray(value["std"], jnp.float32),
+        ),
+        joints=tuple(joints),
+        **{name: float(value[name]) for name in scalars},
+    )
+
+
+def from_json(value: dict[str, Any], *, where: str) -> Model:
+    """Inverse of `to_json`.
+
+    Args:
+      value: The JSON object.
+      where: The file, for error messages.
+
+    Returns:
+      The model.
+
+    Raises:
+      ValueError: names the file and the field that is missing or wrong.
+    """
+    if value.get("system") != SYSTEM:
+        raise ValueError(
+            f"{where}: field 'system' is {value.get('system')!r}, expected {SYSTEM!r}"
+        )
+    parts = {
+        "config": lambda x: runs.config_from_json(Config, x),
+        "paths": lambda x: runs.config_from_json(smgdiff_trajectory.Config, x),
+        "representation": _representation,
+        "labels": runs.names_from_json,
+        "speeds": lambda x: tuple(_numbers("speed", x, least=0.0)),
+        "source": lambda x: runs.names_from_json([x])[0],
+    }
+    made = {}
+    for field, make in parts.items():
+        if field not in value:
+            raise ValueError(f"{where}: field {field!r} is missing")
+        try:
+            made[field] = make(value[field])
+        except KeyError as error:
+            raise ValueError(f"{where}: field {field!r}: {error} is missing") from error
+        except (TypeError, ValueError, IndexError) as error:
+            raise ValueError(f"{where}: field {field!r}: {error}") from error
+    model = Model(**made)
+    labels, size = len(model.labels), model.representation.normalizer.mean.size
+    for name, found, expected in (
+        ("config.num_features", model.config.num_features, size),
+        ("config.num_labels", model.config.num_labels, labels),
+        ("paths.num_labels", model.paths.num_labels, labels),
+        ("speeds", len(model.speeds), labels),
+    ):
+        if found != expected:
+            raise ValueError(f"{where}: field {name!r} is {found}, expected {expected}")
+    return model

@@ -1,0 +1,232 @@
+"""Steered players for SMGDiff's second table, and how much paths owe to their noise.
+
+Players start with held-out frames and keep one command: the mean velocity and the skill
+of what was then recorded. Several players share a start and a command, so that their
+spread is what the method adds.
+
+Source: SMGDiff, section 5.2 and table 2.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxmotion.control import rollout
+from jaxmotion.evaluation import diversity
+from jaxmotion.motion import ground, skeleton, trajectory
+from jaxmotion.motion.ball import Scene
+from jaxmotion.systems.smgdiff import controller as smgdiff_controller
+from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
+from jaxmotion.systems.smgdiff.evaluation import Setting, Situations
+from jaxmotion.systems.smgdiff.guidance import Plan
+from jaxmotion.systems.smgdiff.model import Model
+from jaxmotion.systems.smgdiff.trajectory import Generate, Wish
+from jaxmotion.typing import Key
+
+Play = Callable[[Key, Situations], Scene]
+
+
+def wishes(known: Situations, model: Model) -> Wish:
+    """What users would have asked for: the mean velocity of what was recorded.
+
+    Args:
+      known: Moments of recordings.
+      model: The model.
+
+    Returns:
+      Wishes in the frames of the plans.
+    """
+    bones, config = model.representation.bones, model.config
+
+    def one(known: Situations) -> Wish:
+        end = known.future.motion.root_position[-1, ::2]
+        return Wish(
+            past=trajectory.root_trajectory(bones, known.past.motion),
+            velocity=end * config.fps / config.future,
+            label=known.label,
+        )
+
+    return jax.vmap(one)(known)
+
+
+def player(
+    generate: Generate,
+    plan: Plan,
+    model: Model,
+    *,
+    ticks: int,
+    repeats: int,
+    chunk: int,
+    control: smgdiff_controller.Control | None = None,
+) -> Play:
+    """Rollouts of players that keep their first command, as one compiled program.
+
+    Args:
+      generate: Paths.
+      plan: Plans.
+      model: The model.
+      ticks: Frames of a rollout.
+      repeats: Players of each start.
+      chunk: Players at a time, at most (the largest number that divides theirs).
+      control: Constants of the run-time; None for the defaults.
+
+    Returns:
+      `play(key, known) -> scenes` [players, ticks, ...]; those of one start are
+      neighbours.
+    """
+    driver = smgdiff_controller.controller(
+        generate,
+        plan,
+        representation=model.representation,
+        config=model.config,
+        control=control,
+    )
+    bones = model.representation.bones
+
+    @jax.jit
+    def play(key: Key, known: Situations) -> Scene:
+        known = jax.tree.map(lambda x: jnp.repeat(x, repeats, axis=0), known)
+        wish = wishes(known, model)
+        states = jax.vmap(
+            lambda past: smgdiff_controller.init_state(bones, past, config=model.config)
+        )(known.past)
+        every = lambda x: jnp.repeat(x[:, None], ticks, axis=1)  # noqa: E731
+        commands = trajectory.Command(
+            velocity=every(wish.velocity),
+            facing=every(ground.unit(wish.velocity)),
+            label=every(known.label),
+        )
+        number = known.label.shape[0]
+        size = max(n for n in range(1, chunk + 1) if number % n == 0)
+        frames = rollout.rollout(driver, key, states, commands, chunk=size)[1]
+        return to_scene(frames, model)
+
+    return play
+
+
+def to_scene(frames: smgdiff_controller.Frame, model: Model) -> Scene:
+    """Displayed frames as a scene.
+
+    Args:
+      frames: Of players.
+      model: The model.
+
+    Returns:
+      The scene.
+    """
+    motion = skeleton.Motion(
+        root_position=frames.root_position,
+        joint_rotation=frames.joint_rotation,
+        fps=model.config.fps,
+    )
+    return Scene(motion=motion, ball=frames.ball, touch=frames.touch)
+
+
+@functools.partial(jax.jit, static_argnames=("future", "fps"))
+def _commanded(velocity: Array, *, future: int, fps: float) -> trajectory.Trajectory:
+    """The path along which each window was steered."""
+    times = (jnp.arange(1, future + 1) / fps)[None, :, None]
+    facing = ground.unit(velocity)[:, None]
+    shape = (velocity.shape[0], future, 2)
+    return trajectory.Trajectory(
+        position=jnp.broadcast_to(times, shape)
+        * jnp.broadcast_to(velocity[:, None], shape),
+        facing=jnp.broadcast_to(facing, shape),
+    )
+
+
+def score_players(
+    setting: Setting, model: Model, play: Play, *, repeats: int, starts: int
+) -> list[dict[str, Float[Array, ""]]]:
+    """Scores of steered players: their second plan's length on, in windows of a plan.
+
+    Args:
+      setting: Of the table.
+      model: The model.
+      play: From `player`, of two plans' length or more.
+      repeats: Players of each start.
+      starts: Starts of a replication.
+
+    Returns:
+      One dictionary a replication; "diversity m2" is the variance of joints over
+      players of one start, in the world.
+    """
+    key, future = jax.random.key(setting.seed + 3), model.config.future
+    spread = jax.jit(lambda scene: _diversity(scene, model, repeats))
+    found = []
+    for number, half in enumerate(setting.halves):
+        chosen = jnp.asarray(half[:starts])
+        known = jax.tree.map(lambda x: x[chosen], setting.known)  # noqa: B023
+        scenes = play(jax.random.fold_in(key, number), known)
+        last = jax.tree.map(lambda x: x[:, -future:], scenes)
+        wish = wishes(known, model)
+        velocity = jnp.repeat(wish.velocity, repeats, axis=0)
+        labels = jnp.repeat(known.label, repeats)
+        wanted = _commanded(velocity, future=future, fps=model.config.fps)
+        scores = setting.score(last, wanted, labels)
+        found.append(scores | {"diversity m2": spread(last)})
+    return found
+
+
+def _diversity(scene: Scene, model: Model, repeats: int) -> Array:
+    places = skeleton.joint_positions(model.representation.bones, scene.motion)
+    groups = places.reshape(-1, repeats, *places.shape[1:])
+    return jnp.mean(jax.vmap(diversity.intra_style_variance)(groups))
+
+
+def noise_share(
+    key: Key, generate: Generate, known: Situations, model: Model, *, repeats: int
+) -> dict[str, Float[Array, ""]]:
+    """How much generated paths depend on their noise.
+
+    Args:
+      key: Consumed.
+      generate: Paths.
+      known: Moments of recordings.
+      model: The model.
+      repeats: Paths of each wish.
+
+    Returns:
+      Root mean square distance, half way, of a path from the mean of its wish ("noise
+      cm"), of the mean from what was recorded ("error cm"), and of the straight path
+      from it: with noise far below error, paths do not vary as people do.
+    """
+    wish = wishes(known, model)
+    number = known.label.shape[0]
+
+    @jax.jit
+    def run(key: Key) -> tuple[Array, Array, Array]:
+        keys = jax.random.split(key, (number, repeats))
+        draw = jax.vmap(jax.vmap(generate, (0, None)), (0, 0))
+        middle = model.config.future // 2
+        ends = draw(keys, wish).position[:, :, middle]
+        real = known.future.motion.root_position[:, middle, ::2]
+        line = wish.velocity * (middle + 1) / model.config.fps
+        mean = jnp.mean(ends, axis=1)
+        return ends - mean[:, None], mean - real, line - real
+
+    spread, error, plain = run(key)
+    rms = lambda x: 100 * jnp.sqrt(jnp.mean(jnp.sum(x**2, -1)))  # noqa: E731
+    return {
+        "noise cm": rms(spread),
+        "error cm": rms(error),
+        "straight error cm": rms(plain),
+    }
+
+
+def straight(model: Model) -> Generate:
+    """The straight path of a model's lengths.
+
+    Args:
+      model: The model.
+
+    Returns:
+      As `smgdiff_trajectory.generator`.
+    """
+    config = model.config
+    return functools.partial(
+        smgdiff_trajectory.straight, future=config.future, fps=config.fps
+    )

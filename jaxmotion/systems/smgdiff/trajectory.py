@@ -1,0 +1,251 @@
+"""SMGDiff's first stage: from a skill and a target point to a path on the ground.
+
+A diffusion model with T = 1: its only step starts from noise that knows next to nothing
+of the path, so its loss is a regression and the best answer does not depend on the
+noise. T >= 2 is the same chain, and can draw different paths.
+
+Paths are seen from the last displayed pose and divided by `Config.metres`; so noise of
+unit deviation is as large as a path.
+
+Source: SMGDiff, section 3.1, eq. 3.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.diffusion import chain, schedule
+from jaxmotion.learning import losses
+from jaxmotion.motion import ground, skeleton, trajectory
+from jaxmotion.systems.smgdiff.network import CHANNELS, TrajectoryGenerator
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config:
+    """Architecture and method.
+
+    Attributes:
+      num_labels: Skills.
+      past: Displayed frames that are seen.
+      future: Frames of a path.
+      num_steps: T (paper 1).
+      width: Channels of a token.
+      depth: Layers.
+      heads: Attention heads.
+      hidden: Channels of the feed-forward layers.
+      frames_per_token: Frames of one token.
+      token_margin: Frames beyond its own, on either side, that an output token predicts
+        and shares with its neighbors; ours, 0 in the paper.
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
+      metres: Unit of the network's positions.
+      weight_velocity: Of the displacements, beside the data's 1.
+    """
+
+    num_labels: int
+    past: int = 10
+    future: int = 45
+    num_steps: int = 1
+    width: int = 128
+    depth: int = 2
+    heads: int = 4
+    hidden: int = 256
+    frames_per_token: int = 5
+    token_margin: int = 0
+    token_window: Literal["hann", "trapezoid"] = "hann"
+    metres: float = 1.0
+    weight_velocity: float = 1.0
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Wish:
+    """What a path is made for, in the frame of the last displayed pose.
+
+    Attributes:
+      past: Displayed path.
+      velocity: Wanted velocity (x, z), metres a second; the target point is one second
+        of it away.
+      label: Skill.
+    """
+
+    past: trajectory.Trajectory
+    velocity: Float[Array, "*batch 2"]
+    label: Int[Array, "*batch"]
+
+
+Generate = Callable[[Key, Wish], trajectory.Trajectory]
+
+
+def network(config: Config) -> TrajectoryGenerator:
+    """The denoiser's Flax module.
+
+    Args:
+      config: Its sizes.
+
+    Returns:
+      The module.
+    """
+    names = {field.name for field in dataclasses.fields(TrajectoryGenerator)}
+    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
+    return TrajectoryGenerator(**sizes)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init(key: Key, config: Config) -> Params:
+    """Initial parameters.
+
+    Args:
+      key: Consumed.
+      config: The architecture.
+
+    Returns:
+      Parameters of `network(config)`.
+    """
+    x_t, past = (jnp.zeros((n, CHANNELS)) for n in (config.future, config.past))
+    t, label = jnp.ones((), jnp.int32), jnp.zeros((), jnp.int32)
+    return network(config).init(key, x_t, t, past, jnp.zeros(2), label)["params"]
+
+
+def _pack(path: trajectory.Trajectory, config: Config) -> Array:
+    return jnp.concatenate([path.position / config.metres, path.facing], axis=-1)
+
+
+def _apply(params: Params, x_t: Array, t: Array, wish: Wish, config: Config) -> Array:
+    return network(config).apply(
+        {"params": params},
+        x_t,
+        t,
+        _pack(wish.past, config),
+        wish.velocity / config.metres,
+        wish.label,
+    )
+
+
+def example(
+    bones: skeleton.Skeleton,
+    window: skeleton.Motion,
+    label: Int[Array, ""],
+    *,
+    config: Config,
+) -> tuple[Wish, trajectory.Trajectory]:
+    """One training example: the wish is the mean velocity of what then happened.
+
+    Args:
+      bones: The skeleton.
+      window: Past and future frames, world.
+      label: Skill.
+      config: The method.
+
+    Returns:
+      The wish, and the path of the future.
+    """
+    course = trajectory.root_trajectory(bones, window)
+    last = config.past - 1
+    here = trajectory.PlanarFrame(
+        origin=course.position[last], facing=course.facing[last]
+    )
+    local = trajectory.to_local(course, here)
+    seconds = config.future / window.fps
+    wish = Wish(
+        past=jax.tree.map(lambda x: x[: config.past], local),
+        velocity=local.position[-1] / seconds,
+        label=label,
+    )
+    return wish, jax.tree.map(lambda x: x[config.past :], local)
+
+
+def loss(
+    params: Params,
+    key: Key,
+    batch: tuple[skeleton.Motion, Int[Array, " batch"]],
+    *,
+    bones: skeleton.Skeleton,
+    config: Config,
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """Error of the path and of its displacements.
+
+    Args:
+      params: The network's parameters.
+      key: Consumed.
+      batch: Windows, and their skills.
+      bones: The skeleton.
+      config: The method.
+
+    Returns:
+      The weighted sum, and its terms by name.
+
+    Source: SMGDiff, eq. 3.
+    """
+    windows, labels = batch
+    key_t, key_noise = jax.random.split(key)
+    wish, path = jax.vmap(lambda w, c: example(bones, w, c, config=config))(
+        windows, labels
+    )
+    x_0 = _pack(path, config)
+    table = schedule.cosine_schedule(config.num_steps)
+    t = jax.random.randint(key_t, labels.shape, 1, config.num_steps + 1)
+    noise = jax.random.normal(key_noise, x_0.shape)
+    x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
+    prediction = _apply(params, x_t, t, wish, config)
+    every = jnp.ones(x_0.shape[:-1], bool)
+    terms = {
+        "data": losses.masked_mse(prediction, x_0, every),
+        "velocity": losses.velocity_loss(prediction, x_0, every),
+    }
+    return terms["data"] + config.weight_velocity * terms["velocity"], terms
+
+
+def generator(params: Params, *, config: Config) -> Generate:
+    """The sampler of paths.
+
+    Args:
+      params: The network's parameters.
+      config: The method.
+
+    Returns:
+      `generate(key, wish) -> path` in the frame of the last displayed pose.
+    """
+
+    def generate(key: Key, wish: Wish) -> trajectory.Trajectory:
+        def denoise(key: Key, x_t: Array, t: Array) -> Array:
+            del key  # deterministic
+            return _apply(params, x_t, t, wish, config)
+
+        table = schedule.cosine_schedule(config.num_steps)
+        step = chain.ancestral_step(table, denoise)
+        shape = (config.future, CHANNELS)
+        x = chain.sample(step, key, shape, num_steps=config.num_steps)
+        return trajectory.Trajectory(
+            position=x[:, :2] * config.metres, facing=ground.unit(x[:, 2:])
+        )
+
+    return generate
+
+
+def straight(key: Key, wish: Wish, *, future: int, fps: float) -> trajectory.Trajectory:
+    """The path without a generator: straight to the target, facing along it.
+
+    Args:
+      key: Unused; there so that it can stand for a generator.
+      wish: What the user wants.
+      future: Frames.
+      fps: Frames a second.
+
+    Returns:
+      The path. Where the user wants to stand, the facing stays.
+
+    Source: SMGDiff, section 5.2 ("w/o TGM").
+    """
+    del key
+    times = jnp.arange(1, future + 1) / fps
+    facing = ground.unit(wish.velocity, wish.past.facing[-1])
+    return trajectory.Trajectory(
+        position=times[:, None] * wish.velocity[None],
+        facing=jnp.broadcast_to(facing[None], (future, 2)),
+    )

@@ -1,0 +1,185 @@
+"""The import contract: what each package may import, and one door a third party."""
+
+import ast
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "jaxmotion"
+SYSTEMS = ("aamdm", "camdm", "emdm", "smgdiff")
+
+# Part -> what of jaxmotion it may import besides itself. Imports point down.
+BASE = {"typing", "files"}
+MAY_IMPORT = {
+    "typing.py": set(),
+    # Files as they come, for whatever reads or writes one.
+    "files.py": set(),
+    "diffusion": {"typing"},
+    "motion": {"typing"},
+    # files: published weights (networks/weight_files.py).
+    "networks": BASE,
+    "evaluation": {"typing", "motion"},
+    "control": {"typing", "motion"},
+    "learning": BASE | {"diffusion", "motion"},
+    "data": BASE | {"motion"},
+    "text": BASE | {"networks"},
+    "evaluators": BASE
+    | {"motion", "networks", "learning", "evaluation", "data", "text"},
+    "systems": BASE
+    | {
+        "diffusion",
+        "motion",
+        "networks",
+        "control",
+        "learning",
+        "evaluation",
+        "evaluators",
+        "data",
+        "text",
+    },
+    "viz": {"typing", "motion"},
+    "reporting.py": BASE | {"motion", "data", "viz"},
+    "cli.py": BASE,
+}
+
+
+# Third party -> where it may be imported (prefixes of paths below the root).
+ANYWHERE = {"jax", "jaxtyping", "numpy"}
+DOORS = {
+    # A baseline is one file, with its own network.
+    "flax": (
+        "jaxmotion/networks/",
+        "jaxmotion/evaluators/network.py",
+        *(f"jaxmotion/systems/{name}/network.py" for name in SYSTEMS),
+        "experiments/baselines/",
+    ),
+    "optax": ("jaxmotion/learning/training.py",),
+    "orbax": ("jaxmotion/learning/checkpoint.py",),
+    "tensorflow_datasets": ("jaxmotion/data/builders/",),
+    "scipy": ("jaxmotion/data/",),
+    "matplotlib": ("jaxmotion/viz/",),
+    "PIL": ("jaxmotion/viz/",),
+    "tqdm": ("jaxmotion/learning/loop.py", "experiments/", "benchmarks/"),
+    "tyro": ("experiments/", "benchmarks/"),
+    "torch": ("benchmarks/",),
+    "tokenizers": ("jaxmotion/text/",),
+    "wordllama": ("jaxmotion/text/",),
+}
+
+
+def imports(path):
+    """Every imported module with the line, and whether it is loaded with the file."""
+    tree = ast.parse(path.read_text())
+    inside = {
+        id(node)
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
+        for node in ast.walk(function)
+    }
+    for node in ast.walk(tree):
+        at_top = id(node) not in inside
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node.lineno, at_top
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: relative import"
+            for alias in node.names:
+                yield f"{node.module}.{alias.name}", node.lineno, at_top
+
+
+def files(*folders):
+    found = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
+    assert found
+    return found
+
+
+def relative(path):
+    return path.relative_to(ROOT).as_posix()
+
+
+LIBRARY = files(PACKAGE)
+SCRIPTS = files(ROOT / "experiments", ROOT / "benchmarks")
+
+
+def owner(path):
+    """The entry of MAY_IMPORT that a file falls under; None for __init__.py."""
+    parts = path.relative_to(PACKAGE).parts
+    if parts == ("__init__.py",):
+        return None
+    assert parts[0] in MAY_IMPORT, f"{relative(path)} is in no known part"
+    return parts[0]
+
+
+def test_imports_point_down():
+    wrong = []
+    for path in LIBRARY:
+        part = owner(path)
+        for name, line, _ in imports(path) if part else ():
+            head, *rest = name.split(".")
+            allowed = head not in ("experiments", "benchmarks", "tests")
+            if head == "jaxmotion":
+                allowed = rest[0] in MAY_IMPORT[part] | {part}
+                if part == rest[0] == "systems" and path.parent.name != "systems":
+                    allowed = rest[1] == path.parent.name  # never another system
+            if not allowed:
+                wrong.append(f"{relative(path)}:{line} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_third_parties_come_through_their_doors():
+    wrong = []
+    for path in LIBRARY + SCRIPTS:
+        for name, line, _ in imports(path):
+            head = name.split(".")[0]
+            known = {*sys.stdlib_module_names, *ANYWHERE, "jaxmotion"}
+            # Scripts import the modules beside them by their bare names.
+            beside = path.with_stem(head).exists() or path.with_name(head).is_dir()
+            beside = beside or path.parent.name == head  # a package's own modules
+            if head in known or (path in SCRIPTS and beside):
+                continue
+            if not any(relative(path).startswith(d) for d in DOORS.get(head, ())):
+                wrong.append(f"{relative(path)}:{line} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_what_is_slow_to_load_is_loaded_when_used():
+    """Only builders load tensorflow-datasets and only viz matplotlib: in functions."""
+    inside = {"jaxmotion.data.builders": "builders", "jaxmotion.viz": "viz"}
+    wrong = [
+        f"{relative(path)}:{line} imports {name}"
+        for path in LIBRARY
+        for name, line, at_top in imports(path)
+        for module, folder in inside.items()
+        if name.startswith(module) and folder not in path.parts and at_top
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_cycles():
+    modules = {}
+    for path in LIBRARY:
+        name = relative(path).removesuffix(".py").removesuffix("/__init__")
+        modules[name.replace("/", ".")] = path
+    edges = {}
+    for name, path in modules.items():
+        found = set()
+        for target, _, at_top in imports(path):
+            while at_top and target not in modules and "." in target:
+                target = target.rpartition(".")[0]
+            if at_top and target in modules and modules[target].name != "__init__.py":
+                found.add(target)
+        edges[name] = found - {name}
+    done, path = set(), []
+
+    def visit(name):
+        assert name not in path, " -> ".join([*path, name])
+        if name in done:
+            return
+        path.append(name)
+        for target in sorted(edges[name]):
+            visit(target)
+        path.pop()
+        done.add(name)
+
+    for name in modules:
+        visit(name)

@@ -1,0 +1,147 @@
+"""The README says what is so: its programs run, its commands parse, its links lead."""
+
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import tyro
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def commands():
+    """Commands of the README's shell blocks, each as its words."""
+    lines = [line for block in blocks("bash") for line in block.splitlines()]
+    parts = [part for line in lines for part in line.split("&&") if part.strip()]
+    return [shlex.split(part) for part in parts]
+
+
+SCRIPTS = [words for words in commands() if words[0] == "python"]
+
+
+def test_programs_run_as_they_stand(tmp_path):
+    """In a process and a folder of their own, one after the other."""
+    programs = blocks("python")
+    assert len(programs) == 4
+    # Whether they run is the question: unoptimised programs compile in a third.
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    }
+    done = subprocess.run(
+        [sys.executable, "-W", "error::FutureWarning", "-c", "\n".join(programs)],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", SCRIPTS, ids=lambda words: " ".join(words[1:3]))
+def test_commands_parse(words, monkeypatch):
+    """The script exists and knows the arguments."""
+    _, script, *arguments = words
+    path = ROOT / script
+    monkeypatch.syspath_prepend(str(path.parent))
+    spec = importlib.util.spec_from_file_location(f"readme_{path.stem}", path)
+    module = importlib.util.module_from_spec(spec)
+    # A dataclass looks itself up in its module.
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+        kind = getattr(module, "Command", None) or module.Config
+        parsed = tyro.cli(kind, args=arguments)
+    finally:
+        del sys.modules[spec.name]
+    values = [a for a in arguments if not a.startswith("--")]
+    assert all(v in f"{vars(parsed)}{type(parsed).__name__.lower()}" for v in values)
+
+
+def test_start_commands():
+    assert [words[:3] for words in commands() if words[0] == "pip"] == [
+        ["pip", "install", "-e"]
+    ] * 3  # plain, with the tests' extra, with text encoders
+    # .ci/run looks for this line.
+    assert '\npip install -e ".[test]" && pytest\n' in README
+    assert [words for words in SCRIPTS if words[1].endswith("quickstart.py")]
+
+
+@pytest.mark.parametrize("link", re.findall(r"\]\((?!https?:)([^)#]+)\)", README))
+def test_links_lead_somewhere(link):
+    assert (ROOT / link).is_file()
+
+
+def test_scripts_and_options_that_the_text_names():
+    for name in re.findall(r"`(?:python )?(?:\w+/)?(\w+\.py)`", README):
+        assert list(ROOT.glob(f"*/{name}")), name
+    from jaxmotion.systems.camdm import controller as camdm_controller
+    from jaxmotion.systems.camdm import model as camdm_model
+
+    # The table's defaults and the released constants.
+    default, released = camdm_controller.Control(), camdm_controller.RELEASED
+    assert camdm_model.Config(num_joints=22, num_labels=8).num_steps == 8
+    assert (default.guidance_scale, released.guidance_scale) == (0.7, 0.5)
+    assert (default.guided_plans, released.guided_plans) == (1, 2)
+    assert (default.guide_start, released.guide_start) == (False, True)
+    assert (default.reuse, released.reuse) == (15, 23)
+    assert (default.replan_on_change, released.replan_on_change) == (True, False)
+    assert (default.bias_position, released.bias_position) == (0.7, 0.4)
+    assert (default.apply, released.apply, default.follow) == (15, 15, 0.0)
+
+
+def test_our_own_options_are_off_by_default():
+    from jaxmotion.systems.camdm import model as camdm_model
+    from jaxmotion.systems.camdm import training as camdm_training
+
+    config = camdm_model.Config(num_joints=22, num_labels=8)
+    assert camdm_training.PRESETS["paper"] == {}
+    small = camdm_training.PRESETS["small"]
+    for name, off in (
+        ("frames_per_token", 1),
+        ("token_margin", 0),
+        ("heading", "random"),
+        ("rotation_scale", 1.0),
+        ("norm", "post"),
+    ):
+        assert getattr(config, name) == off
+        assert f"`{name}={small[name]}`".replace("'", '"') in README or (
+            f'`{name}="{small[name]}"`' in README
+        )
+    assert small["dropout"] == 0.0
+
+
+def test_version_is_the_same_everywhere():
+    import jaxmotion
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert project["version"] == jaxmotion.__version__
+    assert f"\nversion: {jaxmotion.__version__}\n" in citation
+    assert jaxmotion.__version__ in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert citation.count("  - type: ") == 4
+
+
+def test_importing_the_package_loads_no_heavy_parts():
+    heavy = ["tensorflow_datasets", "tensorflow", "matplotlib", "orbax", "torch"]
+    code = f"import sys, jaxmotion; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,165 @@
+"""The action recogniser sees the path too, repeats by its key, and learns."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.evaluators import action as action_evaluator
+from jaxmotion.motion import features, skeleton, trajectory
+from tests import tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+CONFIG = action_evaluator.ActionRecognizerConfig(
+    num_classes=2, num_joints=5, num_features=6, hidden=8
+)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return tiny.random_params(action_evaluator.init_action_recognizer, CONFIG)
+
+
+def test_the_input_against_a_loop(bones):
+    motion = tiny.walk(20, turn=1.0, start=0.5)
+    found = action_evaluator.action_recognizer_input(bones, motion)
+    positions = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
+    across = positions[0, 1] - positions[0, 3]
+    ahead = np.cross(across, [0, 1, 0])
+    ahead /= np.linalg.norm(ahead)
+    left = np.cross([0, 1, 0], ahead)
+    start = positions[0, 0] * [1, 0, 1]
+    for frame in range(20):
+        expected = [
+            [(p - start) @ left, p[1], (p - start) @ ahead] for p in positions[frame]
+        ]
+        np.testing.assert_allclose(
+            np.asarray(found[frame]).reshape(5, 3), expected, atol=1e-5
+        )
+    assert np.linalg.norm(found[-1, :3:2]) > 0.5  # the root's path is seen
+
+
+def test_neither_place_nor_facing_of_the_start_is_seen(bones):
+    motion = tiny.walk(20, turn=1.0)
+    frame = trajectory.PlanarFrame(
+        origin=jnp.array([3.0, -5.0]), facing=jnp.array([0.6, -0.8])
+    )
+    np.testing.assert_allclose(
+        action_evaluator.action_recognizer_input(
+            bones, features.from_frame(motion, frame)
+        ),
+        action_evaluator.action_recognizer_input(bones, motion),
+        atol=1e-5,
+    )
+
+
+def test_a_batch_is_turned_motion_by_motion(bones):
+    walks = [tiny.walk(6, start=start) for start in (0.0, 2.0)]
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *walks)
+    found = action_evaluator.action_recognizer_input(bones, both)
+    for one, walk in zip(found, walks, strict=True):
+        expected = action_evaluator.action_recognizer_input(bones, walk)
+        np.testing.assert_allclose(one, expected, atol=1e-6)
+
+
+def test_the_key_alone_decides_the_states(params):
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(4, 6, 15)), jnp.float32)
+
+    def recognize(seed, **changes):
+        config = dataclasses.replace(CONFIG, **changes)
+        return action_evaluator.recognize_actions(
+            params, jax.random.key(seed), x, config=config
+        )
+
+    for first, second in zip(recognize(0), recognize(0), strict=True):
+        np.testing.assert_array_equal(first, second)
+    assert np.abs(recognize(0)[0] - recognize(1)[0]).max() > 1e-2
+    still = recognize(0, state_scale=0.0), recognize(1, state_scale=0.0)
+    np.testing.assert_array_equal(still[0][0], still[1][0])
+    zeros = jnp.zeros((4, 2, CONFIG.hidden))
+    expected, _ = CONFIG.network.apply({"params": params}, x, zeros)
+    np.testing.assert_allclose(still[0][0], expected, atol=1e-6)
+
+
+def test_states_are_standard_normal(params):
+    """A layer's state shows where the update gate keeps all of it (bias of 50)."""
+    count = 4000
+    kept = jax.tree.map(jnp.zeros_like, params)
+    for layer in ("lower", "upper"):
+        kept[layer]["cell"]["iz"]["bias"] += 50.0
+    # The six features read the first six numbers of the upper state, scaled down so
+    # that tanh is linear.
+    kept["feature"]["kernel"] += 1e-3 * jnp.eye(CONFIG.hidden)[:, :6]
+    x = jnp.ones((count, 3, 15))
+    for scale in (1.0, 0.5):
+        found, _ = action_evaluator.recognize_actions(
+            kept,
+            jax.random.key(2),
+            x,
+            config=dataclasses.replace(CONFIG, state_scale=scale),
+        )
+        state = np.asarray(found, np.float64) * 1e3 / scale
+        assert abs(state.mean()) * np.sqrt(state.size) < 4
+        assert abs(state.var() - 1) / np.sqrt(2 / state.size) < 4
+        correlation = np.corrcoef(state.T)[np.triu_indices(6, 1)]
+        assert np.abs(correlation).max() * np.sqrt(count) < 4.5
+
+
+def test_the_loss_is_the_cross_entropy(params):
+    x = jnp.asarray(np.random.default_rng(1).normal(size=(6, 4, 15)), jnp.float32)
+    labels = np.array([0, 1, 1, 0, 1, 0])
+    loss, info = action_evaluator.action_recognizer_loss(
+        params, jax.random.key(1), (x, jnp.asarray(labels)), config=CONFIG
+    )
+    _, logits = action_evaluator.recognize_actions(
+        params, jax.random.key(1), x, config=CONFIG
+    )
+    logits = np.asarray(logits, np.float64)
+    chance = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)
+    expected = -np.mean(np.log(chance[np.arange(6), labels]))
+    np.testing.assert_allclose(loss, expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        info["accuracy"], np.mean(logits.argmax(-1) == labels), rtol=1e-6
+    )
+
+
+def test_it_learns_to_tell_two_actions(bones):
+    """Left turns from right turns; every second walk is held out."""
+    walks = [
+        tiny.walk(12, turn=turn, speed=speed, fps=15.0)
+        for speed in np.linspace(0.5, 1.5, 24)
+        for turn in (-0.8, 0.8)
+    ]
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *walks)
+    x = action_evaluator.action_recognizer_input(bones, together)
+    train, held_out = (
+        x.reshape(12, 2, 2, 12, 15)[:, i].reshape(24, 12, 15) for i in range(2)
+    )
+    labels = jnp.tile(jnp.arange(2), 12)
+    params, info = action_evaluator.train_action_recognizer(
+        jax.random.key(0),
+        train,
+        labels,
+        config=CONFIG,
+        num_steps=40,
+        batch=16,
+        learning_rate=1e-2,
+    )
+    assert info["loss"].shape == (40,)
+    assert info["loss"][-10:].mean() < info["loss"][:3].mean()
+    _, logits = action_evaluator.recognize_actions(
+        params, jax.random.key(1), held_out, config=CONFIG
+    )
+    assert np.mean(logits.argmax(-1) == labels) > 0.8
+
+
+def test_the_released_input_is_not_turned_and_begins_at_the_root(bones):
+    motion = tiny.walk(9, turn=1.0, start=0.5)
+    positions = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
+    centred = positions - positions[:, :1]
+    path = positions[:, :1] - positions[0, 0]
+    found = action_evaluator.released_input(bones, motion)
+    np.testing.assert_allclose(found, (centred + path).reshape(9, -1), atol=1e-6)

@@ -1,0 +1,52 @@
+"""The recogniser's shapes, and that a window's result is its own."""
+
+import jax
+import numpy as np
+import pytest
+
+from jaxmotion.evaluators.network import Recognizer
+from tests import tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+
+def test_shapes_and_independence_of_the_batch():
+    net = Recognizer(num_classes=3, num_features=8)
+    x = jax.random.normal(jax.random.key(0), (4, 6, 15))
+    variables = tiny.random_params(net.init, x)
+    features, logits = net.apply(variables, x)
+    assert features.shape == (4, 8)
+    assert logits.shape == (4, 3)
+    alone = net.apply(variables, x[2:3])
+    np.testing.assert_allclose(alone[0][0], features[2], atol=1e-5)
+    np.testing.assert_allclose(alone[1][0], logits[2], atol=1e-5)
+
+
+def test_default_feature_width_is_512():
+    net = Recognizer(num_classes=100)
+    x = jax.ShapeDtypeStruct((2, 60, 45), "float32")
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    shapes = jax.eval_shape(net.init_with_output, key, x)
+    features, logits = shapes[0]
+    assert features.shape == (2, 512)
+    assert logits.shape == (2, 100)
+
+
+def test_time_matters():
+    net = Recognizer(num_classes=2, num_features=4)
+    x = jax.random.normal(jax.random.key(0), (1, 6, 15))
+    variables = tiny.random_params(net.init, x)
+    _, forwards = net.apply(variables, x)
+    _, backwards = net.apply(variables, x[:, ::-1])
+    assert np.abs(forwards - backwards).max() > 1e-3
+
+
+def test_dropout_needs_training():
+    net = Recognizer(num_classes=2, num_features=4)
+    x = jax.random.normal(jax.random.key(0), (1, 6, 15))
+    variables = tiny.random_params(net.init, x)
+    draw = lambda seed: net.apply(  # noqa: E731
+        variables, x, train=True, rngs={"dropout": jax.random.key(seed)}
+    )
+    np.testing.assert_array_equal(draw(0)[1], draw(0)[1])
+    assert np.abs(draw(0)[1] - draw(1)[1]).max() > 1e-3

@@ -1,0 +1,284 @@
+"""AAMDM's run-time: the wanted path, the guided step, and where the bone goes."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.control import rollout
+from jaxmotion.motion import features
+from jaxmotion.motion.trajectory import Command
+from jaxmotion.systems.aamdm import controller as aamdm_controller
+from jaxmotion.systems.aamdm import model as aamdm_model
+from jaxmotion.systems.aamdm import space as aamdm_space
+from tests import person, tiny
+from tests.reference import pose as reference
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+FPS = 60.0
+JOINTS = 6
+SIZE = 15 * JOINTS + 8
+CONFIG = aamdm_model.Config(features=12 + SIZE, latent=2, width=16, depth=2)
+MOVE, SPIN = np.array([0.3, 0.0, 1.2]), np.array([0.0, 0.8, 0.0])
+
+
+def normal(*shape, seed=0):
+    return person.float32(np.random.default_rng(seed).normal(size=shape))
+
+
+def vector():
+    """An upright pose that moves its bone forward, to the side, and round."""
+    parts = [person.OFFSETS + [[0.0, 1.0, 0.0], *5 * [[0.0] * 3]]]
+    parts += [np.tile([1.0, 0, 0, 0, 1.0, 0], JOINTS), np.zeros(2 * 3 * JOINTS)]
+    return person.float32(np.concatenate([np.ravel(x) for x in parts + [MOVE, SPIN]]))
+
+
+@functools.cache
+def pose():
+    return jnp.concatenate([vector(), jnp.zeros(2)])
+
+
+@functools.cache
+def space():
+    """Full poses in units of their own."""
+    own = np.random.default_rng(3)
+    mean, std = own.normal(size=12 + SIZE), own.uniform(0.5, 2.0, 12 + SIZE)
+    normalizer = features.Normalizer(mean=person.float32(mean), std=person.float32(std))
+    one = jnp.ones(12 + SIZE)
+    return aamdm_space.Space(
+        normalizer=normalizer,
+        change=one,
+        low=-30 * one,
+        high=30 * one,
+        autoencoder=None,
+    )
+
+
+def start(path_seed=4):
+    return aamdm_controller.init_state(
+        space(), pose(), normal(12, seed=path_seed), num_joints=JOINTS
+    )
+
+
+def character(velocity, yaw, turn_rate=0.0, origin=(3.0, -2.0)):
+    """A state that stands and moves as told."""
+    return dataclasses.replace(
+        start(),
+        bone=person.frames(np.array(origin), yaw),
+        velocity=person.float32(velocity),
+        turn_rate=person.float32(turn_rate),
+    )
+
+
+def command(velocity, yaw):
+    return Command(
+        velocity=person.float32(velocity),
+        facing=person.float32(person.directions(yaw)),
+        label=jnp.int32(0),
+    )
+
+
+def driver(step, **options):
+    return aamdm_controller.controller(
+        step, space(), num_joints=JOINTS, fps=FPS, **options
+    )
+
+
+def wanted_path(state, command, fps=FPS, half_life=0.27):
+    return aamdm_controller.wanted_path(state, command, fps=fps, half_life=half_life)
+
+
+# --- the wanted path ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fps", [30.0, 60.0])
+@pytest.mark.parametrize("yaw", [0.0, 2.2])
+def test_whoever_goes_on_as_before_wants_a_straight_line(fps, yaw):
+    velocity = 1.3 * person.directions(yaw + 0.5)
+    state = character(velocity, yaw)
+    found = wanted_path(state, command(velocity, yaw), fps=fps)
+    ahead = np.multiply.outer([1 / 3, 2 / 3, 1.0], 1.3 * person.directions(0.5))
+    expected = [*ahead.ravel(), 0, 1, 0, 1, 0, 1]
+    np.testing.assert_allclose(found, expected, atol=5e-6)
+
+
+def test_stiff_springs_obey_at_once():
+    state = character([0.5, 0.0], 0.3, turn_rate=2.0)
+    found = wanted_path(state, command([0.0, 0.0], 0.3 + 1.1), half_life=1e-3)
+    np.testing.assert_allclose(found[:6], 0.0, atol=5e-3)
+    np.testing.assert_allclose(found[6:], np.tile(person.directions(1.1), 3), atol=1e-4)
+
+
+def test_slow_springs_carry_on_for_now():
+    state = character([0.0, 0.6], 0.0, turn_rate=0.5)
+    found = wanted_path(state, command([0.0, -9.0], 3.0), half_life=1e3)
+    np.testing.assert_allclose(found[:6], [0, 0.2, 0, 0.4, 0, 0.6], atol=0.02)
+    turned = person.directions(0.5 * np.array([1 / 3, 2 / 3, 1.0]))
+    np.testing.assert_allclose(found[6:], turned.ravel(), atol=0.02)
+
+
+def test_a_later_point_is_nearer_to_the_command():
+    state = character([0.0, 0.0], 0.0)
+    found = np.asarray(wanted_path(state, command([0.0, 1.0], 1.0)))
+    speed = np.diff([0.0, *found[1:6:2]]) * 3
+    assert np.all(np.diff(speed) > 0) and 0 < speed[0] and speed[-1] < 1
+    yaw = np.arctan2(found[6::2], found[7::2])
+    assert np.all(np.diff(yaw) > 0) and 0 < yaw[0] and yaw[-1] < 1
+
+
+# --- guidance ----------------------------------------------------------------------
+
+
+def test_objective_is_half_the_squared_distance_of_the_path():
+    frame, goal = normal(20), normal(12, seed=1)
+    objective = aamdm_controller.path_objective(goal)
+    gap = np.float64(frame)[:12] - np.float64(goal)
+    np.testing.assert_allclose(objective(frame), gap @ gap / 2, rtol=1e-5)
+    found = jax.grad(objective)(frame)
+    np.testing.assert_allclose(found, [*gap, *np.zeros(8)], rtol=1e-5, atol=1e-6)
+
+
+def test_without_a_goal_the_step_is_the_transition():
+    transition = aamdm_model.transition(
+        tiny.random_params(aamdm_model.init, CONFIG), config=CONFIG
+    )
+    step = aamdm_controller.guided(transition, scale=0.5)
+    frame = normal(12 + SIZE)
+    found = jax.jit(lambda k, x: step(k, x, None))(jax.random.key(1), frame)
+    plain = jax.jit(transition)(jax.random.key(1), frame)
+    np.testing.assert_array_equal(found, plain)
+    steered = jax.jit(step)(jax.random.key(1), frame, normal(12, seed=1))
+    assert np.abs(steered - plain).max() > 1e-3
+
+
+def test_a_goal_becomes_the_objective_of_the_transition():
+    seen = {}
+
+    def transition(key, previous, **options):
+        seen.update(options)
+        return previous
+
+    goal = normal(12, seed=1)
+    aamdm_controller.guided(transition, scale=0.7)(jax.random.key(0), normal(20), goal)
+    assert seen["scale"] == 0.7
+    at_goal = jnp.concatenate([goal, jnp.ones(8)])
+    assert seen["objective"](at_goal) == 0.0 < seen["objective"](at_goal + 1.0)
+
+
+# --- the controller ----------------------------------------------------------------
+
+
+def test_a_character_starts_at_the_origin_as_its_pose_moves():
+    state = start()
+    np.testing.assert_array_equal(state.bone.origin, [0, 0])
+    np.testing.assert_array_equal(state.bone.facing, [0, 1])
+    np.testing.assert_allclose(state.velocity, MOVE[[0, 2]], rtol=1e-5)
+    np.testing.assert_allclose(state.turn_rate, SPIN[1], rtol=1e-5)
+    poses = aamdm_space.to_poses(space(), state.frame)
+    np.testing.assert_allclose(poses, pose(), atol=1e-5)
+
+
+@pytest.mark.parametrize("steered", [False, True])
+def test_a_fixed_frame_moves_the_bone_by_its_velocity(steered):
+    frame = start(path_seed=9).frame
+    made = driver(lambda key, previous, goal: frame, steered=steered)
+    ticks = 30
+    given = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (1, ticks, *x.shape)), command([1.0, 0.5], 0.4)
+    )
+    states = jax.tree.map(lambda x: x[None], character([9.0, 9.0], 0.7, origin=(1, 2)))
+    roll = jax.jit(functools.partial(rollout.rollout, made))
+    states, frames = roll(jax.random.key(0), states, given)
+
+    position, facing = np.array([1.0, 2.0]), person.directions(0.7)
+    for i in range(ticks):
+        position, facing = reference.advance(position, facing, MOVE, SPIN, FPS)
+        np.testing.assert_allclose(frames.bone.origin[0, i], position, atol=1e-4)
+        np.testing.assert_allclose(frames.bone.facing[0, i], facing, atol=1e-4)
+        world = (reference.turn(facing) @ MOVE)[[0, 2]]
+        np.testing.assert_allclose(frames.velocity[0, i], world, atol=1e-4)
+    np.testing.assert_allclose(states.bone.origin[0], position, atol=1e-4)
+    np.testing.assert_allclose(states.turn_rate, SPIN[1], atol=1e-4)
+    np.testing.assert_allclose(frames.path[0, -1], normal(12, seed=9), atol=1e-4)
+    np.testing.assert_array_equal(frames.desired_velocity, given.velocity)
+    np.testing.assert_array_equal(frames.desired_facing, given.facing)
+    # Joint 0 stands over the bone, in its direction.
+    np.testing.assert_allclose(frames.root_position[0, -1, 1], 1.0, atol=1e-4)
+    np.testing.assert_allclose(frames.root_position[0, -1, ::2], position, atol=1e-4)
+    six = np.asarray(frames.joint_rotation[0, -1, 0])
+    turned = reference.turn(facing)
+    np.testing.assert_allclose(six, turned[:, :2].T.ravel(), atol=1e-4)
+
+
+@pytest.mark.parametrize("steered", [False, True])
+def test_only_steered_characters_have_a_goal(steered):
+    goals = []
+
+    def step(key, previous, goal):
+        goals.append(goal)
+        return previous
+
+    state, given = character([0.0, 1.0], 0.5), command([1.0, 0.0], 1.5)
+    made = driver(step, steered=steered, half_life=0.4)
+    found, shown = rollout.tick(made, jax.random.key(0), state, given)
+    if not steered:
+        assert goals and all(goal is None for goal in goals)
+        np.testing.assert_array_equal(shown.wanted, shown.path)
+        return
+    wanted = wanted_path(state, given, half_life=0.4)
+    np.testing.assert_allclose(shown.wanted, wanted, atol=1e-5)
+    planned = made.plans[0](jax.random.key(0), state, given)
+    own = space().normalizer
+    expected = (wanted - own.mean[:12]) / own.std[:12]
+    np.testing.assert_allclose(goals[-1], expected, atol=1e-5)
+    np.testing.assert_array_equal(planned.frame, state.frame)
+
+
+def test_frames_stay_within_the_bounds_of_the_data():
+    far = jnp.linspace(-99.0, 99.0, 12 + SIZE)
+    state, given = character([0.0, 1.0], 0.5), command([1.0, 0.0], 1.5)
+    for options, bound in ((dict(), 30.0), (dict(bounded=False), 99.0)):
+        made = driver(lambda key, previous, goal: far, steered=False, **options)
+        found = rollout.tick(made, jax.random.key(0), state, given)[0].frame
+        np.testing.assert_allclose(found, np.clip(far, -bound, bound))
+
+
+def test_an_unsteered_character_ignores_its_commands():
+    step = aamdm_controller.guided(
+        aamdm_model.transition(
+            tiny.random_params(aamdm_model.init, CONFIG), config=CONFIG
+        ),
+        scale=1.0,
+    )
+    made = driver(step, steered=False)
+    tick = jax.jit(lambda s, c: rollout.tick(made, jax.random.key(0), s, c)[0])
+    found = [tick(start(), command([x, 0.0], x)) for x in (0.0, 2.0)]
+    np.testing.assert_array_equal(found[0].frame, found[1].frame)
+
+
+def test_characters_together_are_what_each_is_alone():
+    params = tiny.random_params(aamdm_model.init, CONFIG)
+    transition = aamdm_model.transition(params, config=CONFIG)
+    made = driver(aamdm_controller.guided(transition, scale=0.1))
+    key, characters, ticks = jax.random.key(5), 3, 3
+    states = [character([0.1 * c, 1.0], 0.5 * c) for c in range(characters)]
+    given = [
+        [command([np.sin(c + i), 1.0], 0.3 * i - c) for i in range(ticks)]
+        for c in range(characters)
+    ]
+    stack = lambda rows: jax.tree.map(lambda *x: jnp.stack(x), *rows)  # noqa: E731
+    together = jax.jit(functools.partial(rollout.rollout, made))(
+        jax.random.clone(key), stack(states), stack([stack(row) for row in given])
+    )[1]
+    tick = jax.jit(functools.partial(rollout.tick, made))
+    for c in range(characters):
+        own, state = jax.random.fold_in(key, c), states[c]
+        for i in range(ticks):
+            state, alone = tick(jax.random.fold_in(own, i), state, given[c][i])
+            both = zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True)
+            for a, b in both:
+                np.testing.assert_allclose(a[c, i], b, rtol=2e-3, atol=2e-3)

@@ -1,0 +1,278 @@
+"""AAMDM's transition and losses."""
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.diffusion import chain, schedule
+from jaxmotion.systems.aamdm import loss as aamdm_loss
+from jaxmotion.systems.aamdm import model as aamdm_model
+from tests import tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+CONFIG = aamdm_model.Config(features=3, latent=2, width=16, depth=2, window=4)
+CHANGING = dataclasses.replace(CONFIG, target="change")
+CHANGE = jnp.array([0.5, 0.1, 2.0])
+
+
+@functools.cache
+def parameters():
+    return tiny.random_params(aamdm_model.init, CONFIG)
+
+
+def normal(*shape, seed=0):
+    values = np.random.default_rng(seed).normal(size=shape)
+    return jnp.asarray(values, jnp.float32)
+
+
+@pytest.mark.parametrize(("drafts", "polishes"), [(3, 2), (5, 0), (0, 5), (1, 1)])
+def test_drafts_come_before_polishes(drafts, polishes):
+    """Each step, one by one, with the network that its number belongs to."""
+    config = dataclasses.replace(CONFIG, drafts=drafts, polishes=polishes)
+    params = tiny.random_params(aamdm_model.init, config)
+    key, previous = jax.random.key(1), normal(3)
+    found = jax.jit(aamdm_model.transition(params, config=config))(key, previous)
+
+    key_start, key_chain = jax.random.split(jax.random.clone(key))
+    x = jax.random.normal(key_start, (3,))
+    for t in range(config.num_steps, 0, -1):
+        name, make = ("generator", aamdm_model.draft), ("polisher", aamdm_model.polish)
+        part = name if t > polishes else make
+        denoise = part[1](params[part[0]], previous, config=config)
+        step = chain.ancestral_step(config.table(), denoise)
+        x = step(jax.random.fold_in(key_chain, t), x, jnp.array(t))
+    np.testing.assert_allclose(found, x, rtol=1e-5, atol=1e-6)
+
+
+def test_characters_batch_by_vmap_and_compile_once():
+    step = aamdm_model.transition(parameters(), config=CONFIG)
+    traced = chex.assert_max_traces(lambda *a: jax.vmap(step)(*a), n=1)
+    run = jax.jit(traced)
+    keys, previous = jax.random.split(jax.random.key(0), 4), normal(4, 3)
+    together = run(keys, previous)
+    run(jax.random.split(jax.random.key(9), 4), previous + 1)
+    alone = jnp.stack([step(k, x) for k, x in zip(keys, previous, strict=True)])
+    np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)
+
+
+def test_guidance_lowers_its_objective():
+    step = aamdm_model.transition(parameters(), config=CONFIG)
+    goal = jnp.array([0.5, -0.5, 1.0])
+    objective = lambda x: 0.5 * jnp.sum(jnp.square(x - goal))  # noqa: E731
+
+    @functools.partial(jax.jit, static_argnums=())
+    def mean(scale):
+        keys = jax.random.split(jax.random.key(0), 64)
+        guided = lambda k: step(k, normal(3), objective=objective, scale=scale)  # noqa: E731
+        return jnp.mean(jax.vmap(objective)(jax.vmap(guided)(keys)))
+
+    assert mean(0.05) < mean(0.0)
+    plain = jax.jit(step)(jax.random.key(5), normal(3))
+    off = step(jax.random.key(5), normal(3), objective=objective, scale=0.0)
+    np.testing.assert_allclose(off, plain, rtol=1e-5, atol=1e-6)
+
+
+def test_polisher_loss_is_a_loop_over_its_own_predictions():
+    windows, key = normal(6, 5, 3), jax.random.key(2)
+    params = parameters()["polisher"]
+    loss, terms = jax.jit(functools.partial(aamdm_loss.polisher_loss, config=CONFIG))(
+        params, key, windows
+    )
+    key_t, key_noise = jax.random.split(jax.random.clone(key))
+    t = jax.random.randint(key_t, (5, 6), 1, 6)
+    noise = jax.random.normal(key_noise, windows.shape)
+    own, errors, changes = windows[:, 0], [], []
+    for i in range(1, 5):
+        x_t = schedule.q_sample(CONFIG.table(), windows[:, i], t[i], noise[:, i])
+        now = aamdm_model.network(CONFIG).apply({"params": params}, x_t, t[i], own)
+        errors.append(np.abs(now - windows[:, i]))
+        changes.append(np.abs(now - own - windows[:, i] + windows[:, i - 1]))
+        own = now
+    np.testing.assert_allclose(terms["value"], np.mean(errors), rtol=1e-4)
+    np.testing.assert_allclose(terms["velocity"], np.mean(changes), rtol=1e-4)
+    np.testing.assert_allclose(
+        loss, np.mean(errors) + 0.1 * np.mean(changes), rtol=1e-4
+    )
+
+
+def test_each_player_moves_only_itself():
+    params, windows = parameters(), normal(8, 3, 3)
+    judge = functools.partial(aamdm_loss.discriminator_loss, config=CONFIG)
+    make = functools.partial(aamdm_loss.generator_loss, config=CONFIG)
+    given = params["discriminator"], params["generator"], jax.random.key(0), windows
+    (loss, info), grad = jax.value_and_grad(judge, has_aux=True)(*given)
+    expected = info["adversarial"] + 0.5 * CONFIG.weight_r1 * info["r1"]
+    np.testing.assert_allclose(loss, expected, rtol=1e-6)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(grad))
+    given = params["generator"], params["discriminator"], jax.random.key(0), windows
+    _, grad = jax.value_and_grad(make, has_aux=True)(*given)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(grad))
+    assert any(np.abs(x).max() > 0 for x in jax.tree.leaves(grad))
+
+
+# --- changes as the target ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(), (5,), (2, 5)])
+def test_a_change_is_scaled_and_comes_back(shape):
+    frame, previous = normal(*shape, 3), normal(*shape, 3, seed=1)
+    x_0 = aamdm_model.to_target(frame, previous, CHANGE)
+    for i, scale in enumerate((0.5, 0.1, 2.0)):
+        step = np.float64(frame - previous)[..., i] / scale
+        np.testing.assert_allclose(x_0[..., i], step, rtol=1e-5, atol=1e-6)
+    found = aamdm_model.from_target(x_0, previous, CHANGE)
+    np.testing.assert_allclose(found, frame, rtol=1e-5, atol=1e-6)
+
+
+def test_without_a_scale_the_target_is_the_frame():
+    frame, previous = normal(5, 3), normal(5, 3, seed=1)
+    for through in (aamdm_model.to_target, aamdm_model.from_target):
+        np.testing.assert_array_equal(through(frame, previous, None), frame)
+
+
+@pytest.mark.parametrize(
+    ("config", "change", "message"),
+    [
+        (CHANGING, None, "'change'.*is none"),
+        (CONFIG, CHANGE, r"'frame'.*shape \(3,\)"),
+    ],
+)
+def test_the_scale_of_changes_must_fit_the_target(config, change, message):
+    params, windows, key = parameters(), normal(8, 5, 3), jax.random.key(0)
+    given = dict(config=config, change=change)
+    players = params["generator"], params["discriminator"]
+    for make in (
+        lambda: aamdm_model.check_change(config, change),
+        lambda: aamdm_model.transition(params, **given),
+        lambda: aamdm_loss.polisher_loss(params["polisher"], key, windows, **given),
+        lambda: aamdm_loss.generator_loss(*players, key, windows, **given),
+        lambda: aamdm_loss.discriminator_loss(*players[::-1], key, windows, **given),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+    aamdm_model.check_change(CHANGING, CHANGE)
+    aamdm_model.check_change(CONFIG, None)
+
+
+def test_the_chain_of_changes_is_added_to_the_previous_frame():
+    params, key, previous = parameters(), jax.random.key(1), normal(3)
+    step = aamdm_model.transition(params, config=CHANGING, change=CHANGE)
+    found = jax.jit(step)(key, previous)
+
+    key_start, key_chain = jax.random.split(jax.random.clone(key))
+    x = jax.random.normal(key_start, (3,))
+    for t in range(5, 0, -1):
+        name, make = ("generator", aamdm_model.draft), ("polisher", aamdm_model.polish)
+        part = name if t > 2 else make
+        denoise = part[1](params[part[0]], previous, config=CHANGING)
+        reverse = chain.ancestral_step(CHANGING.table(), denoise)
+        x = reverse(jax.random.fold_in(key_chain, t), x, jnp.array(t))
+    expected = np.float64(previous) + np.float64(x) * [0.5, 0.1, 2.0]
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_guidance_sees_frames_and_not_changes():
+    """An objective that is flat where frames lie, and steep at their changes."""
+    step = aamdm_model.transition(parameters(), config=CHANGING, change=CHANGE)
+
+    @jax.jit
+    def guided(previous):
+        objective = lambda x: jnp.sum(jnp.where(x < 50.0, x**2, 0.0))  # noqa: E731
+        key = jax.random.key(3)
+        return step(key, previous, objective=objective, scale=0.1)
+
+    plain = jax.jit(step)
+    for place, moves in ((100.0, False), (0.0, True)):
+        previous = jnp.full(3, place)
+        gap = np.abs(guided(previous) - plain(jax.random.key(3), previous)).max()
+        assert (gap > 1e-3) == moves
+
+
+class Constant:
+    """A network that predicts the same whatever it sees."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def apply(self, params, x_t, t, previous, latent=None):
+        return jnp.broadcast_to(self.value, x_t.shape)
+
+
+def test_windows_of_an_even_change_cost_who_predicts_it_nothing(monkeypatch):
+    pace = jnp.array([1.0, -2.0, 0.5])
+    start = normal(6, 1, 3)
+    frames = jnp.arange(5.0).reshape(1, 5, 1) * (pace * CHANGE).reshape(1, 1, 3)
+    windows = start + frames
+    given = dict(config=CHANGING, change=CHANGE)
+
+    def loss(wrong):
+        made = Constant((pace + wrong).reshape(1, 3))
+        monkeypatch.setattr(aamdm_model, "network", lambda config: made)
+        return aamdm_loss.polisher_loss({}, jax.random.key(0), windows, **given)
+
+    value, terms = loss(0.0)
+    np.testing.assert_allclose(value, 0.0, atol=1e-5)
+    # An error of 0.3 deviations a frame adds up over the four frames of the window.
+    value, terms = loss(0.3)
+    np.testing.assert_allclose(terms["value"], 0.3 * (1 + 2 + 3 + 4) / 4, rtol=1e-4)
+    np.testing.assert_allclose(terms["velocity"], 0.3, rtol=1e-4)
+    np.testing.assert_allclose(value, 0.75 + 0.1 * 0.3, rtol=1e-4)
+
+
+# --- noise on given frames ---------------------------------------------------------
+
+
+def test_each_row_has_noise_of_a_size_of_its_own():
+    found = aamdm_loss.random_noise(jax.random.key(0), (2000, 200), largest=0.3)
+    size = np.std(found, axis=1)
+    expected = 0.3 * np.array([0.1, 0.5, 0.9])
+    np.testing.assert_allclose(np.quantile(size, [0.1, 0.5, 0.9]), expected, rtol=0.1)
+    assert size.max() < 0.3 * 1.3
+    none = aamdm_loss.random_noise(jax.random.key(0), (20, 3), largest=0.0)
+    np.testing.assert_array_equal(none, 0.0)
+
+
+@pytest.mark.parametrize("largest", [0.0, 0.2])
+def test_given_frames_are_shaken_in_units_of_the_target(monkeypatch, largest):
+    """Who adds the right change keeps the error of the first frame to the end."""
+    pace = jnp.array([1.0, -2.0, 0.5])
+    frames = jnp.arange(5.0).reshape(1, 5, 1) * (pace * CHANGE).reshape(1, 1, 3)
+    windows = jnp.broadcast_to(frames, (3000, 5, 3))
+    made = Constant(pace.reshape(1, 3))
+    monkeypatch.setattr(aamdm_model, "network", lambda config: made)
+    config = dataclasses.replace(CHANGING, previous_noise=largest)
+    given = dict(config=config, change=CHANGE)
+    _, terms = aamdm_loss.polisher_loss({}, jax.random.key(0), windows, **given)
+    error = largest / 2 * np.sqrt(2 / np.pi)
+    np.testing.assert_allclose(terms["value"], error, rtol=0.05, atol=1e-5)
+    np.testing.assert_allclose(terms["velocity"], error / 4, rtol=0.05, atol=1e-5)
+
+
+@pytest.mark.parametrize(("config", "change"), [(CONFIG, None), (CHANGING, CHANGE)])
+def test_players_are_given_shaken_frames(monkeypatch, config, change):
+    seen = []
+
+    class Judge:
+        def apply(self, params, x, x_t, t, previous):
+            seen.append(previous)
+            return jnp.zeros(len(x))
+
+    monkeypatch.setattr(aamdm_model, "discriminator", lambda config: Judge())
+    monkeypatch.setattr(
+        aamdm_model, "network", lambda config: Constant(jnp.zeros((1, 3)))
+    )
+    windows = jnp.broadcast_to(normal(1, 3, 3), (3000, 3, 3))
+    for largest in (0.0, 0.2):
+        own = dataclasses.replace(config, previous_noise=largest, own_previous=0.0)
+        given = dict(config=own, change=change)
+        aamdm_loss.generator_loss({}, {}, jax.random.key(0), windows, **given)
+        noise = np.abs(np.float64(seen.pop()) - np.float64(windows[:, -2])).mean(0)
+        units = np.ones(3) if change is None else np.float64(change)
+        expected = largest / 2 * np.sqrt(2 / np.pi) * units
+        np.testing.assert_allclose(noise, expected, rtol=0.1, atol=1e-6)

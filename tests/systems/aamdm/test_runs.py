@@ -1,0 +1,230 @@
+"""Folders of AAMDM: prepared once, loaded or refused, and the chains in them."""
+
+import dataclasses
+import json
+import shutil
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.data import clips_io
+from jaxmotion.learning import checkpoint
+from jaxmotion.systems.aamdm import model as aamdm_model
+from jaxmotion.systems.aamdm import space as aamdm_space
+from jaxmotion.systems.aamdm import training as aamdm_training
+from tests import person, tiny
+
+# Orbax abandons its other reads when one fails.
+pytestmark = [
+    pytest.mark.usefixtures("quick_compile"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+
+LENGTHS = (160, 90, 160, 30)
+MADE = dict(field="theme", labels=("walk",), fps=60.0, held_out=0.2, mirrored=True)
+BUDGET = aamdm_training.Budget(
+    steps=2, batch=4, chunk=1, save_every=2, optimizer="adamw"
+)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "clips.npz"
+    clips_io.save_clips(path, person.clips(LENGTHS))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory, quick_compile):
+    """The walks, clips 0 and 2, and their mirror images."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return aamdm_training.prepare(folder, data, **MADE)
+
+
+# --- data of a folder --------------------------------------------------------------
+
+
+def test_clips_are_chosen_mirrored_described_and_split(run, data):
+    assert run.train.offsets.tolist() == [0, 68, 136, 204, 272]
+    assert run.held_out.offsets.tolist() == [0, 32, 64, 96, 128]
+    assert run.bones.names == person.NAMES and run.source == "made in the tests"
+    assert run.embedding.num_joints == 6 and run.embedding.fps == 60.0
+    assert run.config["data"] == [str(data)] and run.config["mirrored"] is True
+    assert len(run.config["clips"]) == 4
+    # Sideways and turning velocities of the mirror images are the opposite ones.
+    own, image = run.train.poses[:136], run.train.poses[136:]
+    for channel, sign in ((-8, -1.0), (-6, 1.0), (-4, -1.0)):
+        np.testing.assert_allclose(
+            image[:, channel], sign * own[:, channel], rtol=1e-3, atol=1e-3
+        )
+
+
+def test_what_is_prepared_is_not_prepared_again(run, data, monkeypatch):
+    monkeypatch.setattr(clips_io, "load_clips", lambda path: pytest.fail("read"))
+    again = aamdm_training.prepare(run.folder, data, **MADE)
+    pairs = zip(jax.tree.leaves(again.train), jax.tree.leaves(run.train), strict=True)
+    for a, b in pairs:
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    "change", [dict(fps=120.0), dict(labels=()), dict(held_out=0.3), dict(mirrored=0)]
+)
+def test_a_folder_keeps_to_how_it_was_made(run, data, change):
+    change = {k: bool(v) if k == "mirrored" else v for k, v in change.items()}
+    before = (run.folder / "config.json").read_text()
+    with pytest.raises(ValueError, match=f"{run.folder}.*another folder"):
+        aamdm_training.prepare(run.folder, data, **MADE | change)
+    assert (run.folder / "config.json").read_text() == before
+
+
+def test_data_that_do_not_fit_are_named(data, tmp_path):
+    with pytest.raises(OSError, match="gone.npz"):
+        aamdm_training.prepare(tmp_path, tmp_path / "gone.npz", **MADE)
+    for change, message in (
+        (dict(labels=("fly",)), "unknown theme 'fly'"),
+        (dict(field="mood"), "unknown label field 'mood'"),
+        (dict(fps=24.0), "cannot be resampled to 24"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            aamdm_training.prepare(tmp_path, data, **MADE | change)
+    assert not (tmp_path / "config.json").exists()
+
+
+def without(field):
+    def change(folder):
+        path = folder / "config.json"
+        value = json.loads(path.read_text())
+        del value[field]
+        path.write_text(json.dumps(value))
+
+    return change
+
+
+def written(name, content):
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+DAMAGED = {
+    "no config": lambda folder: (folder / "config.json").unlink(),
+    "no frames": lambda folder: (folder / "frames.npz").unlink(),
+    "another system": written("config.json", b'{"system": "camdm"}'),
+    "half a config": written("config.json", b'{"system": "aam'),
+    "a list": written("config.json", b"[]"),
+    "no rate": without("fps"),
+    "no skeleton": without("skeleton"),
+    "half the frames": written("frames.npz", b"PK\x03\x04"),
+    "emptied frames": written("frames.npz", b""),
+    "text for frames": written("frames.npz", b"hello"),
+}
+
+
+@pytest.mark.parametrize("how", DAMAGED)
+def test_a_folder_that_is_none_is_named(run, tmp_path, how):
+    folder = tmp_path / "copy"
+    folder.mkdir()
+    for name in ("config.json", "frames.npz"):
+        shutil.copy(run.folder / name, folder)
+    aamdm_training.load_run(folder)
+    DAMAGED[how](folder)
+    with pytest.raises(ValueError, match=str(folder)):
+        aamdm_training.load_run(folder)
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(ValueError, match="gone.*no run folder"):
+        aamdm_training.load_run(tmp_path / "gone")
+
+
+# --- spaces and chains -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def space(run):
+    return aamdm_training.make_space(run, None)
+
+
+CONFIG = aamdm_model.Config(features=110, latent=2, width=16, depth=1, window=2)
+
+
+@pytest.fixture(scope="module")
+def chain(run, space):
+    """Parameters of both stages, of chains of five steps."""
+    given, init = (run, "full_pose", space, CONFIG, BUDGET), aamdm_model.init
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(aamdm_model, "init", lambda k, c: tiny.random_params(init, c))
+        return {
+            "polisher": aamdm_training.train_polisher(*given),
+            "generator": aamdm_training.train_generator(*given),
+        }
+
+
+def test_a_space_of_a_run_is_read_back(run, space):
+    found = aamdm_training.load_space(run, "full_pose")
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(space), strict=True):
+        np.testing.assert_array_equal(a, b)
+    frames = aamdm_space.to_frames(found, run.train.poses, run.train.paths)
+    np.testing.assert_allclose(jnp.mean(frames, axis=0), 0.0, atol=1e-3)
+    with pytest.raises(checkpoint.CheckpointError, match=str(run.folder / "embedded")):
+        aamdm_training.load_space(run, "embedded")
+
+
+def test_a_space_that_is_there_is_loaded(run, space, monkeypatch):
+    monkeypatch.setattr(checkpoint, "save", lambda *a, **k: pytest.fail("saved"))
+    again = aamdm_training.make_space(run, None)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(space), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(("drafts", "polishes"), [(3, 2), (4, 1), (5, 0), (0, 5)])
+def test_chains_of_one_length_share_their_networks(run, space, chain, drafts, polishes):
+    params, config = aamdm_training.load_networks(
+        run, "full_pose", space, drafts=drafts, polishes=polishes
+    )
+    assert config == dataclasses.replace(CONFIG, drafts=drafts, polishes=polishes)
+    used = {"generator": drafts, "polisher": polishes}
+    assert set(params) == {name for name, steps in used.items() if steps}
+    for name, found in params.items():
+        pairs = zip(jax.tree.leaves(found), jax.tree.leaves(chain[name]), strict=True)
+        for a, b in pairs:
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_stored_chain_makes_frames(run, space, chain):
+    step = aamdm_training.load_chain(run, "full_pose", space, drafts=3, polishes=2)
+    previous = aamdm_space.to_frames(space, run.train.poses[0], run.train.paths[0])
+    found = jax.jit(step)(jax.random.key(0), previous)
+    made = aamdm_model.transition(chain, config=CONFIG)
+    expected = jax.jit(made)(jax.random.key(0), previous)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_chain_that_was_not_trained_is_named(run, space, chain):
+    for missing, options in (
+        ("T6", dict(drafts=4, polishes=2)),
+        ("T5_change", dict(drafts=3, polishes=2, target="change")),
+    ):
+        folder = str(run.folder / "full_pose" / missing)
+        with pytest.raises(checkpoint.CheckpointError, match=folder):
+            aamdm_training.load_chain(run, "full_pose", space, **options)
+
+
+def test_a_chain_of_another_space_is_named(run, space, chain):
+    narrow = jax.tree.map(lambda x: x[:-1], space)
+    with pytest.raises(ValueError, match="110 channels, expected the 109"):
+        aamdm_training.load_chain(run, "full_pose", narrow, drafts=3, polishes=2)
+
+
+def test_a_chain_is_not_trained_over_another(run, space, chain):
+    wide = dataclasses.replace(CONFIG, window=3)
+    with pytest.raises(ValueError, match="polisher: of another model: config"):
+        aamdm_training.train_polisher(run, "full_pose", space, wide, BUDGET)
+
+
+def test_a_chain_in_a_folder_of_another_length_is_named(run, space, chain):
+    folder = run.folder / "full_pose"
+    shutil.copytree(folder / "T5", folder / "T7")
+    with pytest.raises(ValueError, match="T7.*chains of 5 steps, expected 7"):
+        aamdm_training.load_chain(run, "full_pose", space, drafts=5, polishes=2)

@@ -1,0 +1,204 @@
+"""A model as a value: to JSON and back, from a run folder, and what may be wrong."""
+
+import copy
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from jaxmotion.learning import checkpoint, training
+from jaxmotion.systems.camdm import model as camdm_model
+from tests import tiny
+
+
+@pytest.fixture
+def model(bones, config):
+    return camdm_model.Model(
+        config=config, bones=bones, labels=tiny.STYLES, source="tests (no licence)"
+    )
+
+
+def test_json_and_back(model):
+    text = json.dumps(camdm_model.to_json(model))
+    found = camdm_model.from_json(json.loads(text), where="here")
+    assert found.config == model.config
+    assert hash(found.config) == hash(model.config)
+    assert (found.labels, found.source) == (model.labels, model.source)
+    for field in ("parents", "names", "feet"):
+        assert getattr(found.bones, field) == getattr(model.bones, field)
+    np.testing.assert_array_equal(found.bones.offsets, model.bones.offsets)
+
+
+def test_labels_by_name(model):
+    assert [model.label(name) for name in tiny.STYLES] == [0, 1]
+    with pytest.raises(ValueError, match="unknown style 'sad'.*calm, brisk"):
+        model.label("sad")
+
+
+BAD = {
+    "system": (lambda v: v.update(system="emdm"), "'system' is 'emdm'"),
+    "no system": (lambda v: v.pop("system"), "'system' is None"),
+    "unknown field": (
+        lambda v: v["config"].update(size=3),
+        "'config': has unknown.*size",
+    ),
+    "no config": (lambda v: v.pop("config"), "config"),
+    "no skeleton": (lambda v: v.pop("skeleton"), "skeleton"),
+    "no names": (lambda v: v["skeleton"].pop("names"), "names"),
+    "no labels": (lambda v: v.pop("labels"), "labels"),
+    "missing size": (lambda v: v["config"].pop("num_joints"), "num_joints"),
+    "wrong parents": (
+        lambda v: v["skeleton"].update(parents=[-1, 3, 1, 0, 3]),
+        "parent of joint 1",
+    ),
+    "nan offset": (
+        lambda v: v["skeleton"]["offsets"][2].__setitem__(1, float("nan")),
+        "'skeleton'.*offset of joint 2 is .*nan",
+    ),
+    "offset of 1e39": (
+        lambda v: v["skeleton"]["offsets"][2].__setitem__(1, 1e39),
+        r"'skeleton'.*offset of joint 2 is .*1e\+39.*within 1e\+06 m",
+    ),
+    "ragged offsets": (
+        lambda v: v["skeleton"]["offsets"][2].append(1.0),
+        "'skeleton'.*offsets should be 5 rows of 3",
+    ),
+    "foot out of range": (
+        lambda v: v["skeleton"].update(feet=[2, 5]),
+        r"'skeleton'.*feet \[2, 5\]: expected different joints in 0..4",
+    ),
+    "foot that is a word": (
+        lambda v: v["skeleton"].update(feet=["toe"]),
+        "'skeleton'.*feet should be whole numbers, found 'toe'",
+    ),
+    "joint name twice": (
+        lambda v: v["skeleton"]["names"].__setitem__(1, v["skeleton"]["names"][0]),
+        "'skeleton'.*two joints have the name",
+    ),
+    "one name less": (
+        lambda v: v["skeleton"]["names"].pop(),
+        "'skeleton'.*4 names for 5 joints",
+    ),
+    "names that are a word": (
+        lambda v: v["skeleton"].update(names="abcde"),
+        "'skeleton'.*names should be a list, found 'abcde'",
+    ),
+    "parents of halves": (
+        lambda v: v["skeleton"].update(parents=[-1, 0.0, 1, 0, 3]),
+        "'skeleton'.*parents should be whole numbers, found 0.0",
+    ),
+    "config that is a list": (
+        lambda v: v.update(config=[1]),
+        "'config': a JSON list, expected an object",
+    ),
+    "labels that are numbers": (
+        lambda v: v.update(labels=[1, 2]),
+        "'labels': .1, 2., expected a list of different names",
+    ),
+    "odd heads": (
+        lambda v: v["config"].update(heads=3),
+        r"width is 16, expected a multiple of heads \(3\)",
+    ),
+    **{
+        f"{name} {value}": (
+            lambda v, name=name, value=value: v["config"].update({name: value}),
+            f"'config': {name} is .*, expected ",
+        )
+        for name, value in (
+            ("num_steps", 0),
+            ("num_steps", 8.0),
+            ("num_steps", True),
+            ("network", "x"),
+            ("network", None),
+            ("heads", 0),
+            ("width", 10**9),
+            ("width", "16"),
+            ("depth", -1),
+            ("future", 10**6),
+            ("heading", "north"),
+            ("rotation_layout", 3),
+            ("norm", ["post"]),
+            ("fps", -1.0),
+            ("fps", float("nan")),
+            ("dropout", float("inf")),
+            ("dropout", 1.0),
+            ("weight_foot", -1.0),
+            ("weight_foot", 1e300),
+            ("rotation_mean", 0.5),
+            ("rotation_mean", [float("nan")]),
+            ("token_margin", -1),
+            ("token_window", "box"),
+        )
+    },
+    "another skeleton": (
+        lambda v: v["config"].update(num_joints=7),
+        "'skeleton' has 5 entries, the config 7",
+    ),
+    "another style": (
+        lambda v: v["labels"].append("sad"),
+        "'labels' has 3 entries, the config 2",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_wrong_is_named_with_its_file(model, case):
+    change, message = BAD[case]
+    value = copy.deepcopy(camdm_model.to_json(model))
+    change(value)
+    with pytest.raises(ValueError, match=f"some/file.*{message}"):
+        camdm_model.from_json(value, where="some/file")
+
+
+def save_run(folder, model, params):
+    state = training.init_train_state(params, optax.adam(1e-3))
+    state = training.TrainState(
+        step=jnp.int32(4),
+        params=params,
+        ema_params=jax.tree.map(lambda x: 2 * x, params),
+        opt_state=state.opt_state,
+    )
+    value = camdm_model.to_json(model) | {"experiment": {"steps": 4}}
+    checkpoint.save(folder / "checkpoints", 4, state, value)
+
+
+def test_a_run_gives_its_averaged_parameters(tmp_path, model, params):
+    save_run(tmp_path, model, params)
+    found, found_params, value = camdm_model.load(tmp_path)
+    assert found.config == model.config
+    assert value["experiment"] == {"steps": 4}
+    jax.tree.map(
+        lambda a, b: np.testing.assert_array_equal(a, 2 * b), found_params, params
+    )
+
+
+def test_an_exported_file(tmp_path, model, params):
+    path = tmp_path / "model.npz"
+    checkpoint.export_params(path, params, camdm_model.to_json(model), dtype=np.float32)
+    found, found_params, _ = camdm_model.load(path)
+    assert found.labels == model.labels
+    jax.tree.map(np.testing.assert_array_equal, found_params, params)
+
+
+def test_parameters_of_another_size_are_refused(tmp_path, model, params):
+    """The JSON says depth 2, the parameters are of depth 1."""
+    shallow = {k: v for k, v in params.items() if k != "layers_1"}
+    assert len(shallow) < len(params)
+    save_run(tmp_path / "run", model, shallow)
+    path = tmp_path / "model.npz"
+    checkpoint.export_params(path, shallow, camdm_model.to_json(model))
+    for place in (tmp_path / "run", path):
+        with pytest.raises(checkpoint.CheckpointError, match=str(place)):
+            camdm_model.load(place)
+
+
+def test_a_folder_without_a_model(tmp_path):
+    for place in (tmp_path, tmp_path / "none"):
+        with pytest.raises(checkpoint.CheckpointError, match=str(place)):
+            camdm_model.load(place)
+    checkpoint.save(tmp_path / "checkpoints", 1, {"a": jnp.ones(2)}, {"system": "else"})
+    with pytest.raises(ValueError, match=f"{tmp_path}.*'system' is 'else'"):
+        camdm_model.load(tmp_path)

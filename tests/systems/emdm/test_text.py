@@ -1,0 +1,103 @@
+"""The text condition as released and as ours, against CLIP's oracle."""
+
+import numpy as np
+import pytest
+
+from jaxmotion.data import text_motion, text_motion_io
+from jaxmotion.systems.emdm import text as emdm_text
+from jaxmotion.systems.emdm import training as emdm_training
+from tests.reference import clip as oracle
+from tests.text import samples
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+# The context is 24: the longer one just fits it whole, and the release cuts it.
+SHORT, LONG = "a person turns left", "a " * 21 + "left"
+
+
+def ids(text):
+    """Of a whole text, by the tokenizer alone."""
+    made = samples.tokenizer()
+    made.no_padding()
+    made.no_truncation()
+    return made.encode(text).ids
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run folder without its form, and weights of CLIP's text tower."""
+    clip = tmp_path / "clip"
+    clip.mkdir()
+    weights = samples.folder(clip)
+    motions = text_motion.text_motions(
+        [np.random.default_rng(0).normal(size=(40, 263)).astype(np.float32)],
+        [[(SHORT, "a/DET"), (LONG, "a/DET")]],
+        ["train"],
+        ["clip"],
+        mean=np.zeros(263),
+        std=np.ones(263),
+        fps=20.0,
+        source="made in the tests",
+    )
+    text_motion_io.save_text_motions(tmp_path / "data.npz", motions)
+
+    def write(**given):
+        value = {"task": "text", "encoder": str(clip)} | given
+        emdm_training.write_config(tmp_path, value)
+        return tmp_path
+
+    return write, weights
+
+
+def vectors(weights, texts):
+    """Of lists of tokens; the first end is where a text ends."""
+    end = samples.tokenizer().token_to_id(samples.END)
+    return np.array([oracle.encode(weights, t, end, samples.HEADS) for t in texts])
+
+
+def released(text):
+    """Start, 20 tokens at most, end, and zeros up to the whole context."""
+    start, *inner, end = ids(text)
+    cut = [start, *inner[:20], end]
+    return cut + [0] * (samples.SIZES["context"] - len(cut))
+
+
+def test_released_texts_are_cut_and_not_scaled(folder):
+    write, weights = folder
+    assert len(ids(LONG)) > 22
+    run = emdm_text.load_run(write(text_form="released"))
+    want = vectors(weights, [released(SHORT), released(LONG)])
+    whole = vectors(weights, [ids(SHORT), ids(LONG)])
+    assert np.abs(want[1] - whole[1]).max() > 1e-2
+    np.testing.assert_allclose(run.vectors[run.index], want, atol=1e-5)
+    assert run.scale == 1.0
+    # New sentences are read as the captions were.
+    np.testing.assert_allclose(
+        emdm_text.encode(run, (LONG, SHORT)), want[::-1], atol=1e-5
+    )
+
+
+@pytest.mark.parametrize("given", [{}, {"text_form": "unit"}])
+def test_unit_texts_are_whole_and_scaled(folder, given):
+    """Also in folders from before there was a choice."""
+    write, weights = folder
+    run = emdm_text.load_run(write(**given))
+    whole = vectors(weights, [ids(SHORT), ids(LONG)])
+    whole /= np.sqrt((whole**2).mean())
+    np.testing.assert_allclose(run.vectors[run.index], whole, atol=1e-5)
+    np.testing.assert_allclose(emdm_text.encode(run, (LONG,)), whole[1:], atol=1e-5)
+
+
+def test_the_two_forms_have_caches_of_their_own(folder):
+    write, _ = folder
+    emdm_text.load_run(write(text_form="released"))
+    with pytest.raises(ValueError, match="texts.npz: field 'encoder'.*22 tokens"):
+        emdm_text.load_run(write(text_form="unit"))
+
+
+def test_the_default_is_the_released_form_with_clip_alone():
+    assert emdm_text.default_form("path/to/clip") == "released"
+    for name in ("wordllama", "hashed"):
+        assert emdm_text.default_form(name) == "unit"
+        with pytest.raises(ValueError, match=f"'released'.*encoder is '{name}'"):
+            emdm_text.make_encoder(name, "released")

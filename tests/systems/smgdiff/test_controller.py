@@ -1,0 +1,178 @@
+"""SMGDiff's run-time: when it plans, and how plans join what is displayed."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.control import rollout
+from jaxmotion.motion.trajectory import Command
+from jaxmotion.systems.smgdiff import controller as smgdiff_controller
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import model as smgdiff_model
+from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
+from tests import ball_walker, tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+CONTROL = smgdiff_controller.Control(apply=5, reuse=4)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """Representation, config, and a controller of random networks."""
+    scenes = [ball_walker.scene(16, speed=s, start=s) for s in (0.6, 1.0, 1.4)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *scenes)
+    representation = smgdiff_scene.fit(
+        tiny.skeleton(), stacked, joints=(2, 4), radius=0.11
+    )
+    config = smgdiff_model.Config(
+        num_features=representation.normalizer.mean.size,
+        num_labels=2,
+        past=4,
+        future=12,
+        num_steps=2,
+        width=16,
+        depth=1,
+        heads=2,
+        hidden=32,
+    )
+    generate, sample = parts_of(representation, config)
+    driver = smgdiff_controller.controller(
+        generate,
+        sample,
+        representation=representation,
+        config=config,
+        control=CONTROL,
+    )
+    return representation, config, driver
+
+
+def parts_of(representation, config):
+    """Random networks of both stages."""
+    paths = smgdiff_trajectory.Config(
+        num_labels=2,
+        past=4,
+        future=12,
+        width=16,
+        depth=1,
+        hidden=32,
+        frames_per_token=2,
+    )
+    sample = smgdiff_guidance.planner(
+        tiny.random_params(smgdiff_model.init, config, seed=3),
+        config=config,
+        representation=representation,
+        guided=smgdiff_guidance.Guidance(end=1, last_sigma=0.01),
+    )
+    generate = smgdiff_trajectory.generator(
+        tiny.random_params(smgdiff_trajectory.init, paths, seed=1), config=paths
+    )
+    return generate, sample
+
+
+def past(frames=6):
+    return ball_walker.scene(frames, speed=1.0, start=0.4)
+
+
+def commands(ticks, *, change=None):
+    velocity = np.tile([0.2, 1.0], (ticks, 1))
+    if change is not None:
+        velocity[change:] = [1.0, 0.0]
+    return Command(
+        velocity=jnp.asarray(velocity, jnp.float32),
+        facing=jnp.tile(jnp.array([0.0, 1.0]), (ticks, 1)),
+        label=jnp.zeros(ticks, jnp.int32),
+    )
+
+
+def played(parts, steered, number=1):
+    _, config, driver = parts
+    state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
+    many = lambda tree: jax.tree.map(lambda x: jnp.stack([x] * number), tree)  # noqa: E731
+    run = jax.jit(lambda *given: rollout.rollout(driver, *given)[1])
+    return run(jax.random.key(1), many(state), many(steered))
+
+
+@pytest.fixture(scope="module")
+def frames(parts):
+    return played(parts, commands(13, change=7), number=2)
+
+
+def test_it_plans_at_first_when_played_out_and_when_told(frames):
+    planned = np.flatnonzero(np.asarray(frames.planned[0]))
+    np.testing.assert_array_equal(planned, [0, 5, 7, 12])
+
+
+def test_a_plan_begins_where_body_and_ball_are_displayed(parts):
+    """Beside the same plan without a seam, which starts wherever the network says."""
+    representation, config, driver = parts
+    generate, sample = parts_of(representation, config)
+    state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
+    wanted = jax.tree.map(lambda x: x[0], commands(1))
+
+    def plan(seam):
+        control = dataclasses.replace(CONTROL, seam=seam)
+        return jax.jit(
+            lambda key: (
+                smgdiff_controller.replan(
+                    generate,
+                    sample,
+                    key,
+                    state,
+                    wanted,
+                    representation=representation,
+                    config=config,
+                    control=control,
+                ).plan
+            )
+        )(jax.random.key(4))
+
+    bare, joined = plan(0.0), plan(0.2)
+    shown = state.past
+    for get in (lambda x: x.ball, lambda x: x.motion.root_position):
+        step = get(bare)[1] - get(bare)[0]
+        expected = get(shown)[-1] + step
+        off, near = (jnp.linalg.norm(get(x)[0] - expected) for x in (bare, joined))
+        # A sixth of the seam later the quintic has given up a fifth of the offset;
+        # the root also brings the velocity along that it had.
+        assert float(near) < 0.5 * float(off)
+        # From 0.2 s on the plan is the network's.
+        np.testing.assert_allclose(get(joined)[6:], get(bare)[6:], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_players_draw_their_own_noise_and_one_alone_is_the_same(parts, frames):
+    assert float(jnp.abs(frames.ball[0, 1] - frames.ball[1, 1]).max()) > 1e-4
+    alone = played(parts, commands(13, change=7))
+    np.testing.assert_allclose(alone.ball[0, :5], frames.ball[0, :5], atol=1e-3)
+
+
+def test_urgency_is_a_matter_of_command_and_cursor(parts):
+    _, config, _ = parts
+    state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
+    wanted = jax.tree.map(lambda x: x[0], commands(1))
+    need = lambda s, c: int(smgdiff_controller.urgency(s, c, control=CONTROL))  # noqa: E731
+    assert need(state, wanted) == 1  # the first command
+    state = dataclasses.replace(state, command=wanted)
+    assert need(state, wanted) == 0
+    other = dataclasses.replace(wanted, label=jnp.int32(1))
+    assert need(state, other) == 1
+    assert need(dataclasses.replace(state, cursor=jnp.int32(5)), wanted) == 1
+
+
+def test_bad_input_is_named(parts):
+    representation, config, _ = parts
+    with pytest.raises(ValueError, match="past has 3 frames, expected 4 or more"):
+        smgdiff_controller.init_state(tiny.skeleton(), past(3), config=config)
+    with pytest.raises(ValueError, match="apply is 13, expected 1..12"):
+        smgdiff_controller.controller(
+            lambda key, wish: None,
+            lambda key, condition: None,
+            representation=representation,
+            config=config,
+            control=smgdiff_controller.Control(apply=13),
+        )

@@ -1,0 +1,308 @@
+"""SMGDiff's motion model: features, losses, and where contact guidance acts."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.motion import rotation, skeleton, trajectory
+from jaxmotion.motion.ball import Scene
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import loss as smgdiff_loss
+from jaxmotion.systems.smgdiff import model as smgdiff_model
+from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.systems.smgdiff.guidance import UNGUIDED, Guidance
+from tests import ball_walker, tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+FEET = (2, 4)
+
+
+def as_jax(scene):
+    return jax.tree.map(jnp.asarray, scene)
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Windows of 16 frames, seen from their fourth."""
+    whole = [ball_walker.scene(16, speed=s, turn=s, start=s) for s in (0.6, 1.0, 1.4)]
+    return jax.tree.map(lambda *x: jnp.stack(x), *[local(as_jax(w)) for w in whole])
+
+
+def local(scene):
+    past = jax.tree.map(lambda x: x[:4], scene.motion)
+    return smgdiff_scene.to_frame(
+        scene, smgdiff_scene.plan_frame(tiny.skeleton(), past)
+    )
+
+
+@pytest.fixture(scope="module")
+def representation(scenes):
+    return smgdiff_scene.fit(tiny.skeleton(), scenes, joints=FEET, radius=0.11)
+
+
+@pytest.fixture(scope="module")
+def config(representation):
+    return smgdiff_model.Config(
+        num_features=representation.normalizer.mean.size,
+        num_labels=2,
+        past=4,
+        future=12,
+        num_steps=4,
+        width=16,
+        depth=1,
+        heads=2,
+        hidden=32,
+        dropout=0.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def params(config):
+    return tiny.random_params(smgdiff_model.init, config, seed=3)
+
+
+@pytest.fixture(scope="module")
+def condition(scenes, representation, config):
+    scene = jax.tree.map(lambda x: x[0], scenes)
+    course = trajectory.root_trajectory(tiny.skeleton(), scene.motion)
+    return smgdiff_loss.situation(
+        scene, course, jnp.int32(1), representation=representation, config=config
+    )[0]
+
+
+def test_smpl_with_four_feet_has_162_channels():
+    """147 of the body, 7 of the ball, 4 + 4 contacts (FACTS 4.2)."""
+    bones = skeleton.Skeleton(
+        offsets=jnp.zeros((24, 3)),
+        parents=(-1, *range(23)),
+        names=tuple(f"j{i}" for i in range(24)),
+        feet=(7, 8, 10, 11),
+    )
+    names = smgdiff_scene.feature_layout(bones, (7, 8, 10, 11))
+    assert names.size == 162
+    assert dict((n, (a, b)) for n, a, b in names.fields)["ball"] == (147, 154)
+
+
+def test_a_scene_comes_back_from_its_features(scenes, representation):
+    x = smgdiff_scene.to_features(scenes, representation)
+    found, stands = smgdiff_scene.to_scene(x, scenes.ball[:, 0], representation)
+    np.testing.assert_allclose(found.ball, scenes.ball, atol=2e-6)
+    np.testing.assert_allclose(
+        found.motion.root_position, scenes.motion.root_position, atol=2e-6
+    )
+    np.testing.assert_allclose(
+        rotation.matrix_from_rot6d(found.motion.joint_rotation),
+        rotation.matrix_from_rot6d(scenes.motion.joint_rotation),
+        atol=1e-5,
+    )
+    np.testing.assert_allclose(found.touch, scenes.touch, atol=1e-6)
+    feet = skeleton.joint_positions(tiny.skeleton(), scenes.motion)[..., FEET, :]
+    speed = np.linalg.norm(np.diff(np.float64(feet), axis=1), axis=-1) * 30
+    inner = np.asarray(stands)[:, :-1]
+    clear = np.abs(speed - 0.3) > 1e-3
+    np.testing.assert_allclose(inner[clear], (speed <= 0.3)[clear], atol=1e-5)
+
+
+def test_features_do_not_know_where_in_the_world(representation):
+    scene = as_jax(ball_walker.scene(16, speed=1.0, turn=0.5))
+    frame = trajectory.PlanarFrame(
+        origin=jnp.array([3.0, -8.0]), facing=jnp.array([0.6, -0.8])
+    )
+    moved = smgdiff_scene.from_frame(scene, frame)
+    assert float(jnp.abs(moved.ball - scene.ball).max()) > 3.0
+    found, expected = (
+        smgdiff_scene.to_features(local(x), representation) for x in (moved, scene)
+    )
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_a_scene_goes_into_a_frame_and_back():
+    scene = as_jax(ball_walker.scene(16, speed=1.0))
+    frame = trajectory.PlanarFrame(
+        origin=jnp.array([3.0, -8.0]), facing=jnp.array([0.6, -0.8])
+    )
+    there = smgdiff_scene.to_frame(scene, frame)
+    back = smgdiff_scene.from_frame(there, frame)
+    np.testing.assert_allclose(back.ball, scene.ball, atol=2e-6)
+    gap = lambda x: jnp.linalg.norm(x.ball - x.motion.root_position, axis=-1)  # noqa: E731
+    np.testing.assert_allclose(gap(there), gap(scene), atol=2e-6)
+
+
+def test_features_are_standardised_by_kind(scenes, representation):
+    x = np.float64(smgdiff_scene.to_features(scenes, representation))
+    rotations = x[..., 3:33].reshape(-1, 30)
+    np.testing.assert_allclose(np.mean(x.reshape(-1, x.shape[-1]), 0), 0, atol=1e-5)
+    std = np.asarray(representation.normalizer.std)
+    unit = max((rotations * std[3:33]).std(0).mean(), 0.05)
+    np.testing.assert_allclose(std[3:33], unit, rtol=1e-4)
+    assert std[0] == std[2] and np.unique(std[3:33]).size == 1
+    assert (std >= 0.05).all()
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "expected"),
+    [
+        (0, 0, [(False, 8, 0)]),
+        (0, 2, [(False, 8, 2), (True, 2, 0)]),
+        (1, 0, [(True, 8, 7), (False, 7, 0)]),
+        (1, 1, [(True, 8, 7), (False, 7, 1), (True, 1, 0)]),
+        (4, 4, [(True, 8, 4), (True, 4, 0)]),
+    ],
+)
+def test_schedules_cut_the_chain(start, end, expected):
+    guided = Guidance(start=start, end=end)
+    assert list(smgdiff_guidance.segments(guided, 8)) == expected
+
+
+@pytest.mark.parametrize(("start", "end"), [(5, 4), (-1, 2), (9, 0)])
+def test_more_guided_steps_than_steps_are_refused(start, end):
+    with pytest.raises(ValueError, match="expected at most 8 in all"):
+        smgdiff_guidance.segments(Guidance(start=start, end=end), 8)
+
+
+def plans(params, config, representation, condition, guided):
+    plan = smgdiff_guidance.planner(
+        params, config=config, representation=representation, guided=guided
+    )
+    keys = jax.random.split(jax.random.key(5), 6)
+    return plan, jax.jit(jax.vmap(plan, (0, None)))(keys, condition)
+
+
+def test_nothing_to_guide_is_the_plain_chain(params, config, representation, condition):
+    """No ball accelerates that much: the objective is zero everywhere."""
+    idle = Guidance(end=2, min_acceleration=1e9)
+    given = (params, config, representation, condition)
+    found, expected = (plans(*given, guided)[1] for guided in (idle, UNGUIDED))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_guidance_pulls_foot_and_ball_together(
+    params, config, representation, condition
+):
+    """Against the unguided plans of the same noise, one by one."""
+    on = Guidance(end=2, last_sigma=0.02, min_acceleration=2.0)
+    objective = jax.vmap(
+        smgdiff_guidance.contact_objective(
+            condition.ball, representation=representation, guided=on
+        )
+    )
+    given = (params, config, representation, condition)
+    guided = np.asarray(objective(plans(*given, on)[1]))
+    plain = np.asarray(objective(plans(*given, UNGUIDED)[1]))
+    assert (plain > 0).all()
+    assert (guided < plain).sum() >= 5
+
+
+def test_guided_plans_are_finite_and_the_same_alone(
+    params, config, representation, condition
+):
+    given = (params, config, representation, condition)
+    plan, batch = plans(*given, Guidance(start=1, end=2))
+    assert bool(jnp.isfinite(batch).all())
+    key = jax.random.split(jax.random.key(5), 6)[2]
+    np.testing.assert_allclose(jax.jit(plan)(key, condition), batch[2], atol=2e-4)
+
+
+def test_a_guided_plan_can_be_differentiated(params, config, representation, condition):
+    plan = smgdiff_guidance.planner(
+        params, config=config, representation=representation, guided=Guidance(end=1)
+    )
+
+    def far(ball):
+        changed = dataclasses.replace(condition, ball=ball)
+        return jnp.sum(plan(jax.random.key(2), changed) ** 2)
+
+    gradient = jax.jit(jax.grad(far))(condition.ball)
+    assert bool(jnp.isfinite(gradient).all())
+
+
+def test_the_truth_costs_nothing_but_its_own_slide(scenes, representation):
+    x = smgdiff_scene.to_features(scenes, representation)
+    terms = smgdiff_loss.loss_terms(x, x, representation=representation)
+    assert set(terms) == {
+        *("data", "velocity", "position", "position_velocity", "foot"),
+        *("ball", "ball_acceleration"),
+    }
+    for name in set(terms) - {"foot"}:
+        assert float(terms[name]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_ball_that_trembles_costs_its_second_differences(scenes, representation):
+    """Every other frame a centimetre higher: differences of 2 cm in each triple."""
+    near = dataclasses.replace(
+        scenes, ball=scenes.motion.root_position + jnp.array([[[0.3, -0.7, 0.4]]])
+    )
+    up = jnp.zeros_like(near.ball).at[:, 1::2, 1].set(0.01)
+    trembling = dataclasses.replace(near, ball=near.ball + up)
+    x, y = (smgdiff_scene.to_features(s, representation) for s in (near, trembling))
+    terms = smgdiff_loss.loss_terms(y, x, representation=representation)
+    frames = near.ball.shape[-2]
+    part_up = (frames // 2) / frames
+    assert float(terms["ball"]) == pytest.approx(part_up * 1e-4 / 3, rel=1e-2)
+    assert float(terms["ball_acceleration"]) == pytest.approx(4e-4 / 3, rel=1e-2)
+
+
+def test_a_ball_that_is_far_away_costs_nothing_of_its_own(scenes, representation):
+    far = dataclasses.replace(
+        scenes, ball=scenes.motion.root_position + jnp.array([[[1.7, 0.0, 0.0]]])
+    )
+    x = smgdiff_scene.to_features(far, representation)
+    terms = smgdiff_loss.loss_terms(1.1 * x, x, representation=representation)
+    assert float(terms["ball"]) == float(terms["ball_acceleration"]) == 0.0
+
+
+def test_a_shifted_person_costs_its_shift(scenes, representation):
+    """Ten centimetres along x: a third of 0.01 square metres in every joint."""
+    x = smgdiff_scene.to_features(scenes, representation)
+    std = representation.normalizer.std[0]
+    shifted = x.at[..., 0].add(0.1 / std)
+    terms = smgdiff_loss.loss_terms(shifted, x, representation=representation)
+    assert float(terms["position"]) == pytest.approx(0.01 / 3, rel=1e-3)
+    assert float(terms["data"]) == pytest.approx(
+        (0.1 / float(std)) ** 2 / x.shape[-1], rel=1e-3
+    )
+    assert float(terms["velocity"]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_training_lowers_the_loss(scenes, representation, config, params):
+    data = (scenes, jnp.array([0, 1, 0]))
+    loss = functools.partial(
+        smgdiff_loss.loss, representation=representation, config=config
+    )
+    step = jax.jit(
+        lambda p, key: (
+            lambda value, grad: (
+                value,
+                jax.tree.map(lambda a, g: a - 0.02 * g, p, grad),
+            )
+        )(*jax.value_and_grad(lambda q: loss(q, key, data)[0])(p))
+    )
+    values = []
+    for i in range(40):
+        value, params = step(params, jax.random.key(i))
+        values.append(float(value))
+    assert np.mean(values[-10:]) < 0.8 * np.mean(values[:10])
+
+
+def test_an_example_is_the_window_itself(scenes, representation, config):
+    """Past and future of the features; the last past frame is the origin."""
+    scene: Scene = jax.tree.map(lambda x: x[1], scenes)
+    condition, future = smgdiff_loss.example(
+        jax.random.key(0),
+        scene,
+        jnp.int32(1),
+        representation=representation,
+        config=config,
+    )
+    whole = smgdiff_scene.to_features(scene, representation)
+    np.testing.assert_allclose(future, whole[4:], atol=1e-4)
+    # All but the contacts, which for the last past frame need the next one.
+    np.testing.assert_allclose(condition.past[:, :38], whole[:4, :38], atol=1e-4)
+    np.testing.assert_allclose(condition.ball, scene.ball[3], atol=1e-5)
+    assert int(condition.label) == 1
+    assert condition.trajectory.position.shape == (12, 2)

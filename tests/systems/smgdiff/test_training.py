@@ -1,0 +1,251 @@
+"""SMGDiff's runs: splits, stages, folders, and what plans and players score."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from jaxmotion.learning import runs
+from jaxmotion.learning.checkpoint import CheckpointError, latest_step, load_config
+from jaxmotion.systems.smgdiff import controller as smgdiff_controller
+from jaxmotion.systems.smgdiff import data as smgdiff_data
+from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import players as smgdiff_players
+from jaxmotion.systems.smgdiff import training as smgdiff_training
+from jaxmotion.systems.smgdiff.guidance import UNGUIDED
+from tests import ball_walker, tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+SIZES = dict(
+    past=4, future=12, num_steps=2, width=16, depth=1, heads=2, hidden=32, dropout=0.0
+)
+PATHS = dict(width=16, depth=1, heads=2, hidden=32, frames_per_token=2)
+BUDGET = runs.Budget(steps=4, batch=4, chunk=2, save_every=2)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Both stages, trained for four updates."""
+    folder = tmp_path_factory.mktemp("run")
+    train, held_out = smgdiff_data.split(ball_walker.clips(60), fraction=0.3)
+    model = smgdiff_training.make_model(train, sizes=SIZES, paths=PATHS)
+    made = smgdiff_training.Run(
+        folder=folder, model=model, train=train, held_out=held_out
+    )
+    smgdiff_training.write_run(made)
+    for stage in ("motion_2", "paths_1"):
+        smgdiff_training.train_stage(made, stage, budget=BUDGET, draft_steps=2)
+    return smgdiff_training.load_run(folder)
+
+
+@pytest.fixture(scope="module")
+def setting(run):
+    return smgdiff_evaluation.make_setting(
+        run.train,
+        run.held_out,
+        run.model,
+        number=16,
+        replications=3,
+        recognizer_steps=40,
+        seed=0,
+    )
+
+
+def test_a_motion_model_starts_from_a_draft_with_weights_of_its_own(run):
+    draft, last = (
+        load_config(run.folder / "motion_2" / where / "checkpoints")
+        for where in ("draft", "")
+    )
+    assert draft["config"] | smgdiff_training.DRAFT == draft["config"]
+    assert draft["config"] != last["config"] == dataclasses.asdict(run.model.config)
+    assert latest_step(run.folder / "motion_2" / "draft" / "checkpoints") == 2
+    assert not (run.folder / "paths_1" / "draft").exists()
+
+
+def test_pieces_of_one_recording_stay_together():
+    data = ball_walker.clips(40)
+    names = tuple(f"take{i // 2}@{i}+40" for i in range(8))
+    data = dataclasses.replace(
+        data, clips=dataclasses.replace(data.clips, clip_names=names)
+    )
+    parts = smgdiff_data.split(data, fraction=0.5, seed=3)
+    takes = [{n.split("@")[0] for n in part.clips.clip_names} for part in parts]
+    assert not takes[0] & takes[1] and len(takes[0] | takes[1]) == 4
+    for part in parts:
+        assert set(np.asarray(part.clips.labels["skill"])) == {0, 1}
+        assert part.position.shape[0] == part.clips.num_frames
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1])
+def test_fractions_out_of_range_are_refused(fraction):
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        smgdiff_data.split(ball_walker.clips(40), fraction=fraction)
+
+
+def test_windows_are_of_one_clip_and_have_its_skill():
+    data = ball_walker.clips(40)
+    arrays = smgdiff_data.scene_arrays(data, 16)
+    scenes, labels = smgdiff_data.sample_scenes(jax.random.key(0), arrays, batch=32)
+    away = np.linalg.norm(
+        np.asarray(scenes.ball - scenes.motion.root_position)[..., ::2], axis=-1
+    )
+    assert set(np.asarray(labels)) == {0, 1}
+    np.testing.assert_array_equal((away > 5).all(axis=1), np.asarray(labels) == 1)
+    np.testing.assert_array_equal((away > 5).any(axis=1), np.asarray(labels) == 1)
+
+
+def test_a_run_comes_back_from_its_folder(run):
+    assert run.model.labels == ("dribble", "off_ball")
+    assert run.model.config.num_features == 30 + 3 + 7 + 2 + 2
+    # Two speeds of the walker, as often: the median lies between.
+    assert all(0.6 < speed < 1.5 for speed in run.model.speeds)
+    model, params = smgdiff_training.load_stage(run, "motion_2")
+    assert model.config.num_steps == 2
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(params))
+
+
+def test_another_model_does_not_go_into_the_same_folder(run):
+    config = dataclasses.replace(run.model.config, width=32)
+    other = dataclasses.replace(
+        run, model=dataclasses.replace(run.model, config=config)
+    )
+    with pytest.raises(ValueError, match="another model: config."):
+        smgdiff_training.write_run(other)
+
+
+def test_stages_are_named_by_kind_and_steps(run):
+    assert smgdiff_training.with_steps(run.model, "paths_3").paths.num_steps == 3
+    for name in ("motion", "motion_0", "motion_x", "dance_8"):
+        with pytest.raises(ValueError, match="unknown stage"):
+            smgdiff_training.with_steps(run.model, name)
+    with pytest.raises(CheckpointError):
+        smgdiff_training.load_stage(run, "motion_5")
+
+
+def test_bad_folders_are_named(tmp_path):
+    with pytest.raises(
+        FileNotFoundError, match="config.json: no such file: expected a run folder"
+    ):
+        smgdiff_training.load_run(tmp_path)
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(ValueError, match="not JSON"):
+        smgdiff_training.load_run(tmp_path)
+    (tmp_path / "config.json").write_text(json.dumps({"system": "emdm"}))
+    with pytest.raises(ValueError, match="field 'system' is 'emdm'"):
+        smgdiff_training.load_run(tmp_path)
+
+
+def test_situations_hold_what_was_and_what_came(run):
+    model = run.model
+    known = smgdiff_evaluation.situations(run.held_out, model, number=10, seed=0)
+    assert known.future.ball.shape[1:] == (12, 3) and known.past.ball.shape[1:] == (
+        4,
+        3,
+    )
+    last = known.past.motion.root_position[:, -1, ::2]
+    np.testing.assert_allclose(last, 0.0, atol=1e-5)
+    # The smoothed path begins where the person is.
+    start = np.linalg.norm(known.condition.trajectory.position[:, 0], axis=-1)
+    assert (start < 0.1).all()
+    with pytest.raises(ValueError, match="expected 4"):
+        smgdiff_evaluation.situations(run.held_out, model, number=2, seed=0)
+
+
+def test_what_really_happened_scores_well(setting):
+    scores = smgdiff_evaluation.score_real(setting)
+    assert len(scores) == 3
+    for one in scores:
+        assert float(one["ball in ground mm"]) == pytest.approx(0.0, abs=1e-3)
+        assert float(one["trajectory error deg"]) < 20
+        assert float(one["skill accuracy"]) > 0.9  # a ball at hand, or far away
+
+
+def test_planted_errors_are_measured(setting):
+    """The ball sunk by 13 mm; the person moved to the side."""
+
+    def sunk(scene):
+        return dataclasses.replace(scene, ball=scene.ball.at[..., 1].add(-0.013))
+
+    score = setting.score
+    known = setting.known
+    wanted = known.condition.trajectory
+    found = score(sunk(known.future), wanted, known.label)
+    assert float(found["ball in ground mm"]) == pytest.approx(13.0, abs=1e-3)
+    plain = score(known.future, wanted, known.label)
+    assert float(found["foot slide m/s"]) == float(plain["foot slide m/s"])
+    wrong = score(known.future, wanted, 1 - known.label)
+    total = float(wrong["skill accuracy"]) + float(plain["skill accuracy"])
+    assert total == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_plans_are_scored_alike_whatever_the_chunk(run, setting):
+    model, params = smgdiff_training.load_stage(run, "motion_2")
+    plan = smgdiff_guidance.planner(
+        params,
+        config=model.config,
+        representation=model.representation,
+        guided=UNGUIDED,
+    )
+    found = [
+        smgdiff_evaluation.score_plans(
+            setting, smgdiff_evaluation.plan_many(plan, model, chunk=chunk)
+        )
+        for chunk in (1, 3)
+    ]
+    for a, b in zip(*found, strict=True):
+        assert float(a["FID"]) == pytest.approx(float(b["FID"]), rel=1e-3)
+    assert all(np.isfinite(float(v)) for v in found[0][0].values())
+
+
+@pytest.mark.slow
+def test_players_are_scored_with_their_spread(run, setting):
+    model, params = smgdiff_training.load_stage(run, "motion_2")
+    plan = smgdiff_guidance.planner(
+        params,
+        config=model.config,
+        representation=model.representation,
+        guided=UNGUIDED,
+    )
+    play = smgdiff_players.player(
+        smgdiff_players.straight(model),
+        plan,
+        model,
+        ticks=24,
+        repeats=2,
+        chunk=2,
+        control=smgdiff_controller.Control(apply=5, reuse=4),
+    )
+    scores = smgdiff_players.score_players(setting, model, play, repeats=2, starts=2)
+    assert len(scores) == 3 and float(scores[0]["diversity m2"]) > 0
+
+
+def test_a_straight_path_owes_nothing_to_noise(run, setting):
+    share = smgdiff_players.noise_share(
+        jax.random.key(0),
+        smgdiff_players.straight(run.model),
+        setting.known,
+        run.model,
+        repeats=3,
+    )
+    assert float(share["noise cm"]) == pytest.approx(0.0, abs=1e-4)
+    assert float(share["error cm"]) == pytest.approx(
+        float(share["straight error cm"]), rel=1e-4
+    )
+
+
+def test_the_recogniser_sees_the_ball_no_farther_than_the_reach(run):
+    representation = run.model.representation
+    scene = ball_walker.scene(12, speed=1.0)
+    far = dataclasses.replace(scene, ball=scene.ball.at[..., 0].add(30.0))
+    near, away = (
+        np.asarray(smgdiff_evaluation.recognizer_input(x, representation))
+        for x in (scene, far)
+    )
+    np.testing.assert_allclose(near[:, :15], away[:, :15], atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(away[:, 15:], axis=-1), 2.0, rtol=1e-5)
+    assert tiny.skeleton().num_joints * 3 == 15

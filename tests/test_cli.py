@@ -1,0 +1,44 @@
+"""How a script ends."""
+
+import pytest
+
+from jaxmotion import cli
+from jaxmotion.learning.loop import TrainingDiverged
+
+
+def raising(error):
+    def main():
+        raise error
+
+    return main
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        FileNotFoundError("clips.npz: no such file"),
+        ValueError("clips.npz: field 'fps'"),
+        TrainingDiverged("loss is nan at step 3"),
+    ],
+)
+def test_bad_input_is_one_line(error):
+    with pytest.raises(SystemExit) as stop:
+        cli.start(raising(error))
+    assert stop.value.code == f"error: {error}"
+
+
+@pytest.mark.parametrize("words", ["", "stopped at step 3; saved in runs/x"])
+def test_after_ctrl_c_it_says_what_was_saved(capsys, words):
+    with pytest.raises(SystemExit) as stop:
+        cli.start(raising(KeyboardInterrupt(words)))
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == (words and words + "\n")
+
+
+def test_mistakes_of_the_program_are_not_hidden():
+    with pytest.raises(KeyError):
+        cli.start(raising(KeyError("x")))
+
+
+def test_a_script_that_ends_well_returns():
+    assert cli.start(lambda: None) is None
