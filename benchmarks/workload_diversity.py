@@ -14,6 +14,7 @@ import workload
 from jaxtyping import Array, Float
 
 from jaxmotion.control import rollout
+from jaxmotion.data import selection
 from jaxmotion.evaluation import diversity
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.motion import skeleton, trajectory
@@ -110,7 +111,7 @@ def make_load(
             found.field,
         )
     label = np.array([0 if style is None else model.label(style)])
-    speeds = np.asarray(camdm_steering.style_speeds(clips, field=field))[label]
+    speeds = np.asarray(selection.label_speeds(clips, field=field))[label]
     speeds = speeds if speed is None else np.array([speed])
     commands = camdm_steering.preset_batch(
         preset, label, speeds, seconds=seconds, fps=model.config.fps

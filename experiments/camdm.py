@@ -313,6 +313,7 @@ def evaluate(args: Evaluate) -> None:
         evaluator=evaluator,
     )
     report = {"arguments": camdm_training.arguments_json(args)} | report
+    report |= reporting.provenance()
     notes = (frozen.note(report["evaluator"]),)
     reporting.write_table(out, rows, report, notes)
     print(report)
@@ -334,6 +335,7 @@ def speeds(args: Speeds) -> None:
         seed=args.seed,
     )
     report = {"arguments": camdm_training.arguments_json(args)} | report
+    report |= reporting.provenance()
     reporting.write_table(out, rows, report, (by_frame.to_markdown(plans),))
 
 

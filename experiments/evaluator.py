@@ -22,12 +22,14 @@ from jaxmotion import cli
 from jaxmotion.data import selection
 from jaxmotion.data.ball_clips import load_ball_clips
 from jaxmotion.evaluators import frozen
-from jaxmotion.evaluators import training as evaluator_training
 from jaxmotion.evaluators.frozen import Evaluator
 from jaxmotion.learning import loop
+from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import training as camdm_training
+from jaxmotion.systems.emdm import action_evaluation as emdm_action_evaluation
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.smgdiff import data as smgdiff_data
+from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +104,7 @@ def train_style(args: Train) -> Evaluator:
         one_file(args), contents, field, args.held_out
     )
     steps = 1500 if args.updates is None else args.updates
-    return evaluator_training.train_style(
+    return camdm_evaluation.train_style(
         train, held_out, field=field, num_steps=steps, seed=args.seed
     )
 
@@ -125,7 +127,7 @@ def train_action(args: Train) -> Evaluator:
         emdm_data.action_arrays(part, field=field, frames=frames) for part in parts
     )
     steps = 1500 if args.updates is None else args.updates
-    return evaluator_training.train_action(
+    return emdm_action_evaluation.train_action(
         train, held_out, field=field, num_steps=steps, seed=args.seed
     )
 
@@ -138,7 +140,7 @@ def train_ball(args: Train) -> Evaluator:
         )
     data = load_ball_clips(one_file(args))
     train, held_out = smgdiff_data.split(data, fraction=args.held_out)
-    return evaluator_training.train_ball(
+    return smgdiff_evaluation.train_ball(
         train,
         held_out,
         frames=45 if args.frames is None else args.frames,

@@ -217,7 +217,7 @@ def steer(args: Config, clips, model, params, key):
     """Rolls out the characters; returns frames and the style of each character."""
     styles = [model.label(name) for name in args.styles]
     labels = np.resize(styles, args.characters)
-    speeds = np.asarray(camdm_steering.style_speeds(clips, field="style"))[labels]
+    speeds = np.asarray(selection.label_speeds(clips, field="style"))[labels]
     commands = camdm_steering.preset_batch(
         "forward", labels, speeds, seconds=args.seconds, fps=model.config.fps
     )
@@ -253,9 +253,7 @@ def train_walker(args: Config):
 
     fps = model.config.fps
     made = camdm_steering.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=30)
-    real = camdm_steering.data_windows(
-        clips, stride=camdm_steering.WINDOW, field="style"
-    )
+    real = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field="style")
     height = procedural.TOE_HEIGHT + 0.01
     rows = {
         "data": camdm_evaluation.metric_row(model.bones, real, None, height=height),

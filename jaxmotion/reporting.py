@@ -16,10 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmotion import files
-from jaxmotion.control import presets
 from jaxmotion.data import bvh
 from jaxmotion.evaluation import table
-from jaxmotion.motion import skeleton
+from jaxmotion.motion import skeleton, trajectory
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -76,7 +75,7 @@ def write_rollout(
     walked = positions[:, 0, ::2]
     commanded = None
     if desired_velocity is not None:
-        path = presets.integrate_path(desired_velocity, fps)
+        path = trajectory.integrate_path(desired_velocity, fps)
         commanded = np.asarray(path) + walked[0]
     shown = dict(fps=fps, names=bones.names, commanded=commanded, walked=walked)
     shown |= dict(title=title, caption=caption)

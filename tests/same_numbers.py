@@ -38,7 +38,7 @@ TRAIN = {
 EVALUATE = {
     "camdm": "--rollouts 2 --seconds 4 --recognizer-steps 20 --contents",
     "aamdm": "--rows aamdm --rollouts 4 --seconds 1 --long-minutes 0",
-    "emdm": "--samples 8 --replications 2 --long-replications 2 --evaluator-steps 20",
+    "emdm": "--samples 16 --replications 2 --long-replications 2 --evaluator-steps 20",
     "smgdiff": "--tables steps --windows 8 --replications 2 --recognizer-steps 20",
 }
 ROLLOUT = {

@@ -144,16 +144,14 @@ def _judge(job: Job, run: camdm_training.Run) -> tuple[Judge, dict[str, Row]]:
     recognizer = camdm_evaluation.recognizer(
         key_fit, run, job.evaluator, num_steps=budget["recognizer_updates"]
     )
-    real = camdm_steering.data_windows(
-        run.held_out, stride=camdm_steering.WINDOW, field=field
-    )
-    dense = camdm_steering.data_windows(run.train, stride=10, field=field)
+    real = windows.eval_windows(run.held_out, stride=windows.EVAL_WINDOW, field=field)
+    dense = windows.eval_windows(run.train, stride=10, field=field)
     feature, hits = style_evaluator.recognized(bones, real, recognizer)
     reference, _ = style_evaluator.recognized(bones, dense, recognizer)
     own = camdm_evaluation.random_half(
         np.asarray(dense.group), np.asarray(dense.label), job.seed
     )
-    made = styles * ((ticks - camdm_evaluation.SKIP) // camdm_steering.WINDOW)
+    made = styles * ((ticks - camdm_evaluation.SKIP) // windows.EVAL_WINDOW)
     height = camdm_evaluation.contact_height(bones, real)
     judge = Judge(
         recognizer=recognizer,

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxmotion.motion.trajectory import Command
 
@@ -120,18 +119,3 @@ def segment_commands(
         facing=jnp.asarray(_unit(row[:, 2]), dtype=jnp.float32),
         label=jnp.asarray(row[:, 4], jnp.int32),
     )
-
-
-def integrate_path(
-    velocity: Float[Array, "*batch frames 2"], fps: float
-) -> Float[Array, "*batch frames 2"]:
-    """Path of a point that starts at the origin and moves with given velocities.
-
-    Args:
-      velocity: Metres a second, one a frame.
-      fps: Frames a second.
-
-    Returns:
-      Positions after each frame, metres.
-    """
-    return jnp.cumsum(velocity, axis=-2) / fps

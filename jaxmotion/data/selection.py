@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxmotion.data.clips import Clips, check_skeletons, take_clips
 
@@ -231,3 +231,24 @@ def _merged(parts: Sequence[Clips], field: str, words: tuple[str, ...]) -> Array
         for part in parts
     ]
     return jnp.asarray(np.concatenate(numbers), jnp.int32)
+
+
+def label_speeds(clips: Clips, *, field: str) -> Float[Array, " labels"]:
+    """Median speed of the root in each style: the speed to command it at.
+
+    Args:
+      clips: Locomotion clips; jumps from clip to clip do not count.
+      field: Label field that is the style.
+
+    Returns:
+      Metres a second; 0 for a style without clips.
+    """
+    step = np.diff(np.asarray(clips.root_position)[:, ::2], axis=0)
+    speed = np.linalg.norm(step, axis=-1) * clips.fps
+    offsets = np.asarray(clips.offsets)
+    owner = np.repeat(np.asarray(clips.labels[field]), np.diff(offsets))[:-1]
+    inside = np.ones(speed.size, bool)
+    inside[offsets[1:-1] - 1] = False
+    number = len(clips.names(field))
+    found = [speed[inside & (owner == label)] for label in range(number)]
+    return jnp.asarray([np.median(x) if x.size else 0.0 for x in found], jnp.float32)

@@ -10,9 +10,10 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.clips import Clips
+from jaxmotion.motion import rotation, trajectory
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.typing import Key
 
@@ -133,3 +134,52 @@ def sample_windows(
         index.starts[chosen]
     )
     return windows, index.clips[chosen]
+
+
+EVAL_WINDOW = 60
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class EvalWindows:
+    """Windows of real or generated motion with what was wanted of them.
+
+    Attributes:
+      motion: Windows of 60 frames, world.
+      velocity: Wanted velocity in each frame, metres a second.
+      facing: Wanted facing in each frame.
+      label: Style of each window.
+      group: Clip or rollout of each window.
+    """
+
+    motion: Motion
+    velocity: Float[Array, "windows frames 2"]
+    facing: Float[Array, "windows frames 2"]
+    label: Int[Array, "windows"]
+    group: Int[Array, "windows"]
+
+
+def eval_windows(clips: Clips, *, stride: int, field: str) -> EvalWindows:
+    """Windows of real clips; what is wanted is their own path, smoothed.
+
+    Args:
+      clips: The clips; those shorter than a window are left out.
+      stride: Frames between the starts of windows.
+      field: Label field that is the style.
+
+    Returns:
+      The windows; wanted paths are filtered with sigma 10 frames, as in training.
+    """
+    index = windows.window_index(clips, EVAL_WINDOW, stride=stride, short="skip")
+    motion = jax.vmap(lambda s: windows.cut(clips, s, EVAL_WINDOW))(index.starts)
+    path = trajectory.root_trajectory(clips.skeleton, motion)
+    matrix = trajectory.smoothing_matrices(EVAL_WINDOW, (10.0,))[0]
+    position = trajectory.smooth(path.position, matrix)
+    facing = trajectory.smooth(path.facing, matrix)
+    return EvalWindows(
+        motion=motion,
+        velocity=jnp.gradient(position, axis=-2) * clips.fps,
+        facing=rotation.safe_normalize(facing, jnp.array([0.0, 1.0])),
+        label=clips.labels[field][index.clips],
+        group=index.clips,
+    )

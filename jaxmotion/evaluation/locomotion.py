@@ -6,7 +6,6 @@ smoothed, which is also what the network is trained to follow: the errors of the
 ground-truth row are therefore those of a walker's natural sway.
 """
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -53,18 +52,3 @@ def locomotion_metrics(
         "acceleration": smoothness.acceleration(positions, fps),
         "jerk": smoothness.jerk(positions, fps),
     }
-
-
-def smooth(
-    x: Float[Array, "*batch frames n"], matrix: Float[Array, "frames frames"]
-) -> Float[Array, "*batch frames n"]:
-    """Filters along time with a matrix of weights.
-
-    Args:
-      x: Frames.
-      matrix: Row f holds the weights of frame f.
-
-    Returns:
-      Filtered frames.
-    """
-    return jax.numpy.einsum("fg,...gn->...fn", matrix, x)

@@ -15,11 +15,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.clips import Clips
+from jaxmotion.data.windows import EVAL_WINDOW as WINDOW
+from jaxmotion.data.windows import EvalWindows as Windows
+from jaxmotion.data.windows import eval_windows as data_windows
 from jaxmotion.evaluators.network import Recognizer, StyleClassifier
 from jaxmotion.learning import training
 from jaxmotion.motion import rotation, skeleton, trajectory
 from jaxmotion.motion.facing import body_facing, plain_names
-from jaxmotion.systems.camdm.steering import WINDOW, Windows, data_windows
 from jaxmotion.typing import Key, Params
 
 

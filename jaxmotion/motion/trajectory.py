@@ -18,12 +18,15 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.motion import ground
 from jaxmotion.motion.facing import hip_facing, hip_joints
+from jaxmotion.motion.rotation import safe_normalize
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.motion.spring import Scalar, facing_spring, velocity_spring
+from jaxmotion.typing import Key
 
 
 @jax.tree_util.register_dataclass
@@ -272,3 +275,85 @@ def to_world(trajectory: Trajectory, frame: PlanarFrame) -> Trajectory:
         position=position + frame.origin[..., None, :],
         facing=ground.out_of_frame(trajectory.facing, facing),
     )
+
+
+def smoothing_matrices(
+    frames: int, sigmas: tuple[float, ...]
+) -> Float[Array, "sigmas {frames} {frames}"]:
+    """Gaussian filters along time as matrices; the border reflects.
+
+    Args:
+      frames: Length of the window.
+      sigmas: Standard deviations in frames; 0 gives the identity.
+
+    Returns:
+      One matrix each; rows sum to 1.
+    """
+    matrices = []
+    for sigma in sigmas:
+        radius = int(4 * sigma + 0.5)
+        offset = np.arange(-radius, radius + 1)
+        weight = np.exp(-0.5 * (offset / sigma) ** 2) if sigma else np.ones(1)
+        place = (np.arange(frames)[:, None] + offset) % (2 * frames)
+        place = np.where(place < frames, place, 2 * frames - 1 - place)
+        matrix = np.zeros((frames, frames))
+        np.add.at(matrix, (np.arange(frames)[:, None], place), weight / weight.sum())
+        matrices.append(matrix)
+    return jnp.asarray(np.stack(matrices), jnp.float32)
+
+
+def smooth_course(key: Key, course: Trajectory, *, last: int) -> Trajectory:
+    """A recorded path as a user might have asked for it.
+
+    The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4,
+    1/4); the facings are smoothed with sigma 5 or 10.
+
+    Args:
+      key: Consumed.
+      course: Path of one window.
+      last: Frame in which the smoothed path stays where it was.
+
+    Returns:
+      The path.
+
+    Source: released code of CAMDM. Differs: facings are smoothed within the window,
+    there within the whole clip.
+    """
+    key_path, key_facing = jax.random.split(key)
+    filters = smoothing_matrices(course.position.shape[0], (0.0, 5.0, 10.0))
+    weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
+    path = filters[jax.random.categorical(key_path, weights)] @ course.position
+    path = path + (course.position[last] - path[last])[None]
+    facings = filters[1 + jax.random.bernoulli(key_facing).astype(int)] @ course.facing
+    facings = safe_normalize(facings, jnp.array([0.0, 1.0]))
+    return Trajectory(position=path, facing=facings)
+
+
+def smooth(
+    x: Float[Array, "*batch frames n"], matrix: Float[Array, "frames frames"]
+) -> Float[Array, "*batch frames n"]:
+    """Filters along time with a matrix of weights.
+
+    Args:
+      x: Frames.
+      matrix: Row f holds the weights of frame f.
+
+    Returns:
+      Filtered frames.
+    """
+    return jax.numpy.einsum("fg,...gn->...fn", matrix, x)
+
+
+def integrate_path(
+    velocity: Float[Array, "*batch frames 2"], fps: float
+) -> Float[Array, "*batch frames 2"]:
+    """Path of a point that starts at the origin and moves with given velocities.
+
+    Args:
+      velocity: Metres a second, one a frame.
+      fps: Frames a second.
+
+    Returns:
+      Positions after each frame, metres.
+    """
+    return jnp.cumsum(velocity, axis=-2) / fps

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.control import presets
+from jaxmotion.motion import trajectory
 
 FPS = 30.0
 
@@ -88,7 +89,7 @@ def test_bad_arguments_are_named(bad, message):
 def test_the_path_is_the_integral_of_the_velocity():
     time = np.arange(1, 91) / FPS
     velocity = np.stack([np.cos(time), np.sin(time)], axis=-1).astype(np.float32)
-    found = presets.integrate_path(jnp.stack([velocity, 2 * velocity]), FPS)
+    found = trajectory.integrate_path(jnp.stack([velocity, 2 * velocity]), FPS)
     exact = np.stack([np.sin(time), 1 - np.cos(time)], axis=-1)
     # A sum of right ends is off by half a step at most.
     np.testing.assert_allclose(found[0], exact, atol=0.5 / FPS * 2)

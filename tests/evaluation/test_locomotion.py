@@ -10,7 +10,7 @@ import pytest
 
 from jaxmotion.data import gaits, procedural
 from jaxmotion.evaluation import locomotion
-from jaxmotion.motion import skeleton
+from jaxmotion.motion import skeleton, trajectory
 
 FRAMES, WINDOW, FPS, SPEED = 300, 60, 30.0, 1.2
 BONES = procedural.walker_skeleton()
@@ -135,6 +135,6 @@ def test_smoothing_is_a_product_with_the_matrix():
     rng = np.random.default_rng(0)
     x = rng.normal(size=(3, 5, 2)).astype(np.float32)
     matrix = rng.normal(size=(5, 5)).astype(np.float32)
-    found = locomotion.smooth(jnp.asarray(x), jnp.asarray(matrix))
+    found = trajectory.smooth(jnp.asarray(x), jnp.asarray(matrix))
     expected = np.stack([matrix.astype(float) @ part for part in x])
     np.testing.assert_allclose(found, expected, atol=1e-5)

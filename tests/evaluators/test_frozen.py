@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from jaxmotion.data import clips_io
+from jaxmotion.data.windows import eval_windows as data_windows
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.evaluators import training as evaluator_training
 from jaxmotion.learning import checkpoint
 from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
-from jaxmotion.systems.camdm.steering import data_windows
 from jaxmotion.systems.emdm import action_evaluation as emdm_action_evaluation
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import training as emdm_training
@@ -192,7 +191,7 @@ def test_the_fingerprint_of_clips_is_of_what_is_learnt_from():
 @pytest.mark.slow
 def test_an_evaluator_of_styles_judges_from_its_file_as_when_it_was_trained(tmp_path):
     clips = tiny.clips(60)
-    made = evaluator_training.train_style(
+    made = camdm_evaluation.train_style(
         clips, clips, field="style", num_steps=1, seed=0
     )
     assert (made.kind, made.frames, made.updates) == ("style", 60, 1)
@@ -223,7 +222,7 @@ def actions(tmp_path_factory):
 
 @pytest.mark.slow
 def test_an_evaluator_of_actions_is_the_recogniser_a_run_trains(actions, tmp_path):
-    made = evaluator_training.train_action(
+    made = emdm_action_evaluation.train_action(
         actions.train, actions.held_out, field="style", num_steps=3, seed=0
     )
     evaluators.save(tmp_path / "e.npz", made)
@@ -256,7 +255,7 @@ def ball():
     """Clips with a ball in two parts, a model for them, and a trained evaluator."""
     train, held_out = smgdiff_data.split(ball_walker.clips(60), fraction=0.3)
     model = smgdiff_training.make_model(train, sizes=dict(future=FRAMES))
-    made = evaluator_training.train_ball(
+    made = smgdiff_evaluation.train_ball(
         train, held_out, frames=FRAMES, num_steps=20, seed=0
     )
     return train, held_out, model, made

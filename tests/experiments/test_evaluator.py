@@ -10,13 +10,12 @@ import jax
 import numpy as np
 import pytest
 
-from jaxmotion.data import clips_io
+from jaxmotion.data import clips_io, windows
 from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
-from jaxmotion.systems.camdm import steering as camdm_steering
 from tests import ball_walker, tiny
 from tests.protocols import samples
 
@@ -236,15 +235,15 @@ def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
     run, evaluator = samples.run(), evaluators.load(out)
     get = functools.partial(camdm_evaluation.recognizer, jax.random.key(0))
     judge = get(run, evaluator, num_steps=1)
-    windows = camdm_steering.data_windows(run.train, stride=60, field="style")
+    found = windows.eval_windows(run.train, stride=60, field="style")
     bones = run.model.bones
-    features, hits = style_evaluator.recognized(bones, windows, judge)
-    x = np.array(style_evaluator.released_input(bones, windows.motion))
+    features, hits = style_evaluator.recognized(bones, found, judge)
+    x = np.array(style_evaluator.released_input(bones, found.motion))
     with torch.inference_mode():
         wanted, logits = peer(torch.from_numpy(x.swapaxes(1, 2)))
     assert wanted.std() > 0.1
     np.testing.assert_allclose(features, wanted.numpy(), atol=1e-5 * wanted.abs().max())
-    classes = np.array([1, 3])[np.asarray(windows.label)]
+    classes = np.array([1, 3])[np.asarray(found.label)]
     np.testing.assert_array_equal(hits, logits.argmax(-1).numpy() == classes)
 
     other = dataclasses.replace(evaluator, labels=("a", "neutral", "b", "c"))

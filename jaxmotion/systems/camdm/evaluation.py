@@ -7,10 +7,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxmotion.data.clips import Clips
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmotion import reporting
+from jaxmotion.data import selection, windows
+from jaxmotion.data.windows import EvalWindows as Windows
 from jaxmotion.evaluation import (
     diversity,
     frechet,
@@ -21,12 +24,12 @@ from jaxmotion.evaluation import (
 )
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
+from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
 from jaxmotion.evaluators.style import Recognized, in_batches, recognized
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import release as camdm_release
 from jaxmotion.systems.camdm import steering as camdm_steering
-from jaxmotion.systems.camdm.steering import Windows
 from jaxmotion.systems.camdm.training import Run
 from jaxmotion.typing import Key
 
@@ -355,7 +358,7 @@ def preset_of_run(
     Raises:
       ValueError: if there is no such preset.
     """
-    speeds = np.asarray(camdm_steering.style_speeds(run.train, field=run.field))[labels]
+    speeds = np.asarray(selection.label_speeds(run.train, field=run.field))[labels]
     speeds = speeds if speed is None else np.full(labels.shape, speed)
     return speeds, camdm_steering.preset_batch(
         preset, labels, speeds, seconds=seconds, fps=run.model.config.fps
@@ -498,10 +501,8 @@ def evaluate_run(
     key_fit, key_roll = jax.random.split(jax.random.key(seed))
     judge = recognizer(key_fit, run, evaluator, num_steps=recognizer_steps)
     frames = _timed_rollouts(run, key_roll, states, commands, chunk)
-    real = camdm_steering.data_windows(
-        run.held_out, stride=camdm_steering.WINDOW, field=field
-    )
-    dense = camdm_steering.data_windows(run.train, stride=10, field=field)
+    real = windows.eval_windows(run.held_out, stride=windows.EVAL_WINDOW, field=field)
+    dense = windows.eval_windows(run.train, stride=10, field=field)
     made = camdm_steering.rollout_windows(
         frames, jnp.asarray(labels), fps=fps, skip=SKIP
     )
@@ -524,7 +525,6 @@ def evaluate_run(
             reference=evaluators.clips_fingerprint(run.train, field),
         ),
         "speeds": dict(zip(model.labels, speeds[::repeats].tolist(), strict=True)),
-        **reporting.provenance(),
     }
 
 
@@ -560,7 +560,7 @@ def recognizer(
         labels=labels,
         joints=joints,
         fps=model.config.fps,
-        frames=camdm_steering.WINDOW,
+        frames=windows.EVAL_WINDOW,
     )
     if frozen is not None:
         return style_evaluator.Recognized(
@@ -586,3 +586,43 @@ def _timed_rollouts(
     taken = time.perf_counter() - begun
     print(f"rolled out in {taken:.0f} s, compilation included", flush=True)
     return frames
+
+
+def train_style(
+    train: Clips, held_out: Clips, *, field: str, num_steps: int, seed: int
+) -> Evaluator:
+    """CAMDM's recogniser, of windows of 60 frames.
+
+    Args:
+      train: Training clips.
+      held_out: Clips for its accuracy.
+      field: Label field that it recognises.
+      num_steps: Updates.
+      seed: Of parameters and batches.
+
+    Returns:
+      The evaluator.
+
+    Raises:
+      ValueError: if a part has no clip as long as a window, or there is no such field.
+    """
+    key_fit, _ = jax.random.split(jax.random.key(seed))
+    found = style_evaluator.fit_recognizer(
+        key_fit, train, field=field, num_steps=num_steps
+    )
+    unseen = windows.eval_windows(held_out, stride=windows.EVAL_WINDOW, field=field)
+    _, hits = style_evaluator.recognized(train.skeleton, unseen, found)
+    return Evaluator(
+        kind="style",
+        params=found.params,
+        field=field,
+        labels=train.names(field),
+        joints=train.skeleton.names,
+        fps=train.fps,
+        frames=windows.EVAL_WINDOW,
+        source=train.source,
+        clips=clips_fingerprint(train, field),
+        seed=seed,
+        updates=num_steps,
+        accuracy=float(np.mean(hits)),
+    )

@@ -5,12 +5,11 @@ Source: Chen et al. 2024 (CAMDM), eq. 2-4, and the released code.
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
-from jaxmotion.motion import features, rotation, skeleton, trajectory
+from jaxmotion.motion import features, skeleton, trajectory
 from jaxmotion.systems.camdm.model import (
     Condition,
     Config,
@@ -47,60 +46,6 @@ def mean_rotations(
     return tuple(round(float(x), 5) for x in mean)
 
 
-def smoothing_matrices(
-    frames: int, sigmas: tuple[float, ...]
-) -> Float[Array, "sigmas {frames} {frames}"]:
-    """Gaussian filters along time as matrices; the border reflects.
-
-    Args:
-      frames: Length of the window.
-      sigmas: Standard deviations in frames; 0 gives the identity.
-
-    Returns:
-      One matrix each; rows sum to 1.
-    """
-    matrices = []
-    for sigma in sigmas:
-        radius = int(4 * sigma + 0.5)
-        offset = np.arange(-radius, radius + 1)
-        weight = np.exp(-0.5 * (offset / sigma) ** 2) if sigma else np.ones(1)
-        place = (np.arange(frames)[:, None] + offset) % (2 * frames)
-        place = np.where(place < frames, place, 2 * frames - 1 - place)
-        matrix = np.zeros((frames, frames))
-        np.add.at(matrix, (np.arange(frames)[:, None], place), weight / weight.sum())
-        matrices.append(matrix)
-    return jnp.asarray(np.stack(matrices), jnp.float32)
-
-
-def smooth_course(
-    key: Key, course: trajectory.Trajectory, *, last: int
-) -> trajectory.Trajectory:
-    """A recorded path as a user might have asked for it.
-
-    The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4,
-    1/4); the facings are smoothed with sigma 5 or 10.
-
-    Args:
-      key: Consumed.
-      course: Path of one window.
-      last: Frame in which the smoothed path stays where it was.
-
-    Returns:
-      The path.
-
-    Source: released code of CAMDM. Differs: facings are smoothed within the window,
-    there within the whole clip.
-    """
-    key_path, key_facing = jax.random.split(key)
-    filters = smoothing_matrices(course.position.shape[0], (0.0, 5.0, 10.0))
-    weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
-    path = filters[jax.random.categorical(key_path, weights)] @ course.position
-    path = path + (course.position[last] - path[last])[None]
-    facings = filters[1 + jax.random.bernoulli(key_facing).astype(int)] @ course.facing
-    facings = rotation.safe_normalize(facings, jnp.array([0.0, 1.0]))
-    return trajectory.Trajectory(position=path, facing=facings)
-
-
 def example(
     key: Key,
     bones: skeleton.Skeleton,
@@ -133,7 +78,7 @@ def example(
         facing = jnp.stack([jnp.sin(yaw), jnp.cos(yaw)])
     frame = trajectory.PlanarFrame(origin=course.position[last], facing=facing)
 
-    smoothed = smooth_course(key_course, course, last=last)
+    smoothed = trajectory.smooth_course(key_course, course, last=last)
     wanted = trajectory.to_local(smoothed, frame)
     poses = to_features(features.to_frame(window, frame), config=config)
     keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_past)

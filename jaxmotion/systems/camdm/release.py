@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import frechet, table
 from jaxmotion.evaluators.style import Recognized, in_batches, recognized
@@ -213,7 +214,7 @@ class Recordings:
     frames: Int[Array, " recordings"]
     label: Int[Array, " recordings"]
     command: trajectory.Command | None
-    windows: camdm_steering.Windows
+    windows: windows.EvalWindows
 
 
 def of_clips(clips: Clips, *, field: str) -> Recordings:
@@ -231,9 +232,7 @@ def of_clips(clips: Clips, *, field: str) -> Recordings:
         frames=jnp.asarray(frames),
         label=clips.labels[field],
         command=None,
-        windows=camdm_steering.data_windows(
-            clips, stride=camdm_steering.WINDOW, field=field
-        ),
+        windows=windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field=field),
     )
 
 
@@ -263,9 +262,7 @@ def style_features(
     bones: skeleton.Skeleton, clips: Clips, recognizer: Recognized, *, field: str
 ) -> Groups:
     """Features of the training clips by style: what Fréchet distances are taken to."""
-    found = camdm_steering.data_windows(
-        clips, stride=camdm_steering.WINDOW, field=field
-    )
+    found = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field=field)
     features, _ = recognized(bones, found, recognizer)
     number = len(clips.names(field))
     return in_groups(features, np.asarray(found.label), number)

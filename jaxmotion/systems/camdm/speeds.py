@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion import reporting
+from jaxmotion.data import windows
 from jaxmotion.evaluation import by_frame, locomotion, table
 from jaxmotion.evaluators.style import in_batches
 from jaxmotion.motion import skeleton
@@ -27,7 +28,7 @@ _NEAR, _STILL = 0.15, 0.1
 
 
 def _row(
-    run: Run, found: camdm_steering.Windows, *, height: float, rest: float
+    run: Run, found: windows.EvalWindows, *, height: float, rest: float
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Metrics of windows and their clip or rollout."""
     # Over half a second, so that the sway of the hips does not count.
@@ -35,7 +36,7 @@ def _row(
     feet = jnp.array(run.model.bones.feet)
 
     @jax.jit
-    def measure(x: camdm_steering.Windows) -> dict[str, jax.Array]:
+    def measure(x: windows.EvalWindows) -> dict[str, jax.Array]:
         positions = skeleton.joint_positions(run.model.bones, x.motion)
         path = positions[..., 0, ::2]
         way = jnp.linalg.norm(path[..., half:, :] - path[..., :-half, :], axis=-1)
@@ -105,8 +106,8 @@ def speed_table(
     label = model.label(style)
     labels = np.full(rollouts, label)
     real = {
-        name: camdm_steering.data_windows(
-            clips, stride=camdm_steering.WINDOW // 2, field=run.field
+        name: windows.eval_windows(
+            clips, stride=windows.EVAL_WINDOW // 2, field=run.field
         )
         for name, clips in (("held-out", run.held_out), ("training", run.train))
     }
@@ -169,6 +170,5 @@ def speed_table(
         "seconds": seconds,
         "contact_height_m": height,
         "by_frame_of_the_plan": by_frame.to_json(plans),
-        **reporting.provenance(),
     }
     return rows, plans, report

@@ -9,72 +9,21 @@ Source: Chen et al. 2024 (CAMDM), section 4.1 and table 1; what its release comp
 instead is in the columns of `protocols.camdm_release`.
 """
 
-import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from jaxmotion.control import presets, rollout
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
-from jaxmotion.evaluation import locomotion
-from jaxmotion.motion import features, rotation, skeleton, trajectory
+from jaxmotion.motion import features, skeleton, trajectory
 from jaxmotion.systems.camdm import controller as camdm_controller
-from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm.model import Model
 from jaxmotion.typing import Key, Params
-
-WINDOW = 60
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Windows:
-    """Windows of real or generated motion with what was wanted of them.
-
-    Attributes:
-      motion: Windows of 60 frames, world.
-      velocity: Wanted velocity in each frame, metres a second.
-      facing: Wanted facing in each frame.
-      label: Style of each window.
-      group: Clip or rollout of each window.
-    """
-
-    motion: skeleton.Motion
-    velocity: Float[Array, "windows frames 2"]
-    facing: Float[Array, "windows frames 2"]
-    label: Int[Array, "windows"]
-    group: Int[Array, "windows"]
-
-
-def data_windows(clips: Clips, *, stride: int, field: str) -> Windows:
-    """Windows of real clips; what is wanted is their own path, smoothed.
-
-    Args:
-      clips: The clips; those shorter than a window are left out.
-      stride: Frames between the starts of windows.
-      field: Label field that is the style.
-
-    Returns:
-      The windows; wanted paths are filtered with sigma 10 frames, as in training.
-    """
-    index = windows.window_index(clips, WINDOW, stride=stride, short="skip")
-    motion = jax.vmap(lambda s: windows.cut(clips, s, WINDOW))(index.starts)
-    path = trajectory.root_trajectory(clips.skeleton, motion)
-    matrix = camdm_loss.smoothing_matrices(WINDOW, (10.0,))[0]
-    position = locomotion.smooth(path.position, matrix)
-    facing = locomotion.smooth(path.facing, matrix)
-    return Windows(
-        motion=motion,
-        velocity=jnp.gradient(position, axis=-2) * clips.fps,
-        facing=rotation.safe_normalize(facing, jnp.array([0.0, 1.0])),
-        label=clips.labels[field][index.clips],
-        group=index.clips,
-    )
 
 
 def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
@@ -88,11 +37,11 @@ def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
     Raises:
       ValueError: names the length that is needed.
     """
-    if ticks < skip + WINDOW:
+    if ticks < skip + windows.EVAL_WINDOW:
         raise ValueError(
             f"rollouts of {ticks / fps:g} s are too short to measure: expected at "
-            f"least {(skip + WINDOW) / fps:g} s ({skip} frames left out, then windows "
-            f"of {WINDOW})"
+            f"least {(skip + windows.EVAL_WINDOW) / fps:g} s ({skip} frames left out, "
+            f"then windows of {windows.EVAL_WINDOW})"
         )
 
 
@@ -102,7 +51,7 @@ def rollout_windows(
     *,
     fps: float,
     skip: int,
-) -> Windows:
+) -> windows.EvalWindows:
     """Windows of rollouts, one behind the other.
 
     Args:
@@ -119,13 +68,13 @@ def rollout_windows(
     """
     characters, ticks = frames.root_position.shape[:2]
     check_ticks(ticks, fps=fps, skip=skip)
-    number = (ticks - skip) // WINDOW
+    number = (ticks - skip) // windows.EVAL_WINDOW
 
     def cut(x: Array) -> Array:
-        x = x[:, skip : skip + number * WINDOW]
-        return x.reshape(characters * number, WINDOW, *x.shape[2:])
+        x = x[:, skip : skip + number * windows.EVAL_WINDOW]
+        return x.reshape(characters * number, windows.EVAL_WINDOW, *x.shape[2:])
 
-    return Windows(
+    return windows.EvalWindows(
         motion=skeleton.Motion(
             root_position=cut(frames.root_position),
             joint_rotation=cut(frames.joint_rotation),
@@ -136,27 +85,6 @@ def rollout_windows(
         label=jnp.repeat(labels, number),
         group=jnp.repeat(jnp.arange(characters), number),
     )
-
-
-def style_speeds(clips: Clips, *, field: str) -> Float[Array, " labels"]:
-    """Median speed of the root in each style: the speed to command it at.
-
-    Args:
-      clips: Locomotion clips; jumps from clip to clip do not count.
-      field: Label field that is the style.
-
-    Returns:
-      Metres a second; 0 for a style without clips.
-    """
-    step = np.diff(np.asarray(clips.root_position)[:, ::2], axis=0)
-    speed = np.linalg.norm(step, axis=-1) * clips.fps
-    offsets = np.asarray(clips.offsets)
-    owner = np.repeat(np.asarray(clips.labels[field]), np.diff(offsets))[:-1]
-    inside = np.ones(speed.size, bool)
-    inside[offsets[1:-1] - 1] = False
-    number = len(clips.names(field))
-    found = [speed[inside & (owner == label)] for label in range(number)]
-    return jnp.asarray([np.median(x) if x.size else 0.0 for x in found], jnp.float32)
 
 
 def check_labels(labels: np.ndarray | Array, model: Model) -> None:

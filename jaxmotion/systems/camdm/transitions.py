@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from jaxmotion.data import windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.transitions import transition
 from jaxmotion.evaluators import style as style_evaluator
@@ -30,7 +31,7 @@ from jaxmotion.systems.camdm.training import Run
 
 # Frames between the windows in which the new style is looked for.
 STRIDE = 3
-HALF = camdm_steering.WINDOW // 2
+HALF = windows.EVAL_WINDOW // 2
 # Seconds behind the command whose motion is measured; the paper's 120 frames.
 MEASURED = 4.0
 MOTION = ("foot_slide_m/s", "jerk_m/s3")
@@ -161,7 +162,7 @@ def find_changes(
     found = []
     for centre in centres:
         first = changes.tick + int(centre) - HALF
-        last = first + camdm_steering.WINDOW
+        last = first + windows.EVAL_WINDOW
         cut = jax.tree.map(lambda x: x[:, first:last], frames)  # noqa: B023
         label = jnp.asarray(changes.new)
         made = camdm_steering.rollout_windows(cut, label, fps=fps, skip=0)
@@ -245,8 +246,8 @@ def evaluate_transitions(
     Returns:
       The table.
     """
-    real = camdm_steering.data_windows(
-        run.held_out, stride=camdm_steering.WINDOW, field=run.field
+    real = windows.eval_windows(
+        run.held_out, stride=windows.EVAL_WINDOW, field=run.field
     )
     height = camdm_evaluation.contact_height(run.model.bones, real)
 
@@ -280,7 +281,7 @@ def clip_accuracy(run: Run, recognizer: Recognized) -> table.Cell:
     Returns:
       Per cent, over clips.
     """
-    real = camdm_steering.data_windows(run.held_out, stride=STRIDE, field=run.field)
+    real = windows.eval_windows(run.held_out, stride=STRIDE, field=run.field)
     _, hits = style_evaluator.recognized(run.model.bones, real, recognizer)
     return table.cell(
         table.group_means(hits, real.group), scale=100.0, bounds=(0.0, 1.0)

@@ -7,6 +7,7 @@ Source: Zhou et al. 2024 (EMDM), section 4.3; the evaluation of Guo et al. 2020
 (Action2Motion) with uniform actions.
 """
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -16,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from jaxmotion.evaluation import contact, diversity, frechet, plausibility, smoothness
 from jaxmotion.evaluators import action as action_evaluator
 from jaxmotion.evaluators import frozen as evaluators
+from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
 from jaxmotion.learning import checkpoint, runs
 from jaxmotion.motion import skeleton
 from jaxmotion.systems.emdm import data as emdm_data
@@ -230,3 +232,51 @@ def ground_height(run: ActionRun) -> float:
     )
     positions = skeleton.joint_positions(run.clips.skeleton, motion)
     return float(jnp.median(jnp.min(positions[..., 1], axis=-1)))
+
+
+# Motions of each action for the accuracy.
+_HELD_OUT = 40
+
+
+def train_action(
+    train: ActionArrays,
+    held_out: ActionArrays,
+    *,
+    field: str,
+    num_steps: int,
+    seed: int,
+) -> Evaluator:
+    """EMDM's recogniser, of motions with actions drawn uniformly.
+
+    Args:
+      train: Training clips.
+      held_out: Clips for its accuracy.
+      field: Label field that is the action.
+      num_steps: Updates.
+      seed: Of parameters, batches and motions.
+
+    Returns:
+      The evaluator.
+    """
+    clips = train.clips
+    config, params = fit_recognizer(train, num_steps=num_steps, seed=seed)
+    wanted = jnp.repeat(jnp.arange(config.num_classes), _HELD_OUT)
+    key_motion, key_state = jax.random.split(jax.random.key(seed + 1))
+    positions = real_positions(key_motion, wanted, held_out)
+    x = positions.reshape(*positions.shape[:2], -1)
+    recognize = functools.partial(action_evaluator.recognize_actions, config=config)
+    _, logits = jax.jit(recognize)(params, key_state, x)
+    return Evaluator(
+        kind="action",
+        params=params,
+        field=field,
+        labels=clips.names(field),
+        joints=clips.skeleton.names,
+        fps=clips.fps,
+        frames=train.frames,
+        source=clips.source,
+        clips=clips_fingerprint(clips, field),
+        seed=seed,
+        updates=num_steps,
+        accuracy=float(jnp.mean(jnp.argmax(logits, axis=-1) == wanted)),
+    )

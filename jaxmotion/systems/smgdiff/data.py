@@ -9,8 +9,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.data import windows
 from jaxmotion.data.ball_clips import BallClips, cut_scene, take_ball_clips
+from jaxmotion.data.selection import label_speeds as style_speeds
 from jaxmotion.motion.ball import Scene
-from jaxmotion.systems.camdm.steering import style_speeds
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.typing import Key
 

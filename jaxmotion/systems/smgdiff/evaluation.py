@@ -21,12 +21,13 @@ from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.evaluation import ball, frechet, locomotion
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
+from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
 from jaxmotion.motion import ground, rotation, skeleton, trajectory
 from jaxmotion.motion.ball import Scene
-from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff.guidance import Plan
 from jaxmotion.systems.smgdiff.model import Condition, Model
 from jaxmotion.systems.smgdiff.scene import Representation
@@ -278,15 +279,15 @@ def situations(data: BallClips, model: Model, *, number: int, seed: int) -> Situ
 
 @functools.partial(jax.jit, static_argnames=("config",))
 def _situations(scenes: Scene, labels: Array, representation, config) -> Situations:
-    matrix = camdm_loss.smoothing_matrices(config.window, (10.0,))[0]
+    matrix = trajectory.smoothing_matrices(config.window, (10.0,))[0]
     last, bones = config.past - 1, representation.bones
 
     @jax.vmap
     def one(scene: Scene, label: Array) -> Situations:
         course = trajectory.root_trajectory(bones, scene.motion)
-        path = locomotion.smooth(course.position, matrix)
+        path = trajectory.smooth(course.position, matrix)
         path = path + (course.position[last] - path[last])[None]
-        facing = locomotion.smooth(course.facing, matrix)
+        facing = trajectory.smooth(course.facing, matrix)
         facing = rotation.safe_normalize(facing, jnp.array([0.0, 1.0]))
         wanted = trajectory.Trajectory(position=path, facing=facing)
         condition, _ = smgdiff_loss.situation(
@@ -502,3 +503,61 @@ def score_plans(
         return run(jax.random.fold_in(key, number), conditions)
 
     return score_scenes(setting, scenes_of)
+
+
+# Windows of clips with a ball: as many as `experiments/smgdiff.py evaluate` takes.
+_BALL_WINDOWS = 1200
+
+
+def train_ball(
+    train: BallClips,
+    held_out: BallClips,
+    *,
+    frames: int,
+    num_steps: int,
+    seed: int,
+) -> Evaluator:
+    """SMGDiff's recogniser of skills, of joints and ball.
+
+    Args:
+      train: Training clips.
+      held_out: Clips for its accuracy.
+      frames: Frames of a plan.
+      num_steps: Updates.
+      seed: Of parameters, batches and windows.
+
+    Returns:
+      The evaluator.
+
+    Raises:
+      ValueError: if clips are too short or too few.
+    """
+    model = smgdiff_training.make_model(train, sizes={"future": frames})
+    draw = functools.partial(situations, model=model)
+    known = draw(train, number=_BALL_WINDOWS, seed=seed)
+    judge = make_judge(
+        jax.random.key(seed),
+        known.future,
+        known.label,
+        representation=model.representation,
+        num_labels=len(model.labels),
+        num_steps=num_steps,
+    )
+    unseen = draw(held_out, number=_BALL_WINDOWS, seed=seed + 1)
+    x = jax.jit(recognizer_input)(unseen.future, model.representation)
+    recognize = functools.partial(style_evaluator.recognize, config=judge.config)
+    _, logits = jax.jit(recognize)(judge.params, x)
+    return Evaluator(
+        kind="ball",
+        params=judge.params,
+        field=smgdiff_data.FIELD,
+        labels=model.labels,
+        joints=model.representation.bones.names,
+        fps=model.config.fps,
+        frames=frames,
+        source=train.clips.source,
+        clips=clips_fingerprint(train, smgdiff_data.FIELD),
+        seed=seed,
+        updates=num_steps,
+        accuracy=float(jnp.mean(jnp.argmax(logits, axis=-1) == unseen.label)),
+    )

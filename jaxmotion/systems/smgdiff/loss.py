@@ -11,7 +11,7 @@ from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
 from jaxmotion.motion import ball, features, skeleton, trajectory
 from jaxmotion.motion.ball import Scene
-from jaxmotion.systems.camdm.loss import smooth_course
+from jaxmotion.motion.trajectory import smooth_course
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff.model import Condition, Config, network
 from jaxmotion.systems.smgdiff.scene import Representation

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmotion import reporting
-from jaxmotion.data import selection
+from jaxmotion.data import selection, windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
@@ -30,8 +30,8 @@ def parts():
     recognizer = style_evaluator.fit_recognizer(
         jax.random.key(0), train, field="style", num_steps=40, batch=16
     )
-    real = camdm_steering.data_windows(held_out, stride=10, field="style")
-    dense = camdm_steering.data_windows(train, stride=10, field="style")
+    real = windows.eval_windows(held_out, stride=10, field="style")
+    dense = windows.eval_windows(train, stride=10, field="style")
     return run, recognizer, real, dense
 
 

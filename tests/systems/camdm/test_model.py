@@ -78,7 +78,7 @@ def test_networks_by_name_have_the_configs_sizes(name):
 @pytest.mark.parametrize("frames", [16, 55, 200])
 def test_smoothing_is_scipys_filter_with_reflecting_borders(frames):
     sigmas = (0.0, 1.0, 5.0, 10.0)
-    matrices = camdm_loss.smoothing_matrices(frames, sigmas)
+    matrices = trajectory.smoothing_matrices(frames, sigmas)
     path = np.random.default_rng(0).normal(size=(frames, 2))
     for matrix, sigma in zip(matrices, sigmas, strict=True):
         expected = path

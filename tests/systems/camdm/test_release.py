@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.data import windows
 from jaxmotion.data.clips import clip_motion
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.style import RecognizerConfig
@@ -111,9 +112,7 @@ def test_distances_are_of_each_recording_to_its_style(monkeypatch):
     )
     styles = camdm_release.style_features(bones, clips, judge, field="style")
     found = camdm_release.distances(bones, recordings(), judge, styles)
-    dense = camdm_steering.data_windows(
-        clips, stride=camdm_steering.WINDOW, field="style"
-    )
+    dense = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field="style")
     reference, _ = recognized(bones, dense, None)
     frames, commands = rollouts()
     for i, label in enumerate(LABELS):

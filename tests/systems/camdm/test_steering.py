@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.control import presets
-from jaxmotion.data import windows
+from jaxmotion.data import selection, windows
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import steering as camdm_steering
@@ -26,7 +26,7 @@ def run():
 
 def test_data_windows_are_the_clips_frames(run):
     clips = run.train
-    found = camdm_steering.data_windows(clips, stride=30, field="style")
+    found = windows.eval_windows(clips, stride=30, field="style")
     # Clips of 120 frames: windows at 0, 30 and 60.
     count = 3 * clips.num_clips
     assert found.motion.root_position.shape == (count, 60, 3)
@@ -43,7 +43,7 @@ def test_data_windows_are_the_clips_frames(run):
 
 
 def test_what_is_wanted_of_a_clip_is_its_own_path_smoothed(run):
-    found = camdm_steering.data_windows(run.train, stride=60, field="style")
+    found = windows.eval_windows(run.train, stride=60, field="style")
     path = np.asarray(found.motion.root_position, float)[..., ::2]
     # Over most of a window the wanted path goes where the walker goes.
     wanted = np.asarray(found.velocity, float)[:, 10:50].sum(axis=1) / 30.0
@@ -84,7 +84,7 @@ def test_rollouts_too_short_to_measure_are_named():
 
 def test_style_speeds_are_medians_within_clips(run):
     clips = run.train
-    found = camdm_steering.style_speeds(clips, field="style")
+    found = selection.label_speeds(clips, field="style")
     steps = {0: [], 1: []}
     for clip in range(clips.num_clips):
         own = slice(int(clips.offsets[clip]), int(clips.offsets[clip + 1]))
@@ -98,7 +98,7 @@ def test_a_style_without_clips_has_no_speed_and_no_start(run):
     lonely = dataclasses.replace(
         run.train, labels={"style": jnp.zeros_like(run.train.labels["style"])}
     )
-    assert camdm_steering.style_speeds(lonely, field="style")[1] == 0.0
+    assert selection.label_speeds(lonely, field="style")[1] == 0.0
     with pytest.raises(ValueError, match="no clip of style 'zombie' to start from"):
         camdm_steering.start_states(lonely, run.model, LABELS, field="style", seed=0)
 
@@ -249,6 +249,6 @@ def test_the_walker_as_a_rollout_goes_where_its_command_says():
         root_position=frames.root_position, joint_rotation=frames.joint_rotation
     )
     assert motion.root_position.shape == (2, 180, 3)
-    asked = np.asarray(presets.integrate_path(frames.desired_velocity, 30.0))[:, -1]
+    asked = np.asarray(trajectory.integrate_path(frames.desired_velocity, 30.0))[:, -1]
     walked = np.asarray(frames.root_position)[:, -1, ::2]
     assert np.linalg.norm(asked - walked, axis=-1).max() < 0.4
