@@ -145,7 +145,9 @@ def training_program(
       The jitted function and its arguments.
     """
     optimizer = training.adamw_cosine(num_steps=1000)
-    loss = functools.partial(camdm_loss.loss, bones=model.bones, config=model.config)
+    loss = functools.partial(
+        camdm_loss.loss, skeleton=model.skeleton, config=model.config
+    )
 
     sample_batch = camdm_training.window_sampler(field="style", batch=args.batch)
     update = training.make_update(loss, optimizer)
@@ -187,7 +189,7 @@ def programs(args: Config) -> Iterator[tuple[str, Callable, tuple]]:
     yield name, *training_program(args, model, params, clips)
 
     def rolled(params: Params, key: Key, states: Any, commands: Any) -> Any:
-        controller = camdm_controller.controller(params, model.bones, config=config)
+        controller = camdm_controller.controller(params, model.skeleton, config=config)
         return rollout.rollout(controller, key, states, commands)
 
     steered = workload.steered(model, clips, args.characters, seconds=args.seconds)

@@ -101,7 +101,9 @@ def camdm_program(width: int, batch: int) -> Program:
     sizes = camdm_training.PRESETS["small"] | {"width": width, "hidden": 4 * width}
     model = camdm_training.make_model(clips, field="style", **sizes)
     optimizer = training.muon_cosine(num_steps=1000)
-    loss = functools.partial(camdm_loss.loss, bones=model.bones, config=model.config)
+    loss = functools.partial(
+        camdm_loss.loss, skeleton=model.skeleton, config=model.config
+    )
     return Program(
         update=training.make_update(loss, optimizer),
         sample=camdm_training.window_sampler(field="style", batch=batch),

@@ -115,13 +115,13 @@ def walker_model(
             num_joints=clips.skeleton.num_joints, num_labels=len(labels), **sizes
         )
         model = camdm_model.Model(
-            config=config, bones=clips.skeleton, labels=labels, source=clips.source
+            config=config, skeleton=clips.skeleton, labels=labels, source=clips.source
         )
         return model, camdm_model.init(jax.random.key(0), config)
     model, params, _ = camdm_model.load(run)
-    if (model.labels, model.bones.names) != (labels, clips.skeleton.names):
+    if (model.labels, model.skeleton.names) != (labels, clips.skeleton.names):
         raise ValueError(
-            f"{run}: a model of {model.bones.num_joints} joints and the styles "
+            f"{run}: a model of {model.skeleton.num_joints} joints and the styles "
             f"{', '.join(model.labels)}: expected one of the procedural walker"
         )
     return model, params
@@ -180,7 +180,7 @@ def camdm_load(
     return Load(
         params=params,
         controller=lambda params: camdm_controller.controller(
-            params, model.bones, config=model.config
+            params, model.skeleton, config=model.config
         ),
         start=lambda number: steered(
             model, clips, number, seconds=seconds, staggered=staggered
@@ -188,7 +188,7 @@ def camdm_load(
         plans=lambda frames: float(frames.planned.sum()),
         fps=model.config.fps,
         config=model.config,
-        joints=model.bones.num_joints,
+        joints=model.skeleton.num_joints,
     )
 
 

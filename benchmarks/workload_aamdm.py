@@ -54,7 +54,7 @@ def _trained(
     params, config = aamdm_training.load_networks(
         run, "embedded", space, drafts=3, polishes=2
     )
-    return config, params, space, run.held_out, run.bones.num_joints
+    return config, params, space, run.held_out, run.skeleton.num_joints
 
 
 def make_load(run: Path | None, *, width: int, seconds: float) -> workload.Load:

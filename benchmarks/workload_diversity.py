@@ -17,7 +17,8 @@ from jaxmotion.control import rollout
 from jaxmotion.data import selection
 from jaxmotion.evaluation import diversity
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.motion import trajectory
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import steering as camdm_steering
@@ -134,7 +135,7 @@ def check_same(a: Load, b: Load) -> None:
       ValueError: says what differs.
     """
     pairs = {
-        "joints": (a.model.bones.names, b.model.bones.names),
+        "joints": (a.model.skeleton.names, b.model.skeleton.names),
         "styles": (a.model.labels, b.model.labels),
         "past frames": (a.model.config.past, b.model.config.past),
     }
@@ -178,8 +179,10 @@ def one_rollout(
     Returns:
       Kept frames, without the axis of rollouts.
     """
-    bones, config = load.model.bones, load.model.config
-    driver = camdm_controller.controller(params, bones, config=config, control=control)
+    skeleton, config = load.model.skeleton, load.model.config
+    driver = camdm_controller.controller(
+        params, skeleton, config=config, control=control
+    )
     start = dataclasses.replace(load.state, guided=jnp.asarray(guided, jnp.int32))
 
     def body(state: Any, xs: tuple) -> tuple[Any, tuple[Array, Array]]:
@@ -191,11 +194,9 @@ def one_rollout(
     ticks = load.commands.label.shape[0]
     _, shown = jax.lax.scan(body, start, (jnp.arange(ticks), load.commands))
     root, rotation = jax.tree.map(lambda x: x[(ticks - 1) % every :: every], shown)
-    motion = skeleton.Motion(
-        root_position=root, joint_rotation=rotation, fps=config.fps / every
-    )
-    world = skeleton.joint_positions(bones, motion)
-    pose = style_evaluator.recognizer_input(bones, motion).reshape(world.shape)
+    motion = Motion(root_position=root, joint_rotation=rotation, fps=config.fps / every)
+    world = joint_positions(skeleton, motion)
+    pose = style_evaluator.recognizer_input(skeleton, motion).reshape(world.shape)
     return Motions(world=world, pose=pose)
 
 

@@ -47,17 +47,17 @@ def program(
       The jitted function, its arguments, and frames of a plan.
     """
     offsets = np.random.default_rng(0).normal(0.0, 0.15, (24, 3))
-    bones = Skeleton(
+    skeleton = Skeleton(
         offsets=jnp.asarray(offsets, jnp.float32),
         parents=smpl.PARENTS,
         names=smpl.JOINTS,
         feet=(7, 8, 10, 11),
     )
-    size = feature_layout(bones, bones.feet).size
+    size = feature_layout(skeleton, skeleton.feet).size
     representation = Representation(
-        bones=bones,
+        skeleton=skeleton,
         normalizer=Normalizer(mean=jnp.zeros(size), std=jnp.ones(size)),
-        joints=bones.feet,
+        joints=skeleton.feet,
         fps=30.0,
     )
     config = smgdiff_model.Config(

@@ -244,7 +244,7 @@ def rollout(args: Rollout) -> None:
     )
     reporting.write_rollout(
         out,
-        run.bones,
+        run.skeleton,
         motion,
         frames.desired_velocity[0],
         title=f"{args.row}{'' if args.steered else ', not steered'}",

@@ -356,7 +356,7 @@ def rollout(args: Rollout) -> None:
     )
     title = " to ".join(filter(None, (args.style, args.to_style)))
     reporting.write_rollout(
-        out, run.model.bones, motion, velocity, title=title, caption=run.model.source
+        out, run.model.skeleton, motion, velocity, title=title, caption=run.model.source
     )
 
 
@@ -422,7 +422,7 @@ def import_weights(args: Import) -> None:
     """Writes the file."""
     bones = camdm_training.released_skeleton(args.skeleton, scale=args.scale)
     labels = args.labels and camdm_published.read_styles(args.labels)
-    model, params = camdm_published.load(args.weights, bones=bones, labels=labels)
+    model, params = camdm_published.load(args.weights, skeleton=bones, labels=labels)
     # Which clips to use, as `train` would note it.
     clips = camdm_training.arguments_json(Train(data=args.data, contents=()))
     config = camdm_model.to_json(model) | {"experiment": clips}

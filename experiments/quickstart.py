@@ -130,13 +130,15 @@ def steer_shipped(args: Config):
     )
     made = camdm_steering.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=0)
     standing = jax.tree.map(lambda x: x[0], model.starts)
-    toes = skeleton.joint_positions(model.bones, standing)[..., model.bones.feet, 1]
+    toes = skeleton.joint_positions(model.skeleton, standing)[
+        ..., model.skeleton.feet, 1
+    ]
     row = camdm_evaluation.metric_row(
-        model.bones, made, None, height=float(toes.min()) + 0.01
+        model.skeleton, made, None, height=float(toes.min()) + 0.01
     )
     reporting.write_rollout(
         args.out,
-        model.bones,
+        model.skeleton,
         first_motion(frames, fps),
         frames.desired_velocity[0],
         title="stand, walk, turn, jog, run, stop, crouch",
@@ -192,7 +194,7 @@ def train(args: Config, clips, model, params, key):
         return jax.tree.map(lambda *x: jnp.concatenate(x), *halves)
 
     objective = functools.partial(
-        camdm_loss.loss, bones=model.bones, config=model.config
+        camdm_loss.loss, skeleton=model.skeleton, config=model.config
     )
     update = training.make_update(objective, optimizer, ema_decay=0.995)
     state = loop.train(
@@ -256,12 +258,14 @@ def train_walker(args: Config):
     real = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field="style")
     height = procedural.TOE_HEIGHT + 0.01
     rows = {
-        "data": camdm_evaluation.metric_row(model.bones, real, None, height=height),
-        "rollouts": camdm_evaluation.metric_row(model.bones, made, None, height=height),
+        "data": camdm_evaluation.metric_row(model.skeleton, real, None, height=height),
+        "rollouts": camdm_evaluation.metric_row(
+            model.skeleton, made, None, height=height
+        ),
     }
     reporting.write_rollout(
         args.out,
-        model.bones,
+        model.skeleton,
         first_motion(frames, fps),
         frames.desired_velocity[0],
         title=f"procedural walker: {', '.join(args.styles)}",

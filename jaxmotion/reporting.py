@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Float
 from jaxmotion import files
 from jaxmotion.data import bvh
 from jaxmotion.evaluation import table
-from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.motion import trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,8 +41,8 @@ class Ball:
 
 def write_rollout(
     folder: Path,
-    bones: skeleton.Skeleton,
-    motion: skeleton.Motion,
+    skeleton: Skeleton,
+    motion: Motion,
     desired_velocity: Float[Array, "frames 2"] | None,
     *,
     title: str,
@@ -53,7 +54,7 @@ def write_rollout(
 
     Args:
       folder: Where to; made if missing.
-      bones: The skeleton.
+      skeleton: The skeleton.
       motion: Frames of one character, world.
       desired_velocity: What was commanded, metres a second; its integral is drawn as
         the commanded path. None if nothing was.
@@ -70,14 +71,14 @@ def write_rollout(
 
     fps = motion.fps
     folder.mkdir(parents=True, exist_ok=True)
-    bvh.write_bvh(folder / f"{name}.bvh", bvh.bvh_from_motion(bones, motion))
-    positions = np.asarray(skeleton.joint_positions(bones, motion))
+    bvh.write_bvh(folder / f"{name}.bvh", bvh.bvh_from_motion(skeleton, motion))
+    positions = np.asarray(joint_positions(skeleton, motion))
     walked = positions[:, 0, ::2]
     commanded = None
     if desired_velocity is not None:
         path = trajectory.integrate_path(desired_velocity, fps)
         commanded = np.asarray(path) + walked[0]
-    shown = dict(fps=fps, names=bones.names, commanded=commanded, walked=walked)
+    shown = dict(fps=fps, names=skeleton.names, commanded=commanded, walked=walked)
     shown |= dict(title=title, caption=caption)
     gif, page = dict(shown), dict(shown)
     if ball is not None:
@@ -85,8 +86,8 @@ def write_rollout(
         place = dict(ball=ball.position, radius=ball.radius)
         gif |= place | dict(feet=ball.joints, contact=ball.touch)
         page |= place | dict(touch=np.any(ball.touch, axis=-1))
-    animation.save_gif(folder / f"{name}.gif", positions, bones.parents, **gif)
-    html.save_html(folder / f"{name}.html", positions, bones.parents, **page)
+    animation.save_gif(folder / f"{name}.gif", positions, skeleton.parents, **gif)
+    html.save_html(folder / f"{name}.html", positions, skeleton.parents, **page)
     print(f"wrote {name}.bvh, {name}.gif and {name}.html to {folder}")
 
 

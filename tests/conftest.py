@@ -27,7 +27,7 @@ def quick_compile():
 
 
 @pytest.fixture(scope="session")
-def bones():
+def skeleton():
     """Hips and two legs."""
     from tests import tiny
 

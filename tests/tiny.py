@@ -148,7 +148,9 @@ def training_parts(
         motion, clip = windows.sample_windows(key, walker, index, batch=batch)
         return motion, walker.labels["style"][clip]
 
-    objective = functools.partial(camdm_loss.loss, bones=walker.skeleton, config=config)
+    objective = functools.partial(
+        camdm_loss.loss, skeleton=walker.skeleton, config=config
+    )
     update = training.make_update(objective, optimizer, ema_decay=0.9)
     run = training.train_chunk(update, sample_batch, num_steps=num_steps, mesh=mesh)
     params = random_params(camdm_model.init, config, seed=3)

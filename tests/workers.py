@@ -45,15 +45,15 @@ def commands() -> Command:
 
 def roll(mesh=None, chunk=None):
     """A rollout of characters who need their plans at different ticks."""
-    bones = tiny.skeleton()
+    skeleton = tiny.skeleton()
     past = tiny.walk(CONFIG.past)
-    state = camdm_controller.init_state(bones, past, config=CONFIG)
+    state = camdm_controller.init_state(skeleton, past, config=CONFIG)
     states = jax.tree.map(lambda x: jnp.stack([x] * CHARACTERS), state)
     control = camdm_controller.Control(apply=5, reuse=6)
 
     def run(params, key, states, commands):
         made = camdm_controller.controller(
-            params, bones, config=CONFIG, control=control
+            params, skeleton, config=CONFIG, control=control
         )
         return rollout.rollout(made, key, states, commands, mesh=mesh, chunk=chunk)
 

@@ -57,7 +57,7 @@ def _unbounded(
     )
     roll = aamdm_evaluation.roller(run, space, step, steered=False, bounded=False)
     frames = roll(jax.random.key(args.seed), states, given)[1]
-    positions = aamdm_evaluation.positions_of(run.bones, frames)
+    positions = aamdm_evaluation.positions_of(run.skeleton, frames)
     found = aamdm_evaluation.long_health(positions, None, reference, fps=run.train.fps)
     return table.Cell(value=float(found["diverged"]), samples=found["rollouts"])
 
@@ -85,7 +85,7 @@ def measure(
         roll = aamdm_evaluation.roller(run, space, step, steered=steered)
         frames = _skip(roll(key, states, given)[1], skip)
         found = aamdm_evaluation.free_row(
-            key_pairs, run.bones, reference, frames, fps=fps
+            key_pairs, run.skeleton, reference, frames, fps=fps
         )
         if steered:
             wanted = ("fid", "ffr_mann", "ffr_gmd", "diverged")
@@ -116,7 +116,7 @@ def data_rows(
         )
         key = jax.random.key(args.seed)
         found[name] = aamdm_evaluation.free_row(
-            key, run.bones, reference, frames, fps=run.train.fps
+            key, run.skeleton, reference, frames, fps=run.train.fps
         )
         print(f"{name}: {args.rollouts} windows of {length} frames")
     return found
@@ -139,7 +139,7 @@ def long_rollouts(
     for steered in (False, True):
         roll = aamdm_evaluation.roller(run, space, step, steered=steered)
         frames = roll(jax.random.key(args.seed), states, given)[1]
-        positions = aamdm_evaluation.positions_of(run.bones, frames)
+        positions = aamdm_evaluation.positions_of(run.skeleton, frames)
         found["steered" if steered else "free"] = aamdm_evaluation.long_health(
             positions,
             frames.desired_velocity if steered else None,
@@ -155,7 +155,7 @@ def evaluate(
 ) -> tuple[dict[str, Row], dict[str, Any]]:
     """The table, and what belongs beside it; rows.json has what is done so far."""
     steppers = trained_rows(run, args.rows, args)
-    reference = aamdm_evaluation.make_reference(run.bones, run.train)
+    reference = aamdm_evaluation.make_reference(run.skeleton, run.train)
     found = data_rows(run, reference, args)
     for name, (step, space) in steppers.items():
         found[name] = measure(name, run, space, step, reference, args)

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion import reporting
-from jaxmotion.motion import humanml_skeleton, skeleton
+from jaxmotion.motion import humanml_skeleton
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import features as emdm_features
 from jaxmotion.systems.emdm import model as emdm_model
@@ -71,7 +72,7 @@ def _from_actions(args: Any, out: Path) -> None:
         vectors = jnp.zeros((1, 0))
     motions = emdm_features.to_motion(_generate(args, vectors, 1.0), run.representation)
     for i, title in enumerate(args.action or ("motion",)):
-        motion = skeleton.Motion(
+        motion = Motion(
             root_position=motions.root_position[i],
             joint_rotation=motions.joint_rotation[i],
             fps=run.clips.fps,
@@ -94,12 +95,12 @@ def _from_texts(args: Any, out: Path) -> None:
     x = _generate(args, emdm_text.encode(run, args.text), 2.5)
     positions = emdm_text.joints(run, x)
     for i, text in enumerate(args.text):
-        bones, motion = humanml_skeleton.motion_from_joints(
+        skeleton, motion = humanml_skeleton.motion_from_joints(
             positions[i], run.motions.fps
         )
         reporting.write_rollout(
             out,
-            bones,
+            skeleton,
             motion,
             None,
             title=text,

@@ -27,7 +27,7 @@ def mean_pose(model: camdm_model.Model) -> skeleton.Motion:
     config = model.config
     zeros = jnp.zeros((config.past, config.num_features))
     motion = camdm_model.to_motion(zeros, config=config)
-    lowest = jnp.min(skeleton.joint_positions(model.bones, motion)[..., 1])
+    lowest = jnp.min(skeleton.joint_positions(model.skeleton, motion)[..., 1])
     raised = motion.root_position.at[:, 1].set(-lowest)
     return dataclasses.replace(motion, root_position=raised)
 
@@ -52,7 +52,9 @@ def first_state(
     """
     config = model.config
     if data is None and config.rotation_mean and config.heading == "facing":
-        return camdm_controller.init_state(model.bones, mean_pose(model), config=config)
+        return camdm_controller.init_state(
+            model.skeleton, mean_pose(model), config=config
+        )
     loaded = camdm_training.load_run(run, data)
     states = camdm_steering.start_states(
         loaded.train, model, np.zeros(1, int), field=loaded.field, seed=0
@@ -76,8 +78,8 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
     """
     model, params, _ = camdm_model.load(run)
     return ControlledSimulation(
-        camdm_controller.controller(params, model.bones, config=model.config),
-        model.bones,
+        camdm_controller.controller(params, model.skeleton, config=model.config),
+        model.skeleton,
         first_state(run, data, model),
         lambda frame: {"root": frame.root_position, "rotations": frame.joint_rotation},
         labels=model.labels,

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.control import rollout
-from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.motion import trajectory
+from jaxmotion.motion.skeleton import Skeleton
 from serving.protocol import Command
 
 # A character between two ticks: seed of its noise, and the controller's state.
@@ -24,7 +25,7 @@ class ControlledSimulation:
     def __init__(
         self,
         controller: rollout.Controller,
-        bones: skeleton.Skeleton,
+        skeleton: Skeleton,
         first: Any,
         arrays: Callable[[Any], dict[str, jax.Array]],
         *,
@@ -35,15 +36,15 @@ class ControlledSimulation:
 
         Args:
           controller: Of one character, with commands `trajectory.Command`.
-          bones: The skeleton.
+          skeleton: The skeleton.
           first: State of the controller that every character begins with.
           arrays: Picks what to show of a controller's frame, by name.
           labels: Names of the styles or skills.
           fps: Ticks a second.
         """
         self.fps, self.labels = fps, labels
-        self.joints, self.parents = bones.names, bones.parents
-        self.offsets = np.asarray(bones.offsets)
+        self.joints, self.parents = skeleton.names, skeleton.parents
+        self.offsets = np.asarray(skeleton.offsets)
         self._first = first
 
         # The key is made inside: one call a tick, and no key that outlives it.

@@ -33,7 +33,7 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
     paths, path_params = smgdiff_training.load_stage(loaded, "paths_1")
     known = smgdiff_evaluation.situations(loaded.train, model, number=8, seed=0)
     past = jax.tree.map(lambda x: x[0], known.past)
-    bones = model.representation.bones
+    skeleton = model.representation.skeleton
     driver = smgdiff_controller.controller(
         smgdiff_trajectory.generator(path_params, config=paths.paths),
         smgdiff_guidance.planner(
@@ -47,8 +47,8 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
     )
     return ControlledSimulation(
         driver,
-        bones,
-        smgdiff_controller.init_state(bones, past, config=model.config),
+        skeleton,
+        smgdiff_controller.init_state(skeleton, past, config=model.config),
         lambda frame: {
             "root": frame.root_position,
             "rotations": frame.joint_rotation,

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxmotion import reporting
 from jaxmotion.control import rollout
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
@@ -81,7 +81,7 @@ def play(args: Any, run: Run, out: Path) -> None:
       out: Folder.
     """
     model, params = smgdiff_training.load_stage(run, f"motion_{args.steps}")
-    features, bones = model.representation, model.representation.bones
+    features, skeleton = model.representation, model.representation.skeleton
     steered = commands(model, args.skills or model.labels, seconds=args.seconds)
     driver = smgdiff_controller.controller(
         generator_of(run, args.paths),
@@ -97,7 +97,7 @@ def play(args: Any, run: Run, out: Path) -> None:
     known = smgdiff_evaluation.situations(run.train, model, number=2000, seed=args.seed)
     first = int(np.flatnonzero(np.asarray(known.label) == int(steered.label[0]))[0])
     past = jax.tree.map(lambda x: x[first], known.past)
-    state = smgdiff_controller.init_state(bones, past, config=model.config)
+    state = smgdiff_controller.init_state(skeleton, past, config=model.config)
     one = lambda tree: jax.tree.map(lambda x: x[None], tree)  # noqa: E731
     run_all = jax.jit(lambda *given: rollout.rollout(driver, *given)[1])
     frames = run_all(jax.random.key(args.seed), one(state), one(steered))
@@ -105,7 +105,7 @@ def play(args: Any, run: Run, out: Path) -> None:
     touch = np.asarray(scene.touch) > 0.5
     reporting.write_rollout(
         out,
-        bones,
+        skeleton,
         scene.motion,
         steered.velocity,
         title=", ".join(args.skills or model.labels),
@@ -128,8 +128,11 @@ def report(model: Model, scene: Any, touch: np.ndarray) -> None:
       scene: The rollout.
       touch: Frames and joints that touch.
     """
-    bones, joints = model.representation.bones, jnp.array(model.representation.joints)
-    places = skeleton.joint_positions(bones, scene.motion)[:, joints]
+    skeleton, joints = (
+        model.representation.skeleton,
+        jnp.array(model.representation.joints),
+    )
+    places = joint_positions(skeleton, scene.motion)[:, joints]
     nearest = jnp.min(jnp.linalg.norm(places - scene.ball[:, None], axis=-1), axis=-1)
     away = jnp.linalg.norm((scene.ball - scene.motion.root_position)[:, ::2], axis=-1)
     print(

@@ -91,11 +91,11 @@ def _plan_row(
     many = smgdiff_evaluation.plan_many(plan, model, chunk=chunk)
     found = _row(smgdiff_evaluation.score_plans(setting, many))
     scenes = many(jax.random.key(setting.seed), setting.known.condition)
-    positions = skeleton.joint_positions(model.representation.bones, scenes.motion)
+    positions = skeleton.joint_positions(model.representation.skeleton, scenes.motion)
     at = jnp.arange(model.config.future) % model.config.frames_per_token
     places = by_frame.by_frame(
         positions,
-        model.representation.bones.feet,
+        model.representation.skeleton.feet,
         jnp.broadcast_to(at, positions.shape[:2]),
         model.config.fps,
         num_places=model.config.frames_per_token,

@@ -125,7 +125,7 @@ def _stepper(setting: Setting, point: Point) -> Stepper:
 def _frames_row(setting: Setting, key: Array, frames: Frame) -> Row:
     return aamdm_evaluation.free_row(
         key,
-        setting.run.bones,
+        setting.run.skeleton,
         setting.reference,
         frames,
         fps=setting.run.train.fps,
@@ -193,7 +193,7 @@ def bench(job: Job) -> Bench:
         job=job,
         run=run,
         space=aamdm_training.load_space(run, "embedded"),
-        reference=aamdm_evaluation.make_reference(run.bones, run.train),
+        reference=aamdm_evaluation.make_reference(run.skeleton, run.train),
     )
     return Bench(
         real={

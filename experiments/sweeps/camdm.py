@@ -17,7 +17,7 @@ from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.evaluators import frozen
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
@@ -106,7 +106,7 @@ def condition_of(run: camdm_training.Run, *, seed: int) -> camdm_model.Condition
     label = run.held_out.labels[run.field][clip]
     first = functools.partial(jax.tree.map, lambda x: x[0])
     make = jax.jit(functools.partial(camdm_loss.example, config=config))
-    return make(key_example, run.model.bones, first(motion), label[0])[0]
+    return make(key_example, run.model.skeleton, first(motion), label[0])[0]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -134,7 +134,7 @@ class Judge:
 
 def _judge(job: Job, run: camdm_training.Run) -> tuple[Judge, dict[str, Row]]:
     """Trains the recogniser; scores the clips."""
-    bones, field = run.model.bones, run.field
+    skeleton, field = run.model.skeleton, run.field
     styles, budget = len(run.model.labels), job.budget
     ticks = round(budget["seconds"] * run.model.config.fps)
     camdm_steering.check_ticks(
@@ -146,17 +146,19 @@ def _judge(job: Job, run: camdm_training.Run) -> tuple[Judge, dict[str, Row]]:
     )
     real = windows.eval_windows(run.held_out, stride=windows.EVAL_WINDOW, field=field)
     dense = windows.eval_windows(run.train, stride=10, field=field)
-    feature, hits = style_evaluator.recognized(bones, real, recognizer)
-    reference, _ = style_evaluator.recognized(bones, dense, recognizer)
+    feature, hits = style_evaluator.recognized(skeleton, real, recognizer)
+    reference, _ = style_evaluator.recognized(skeleton, dense, recognizer)
     own = camdm_evaluation.random_half(
         np.asarray(dense.group), np.asarray(dense.label), job.seed
     )
     made = styles * ((ticks - camdm_evaluation.SKIP) // windows.EVAL_WINDOW)
-    height = camdm_evaluation.contact_height(bones, real)
+    height = camdm_evaluation.contact_height(skeleton, real)
     judge = Judge(
         recognizer=recognizer,
         reference=reference,
-        styles=camdm_release.style_features(bones, run.train, recognizer, field=field),
+        styles=camdm_release.style_features(
+            skeleton, run.train, recognizer, field=field
+        ),
         height=height,
         root=float(np.median(np.asarray(real.motion.root_position)[..., 1])),
         count=min(made, len(feature), int(own.sum()), int((~own).sum())),
@@ -171,21 +173,21 @@ def _judge(job: Job, run: camdm_training.Run) -> tuple[Judge, dict[str, Row]]:
     whole = camdm_release.of_clips(run.held_out, field=field)
     return judge, {
         GROUND_TRUTH: distances(feature, reference)
-        | camdm_evaluation.metric_row(bones, real, hits, height=height)
-        | _released(judge, bones, whole),
+        | camdm_evaluation.metric_row(skeleton, real, hits, height=height)
+        | _released(judge, skeleton, whole),
         NOISE_FLOOR: distances(reference[own], reference[~own]),
     }
 
 
 def _released(
     judge: Judge,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     whole: camdm_release.Recordings,
     group: np.ndarray | None = None,
 ) -> Row:
     """Columns of the released evaluation."""
-    values = camdm_release.metrics(bones, whole)
-    fid = camdm_release.distances(bones, whole, judge.recognizer, judge.styles)
+    values = camdm_release.metrics(skeleton, whole)
+    fid = camdm_release.distances(skeleton, whole, judge.recognizer, judge.styles)
     return camdm_release.row(values | {"fid": fid}, group)
 
 
@@ -206,7 +208,7 @@ def _fid(job: Job, judge: Judge, features: np.ndarray, owner: np.ndarray) -> Cel
 
 def score(job: Job, judge: Judge, run: camdm_training.Run) -> Row:
     """Steers one character a style in each replication, and measures them."""
-    model, bones, fps = run.model, run.model.bones, run.model.config.fps
+    model, skeleton, fps = run.model, run.model.skeleton, run.model.config.fps
     _, commands = camdm_evaluation.preset_of_run(
         run, PRESET, judge.labels, seconds=job.budget["seconds"], speed=None
     )
@@ -220,19 +222,21 @@ def score(job: Job, judge: Judge, run: camdm_training.Run) -> Row:
     made = camdm_steering.rollout_windows(
         frames, jnp.asarray(judge.labels), fps=fps, skip=camdm_evaluation.SKIP
     )
-    features, hits = style_evaluator.recognized(bones, made, judge.recognizer)
+    features, hits = style_evaluator.recognized(skeleton, made, judge.recognizer)
     owner = np.asarray(made.group) % job.replications
     # Of each replication, not of each character: these are what is independent.
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
-    health = camdm_evaluation.rollout_health(bones, frames, fps=fps, height=judge.root)
+    health = camdm_evaluation.rollout_health(
+        skeleton, frames, fps=fps, height=judge.root
+    )
     row = {"fid": _fid(job, judge, features, owner)}
     row |= camdm_evaluation.unbiased_cells(features, judge.reference, seed=job.seed)
-    row |= camdm_evaluation.metric_row(bones, grouped, hits, height=judge.height)
+    row |= camdm_evaluation.metric_row(skeleton, grouped, hits, height=judge.height)
     whole = camdm_release.of_rollouts(frames, commands, fps=fps)
     replication = np.arange(judge.labels.size) % job.replications
-    row |= _released(judge, bones, whole, replication)
+    row |= _released(judge, skeleton, whole, replication)
     row["diversity_m2"] = camdm_evaluation.repeat_diversity(
-        bones, made, repeats=job.replications
+        skeleton, made, repeats=job.replications
     )
     for name in ("diverged", "frozen"):
         row[name] = Cell(value=float(health[name]), samples=health["rollouts"])

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmotion.evaluation import alignment, contact, smoothness
-from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.motion import trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.spring import Scalar
 
 
 def locomotion_metrics(
-    bones: skeleton.Skeleton,
-    motion: skeleton.Motion,
+    skeleton: Skeleton,
+    motion: Motion,
     wanted_velocity: Float[Array, "windows frames 2"],
     wanted_facing: Float[Array, "windows frames 2"],
     *,
@@ -25,7 +26,7 @@ def locomotion_metrics(
     """Metrics of windows.
 
     Args:
-      bones: The skeleton; its feet are the joints whose sliding counts.
+      skeleton: The skeleton; its feet are the joints whose sliding counts.
       motion: Windows [windows, frames, ...], world.
       wanted_velocity: Velocity asked for in each frame, metres a second.
       wanted_facing: Facing asked for in each frame.
@@ -36,10 +37,10 @@ def locomotion_metrics(
       over slide_seconds of low feet; skate_ratio; acceleration, m/s^2; jerk, m/s^3.
     """
     fps = motion.fps
-    positions = skeleton.joint_positions(bones, motion)
-    feet = positions[..., jnp.array(bones.feet), :]
+    positions = joint_positions(skeleton, motion)
+    feet = positions[..., jnp.array(skeleton.feet), :]
     path = positions[..., 0, ::2]
-    facing = trajectory.root_trajectory(bones, motion).facing
+    facing = trajectory.root_trajectory(skeleton, motion).facing
     slide = contact.slide_distance(feet, fps, max_height=contact_height)
     direction = alignment.trajectory_error(wanted_velocity, path, fps)
     return {

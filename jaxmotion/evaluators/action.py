@@ -18,7 +18,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.network import ActionRecognizer
-from jaxmotion.motion import features, skeleton, trajectory
+from jaxmotion.motion import features, trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.typing import Key, Params
 
 
@@ -47,7 +48,7 @@ class ActionRecognizerConfig:
 
 
 def action_recognizer_input(
-    bones: skeleton.Skeleton, motion: skeleton.Motion
+    skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames channels"]:
     """Joint positions in the ground frame of the first pose.
 
@@ -55,35 +56,35 @@ def action_recognizer_input(
     root takes from there is kept.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       motion: Frames of it.
 
     Returns:
       Metres; three channels a joint.
     """
-    root = trajectory.root_trajectory(bones, motion)
+    root = trajectory.root_trajectory(skeleton, motion)
     frame = trajectory.PlanarFrame(
         origin=root.position[..., 0, :], facing=root.facing[..., 0, :]
     )
-    positions = skeleton.joint_positions(bones, features.to_frame(motion, frame))
+    positions = joint_positions(skeleton, features.to_frame(motion, frame))
     return positions.reshape(*positions.shape[:-2], -1)
 
 
 def released_input(
-    bones: skeleton.Skeleton, motion: skeleton.Motion
+    skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames channels"]:
     """Joint positions as the published recognizer looks at them: from the first root.
 
     Nothing is turned. There the joints are those of SMPL with its mean shape.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       motion: Frames of it.
 
     Returns:
       Metres; three channels a joint.
     """
-    positions = skeleton.joint_positions(bones, motion)
+    positions = joint_positions(skeleton, motion)
     positions = positions - positions[..., :1, :1, :]
     return positions.reshape(*positions.shape[:-2], -1)
 

@@ -20,8 +20,9 @@ from jaxmotion.data.windows import EvalWindows as Windows
 from jaxmotion.data.windows import eval_windows as data_windows
 from jaxmotion.evaluators.network import Recognizer, StyleClassifier
 from jaxmotion.learning import training
-from jaxmotion.motion import rotation, skeleton, trajectory
+from jaxmotion.motion import rotation, trajectory
 from jaxmotion.motion.facing import body_facing, plain_names
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.typing import Key, Params
 
 
@@ -45,10 +46,10 @@ class RecognizerConfig:
         return Recognizer(self.num_classes)
 
     def read(
-        self, bones: skeleton.Skeleton, motion: skeleton.Motion
+        self, skeleton: Skeleton, motion: Motion
     ) -> Float[Array, "*batch frames channels"]:
         """What the network looks at."""
-        return recognizer_input(bones, motion)
+        return recognizer_input(skeleton, motion)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -63,10 +64,10 @@ class ReleasedConfig(RecognizerConfig):
         return StyleClassifier(self.num_classes)
 
     def read(
-        self, bones: skeleton.Skeleton, motion: skeleton.Motion
+        self, skeleton: Skeleton, motion: Motion
     ) -> Float[Array, "*batch frames channels"]:
         """What the network looks at."""
-        return released_input(bones, motion)
+        return released_input(skeleton, motion)
 
 
 # The joints of the released classifier as `plain_names` has them, of Mixamo's skeleton
@@ -83,24 +84,24 @@ _RELEASED_NAMES = tuple(
 RELEASED_JOINTS = _RELEASED_NAMES[1]
 
 
-def released_joints(bones: skeleton.Skeleton) -> tuple[int, ...]:
+def released_joints(skeleton: Skeleton) -> tuple[int, ...]:
     """The joints that the released classifier looks at, in its order.
 
     Raises:
       ValueError: if the skeleton has neither Mixamo's nor 100STYLE's names.
     """
-    plain = plain_names(bones)
+    plain = plain_names(skeleton)
     for names in _RELEASED_NAMES:
         if set(names) <= set(plain):
             return tuple(plain.index(name) for name in names)
     raise ValueError(
         f"the released classifier needs the joints {', '.join(RELEASED_JOINTS)}, or "
-        f"{', '.join(_RELEASED_NAMES[0])}; the skeleton has {', '.join(bones.names)}"
+        f"{', '.join(_RELEASED_NAMES[0])}; the skeleton has {', '.join(skeleton.names)}"
     )
 
 
 def released_input(
-    bones: skeleton.Skeleton, motion: skeleton.Motion
+    skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames channels"]:
     """What the released classifier looks at.
 
@@ -108,7 +109,7 @@ def released_input(
     shoulders face +x.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       motion: Frames of it, at 30 a second.
 
     Returns:
@@ -119,9 +120,9 @@ def released_input(
 
     Source: released feature extractor of CAMDM (Chen et al. 2024).
     """
-    joints = jnp.asarray(released_joints(bones))
-    positions = skeleton.joint_positions(bones, motion)
-    turn = rotation.matrix_from_facing(body_facing(bones, positions))
+    joints = jnp.asarray(released_joints(skeleton))
+    positions = joint_positions(skeleton, motion)
+    turn = rotation.matrix_from_facing(body_facing(skeleton, positions))
     local = positions[..., joints, :] - positions[..., :1, :]
     x, y, z = jnp.moveaxis(jnp.einsum("...ji,...kj->...ki", turn, local), -1, 0)
     local = jnp.stack([z, y, -x], axis=-1)  # from facing +z
@@ -129,7 +130,7 @@ def released_input(
 
 
 def recognizer_input(
-    bones: skeleton.Skeleton, motion: skeleton.Motion
+    skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames channels"]:
     """Joint positions relative to the root and turned to face +z, in each frame.
 
@@ -137,14 +138,14 @@ def recognizer_input(
     what its limbs do.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       motion: Frames of it.
 
     Returns:
       Metres; three channels a joint, the root's height in place of its zeros.
     """
-    positions = skeleton.joint_positions(bones, motion)
-    facing = trajectory.root_trajectory(bones, motion).facing
+    positions = joint_positions(skeleton, motion)
+    facing = trajectory.root_trajectory(skeleton, motion).facing
     turn = jnp.swapaxes(rotation.matrix_from_facing(facing), -1, -2)
     local = positions - positions[..., :1, :]
     local = jnp.einsum("...ij,...kj->...ki", turn, local)
@@ -377,19 +378,19 @@ def fit_recognizer(
 
 
 def recognized(
-    bones: skeleton.Skeleton, found: Windows, recognizer: Recognized
+    skeleton: Skeleton, found: Windows, recognizer: Recognized
 ) -> tuple[np.ndarray, np.ndarray]:
     """Features of windows, and whether each one's style is recognised.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       found: Windows.
       recognizer: From `fit_recognizer`.
 
     Returns:
       Features [windows, 512], and hits [windows] (0 or 1).
     """
-    run = functools.partial(_recognize, recognizer.params, bones, recognizer.config)
+    run = functools.partial(_recognize, recognizer.params, skeleton, recognizer.config)
     label = found.label
     if recognizer.classes:
         label = jnp.asarray(recognizer.classes)[label]
@@ -399,11 +400,11 @@ def recognized(
 @functools.partial(jax.jit, static_argnums=2)
 def _recognize(
     params: Params,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     config: RecognizerConfig,
-    x: tuple[skeleton.Motion, Array],
+    x: tuple[Motion, Array],
 ) -> tuple[Array, Array]:
     motion, label = x
-    given = config.read(bones, motion)
+    given = config.read(skeleton, motion)
     feature, logits = recognize(params, given, config=config)
     return feature, (jnp.argmax(logits, axis=-1) == label).astype(jnp.float32)

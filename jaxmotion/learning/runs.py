@@ -341,20 +341,20 @@ def load_params(
     return found["ema_params"]
 
 
-def skeleton_to_json(bones: Skeleton) -> dict[str, Any]:
+def skeleton_to_json(skeleton: Skeleton) -> dict[str, Any]:
     """JSON of a skeleton.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
 
     Returns:
       A JSON object.
     """
     return {
-        "offsets": np.asarray(bones.offsets, np.float64).tolist(),
-        "parents": list(bones.parents),
-        "names": list(bones.names),
-        "feet": list(bones.feet),
+        "offsets": np.asarray(skeleton.offsets, np.float64).tolist(),
+        "parents": list(skeleton.parents),
+        "names": list(skeleton.names),
+        "feet": list(skeleton.feet),
     }
 
 

@@ -246,11 +246,11 @@ def to_frame(motion: Motion, frame: PlanarFrame) -> Motion:
     return _move(motion, frame.facing, -frame.origin, zero, ground.into_frame)
 
 
-def to_first_pose(bones: Skeleton, motion: Motion) -> Motion:
+def to_first_pose(skeleton: Skeleton, motion: Motion) -> Motion:
     """Moves motions so that they start at the ground's origin facing +z.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       motion: In the world.
 
     Returns:
@@ -261,7 +261,7 @@ def to_first_pose(bones: Skeleton, motion: Motion) -> Motion:
         joint_rotation=motion.joint_rotation[..., :1, :, :],
         fps=motion.fps,
     )
-    path = root_trajectory(bones, first)
+    path = root_trajectory(skeleton, first)
     return to_frame(
         motion,
         PlanarFrame(origin=path.position[..., 0, :], facing=path.facing[..., 0, :]),

@@ -144,9 +144,11 @@ def _chain_rotations(joints: Array, facing: Array, layout: Layout) -> Array:
     """Rotations [..., F, J - 1, 6] of canonical joints along the chains."""
     parents = jnp.array(layout.parents[1:])
     rest = jnp.array(layout.raw_offsets[1:], joints.dtype)
-    bones = joints[..., 1:, :] - joints[..., parents, :]
-    bones = rotation.safe_normalize(bones, jnp.array([0.0, 1.0, 0.0], joints.dtype))
-    world = minimal_swing(rest, bones)
+    segments = joints[..., 1:, :] - joints[..., parents, :]
+    segments = rotation.safe_normalize(
+        segments, jnp.array([0.0, 1.0, 0.0], joints.dtype)
+    )
+    world = minimal_swing(rest, segments)
     start = jnp.swapaxes(rotation.matrix_from_facing(facing), -1, -2)
     every = jnp.concatenate([start[..., None, :, :], world], axis=-3)
     # A chain's first joint follows the root, wherever the chain starts.

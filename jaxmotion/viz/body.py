@@ -170,8 +170,8 @@ def build(
         tree, and grey.
     """
     up_tree = np.array([max(p, 0) for p in parents])
-    bones = np.linalg.norm(positions - positions[:, up_tree], axis=-1)
-    lengths = np.median(bones, axis=0)
+    skeleton = np.linalg.norm(positions - positions[:, up_tree], axis=-1)
+    lengths = np.median(skeleton, axis=0)
     head, is_neck = _head(positions, parents, names)
     trunk = _chain(parents, 0 if head is None else head)
     arms, legs = ([], []) if head is None else _limbs(parents, lengths, trunk)

@@ -162,13 +162,13 @@ def test_bad_input_is_named_before_the_work(
 
 
 @pytest.fixture(scope="module")
-def small(load, bones, quick_compile):
+def small(load, skeleton, quick_compile):
     """`one_rollout` of a small model, and keys and states to map it over."""
     workload = load("workload_diversity")
     model = camdm_model.Model(
-        config=CONFIG, bones=bones, labels=tiny.STYLES, source="made in the tests"
+        config=CONFIG, skeleton=skeleton, labels=tiny.STYLES, source="made in the tests"
     )
-    state = camdm_controller.init_state(bones, tiny.walk(CONFIG.past), config=CONFIG)
+    state = camdm_controller.init_state(skeleton, tiny.walk(CONFIG.past), config=CONFIG)
     ahead = jnp.broadcast_to(jnp.array([0.0, 1.0]), (TICKS, 2))
     commands = Command(velocity=ahead, facing=ahead, label=jnp.zeros(TICKS, jnp.int32))
     given = workload.Load(

@@ -65,7 +65,7 @@ def test_a_planner_is_traced_once():
     assert np.abs(results[1] - results[0]).max() > 1e-3
 
 
-def test_a_rollout_is_traced_once(bones):
+def test_a_rollout_is_traced_once(skeleton):
     """Other states, commands and moments at which plans are made."""
     control = camdm_controller.Control(apply=5, reuse=6)
 
@@ -73,14 +73,14 @@ def test_a_rollout_is_traced_once(bones):
     @chex.assert_max_traces(n=1)
     def run(params, key, states, commands):
         made = camdm_controller.controller(
-            params, bones, config=CONFIG, control=control
+            params, skeleton, config=CONFIG, control=control
         )
         return rollout.rollout(made, key, states, commands)
 
     planned = []
     for seed in range(2):
         state = camdm_controller.init_state(
-            bones, tiny.walk(CONFIG.past, start=float(seed)), config=CONFIG
+            skeleton, tiny.walk(CONFIG.past, start=float(seed)), config=CONFIG
         )
         states = jax.tree.map(lambda x: jnp.stack([x] * 2), state)
         later = np.arange(6) > 2 + seed

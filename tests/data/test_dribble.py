@@ -117,8 +117,10 @@ def test_legs_never_come_into_the_ball():
             leg = part.joints[:, [toe, toe - 1, toe - 2]]
             # Bones as many points.
             share = np.linspace(0.0, 1.0, 41)[:, None]
-            bones = leg[:, :-1, None] + share * (leg[:, 1:] - leg[:, :-1])[:, :, None]
-            away = np.linalg.norm(bones - part.ball[:, None, None], axis=-1)
+            points = (
+                leg[:, :-1, None] + share * (leg[:, 1:] - leg[:, :-1])[:, :, None]
+            )
+            away = np.linalg.norm(points - part.ball[:, None, None], axis=-1)
             away = away.min(axis=(1, 2))
             assert away[~near].min() > RADIUS + SETTINGS.thickness - 1e-4
             least = RADIUS + SETTINGS.thickness - SETTINGS.give

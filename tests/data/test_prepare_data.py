@@ -71,8 +71,8 @@ def test_sets_with_captions_are_written(script, tmp_path, capsys):
 
 
 def test_humanact12_keeps_its_rate(script, tmp_path):
-    bones = np.random.default_rng(9).normal(size=(24, 3)) * 0.2
-    pose, joints = test_text_builders.smpl_clip(0, 4, bones)
+    skeleton = np.random.default_rng(9).normal(size=(24, 3)) * 0.2
+    pose, joints = test_text_builders.smpl_clip(0, 4, skeleton)
     (tmp_path / "raw").mkdir()
     content = {"poses": [pose], "joints3D": [joints], "y": [2]}
     (tmp_path / "raw" / "humanact12poses.pkl").write_bytes(pickle.dumps(content))

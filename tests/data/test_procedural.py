@@ -8,7 +8,7 @@ import pytest
 
 from jaxmotion.control import presets
 from jaxmotion.data import gaits, procedural
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import Motion, joint_positions
 
 FPS, SECONDS = 30.0, 16.0
 BONES = procedural.walker_skeleton()
@@ -77,12 +77,14 @@ def test_contacts_are_exact_and_nothing_is_below_the_ground(case):
 @pytest.mark.parametrize("gait", gaits.GAITS)
 def test_bones_keep_their_length(gait):
     _, walk, expected = steered(gait, "strafe")
-    position = np.asarray(skeleton.joint_positions(BONES, walk.motion))
+    position = np.asarray(joint_positions(BONES, walk.motion))
     np.testing.assert_allclose(position, expected, atol=2e-5)
     parents = np.array(BONES.parents[1:])
     length = np.linalg.norm(position[:, 1:] - position[:, parents], axis=-1)
-    bones = np.linalg.norm(np.asarray(BONES.offsets), axis=-1)[1:]
-    np.testing.assert_allclose(length, np.broadcast_to(bones, length.shape), atol=2e-5)
+    lengths = np.linalg.norm(np.asarray(BONES.offsets), axis=-1)[1:]
+    np.testing.assert_allclose(
+        length, np.broadcast_to(lengths, length.shape), atol=2e-5
+    )
 
 
 @pytest.mark.parametrize("case", CASES, ids="-".join)
@@ -220,7 +222,7 @@ def features(clips):
     """Statistics of poses, one row a clip: means and spreads of joint heights and of
     joints relative to the root, facing +z."""
     position = fk(
-        skeleton.Motion(
+        Motion(
             root_position=clips.root_position,
             joint_rotation=clips.joint_rotation,
             fps=30.0,
@@ -344,7 +346,7 @@ def test_random_clips_have_no_jump():
     for seed in (1, 2):
         clips = procedural.make_clips(seed=seed, minutes=16.0)
         position = fk(
-            skeleton.Motion(
+            Motion(
                 root_position=clips.root_position,
                 joint_rotation=clips.joint_rotation,
                 fps=FPS,

@@ -141,6 +141,6 @@ def test_bad_clips_are_refused(walks):
     short = dataclasses.replace(walks, offsets=jnp.array([0, 1, 720]))
     with pytest.raises(ValueError, match="neutral_000 has one frame"):
         rolling.bodies(short, thickness=0.03)
-    bones = dataclasses.replace(walks.skeleton, feet=())
+    skeleton = dataclasses.replace(walks.skeleton, feet=())
     with pytest.raises(ValueError, match="'feet' of the skeleton is empty"):
-        rolling.bodies(dataclasses.replace(walks, skeleton=bones), thickness=0.03)
+        rolling.bodies(dataclasses.replace(walks, skeleton=skeleton), thickness=0.03)

@@ -9,7 +9,8 @@ import pytest
 from jaxmotion.data import walker
 from jaxmotion.data.footsteps import Footsteps
 from jaxmotion.data.gaits import GAITS, Gait
-from jaxmotion.motion import rotation, skeleton
+from jaxmotion.motion import rotation
+from jaxmotion.motion.skeleton import check_parents, forward_kinematics
 
 FRAMES = 40
 STIFF = Gait(sway=0.0, twist=0.0)
@@ -32,10 +33,10 @@ def at_rest(half_width=0.09, ahead=walker.TOE_AHEAD):
 
 
 def positions(root, local):
-    bones = walker.walker_skeleton()
+    skeleton = walker.walker_skeleton()
     rot6d = rotation.rot6d_from_matrix(jnp.asarray(local, jnp.float32))
     joint = jnp.asarray(root, jnp.float32)
-    return np.asarray(skeleton.forward_kinematics(bones, joint, rot6d), float)
+    return np.asarray(forward_kinematics(skeleton, joint, rot6d), float)
 
 
 def solve(steps, gait=STIFF, path=(0.0, 0.0), yaw=0.0):
@@ -48,12 +49,15 @@ def solve(steps, gait=STIFF, path=(0.0, 0.0), yaw=0.0):
 
 
 def test_the_skeleton_is_a_tree_of_plain_measures():
-    bones = walker.walker_skeleton()
-    skeleton.check_parents(bones.parents)
-    assert [bones.names[foot] for foot in bones.feet] == ["LeftToeBase", "RightToeBase"]
-    lengths = np.linalg.norm(np.asarray(bones.offsets), axis=-1)
-    named = dict(zip(bones.names, lengths, strict=True))
-    for name in bones.names:
+    skeleton = walker.walker_skeleton()
+    check_parents(skeleton.parents)
+    assert [skeleton.names[foot] for foot in skeleton.feet] == [
+        "LeftToeBase",
+        "RightToeBase",
+    ]
+    lengths = np.linalg.norm(np.asarray(skeleton.offsets), axis=-1)
+    named = dict(zip(skeleton.names, lengths, strict=True))
+    for name in skeleton.names:
         if name.startswith("Left"):
             twin = "Right" + name.removeprefix("Left")
             assert named[name] == named[twin]
@@ -70,13 +74,13 @@ def test_toes_are_where_the_steps_are(name):
 
 def test_standing_upright_has_level_soles_and_nearly_straight_knees():
     found = solve(at_rest())
-    bones = walker.walker_skeleton()
+    skeleton = walker.walker_skeleton()
     for thigh in (14, 18):
         knee, ankle, toe = (found[0, thigh + i] for i in (1, 2, 3))
         bend = np.linalg.norm(ankle - found[0, thigh])
         assert 0.97 * (walker.THIGH + walker.SHANK) < bend
         sole = toe - ankle
-        np.testing.assert_allclose(sole, np.asarray(bones.offsets)[17], atol=1e-5)
+        np.testing.assert_allclose(sole, np.asarray(skeleton.offsets)[17], atol=1e-5)
         assert knee[2] > 0.5 * (found[0, thigh, 2] + ankle[2]), "the knee is in front"
 
 

@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.evaluation import by_frame, smoothness
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from tests import tiny
 
 
 def still(frames):
     motion = tiny.walk(1)
-    return skeleton.Motion(
+    return Motion(
         root_position=jnp.repeat(motion.root_position, frames, axis=0),
         joint_rotation=jnp.repeat(motion.joint_rotation, frames, axis=0),
         fps=30.0,
@@ -25,7 +25,7 @@ def test_frames_since_the_last_plan():
     np.testing.assert_array_equal(by_frame.frames_since(planned), expected)
 
 
-def test_a_jump_at_a_border_shows_in_three_frames(bones):
+def test_a_jump_at_a_border_shows_in_three_frames(skeleton):
     """1 cm sideways between frames 4 and 5 of each ten: jerk 1:2:1, slide in one."""
     motion = still(40)
     hops = jnp.asarray((np.arange(40) + 5) // 10 * 0.01, jnp.float32)
@@ -33,8 +33,8 @@ def test_a_jump_at_a_border_shows_in_three_frames(bones):
         motion, root_position=motion.root_position.at[:, 0].add(hops)
     )
     found = by_frame.by_frame(
-        skeleton.joint_positions(bones, motion),
-        bones.feet,
+        joint_positions(skeleton, motion),
+        skeleton.feet,
         jnp.arange(40) % 10,
         30.0,
         num_places=10,
@@ -49,12 +49,12 @@ def test_a_jump_at_a_border_shows_in_three_frames(bones):
     assert found.frames.tolist() == [4] * 10
 
 
-def test_the_mean_over_places_is_the_metric(bones):
+def test_the_mean_over_places_is_the_metric(skeleton):
     motion = tiny.walk(33, turn=0.5)
-    positions = skeleton.joint_positions(bones, motion)
+    positions = joint_positions(skeleton, motion)
     found = by_frame.by_frame(
         positions,
-        bones.feet,
+        skeleton.feet,
         jnp.zeros(33, jnp.int32),
         30.0,
         num_places=2,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.motion import features, skeleton, trajectory
+from jaxmotion.motion import features, trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from tests import tiny
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -14,10 +15,10 @@ pytestmark = pytest.mark.usefixtures("quick_compile")
 CONFIG = style_evaluator.RecognizerConfig(num_classes=2, num_joints=5, frames=12)
 
 
-def test_the_input_against_a_loop(bones):
+def test_the_input_against_a_loop(skeleton):
     motion = tiny.walk(20, turn=1.0, start=0.5)
-    found = style_evaluator.recognizer_input(bones, motion)
-    positions = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
+    found = style_evaluator.recognizer_input(skeleton, motion)
+    positions = np.asarray(joint_positions(skeleton, motion), np.float64)
     for frame in range(20):
         root = positions[frame, 0]
         across = positions[frame, 1] - positions[frame, 3]
@@ -34,14 +35,14 @@ def test_the_input_against_a_loop(bones):
         )
 
 
-def test_neither_place_nor_facing_is_seen(bones):
+def test_neither_place_nor_facing_is_seen(skeleton):
     motion = tiny.walk(20, turn=1.0)
     frame = trajectory.PlanarFrame(
         origin=jnp.array([3.0, -5.0]), facing=jnp.array([0.6, -0.8])
     )
     np.testing.assert_allclose(
-        style_evaluator.recognizer_input(bones, features.from_frame(motion, frame)),
-        style_evaluator.recognizer_input(bones, motion),
+        style_evaluator.recognizer_input(skeleton, features.from_frame(motion, frame)),
+        style_evaluator.recognizer_input(skeleton, motion),
         atol=1e-5,
     )
 
@@ -68,13 +69,13 @@ def test_the_loss_is_the_cross_entropy():
 
 
 @pytest.fixture(scope="module")
-def windows_of_styles(bones):
+def windows_of_styles(skeleton):
     """Windows of slow and fast walkers; every second is held out."""
     x, labels = [], []
     for label, speed in enumerate((0.7, 1.4)):
         for start in range(8):
             motion = tiny.walk(60, speed=speed, start=float(start))
-            rows = style_evaluator.recognizer_input(bones, motion)
+            rows = style_evaluator.recognizer_input(skeleton, motion)
             x += [rows[i : i + 12] for i in range(start, 48, 6)]
             labels += [label] * len(range(start, 48, 6))
     return jnp.stack(x), jnp.asarray(labels, jnp.int32)
@@ -94,7 +95,7 @@ def test_it_learns_to_tell_two_styles(windows_of_styles):
 
 def skeleton_with(names, rng):
     """A chain from the root to each joint."""
-    return skeleton.Skeleton(
+    return Skeleton(
         offsets=jnp.asarray(rng.normal(size=(len(names), 3)), jnp.float32),
         parents=(-1, *(0,) * (len(names) - 1)),
         names=tuple(names),
@@ -127,13 +128,13 @@ def test_the_released_input_is_that_of_the_released_scripts(names):
     """Float64: across = shoulders + hips, each of length 1; facing +x; no root."""
     rng = np.random.default_rng(0)
     joints = names.split()
-    bones = skeleton_with([f"rig:{name}" for name in joints], rng)
-    motion = skeleton.Motion(
+    skeleton = skeleton_with([f"rig:{name}" for name in joints], rng)
+    motion = Motion(
         root_position=jnp.asarray(rng.normal(size=(6, 3)), jnp.float32),
         joint_rotation=jnp.asarray(rng.normal(size=(6, len(joints), 6)), jnp.float32),
         fps=30.0,
     )
-    positions = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
+    positions = np.asarray(joint_positions(skeleton, motion), np.float64)
     at = lambda name: positions[:, joints.index(name)]  # noqa: E731
     left_top, right_top, left_hip, right_hip = map(at, ACROSS[names])
     across = np.zeros((6, 3))
@@ -145,11 +146,13 @@ def test_the_released_input_is_that_of_the_released_scripts(names):
     c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
     x, y, z = np.moveaxis(local, -1, 0)
     wanted = np.stack([c * x + s * z, y, c * z - s * x], axis=-1).reshape(6, 45)
-    found = style_evaluator.released_input(bones, motion)
+    found = style_evaluator.released_input(skeleton, motion)
     np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
 def test_the_released_input_names_the_joints_that_it_needs():
-    bones = skeleton_with(["Hips", "LeftUpLeg", "RightUpLeg"], np.random.default_rng(0))
+    skeleton = skeleton_with(
+        ["Hips", "LeftUpLeg", "RightUpLeg"], np.random.default_rng(0)
+    )
     with pytest.raises(ValueError, match="needs the joints hips, neck, .* has Hips, "):
-        style_evaluator.released_joints(bones)
+        style_evaluator.released_joints(skeleton)

@@ -230,7 +230,7 @@ def test_an_export_has_poses_of_the_models_own(call, trained, tmp_path):
     lead = (len(model.labels), 2, model.config.past)
     assert model.starts.root_position.shape == (*lead, 3)
     path = trajectory.root_trajectory(
-        model.bones, jax.tree.map(lambda x: x[1, 1], model.starts)
+        model.skeleton, jax.tree.map(lambda x: x[1, 1], model.starts)
     )
     np.testing.assert_allclose(path.position[-1], 0.0, atol=1e-4)
     np.testing.assert_allclose(path.facing[-1], [0.0, 1.0], atol=1e-4)
@@ -264,9 +264,9 @@ def test_released_weights_become_a_model_that_rolls_out(call, released):
     model, params, _ = camdm_model.load(released / "released.npz")
     assert model.config.num_steps == 4 and model.config.norm == "post"
     assert model.labels == samples.STYLES
-    assert model.bones.feet == samples.clips().skeleton.feet
+    assert model.skeleton.feet == samples.clips().skeleton.feet
     direct, again = camdm_published.load(
-        released / "best.pt", bones=model.bones, labels=model.labels
+        released / "best.pt", skeleton=model.skeleton, labels=model.labels
     )
     assert direct.config == model.config
     jax.tree.map(np.testing.assert_array_equal, params, again)

@@ -236,9 +236,9 @@ def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
     get = functools.partial(camdm_evaluation.recognizer, jax.random.key(0))
     judge = get(run, evaluator, num_steps=1)
     found = windows.eval_windows(run.train, stride=60, field="style")
-    bones = run.model.bones
-    features, hits = style_evaluator.recognized(bones, found, judge)
-    x = np.array(style_evaluator.released_input(bones, found.motion))
+    skeleton = run.model.skeleton
+    features, hits = style_evaluator.recognized(skeleton, found, judge)
+    x = np.array(style_evaluator.released_input(skeleton, found.motion))
     with torch.inference_mode():
         wanted, logits = peer(torch.from_numpy(x.swapaxes(1, 2)))
     assert wanted.std() > 0.1
@@ -249,7 +249,7 @@ def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
     other = dataclasses.replace(evaluator, labels=("a", "neutral", "b", "c"))
     with pytest.raises(ValueError, match="field 'labels' is .* expected"):
         get(run, other, num_steps=1)
-    lame = dataclasses.replace(bones, names=("Hip", *bones.names[1:]))
-    model = dataclasses.replace(run.model, bones=lame)
+    lame = dataclasses.replace(skeleton, names=("Hip", *skeleton.names[1:]))
+    model = dataclasses.replace(run.model, skeleton=lame)
     with pytest.raises(ValueError, match="released classifier needs the joints hips"):
         get(dataclasses.replace(run, model=model), evaluator, num_steps=1)

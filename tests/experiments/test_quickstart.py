@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from jaxmotion.data import bvh
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import joint_positions
 
 ROOT = Path(__file__).parents[2]
 
@@ -27,7 +27,7 @@ def test_a_person_stands_walks_runs_and_crouches(tmp_path):
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert "Open 3D Engine" in found["source"]
-    bones, motion = bvh.motion_from_bvh(bvh.read_bvh(tmp_path / "rollout.bvh"))
+    skeleton, motion = bvh.motion_from_bvh(bvh.read_bvh(tmp_path / "rollout.bvh"))
     hips = np.asarray(motion.root_position)
     frames = round(30 * sum(part[0] for part in found["course"]))
     assert hips.shape == (frames, 3)
@@ -45,7 +45,7 @@ def test_a_person_stands_walks_runs_and_crouches(tmp_path):
     assert along(8.0, 9.4) > 2.3  # runs
     assert along(10.8, 11.4) < 0.5  # has stopped
     assert height(12.8, 13.9) < height(2.0, 3.4) - 0.1  # crouches
-    toes = np.asarray(skeleton.joint_positions(bones, motion))[:, :, 1].min()
+    toes = np.asarray(joint_positions(skeleton, motion))[:, :, 1].min()
     assert -0.06 < toes < 0.06
     with Image.open(tmp_path / "rollout.gif") as image:
         assert image.n_frames > 100

@@ -704,7 +704,7 @@ def model_and_params():
         network="mlp",
     )
     model = camdm_model.Model(
-        config=config, bones=tiny.skeleton(), labels=tiny.STYLES, source="tests"
+        config=config, skeleton=tiny.skeleton(), labels=tiny.STYLES, source="tests"
     )
     return model, tiny.random_params(camdm_model.init, config, seed=1)
 
@@ -790,7 +790,7 @@ def test_the_mean_pose_stands_on_the_ground():
     model, _ = model_and_params()
     motion = module.mean_pose(model)
     assert motion.root_position.shape == (model.config.past, 3)
-    feet = skeleton.joint_positions(model.bones, motion)[:, [2, 4], 1]
+    feet = skeleton.joint_positions(model.skeleton, motion)[:, [2, 4], 1]
     np.testing.assert_allclose(feet, 0.0, atol=1e-6)
     np.testing.assert_allclose(motion.root_position[-1], [0, 0.9, 0], atol=1e-6)
     state = module.first_state(Path("nowhere"), None, model)

@@ -82,9 +82,9 @@ def same_params(params, fields):
 
 
 @pytest.fixture
-def camdm_value(config, bones):
+def camdm_value(config, skeleton):
     model = camdm_model.Model(
-        config=config, bones=bones, labels=tiny.STYLES, source="tests"
+        config=config, skeleton=skeleton, labels=tiny.STYLES, source="tests"
     )
     return camdm_model.to_json(model)
 
@@ -243,7 +243,7 @@ def test_runs_of_aamdm(tmp_path, capsys):
 
     def confirm(_, run):
         value = json.loads((folder / "config.json").read_text())
-        assert run.config == value and run.bones.names == tuple(
+        assert run.config == value and run.skeleton.names == tuple(
             value["skeleton"]["names"]
         )
         with np.load(folder / "frames.npz") as file:
@@ -251,7 +251,7 @@ def test_runs_of_aamdm(tmp_path, capsys):
         # The second before a clip's end that is held out is in neither part.
         gap = round(run.train.fps) * (run.train.offsets.size - 1)
         assert run.train.num_frames + gap + run.held_out.num_frames <= frames
-        for leaf in jax.tree.leaves((run.train, run.held_out, run.bones)):
+        for leaf in jax.tree.leaves((run.train, run.held_out, run.skeleton)):
             assert np.isfinite(np.asarray(leaf)).all()
         assert 0 < run.train.fps < np.inf
 

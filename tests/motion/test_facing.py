@@ -3,11 +3,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.motion import facing, rotation, skeleton
+from jaxmotion.motion import facing, rotation
+from jaxmotion.motion.skeleton import Skeleton, forward_kinematics
 
 
 def biped(names):
-    return skeleton.Skeleton(
+    return Skeleton(
         offsets=jnp.array(
             [[0, 0, 0], [0, 0.1, 0], [0.1, 0, 0.02], [-0.1, 0, 0.02]], jnp.float32
         ),
@@ -36,24 +37,24 @@ def test_unknown_hips_name_what_was_expected():
 
 
 def test_facing_is_that_of_full_kinematics():
-    bones = biped(("Root", "Hips", "UpperLeg_L", "UpperLeg_R"))
+    skeleton = biped(("Root", "Hips", "UpperLeg_L", "UpperLeg_R"))
     rot6d = jax.random.normal(jax.random.key(1), (2, 5, 4, 6))
-    joints = skeleton.forward_kinematics(bones, jnp.zeros((2, 5, 3)), rot6d)
+    joints = forward_kinematics(skeleton, jnp.zeros((2, 5, 3)), rot6d)
     joints = np.asarray(joints, np.float64)
     forward = np.cross(joints[..., 2, :] - joints[..., 3, :], [0, 1, 0])[..., ::2]
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
-    got = facing.hip_facing(bones, rot6d)
+    got = facing.hip_facing(skeleton, rot6d)
     np.testing.assert_allclose(got, forward, atol=1e-5)
-    swapped = facing.hip_facing(bones, rot6d, hips=(3, 2))
+    swapped = facing.hip_facing(skeleton, rot6d, hips=(3, 2))
     np.testing.assert_allclose(swapped, -forward, atol=1e-5)
 
 
 def test_facing_turns_with_the_root():
-    bones = biped(("Root", "Hips", "LeftUpLeg", "RightUpLeg"))
+    skeleton = biped(("Root", "Hips", "LeftUpLeg", "RightUpLeg"))
     yaw = np.array([0.0, 0.5, 3.1, -3.1], np.float32)
     rest = rotation.rot6d_from_matrix(jnp.broadcast_to(jnp.eye(3), (4, 4, 3, 3)))
     turned = rotation.rot6d_from_matrix(rotation.matrix_from_yaw(jnp.asarray(yaw)))
-    got = facing.hip_facing(bones, rest.at[:, 0].set(turned))
+    got = facing.hip_facing(skeleton, rest.at[:, 0].set(turned))
     np.testing.assert_allclose(got, np.stack([np.sin(yaw), np.cos(yaw)], -1), atol=1e-6)
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxmotion.motion import features, rotation, skeleton, trajectory
+from jaxmotion.motion import features, rotation, trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 
-BONES = skeleton.Skeleton(
+BONES = Skeleton(
     offsets=jnp.array([[0, 0, 0], [0.1, 0.3, 0], [0, 0.2, 0.4]], jnp.float32),
     parents=(-1, 0, 1),
     names=("a", "b", "c"),
@@ -16,7 +17,7 @@ BONES = skeleton.Skeleton(
 def motion(shape=(4,), seed=0):
     key_p, key_r = jax.random.split(jax.random.key(seed))
     matrix = rotation.matrix_from_rot6d(jax.random.normal(key_r, (*shape, 3, 6)))
-    return skeleton.Motion(
+    return Motion(
         root_position=jax.random.normal(key_p, (*shape, 3)),
         joint_rotation=rotation.rot6d_from_matrix(matrix),
         fps=60.0,
@@ -49,8 +50,8 @@ def test_to_frame_moves_every_joint_rigidly():
     yaw, origin = [0.4, -3.0], [[1.0, 2.0], [-5.0, 0.5]]
     world = motion((2, 4))
     local = features.to_frame(world, frame(yaw, origin))
-    before = np.asarray(skeleton.joint_positions(BONES, world))
-    after = np.asarray(skeleton.joint_positions(BONES, local))
+    before = np.asarray(joint_positions(BONES, world))
+    after = np.asarray(joint_positions(BONES, local))
     for b in range(2):
         moved = before[b] - np.array([origin[b][0], 0.0, origin[b][1]])
         turn = Rotation.from_rotvec([0, yaw[b], 0]).inv()
@@ -73,20 +74,20 @@ def test_from_frame_inverts_to_frame():
 
 
 def test_frame_change_agrees_with_that_of_the_path():
-    bones = skeleton.Skeleton(
+    skeleton = Skeleton(
         offsets=jnp.array([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]], jnp.float32),
         parents=(-1, 0, 0),
         names=("Hips", "LeftUpLeg", "RightUpLeg"),
     )
     world, where = motion((4,)), frame(2.0, [0.3, -1.0])
-    path = trajectory.root_trajectory(bones, world)
+    path = trajectory.root_trajectory(skeleton, world)
     want = trajectory.to_local(path, where)
-    got = trajectory.root_trajectory(bones, features.to_frame(world, where))
+    got = trajectory.root_trajectory(skeleton, features.to_frame(world, where))
     np.testing.assert_allclose(got.position, want.position, atol=1e-5)
     np.testing.assert_allclose(got.facing, want.facing, atol=1e-5)
 
 
-HIPS = skeleton.Skeleton(
+HIPS = Skeleton(
     offsets=jnp.array([[0, 0, 0], [0.1, 0, 0], [-0.1, 0, 0]], jnp.float32),
     parents=(-1, 0, 0),
     names=("Hips", "LeftUpLeg", "RightUpLeg"),
@@ -111,7 +112,7 @@ def test_motions_are_moved_to_their_own_first_pose(shape):
     np.testing.assert_array_equal(
         found.joint_rotation[..., 1:, :], world.joint_rotation[..., 1:, :]
     )
-    place = jax.jit(lambda m: skeleton.joint_positions(HIPS, m))
+    place = jax.jit(lambda m: joint_positions(HIPS, m))
     before, after = (
         np.asarray(place(m)).reshape(*shape[:-1], -1, 3) for m in (world, found)
     )

@@ -253,12 +253,12 @@ def test_rotations_along_the_chains_rebuild_the_pose(layout):
         humanml.features_from_joints(float32(joints), layout), np.float64
     )
     for t in range(0, FRAMES - 1, 30):
-        bones = canonical[t] - canonical[t][np.maximum(layout.parents, 0)]
+        skeleton = canonical[t] - canonical[t][np.maximum(layout.parents, 0)]
         found = reference.joints_from_rotations(
             vectors[t],
             turns[t],
             canonical[t, 0],
-            np.linalg.norm(bones, axis=-1),
+            np.linalg.norm(skeleton, axis=-1),
             layout.chains,
             layout.raw_offsets,
         )

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.data import bvh, bvh_text
-from jaxmotion.motion import humanml, humanml_skeleton, skeleton
+from jaxmotion.motion import humanml, humanml_skeleton
+from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from tests import person
 from tests.person import float32
 
@@ -34,7 +35,7 @@ fit = humanml_skeleton.motion_from_joints
 
 def rig(names):
     """A skeleton of which only the names matter."""
-    return skeleton.Skeleton(
+    return Skeleton(
         offsets=jnp.zeros((len(names), 3)),
         parents=tuple(range(-1, len(names) - 1)),
         names=tuple(names),
@@ -130,20 +131,20 @@ def rigid_clip(seed=0, swing=0.8):
     vectors[:, 0] += np.multiply.outer(2.0 * time, [0.0, 1.0, 0.0])
     matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
     root = person.waves(time, 3, seed + 1, 0.8) + [2.0, 1.0, 0.0]
-    body = skeleton.Skeleton(offsets=float32(offsets), parents=PARENTS, names=SMPL)
+    body = Skeleton(offsets=float32(offsets), parents=PARENTS, names=SMPL)
     motion = person.motion(root, matrices.reshape(FRAMES, 22, 3, 3), 20.0)
-    return np.asarray(skeleton.joint_positions(body, motion), np.float64)
+    return np.asarray(joint_positions(body, motion), np.float64)
 
 
 def lengths(positions):
-    bones = positions[..., 1:, :] - positions[..., PARENTS[1:], :]
-    return np.linalg.norm(bones, axis=-1)
+    skeleton = positions[..., 1:, :] - positions[..., PARENTS[1:], :]
+    return np.linalg.norm(skeleton, axis=-1)
 
 
 def errors(positions):
     """Distances [F, 22] of the joints of the fitted motion."""
-    bones, motion = fit(float32(positions), fps=20.0)
-    found = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
+    skeleton, motion = fit(float32(positions), fps=20.0)
+    found = np.asarray(joint_positions(skeleton, motion), np.float64)
     return np.linalg.norm(found - positions, axis=-1)
 
 
@@ -154,13 +155,13 @@ def test_rigid_bodies_are_followed_exactly(seed):
 
 def test_fit_is_a_skeleton_and_a_motion_of_the_22_joints():
     positions = rigid_clip()
-    bones, motion = fit(float32(positions), fps=20.0)
-    assert bones.names == SMPL
-    assert bones.parents == PARENTS
-    assert [bones.names[i] for i in bones.feet] == ["left_foot", "right_foot"]
+    skeleton, motion = fit(float32(positions), fps=20.0)
+    assert skeleton.names == SMPL
+    assert skeleton.parents == PARENTS
+    assert [skeleton.names[i] for i in skeleton.feet] == ["left_foot", "right_foot"]
     assert motion.fps == 20.0
     np.testing.assert_array_equal(motion.root_position, float32(positions[:, 0]))
-    np.testing.assert_array_equal(bones.offsets[0], 0.0)
+    np.testing.assert_array_equal(skeleton.offsets[0], 0.0)
     # Leaves have no bone to aim.
     still = np.tile([1, 0, 0, 0, 1, 0], (FRAMES, 1))
     for leaf in (10, 11, 15, 20, 21):
@@ -171,19 +172,19 @@ def test_bones_have_their_mean_lengths():
     positions = rigid_clip()
     stretch = 1.0 + 0.1 * np.sin(np.arange(FRAMES))[:, None, None]
     positions = positions * stretch
-    bones, _ = fit(float32(positions), fps=20.0)
+    skeleton, _ = fit(float32(positions), fps=20.0)
     np.testing.assert_allclose(
-        np.linalg.norm(bones.offsets, axis=-1)[1:],
+        np.linalg.norm(skeleton.offsets, axis=-1)[1:],
         lengths(positions).mean(axis=0),
         atol=1e-5,
     )
 
 
 def test_rest_pose_is_a_t_that_faces_z():
-    bones, _ = fit(float32(rigid_clip()), fps=20.0)
+    skeleton, _ = fit(float32(rigid_clip()), fps=20.0)
     rest = np.zeros((22, 3))
     for joint, parent in enumerate(PARENTS[1:], start=1):
-        rest[joint] = rest[parent] + np.asarray(bones.offsets[joint])
+        rest[joint] = rest[parent] + np.asarray(skeleton.offsets[joint])
     place = dict(zip(SMPL, rest, strict=True))
     assert place["left_wrist"][0] > place["left_elbow"][0] > place["left_shoulder"][0]
     assert place["right_wrist"][0] < place["right_elbow"][0] < 0.0
@@ -195,12 +196,12 @@ def test_rest_pose_is_a_t_that_faces_z():
 
 def test_single_bones_swing_without_twist():
     # An arm in rest but for its elbow, which bends by the smallest rotation.
-    bones, _ = fit(float32(rigid_clip()), fps=20.0)
+    skeleton, _ = fit(float32(rigid_clip()), fps=20.0)
     body = np.tile(np.eye(3), (FRAMES, 22, 1, 1))
     angle = np.linspace(0.1, 2.0, FRAMES)
     body[:, 18] = Rotation.from_rotvec(np.outer(angle, [0.0, -1.0, 0.0])).as_matrix()
     motion = person.motion(np.zeros((FRAMES, 3)), body, 20.0)
-    _, found = fit(skeleton.joint_positions(bones, motion), fps=20.0)
+    _, found = fit(joint_positions(skeleton, motion), fps=20.0)
     np.testing.assert_allclose(found.joint_rotation, motion.joint_rotation, atol=1e-4)
 
 
@@ -255,11 +256,11 @@ def test_fan_of_a_mirrored_body_is_not_mirrored():
 
 def test_export_as_bvh_has_the_same_joints():
     positions = rigid_clip(2)
-    bones, motion = fit(float32(positions), fps=20.0)
-    text = bvh_text.format_bvh(bvh.bvh_from_motion(bones, motion))
+    skeleton, motion = fit(float32(positions), fps=20.0)
+    text = bvh_text.format_bvh(bvh.bvh_from_motion(skeleton, motion))
     read_bones, read = bvh.motion_from_bvh(bvh_text.parse_bvh(text))
     assert read.fps == pytest.approx(20.0)
-    found = np.asarray(skeleton.joint_positions(read_bones, read))
+    found = np.asarray(joint_positions(read_bones, read))
     order = [read_bones.names.index(name) for name in SMPL]
     np.testing.assert_allclose(found[:, order], positions, atol=1e-4)
 

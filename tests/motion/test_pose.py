@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxmotion.motion import features, pose, skeleton
+from jaxmotion.motion import features, pose
+from jaxmotion.motion.skeleton import Skeleton, global_transforms, joint_positions
 from tests import person
 from tests.person import float32
 from tests.reference import pose as reference
@@ -15,7 +16,7 @@ pose_vectors = jax.jit(pose.pose_vectors)
 
 
 @pytest.fixture
-def bones():
+def skeleton():
     return person.skeleton()
 
 
@@ -25,14 +26,14 @@ def described(vectors, num_joints=6):
     return {k: np.asarray(v) for k, v in features.unpack(layout, vectors).items()}
 
 
-def parts_of_walk(bones, velocity, turn_rate=0.0, heading=0.7):
+def parts_of_walk(skeleton, velocity, turn_rate=0.0, heading=0.7):
     """Parts for a stiff person that goes and turns with its bone."""
     time = np.arange(FRAMES) / 60.0
     yaw = heading + turn_rate * time
     root = np.multiply.outer(time, velocity) + np.array([0.2, 0.9, -0.3])
     motion = person.motion(root, person.upright(root, yaw))
     bone = person.path(root[:, [0, 2]], yaw)
-    return described(pose_vectors(bones, motion, bone))
+    return described(pose_vectors(skeleton, motion, bone))
 
 
 # --- the vector ------------------------------------------------------------------
@@ -57,7 +58,7 @@ def test_22_joints_agree_with_products_of_matrices(fps):
     generator = np.random.default_rng(3)
     parents = (-1, *(int(generator.integers(j)) for j in range(1, 22)))
     offsets = generator.normal(scale=0.2, size=(22, 3))
-    body = skeleton.Skeleton(
+    body = Skeleton(
         offsets=float32(offsets),
         parents=parents,
         names=tuple(f"joint{j}" for j in range(22)),
@@ -80,51 +81,51 @@ def test_22_joints_agree_with_products_of_matrices(fps):
     np.testing.assert_allclose(found[:, :336], joined[:, :336], atol=3e-4)
 
 
-def test_bones_of_the_skeleton_are_exactly_constant_channels(bones):
+def test_bones_of_the_skeleton_are_exactly_constant_channels(skeleton):
     root, matrices = person.wander(FRAMES)
     vectors = pose_vectors(
-        bones,
+        skeleton,
         person.motion(root, matrices),
         person.path(*person.wandering_bone(FRAMES)),
     )
     parts = described(vectors)
     position = parts["position"].reshape(FRAMES, 6, 3)
     np.testing.assert_array_equal(
-        position[:, 1:], np.tile(bones.offsets[1:], (FRAMES, 1, 1))
+        position[:, 1:], np.tile(skeleton.offsets[1:], (FRAMES, 1, 1))
     )
     np.testing.assert_array_equal(parts["velocity"][:, 3:], 0.0)
     assert np.all(np.ptp(parts["velocity"][:, :3], axis=0) > 0.1)
 
 
-def test_moving_and_turning_the_world_changes_nothing(bones):
+def test_moving_and_turning_the_world_changes_nothing(skeleton):
     root, matrices = person.wander(FRAMES)
     position, yaw = person.wandering_bone(FRAMES)
     before = pose_vectors(
-        bones, person.motion(root, matrices), person.path(position, yaw)
+        skeleton, person.motion(root, matrices), person.path(position, yaw)
     )
     matrix, shift = person.about_y(2.0), np.array([1.0, 0.0, -2.0])
     moved = matrices.copy()
     moved[:, 0] = matrix @ matrices[:, 0]
     ground = np.insert(position, 1, 0.0, axis=-1) @ matrix.T + shift
     after = pose_vectors(
-        bones,
+        skeleton,
         person.motion(root @ matrix.T + shift, moved),
         person.path(ground[:, [0, 2]], yaw + 2.0),
     )
     np.testing.assert_allclose(after, before, atol=3e-4)
 
 
-def test_height_of_the_root_is_above_the_ground(bones):
-    parts = parts_of_walk(bones, [0.0, 0.0, 0.0])
+def test_height_of_the_root_is_above_the_ground(skeleton):
+    parts = parts_of_walk(skeleton, [0.0, 0.0, 0.0])
     np.testing.assert_allclose(
         parts["position"][:, :3], np.tile([0, 0.9, 0], (FRAMES, 1)), atol=1e-6
     )
 
 
-def test_constant_walk_has_exactly_its_velocity(bones):
+def test_constant_walk_has_exactly_its_velocity(skeleton):
     forward = 1.3 * np.array([np.sin(0.7), 0.0, np.cos(0.7)])
     left = 0.4 * np.array([np.cos(0.7), 0.0, -np.sin(0.7)])
-    parts = parts_of_walk(bones, forward + left)
+    parts = parts_of_walk(skeleton, forward + left)
     expected = np.tile([0.4, 0.0, 1.3], (FRAMES, 1))
     np.testing.assert_allclose(parts["root_velocity"], expected, atol=5e-5)
     for name in ("velocity", "angular_velocity", "root_angular_velocity"):
@@ -132,23 +133,23 @@ def test_constant_walk_has_exactly_its_velocity(bones):
 
 
 @pytest.mark.parametrize("rate", [1.5, -4.0])
-def test_constant_turn_has_exactly_its_rate(bones, rate):
+def test_constant_turn_has_exactly_its_rate(skeleton, rate):
     # Fast enough for the yaw to pass half a turn.
     heading = np.sign(rate) * 2.8
-    parts = parts_of_walk(bones, [0.0, 0.0, 0.0], rate, heading)
+    parts = parts_of_walk(skeleton, [0.0, 0.0, 0.0], rate, heading)
     expected = np.tile([0.0, rate, 0.0], (FRAMES, 1))
     np.testing.assert_allclose(parts["root_angular_velocity"], expected, atol=1e-4)
     for name in ("velocity", "angular_velocity", "root_velocity"):
         np.testing.assert_allclose(parts[name], 0.0, atol=1e-4, err_msg=name)
 
 
-def test_circle_goes_straight_ahead_in_its_own_axes(bones):
+def test_circle_goes_straight_ahead_in_its_own_axes(skeleton):
     fps, rate, radius = 60.0, 2.0, 0.7
     yaw = 0.3 + rate * np.arange(FRAMES) / fps
     centre = np.array([1.0, 0.9, 2.0])
     root = centre + radius * np.stack([-np.cos(yaw), 0 * yaw, np.sin(yaw)], axis=-1)
     vectors = pose_vectors(
-        bones,
+        skeleton,
         person.motion(root, person.upright(root, yaw), fps),
         person.path(root[:, [0, 2]], yaw),
     )
@@ -162,7 +163,7 @@ def test_circle_goes_straight_ahead_in_its_own_axes(bones):
     )
 
 
-def test_joint_that_turns_steadily_has_its_rate_in_the_axes_of_its_parent(bones):
+def test_joint_that_turns_steadily_has_its_rate_in_the_axes_of_its_parent(skeleton):
     time = np.arange(FRAMES) / 60.0
     spin, start = np.array([1.0, -2.0, 0.5]), Rotation.from_rotvec([0.4, 0.9, -1.2])
     root = np.tile([0.0, 0.9, 0.0], (FRAMES, 1))
@@ -170,34 +171,34 @@ def test_joint_that_turns_steadily_has_its_rate_in_the_axes_of_its_parent(bones)
     turns = Rotation.from_rotvec(np.multiply.outer(time, spin)) * start
     matrices[:, 1] = turns.as_matrix()
     bone = person.path(root[:, [0, 2]], 0 * time)
-    parts = described(pose_vectors(bones, person.motion(root, matrices), bone))
+    parts = described(pose_vectors(skeleton, person.motion(root, matrices), bone))
     found = parts["angular_velocity"].reshape(FRAMES, 6, 3)
     np.testing.assert_allclose(found[:, 1], np.tile(spin, (FRAMES, 1)), atol=2e-4)
     # The first joint turns against its bone, which stands.
     np.testing.assert_allclose(found[:, 0], np.tile([0, 1, 0], (FRAMES, 1)), atol=2e-4)
 
 
-def test_steady_acceleration_is_extrapolated_exactly_at_the_ends(bones):
+def test_steady_acceleration_is_extrapolated_exactly_at_the_ends(skeleton):
     time = np.arange(FRAMES) / 60.0
     root = np.stack([0 * time, 0.9 + 4.0 * time**2, 0 * time], axis=-1)
     motion = person.motion(root, person.upright(root, 0 * time))
     parts = described(
-        pose_vectors(bones, motion, person.path(root[:, [0, 2]], 0 * time))
+        pose_vectors(skeleton, motion, person.path(root[:, [0, 2]], 0 * time))
     )
     np.testing.assert_allclose(parts["velocity"][:, 1], 8.0 * time, atol=2e-4)
 
 
-def test_three_frames_are_enough_and_two_are_not(bones):
+def test_three_frames_are_enough_and_two_are_not(skeleton):
     root, matrices = person.wander(3)
     position, yaw = person.wandering_bone(3)
     found = pose.pose_vectors(
-        bones, person.motion(root, matrices), person.path(position, yaw)
+        skeleton, person.motion(root, matrices), person.path(position, yaw)
     )
     assert found.shape == (3, 98)
     assert np.all(np.isfinite(found))
     short = person.motion(root[:2], matrices[:2])
     with pytest.raises(ValueError, match="frames"):
-        pose.pose_vectors(bones, short, person.path(position[:2], yaw[:2]))
+        pose.pose_vectors(skeleton, short, person.path(position[:2], yaw[:2]))
 
 
 @pytest.mark.parametrize("feet", [(), (2,), (2, 4, 5)])
@@ -223,12 +224,12 @@ def test_feet_that_are_not_two_are_refused(feet):
         ([0.1, 0.1, 0.1], 0.0),
     ],
 )
-def test_toe_stands_below_15_cm_a_second_in_space(bones, velocity, stands):
-    parts = parts_of_walk(bones, velocity)
+def test_toe_stands_below_15_cm_a_second_in_space(skeleton, velocity, stands):
+    parts = parts_of_walk(skeleton, velocity)
     np.testing.assert_array_equal(parts["contact"], np.full((FRAMES, 2), stands))
 
 
-def contacts_of_steps(bones, moving):
+def contacts_of_steps(skeleton, moving):
     """Found and expected contacts when the legs turn in some steps [F-1, 2]."""
     count = len(moving) + 1
     lever = np.linalg.norm(person.OFFSETS[2])
@@ -240,7 +241,7 @@ def contacts_of_steps(bones, moving):
         vectors = np.multiply.outer(angles[:, side], [1.0, 0.0, 0.0])
         matrices[:, joint] = Rotation.from_rotvec(vectors).as_matrix()
     bone = np.zeros((count, 2)), np.zeros(count)
-    found = pose_vectors(bones, person.motion(root, matrices), person.path(*bone))
+    found = pose_vectors(skeleton, person.motion(root, matrices), person.path(*bone))
     expected = reference.pose_parts(
         person.OFFSETS,
         person.PARENTS,
@@ -255,26 +256,26 @@ def contacts_of_steps(bones, moving):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_contacts_are_the_median_of_six_frames(bones, seed):
+def test_contacts_are_the_median_of_six_frames(skeleton, seed):
     generator = np.random.default_rng(seed)
     columns = []
     for side in range(2):
         runs = generator.integers(1, 8, 40)
         column = np.repeat((np.arange(40) + side) % 2 == 0, runs)[:90]
         columns.append(np.concatenate([np.full(6, side == 0), column]))
-    found, expected = contacts_of_steps(bones, np.stack(columns, axis=-1))
+    found, expected = contacts_of_steps(skeleton, np.stack(columns, axis=-1))
     assert 10 < expected[:, 0].sum() < 80
     assert np.any(expected[:, 0] != expected[:, 1])
     np.testing.assert_array_equal(found, expected)
 
 
-def test_short_interruptions_of_contacts_and_of_steps_vanish(bones):
+def test_short_interruptions_of_contacts_and_of_steps_vanish(skeleton):
     # The left toe stands but for one step, the right one moves but for two.
     moving = np.zeros((96, 2), bool)
     moving[20, 0] = True
     moving[:, 1] = True
     moving[20:22, 1] = False
-    found, _ = contacts_of_steps(bones, moving)
+    found, _ = contacts_of_steps(skeleton, moving)
     np.testing.assert_array_equal(found, np.tile([1.0, 0.0], (97, 1)))
 
 
@@ -296,19 +297,19 @@ def test_character_transforms_agree_with_products_of_matrices():
         np.testing.assert_allclose(turns[index], expected[:, :3, :3], atol=1e-5)
 
 
-def test_character_transforms_of_a_clip_are_its_joints_seen_from_the_bone(bones):
+def test_character_transforms_of_a_clip_are_its_joints_seen_from_the_bone(skeleton):
     root, matrices = person.wander(FRAMES)
     motion = person.motion(root, matrices)
     position, yaw = person.wandering_bone(FRAMES)
-    parts = described(pose_vectors(bones, motion, person.path(position, yaw)))
+    parts = described(pose_vectors(skeleton, motion, person.path(position, yaw)))
     places, turns = pose.character_transforms(
         person.PARENTS,
         float32(parts["position"]).reshape(FRAMES, 6, 3),
         float32(parts["rotation"]).reshape(FRAMES, 6, 6),
     )
-    world = np.asarray(skeleton.joint_positions(bones, motion), np.float64)
-    _, world_turns = skeleton.global_transforms(
-        bones, motion.root_position, motion.joint_rotation
+    world = np.asarray(joint_positions(skeleton, motion), np.float64)
+    _, world_turns = global_transforms(
+        skeleton, motion.root_position, motion.joint_rotation
     )
     for f in range(FRAMES):
         matrix = person.about_y(yaw[f])
@@ -322,11 +323,11 @@ def test_character_transforms_of_a_clip_are_its_joints_seen_from_the_bone(bones)
 # --- the way back ----------------------------------------------------------------
 
 
-def test_placing_poses_at_their_bones_gives_the_motion(bones):
+def test_placing_poses_at_their_bones_gives_the_motion(skeleton):
     root, matrices = person.wander(FRAMES)
     motion = person.motion(root, matrices)
     bone = person.wandering_bone(FRAMES)
-    vectors = pose_vectors(bones, motion, person.path(*bone))
+    vectors = pose_vectors(skeleton, motion, person.path(*bone))
     found, rot6d = pose.place(vectors, person.frames(*bone), num_joints=6)
     np.testing.assert_allclose(found, motion.root_position, atol=1e-5)
     np.testing.assert_allclose(rot6d, motion.joint_rotation, atol=1e-5)
@@ -397,12 +398,12 @@ def test_motion_of_poses_follows_the_integrated_bone():
         np.testing.assert_allclose(found.joint_rotation[f, 0], six, atol=1e-5)
 
 
-def round_trip_error(bones, fps):
+def round_trip_error(skeleton, fps):
     """Largest error of root position and rotation within half a second."""
     count = int(0.5 * fps) + 1
     motion = person.motion(*person.wander(count, fps), fps)
     position, yaw = person.wandering_bone(count, fps)
-    vectors = pose_vectors(bones, motion, person.path(position, yaw))
+    vectors = pose_vectors(skeleton, motion, person.path(position, yaw))
     start = person.frames(position[0], yaw[0])
     found = pose.motion_from_poses(vectors, start, num_joints=6, fps=fps)
     assert found.fps == fps
@@ -420,18 +421,18 @@ def round_trip_error(bones, fps):
     )
 
 
-def test_error_of_the_round_trip_shrinks_with_the_rate(bones):
-    errors = np.array([round_trip_error(bones, fps) for fps in (30.0, 60.0)])
+def test_error_of_the_round_trip_shrinks_with_the_rate(skeleton):
+    errors = np.array([round_trip_error(skeleton, fps) for fps in (30.0, 60.0)])
     assert np.all(errors[1] < 0.65 * errors[0])
     assert np.all(errors[1] < 0.02)
 
 
-def test_straight_walk_survives_the_round_trip(bones):
+def test_straight_walk_survives_the_round_trip(skeleton):
     time = np.arange(FRAMES) / 60.0
     root = np.multiply.outer(time, [0.8, 0.0, -1.1]) + np.array([0.2, 0.9, -0.3])
     motion = person.motion(root, person.upright(root, 0 * time + 2.5))
     bone = root[:, [0, 2]], 0 * time + 2.5
-    vectors = pose_vectors(bones, motion, person.path(*bone))
+    vectors = pose_vectors(skeleton, motion, person.path(*bone))
     start = person.frames(bone[0][0], bone[1][0])
     found = pose.motion_from_poses(vectors, start, num_joints=6, fps=60.0)
     np.testing.assert_allclose(found.root_position, root, atol=2e-4)

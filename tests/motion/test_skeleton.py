@@ -7,7 +7,17 @@ import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from jaxmotion.motion import rotation, skeleton
+from jaxmotion.motion import rotation
+from jaxmotion.motion.skeleton import (
+    Motion,
+    Skeleton,
+    check_parents,
+    forward_kinematics,
+    from_root,
+    global_transforms,
+    joint_positions,
+    joint_velocities,
+)
 from tests.reference import motion as reference
 
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 1, 7, 0)
@@ -21,10 +31,8 @@ def float32(array):
 
 
 @pytest.fixture
-def bones():
-    return skeleton.Skeleton(
-        offsets=float32(OFFSETS), parents=PARENTS, names=NAMES, feet=(3, 6)
-    )
+def skeleton():
+    return Skeleton(offsets=float32(OFFSETS), parents=PARENTS, names=NAMES, feet=(3, 6))
 
 
 def pose(seed, shape=SHAPE):
@@ -36,9 +44,9 @@ def pose(seed, shape=SHAPE):
     return root, matrices, rotation.rot6d_from_matrix(float32(matrices))
 
 
-def test_forward_kinematics_agrees_with_products_of_matrices(bones):
+def test_forward_kinematics_agrees_with_products_of_matrices(skeleton):
     root, matrices, rot6d = pose(1)
-    positions, turns = skeleton.global_transforms(bones, float32(root), rot6d)
+    positions, turns = global_transforms(skeleton, float32(root), rot6d)
     for index in np.ndindex(SHAPE):
         expected = reference.world_transforms(
             OFFSETS, PARENTS, root[index], matrices[index]
@@ -46,14 +54,14 @@ def test_forward_kinematics_agrees_with_products_of_matrices(bones):
         np.testing.assert_allclose(positions[index], expected[:, :3, 3], atol=5e-6)
         np.testing.assert_allclose(turns[index], expected[:, :3, :3], atol=5e-6)
     np.testing.assert_array_equal(
-        skeleton.forward_kinematics(bones, float32(root), rot6d), positions
+        forward_kinematics(skeleton, float32(root), rot6d), positions
     )
 
 
 @pytest.mark.parametrize("joint", range(len(PARENTS)))
-def test_a_joint_s_own_chain_leads_to_it(bones, joint):
+def test_a_joint_s_own_chain_leads_to_it(skeleton, joint):
     _, matrices, rot6d = pose(1)
-    found = skeleton.from_root(bones, rot6d, joint)
+    found = from_root(skeleton, rot6d, joint)
     for index in np.ndindex(SHAPE):
         expected = reference.world_transforms(
             OFFSETS, PARENTS, np.zeros(3), matrices[index]
@@ -61,57 +69,55 @@ def test_a_joint_s_own_chain_leads_to_it(bones, joint):
         np.testing.assert_allclose(found[index], expected[joint, :3, 3], atol=5e-6)
 
 
-def test_equivariance_under_rigid_motion(bones):
+def test_equivariance_under_rigid_motion(skeleton):
     root, matrices, rot6d = pose(2)
     turn = Rotation.from_rotvec([0.3, -1.1, 0.8]).as_matrix()
     shift = np.array([2.0, -1.0, 0.5])
     moved = matrices.copy()
     moved[..., 0, :, :] = turn @ matrices[..., 0, :, :]
     moved_rot6d = rotation.rot6d_from_matrix(float32(moved))
-    before = skeleton.forward_kinematics(bones, float32(root), rot6d)
-    after = skeleton.forward_kinematics(
-        bones, float32(root @ turn.T + shift), moved_rot6d
-    )
+    before = forward_kinematics(skeleton, float32(root), rot6d)
+    after = forward_kinematics(skeleton, float32(root @ turn.T + shift), moved_rot6d)
     np.testing.assert_allclose(after, np.asarray(before) @ turn.T + shift, atol=5e-6)
 
 
-def test_bone_lengths_are_constant(bones):
+def test_bone_lengths_are_constant(skeleton):
     # Numbers that are no rotations yet: the lengths must not depend on them.
     rot6d = float32(np.random.default_rng(3).normal(size=(*SHAPE, len(PARENTS), 6)))
-    positions = skeleton.forward_kinematics(bones, jnp.zeros((*SHAPE, 3)), rot6d)
+    positions = forward_kinematics(skeleton, jnp.zeros((*SHAPE, 3)), rot6d)
     bone = positions[..., 1:, :] - positions[..., np.array(PARENTS[1:]), :]
     lengths = np.linalg.norm(OFFSETS[1:], axis=-1)
     found = np.linalg.norm(bone, axis=-1)
     np.testing.assert_allclose(found, np.broadcast_to(lengths, found.shape), rtol=1e-5)
 
 
-def test_rest_pose_adds_offsets(bones):
+def test_rest_pose_adds_offsets(skeleton):
     rest = jnp.broadcast_to(float32([1, 0, 0, 0, 1, 0]), (len(PARENTS), 6))
-    found = skeleton.forward_kinematics(bones, float32([1.0, 2.0, 3.0]), rest)
+    found = forward_kinematics(skeleton, float32([1.0, 2.0, 3.0]), rest)
     for joint in range(len(PARENTS)):
         path = reference.chain_of_joints(PARENTS, joint)[1:]
         expected = np.array([1.0, 2.0, 3.0]) + OFFSETS[path].sum(axis=0)
         np.testing.assert_allclose(found[joint], expected, atol=1e-6)
 
 
-def test_a_joint_moves_only_what_hangs_on_it(bones):
+def test_a_joint_moves_only_what_hangs_on_it(skeleton):
     root, _, rot6d = pose(4, ())
     turned = rot6d.at[1].set(float32([0, 0, 1, 0, 1, 0]))
     before, after = (
-        skeleton.forward_kinematics(bones, float32(root), d) for d in (rot6d, turned)
+        forward_kinematics(skeleton, float32(root), d) for d in (rot6d, turned)
     )
     moved = np.linalg.norm(after - before, axis=-1) > 1e-3
     below = [1 in reference.chain_of_joints(PARENTS, j)[:-1] for j in range(10)]
     np.testing.assert_array_equal(moved, below)
 
 
-def test_gradient_agrees_with_finite_differences(bones):
+def test_gradient_agrees_with_finite_differences(skeleton):
     root, _, rot6d = pose(5, ())
     weights = float32(np.random.default_rng(1).normal(size=(len(PARENTS), 3)))
 
     def energy(root, rot6d):
         root, rot6d = jnp.asarray(root), jnp.asarray(rot6d)
-        return jnp.sum(weights * skeleton.forward_kinematics(bones, root, rot6d))
+        return jnp.sum(weights * forward_kinematics(skeleton, root, rot6d))
 
     check_grads(
         energy, (float32(root), rot6d), order=1, modes=("rev",), atol=2e-2, rtol=2e-2
@@ -143,8 +149,8 @@ def energies(shape, parents=PARENTS):
         return jnp.sum(of_positions * positions) + jnp.sum(of_turns * turns)
 
     def written(offsets, root, rot6d):
-        bones = skeleton.Skeleton(offsets=offsets, parents=parents, names=names)
-        return total(*skeleton.global_transforms(bones, root, rot6d))
+        skeleton = Skeleton(offsets=offsets, parents=parents, names=names)
+        return total(*global_transforms(skeleton, root, rot6d))
 
     def plain(offsets, root, rot6d):
         one = functools.partial(plain_transforms, parents, offsets)
@@ -188,8 +194,8 @@ def test_written_gradient_is_that_of_finite_differences(part):
         return np.sum(weights * worlds[:, :3])
 
     def energy(offsets, root, rot6d):
-        bones = skeleton.Skeleton(offsets=offsets, parents=PARENTS, names=NAMES)
-        positions, turns = skeleton.global_transforms(bones, root, rot6d)
+        skeleton = Skeleton(offsets=offsets, parents=PARENTS, names=NAMES)
+        positions, turns = global_transforms(skeleton, root, rot6d)
         whole = jnp.concatenate([turns, positions[..., None]], axis=-1)
         return jnp.sum(float32(weights) * whole)
 
@@ -234,10 +240,10 @@ def test_gradients_of_many_skeletons_by_vmap():
     sizes = float32([0.5, 1.0, 2.0])
 
     def energy(size, root, rot6d):
-        bones = skeleton.Skeleton(
+        skeleton = Skeleton(
             offsets=size * float32(OFFSETS), parents=PARENTS, names=NAMES
         )
-        return jnp.sum(skeleton.forward_kinematics(bones, root, rot6d) ** 2)
+        return jnp.sum(forward_kinematics(skeleton, root, rot6d) ** 2)
 
     given = sizes, float32(root), rot6d
     slope = jax.grad(energy, argnums=(0, 2))
@@ -248,25 +254,23 @@ def test_gradients_of_many_skeletons_by_vmap():
             np.testing.assert_allclose(a[i], b, rtol=1e-4, atol=1e-3)
 
 
-def test_vmap_and_jit_are_leading_axes(bones):
+def test_vmap_and_jit_are_leading_axes(skeleton):
     root, _, rot6d = pose(6)
-    whole = skeleton.forward_kinematics(bones, float32(root), rot6d)
+    whole = forward_kinematics(skeleton, float32(root), rot6d)
 
     def one(root, rot6d):
-        return skeleton.forward_kinematics(bones, root, rot6d)
+        return forward_kinematics(skeleton, root, rot6d)
 
     mapped = jax.jit(jax.vmap(jax.vmap(one)))(float32(root), rot6d)
     np.testing.assert_allclose(mapped, whole, atol=1e-6)
 
 
-def test_joint_positions_of_a_motion(bones):
+def test_joint_positions_of_a_motion(skeleton):
     root, _, rot6d = pose(7)
-    motion = skeleton.Motion(
-        root_position=float32(root), joint_rotation=rot6d, fps=60.0
-    )
+    motion = Motion(root_position=float32(root), joint_rotation=rot6d, fps=60.0)
     np.testing.assert_array_equal(
-        skeleton.joint_positions(bones, motion),
-        skeleton.forward_kinematics(bones, float32(root), rot6d),
+        joint_positions(skeleton, motion),
+        forward_kinematics(skeleton, float32(root), rot6d),
     )
     doubled = jax.jit(lambda m: jax.tree.map(lambda a: 2.0 * a, m))(motion)
     assert doubled.fps == 60.0
@@ -278,7 +282,7 @@ def test_velocities_of_straight_and_of_turning_motion():
     time = np.arange(frames) / fps
     speed = np.array([[1.0, 0.0, -0.5], [0.0, 2.0, 0.0]])
     straight = time[:, None, None] * speed + np.array([5.0, 0.0, 1.0])
-    found = skeleton.joint_velocities(float32(straight), fps)
+    found = joint_velocities(float32(straight), fps)
     assert found.shape == (frames - 1, 2, 3)
     np.testing.assert_allclose(found, np.broadcast_to(speed, found.shape), atol=5e-5)
     # On a circle the chord's speed is r * omega * sinc(omega dt / 2).
@@ -289,26 +293,26 @@ def test_velocities_of_straight_and_of_turning_motion():
             :, None
         ]
     )
-    speeds = jnp.linalg.norm(skeleton.joint_velocities(float32(circle), fps), axis=-1)
+    speeds = jnp.linalg.norm(joint_velocities(float32(circle), fps), axis=-1)
     chord = 2 * radius * np.sin(omega / fps / 2) * fps
     np.testing.assert_allclose(speeds, chord, rtol=1e-5)
 
 
-def test_skeleton_is_a_static_structure(bones):
-    assert bones.num_joints == len(PARENTS)
-    assert bones.index("joint4") == 4
-    leaves, treedef = jax.tree.flatten(bones)
+def test_skeleton_is_a_static_structure(skeleton):
+    assert skeleton.num_joints == len(PARENTS)
+    assert skeleton.index("joint4") == 4
+    leaves, treedef = jax.tree.flatten(skeleton)
     assert len(leaves) == 1
     again = jax.tree.unflatten(treedef, leaves)
     assert (again.parents, again.names, again.feet) == (PARENTS, NAMES, (3, 6))
 
 
-def test_errors_name_what_is_wrong(bones):
+def test_errors_name_what_is_wrong(skeleton):
     with pytest.raises(ValueError, match="unknown joint 'knee'.*joint9"):
-        bones.index("knee")
+        skeleton.index("knee")
     with pytest.raises(ValueError, match="has 9 joints, the skeleton 10"):
-        skeleton.forward_kinematics(bones, jnp.zeros(3), jnp.zeros((9, 6)))
-    skeleton.check_parents(PARENTS)
+        forward_kinematics(skeleton, jnp.zeros(3), jnp.zeros((9, 6)))
+    check_parents(PARENTS)
     for parents, message in [
         ((0, 0), "joint 0 is 0, expected -1"),
         ((-1, 0, 2), r"joint 2 is 2, expected in 0\.\.1"),
@@ -316,4 +320,4 @@ def test_errors_name_what_is_wrong(bones):
         ((-1, 2, 0), r"joint 1 is 2, expected in 0\.\.0"),
     ]:
         with pytest.raises(ValueError, match=message):
-            skeleton.check_parents(parents)
+            check_parents(parents)

@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.motion import facing as facing_module
-from jaxmotion.motion import ground, skeleton, trajectory
+from jaxmotion.motion import ground, trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
 from tests.reference import trajectory as oracle
 
@@ -23,7 +24,7 @@ def path(position, angles=None):
 
 
 def biped(names):
-    return skeleton.Skeleton(
+    return Skeleton(
         offsets=jnp.array(
             [[0, 0, 0], [0, 0.1, 0], [0.1, 0, 0.02], [-0.1, 0, 0.02]], jnp.float32
         ),
@@ -230,14 +231,14 @@ def test_frames_are_rigid_and_invert():
 
 
 def test_root_trajectory_is_that_of_full_kinematics():
-    bones = biped(("Root", "Hips", "UpperLeg_L", "UpperLeg_R"))
+    skeleton = biped(("Root", "Hips", "UpperLeg_L", "UpperLeg_R"))
     key_p, key_r = jax.random.split(jax.random.key(1))
     rot6d = jax.random.normal(key_r, (2, 5, 4, 6))
-    motion = skeleton.Motion(
+    motion = Motion(
         root_position=jax.random.normal(key_p, (2, 5, 3)), joint_rotation=rot6d
     )
-    got = trajectory.root_trajectory(bones, motion)
-    joints = np.asarray(skeleton.joint_positions(bones, motion))
+    got = trajectory.root_trajectory(skeleton, motion)
+    joints = np.asarray(joint_positions(skeleton, motion))
     forward = np.cross(joints[..., 2, :] - joints[..., 3, :], [0, 1, 0])[..., ::2]
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     np.testing.assert_allclose(got.facing, forward, atol=1e-5)

@@ -5,7 +5,7 @@ import numpy as np
 
 from jaxmotion.data import procedural, walker
 from jaxmotion.data.gaits import GAITS
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.motion.trajectory import Command
 
 PARENTS = (-1, 0, 1, 0)
@@ -24,9 +24,9 @@ def circle(frames=12, radius=1.0):
         ],
         axis=-1,
     )
-    bones = np.array([[0, 0, 0], [0, 0.5, 0], [0.4, 0.5, 0], [-0.1, -0.85, 0]])
+    skeleton = np.array([[0, 0, 0], [0, 0.5, 0], [0.4, 0.5, 0], [-0.1, -0.85, 0]])
     swing = np.sin(9 * angle)[:, None, None] * np.array([[0, 0, 0.3]])
-    positions = root[:, None] + bones + swing * (np.arange(4) == 3)[:, None]
+    positions = root[:, None] + skeleton + swing * (np.arange(4) == 3)[:, None]
     return positions, root[:, ::2]
 
 
@@ -43,5 +43,5 @@ def person(seconds=4.0, speed=1.4, turn=1.2):
         label=jnp.zeros(len(angle), jnp.int32),
     )
     made = procedural.walk(commands, next(iter(GAITS.values())), fps=FPS)
-    bones = walker.walker_skeleton()
-    return np.asarray(skeleton.joint_positions(bones, made.motion), float), bones
+    skeleton = walker.walker_skeleton()
+    return np.asarray(joint_positions(skeleton, made.motion), float), skeleton

@@ -84,12 +84,12 @@ LONG = ("a title much longer than any picture is wide " * 5)[:200]
 
 @pytest.mark.parametrize("size", [100, 333, (480, 360)])
 def test_a_long_title_stays_in_one_line_on_the_picture(tmp_path, size):
-    positions, bones = samples.person(seconds=0.1)
+    positions, skeleton = samples.person(seconds=0.1)
     for title in (LONG, "W" * 200, "unbroken_$math_^" * 13, "two\nlines " * 20):
         animation.save_gif(
             tmp_path / "a.gif",
             positions,
-            bones.parents,
+            skeleton.parents,
             fps=samples.FPS,
             title=title,
             size=size,
@@ -116,8 +116,8 @@ def test_text_is_shrunk_before_it_is_elided():
 
 @pytest.mark.parametrize("turn, elevation", [(0.0, 16.0), (1.2, 16.0), (-2.5, 40.0)])
 def test_the_whole_body_is_in_the_picture_in_all_frames(turn, elevation):
-    positions, bones = samples.person(turn=turn)
-    made = body.build(positions, bones.parents, bones.names)
+    positions, skeleton = samples.person(turn=turn)
+    made = body.build(positions, skeleton.parents, skeleton.names)
     box = (16, 40, 464, 330)
     view = camera.follow(
         made, fps=samples.FPS, azimuth=35.0, elevation=elevation, box=box
@@ -145,12 +145,12 @@ def test_a_mean_over_time_keeps_a_straight_line():
 
 
 def test_the_ground_moves_under_the_character_and_stands_in_the_world(tmp_path):
-    positions, bones = samples.person(seconds=3.0, turn=0.0)
+    positions, skeleton = samples.person(seconds=3.0, turn=0.0)
     paths = {}
     for name, still in (("walk", False), ("still", True)):
         shown = np.repeat(positions[:1], len(positions), 0) if still else positions
         path = tmp_path / f"{name}.gif"
-        animation.save_gif(path, shown, bones.parents, fps=samples.FPS)
+        animation.save_gif(path, shown, skeleton.parents, fps=samples.FPS)
         paths[name] = frames(path)[0][:, 250:, :100]  # beside the body
     assert len(paths["still"]) == 1, "equal pictures are one"
     changed = np.any(np.diff(paths["walk"], axis=0), axis=-1).mean(axis=(1, 2))
@@ -164,14 +164,14 @@ def test_the_ground_moves_under_the_character_and_stands_in_the_world(tmp_path):
 
 
 def test_eight_seconds_are_small_and_at_most_20_pictures_a_second(tmp_path):
-    positions, bones = samples.person(seconds=8.0)
+    positions, skeleton = samples.person(seconds=8.0)
     walked = positions[:, 0, ::2]
     animation.save_gif(
         tmp_path / "a.gif",
         positions,
-        bones.parents,
+        skeleton.parents,
         fps=samples.FPS,
-        names=bones.names,
+        names=skeleton.names,
         walked=walked,
         commanded=walked + 0.1,
         title="a walk",
@@ -184,13 +184,13 @@ def test_eight_seconds_are_small_and_at_most_20_pictures_a_second(tmp_path):
 
 
 def test_a_caption_is_below_and_the_title_above(tmp_path):
-    positions, bones = samples.person(seconds=0.1)
+    positions, skeleton = samples.person(seconds=0.1)
     place = {}
     for name in ("title", "caption"):
         text = {name: "data and its licence " * 2}
         path = tmp_path / "a.gif"
         animation.save_gif(
-            path, positions, bones.parents, fps=samples.FPS, size=240, **text
+            path, positions, skeleton.parents, fps=samples.FPS, size=240, **text
         )
         ink = frames(tmp_path / "a.gif")[0][0][:, :70].sum(axis=-1) < 450
         place[name] = [bool(part.any()) for part in (ink[:24], ink[-16:])]

@@ -38,9 +38,9 @@ def heights(made, color):
 
 
 def test_a_head_stands_on_the_last_joint_and_feet_on_the_ground(person):
-    positions, bones = person
-    made = body.build(positions, bones.parents, bones.names)
-    head = positions[:, bones.names.index("Head"), 1].max()
+    positions, skeleton = person
+    made = body.build(positions, skeleton.parents, skeleton.names)
+    head = positions[:, skeleton.names.index("Head"), 1].max()
     top = heights(made, body.SKIN)[1]
     # From the first vertebra to the vertex an adult measures about 0.2 m.
     assert 0.12 < top - head < 0.25
@@ -55,13 +55,13 @@ def test_a_head_stands_on_the_last_joint_and_feet_on_the_ground(person):
         part = np.clip(part, 0, 1)
         away = np.linalg.norm(place - a - part[:, None] * (b - a), axis=-1)
         radius = made.radii[:, 0] + part * np.diff(made.radii)[:, 0]
-        assert (away - radius).min() < 0.005, bones.names[joint]
+        assert (away - radius).min() < 0.005, skeleton.names[joint]
 
 
 def test_toes_point_and_the_nose_looks_ahead(person):
-    positions, bones = person
-    made = body.build(positions, bones.parents, bones.names)
-    joint = bones.names.index
+    positions, skeleton = person
+    made = body.build(positions, skeleton.parents, skeleton.names)
+    joint = skeleton.names.index
     left = positions[:, joint("LeftArm")] - positions[:, joint("RightArm")]
     ahead = np.cross(left, [0.0, 1.0, 0.0])
     nose = made.points[:, made.ends[-1, 0]] - positions[:, joint("Head")]
@@ -69,17 +69,17 @@ def test_toes_point_and_the_nose_looks_ahead(person):
 
 
 def test_a_head_is_found_without_names_and_sides_are_grey(person):
-    positions, bones = person
-    made = body.build(positions, bones.parents, None)
-    named = body.build(positions, bones.parents, bones.names)
+    positions, skeleton = person
+    made = body.build(positions, skeleton.parents, None)
+    named = body.build(positions, skeleton.parents, skeleton.names)
     np.testing.assert_allclose(made.points, named.points)
     assert set(made.colors) == {body.MIDDLE, body.SKIN}
 
 
 def test_the_body_grows_with_the_bones(person):
-    positions, bones = person
-    small = body.build(0.5 * positions, bones.parents, bones.names)
-    large = body.build(positions, bones.parents, bones.names)
+    positions, skeleton = person
+    small = body.build(0.5 * positions, skeleton.parents, skeleton.names)
+    large = body.build(positions, skeleton.parents, skeleton.names)
     np.testing.assert_allclose(2 * small.radii, large.radii)
     np.testing.assert_allclose(2 * small.points, large.points, atol=1e-9)
 

@@ -144,15 +144,15 @@ def test_the_script_draws_every_bone_and_both_paths(tmp_path):
     for path in ("#2ca02c", "#ff7f0e"):
         assert len(of(path)) == 1 and len(of(path)[0]) == 4, "what is walked so far"
         assert len(of(path + "55")) == 1
-    bones = {
+    skeleton = {
         color: np.array(of(color)[0]) for color in (body.MIDDLE, body.LEFT, body.RIGHT)
     }
-    assert all(bone.shape == (2, 3) for bone in bones.values())
+    assert all(bone.shape == (2, 3) for bone in skeleton.values())
     # Ends and radius; up the page is smaller y.
-    spine, foot = bones[body.MIDDLE], bones[body.RIGHT]
+    spine, foot = skeleton[body.MIDDLE], skeleton[body.RIGHT]
     assert spine[1, 1] < spine[0, 1] and foot[1, 1] > foot[0, 1]
     assert all(
-        np.isfinite(bone).all() and bone[:, 2].min() > 0 for bone in bones.values()
+        np.isfinite(bone).all() and bone[:, 2].min() > 0 for bone in skeleton.values()
     )
 
 

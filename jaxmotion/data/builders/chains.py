@@ -100,12 +100,12 @@ def fit_rotations(
         children = [c for c, parent in enumerate(parents) if parent == joint]
         if not children:
             continue
-        bones = position[:, children] - position[:, joint, None]
+        skeleton = position[:, children] - position[:, joint, None]
         # The first offsets are means of bones that still swing a little, and short for
         # it; each turn leaves a square of that.
         for _ in range(3):
-            mean = np.einsum("fba,fcb->fca", fitted[:, joint], bones).mean(0)
-            aim = np.einsum("fca,cb->fab", bones, mean) / np.sum(mean**2)
+            mean = np.einsum("fba,fcb->fca", fitted[:, joint], skeleton).mean(0)
+            aim = np.einsum("fca,cb->fab", skeleton, mean) / np.sum(mean**2)
             fitted[:, joint] = _nearest_rotation(aim + _KEEP * world[:, joint])
         offsets[children] = mean
     return offsets, fitted

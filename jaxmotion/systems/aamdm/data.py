@@ -125,7 +125,7 @@ def pose_data(clips: Clips, *, fps: float = 60.0) -> tuple[PoseData, tuple[str, 
       ValueError: if the skeleton lacks a joint, the rate cannot be reached, or all
         clips are too short.
     """
-    bones = clips.skeleton
+    skeleton = clips.skeleton
     least = simulation.least_frames(fps)
     rows, names = [], []
     for i in range(clips.num_clips):
@@ -135,8 +135,8 @@ def pose_data(clips: Clips, *, fps: float = 60.0) -> tuple[PoseData, tuple[str, 
         motion = simulation.upsample(motion, fps)
         if motion.root_position.shape[0] < least:
             continue
-        bone = simulation.simulation_bone(bones, motion)
-        poses = pose.pose_vectors(bones, motion, bone)
+        bone = simulation.simulation_bone(skeleton, motion)
+        poses = pose.pose_vectors(skeleton, motion, bone)
         paths = path_features.path_features(bone, fps=fps)
         rows.append((poses, paths))
         names.append(clips.clip_names[i])

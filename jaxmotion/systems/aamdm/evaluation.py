@@ -26,8 +26,9 @@ from jaxmotion.evaluation import (
     smoothness,
     table,
 )
-from jaxmotion.motion import features, ground, path_features, pose, skeleton
+from jaxmotion.motion import features, ground, path_features, pose
 from jaxmotion.motion.features import unpack
+from jaxmotion.motion.skeleton import Skeleton, forward_kinematics
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
 from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm.controller import CharacterState, Frame, Stepper
@@ -52,7 +53,7 @@ def start_states(run: Run, space: Space, number: int, *, seed: int) -> Character
     data = run.held_out
     chosen = np.random.default_rng(seed).integers(0, data.num_frames, number)
     init = functools.partial(
-        aamdm_controller.init_state, space, num_joints=run.bones.num_joints
+        aamdm_controller.init_state, space, num_joints=run.skeleton.num_joints
     )
     return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen])
 
@@ -105,7 +106,7 @@ def roller(
     driver = aamdm_controller.controller(
         step,
         space,
-        num_joints=run.bones.num_joints,
+        num_joints=run.skeleton.num_joints,
         fps=run.train.fps,
         steered=steered,
         bounded=bounded,
@@ -114,19 +115,17 @@ def roller(
 
 
 @jax.jit
-def positions_of(bones: skeleton.Skeleton, frames: Frame) -> jax.Array:
+def positions_of(skeleton: Skeleton, frames: Frame) -> jax.Array:
     """World positions of the joints in rollouts.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       frames: Displayed frames.
 
     Returns:
       Positions [characters, ticks, joints, 3], metres.
     """
-    return skeleton.forward_kinematics(
-        bones, frames.root_position, frames.joint_rotation
-    )
+    return forward_kinematics(skeleton, frames.root_position, frames.joint_rotation)
 
 
 def data_frames(
@@ -149,7 +148,7 @@ def data_frames(
     """
     first = starts(data, ticks)
     chosen = np.random.default_rng(seed).integers(0, first.shape[0], number)
-    joints, fps = run.bones.num_joints, data.fps
+    joints, fps = run.skeleton.num_joints, data.fps
 
     @jax.jit
     def window(start: jax.Array) -> Frame:
@@ -223,25 +222,25 @@ class Reference:
     root_height: float
 
 
-def _pose_positions(bones: skeleton.Skeleton, poses: Array) -> Array:
-    parts = unpack(pose.pose_layout(bones.num_joints), poses)
-    split = lambda x: x.reshape(*x.shape[:-1], bones.num_joints, -1)  # noqa: E731
+def _pose_positions(skeleton: Skeleton, poses: Array) -> Array:
+    parts = unpack(pose.pose_layout(skeleton.num_joints), poses)
+    split = lambda x: x.reshape(*x.shape[:-1], skeleton.num_joints, -1)  # noqa: E731
     position, rot6d = split(parts["position"]), split(parts["rotation"])
-    return pose.character_transforms(bones.parents, position, rot6d)[0]
+    return pose.character_transforms(skeleton.parents, position, rot6d)[0]
 
 
-def make_reference(bones: skeleton.Skeleton, data: PoseData) -> Reference:
+def make_reference(skeleton: Skeleton, data: PoseData) -> Reference:
     """The reference of training frames.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       data: Training frames.
 
     Returns:
       The reference; every fifth frame counts.
     """
-    found = jax.jit(lambda x: _pose_positions(bones, x))(data.poses[::STRIDE])
-    toes = np.asarray(found[:, jnp.array(bones.feet), 1])
+    found = jax.jit(lambda x: _pose_positions(skeleton, x))(data.poses[::STRIDE])
+    toes = np.asarray(found[:, jnp.array(skeleton.feet), 1])
     flat = found.reshape(len(found), -1)
     # A centimetre: the chest hardly leaves the bone's axis.
     normalizer = features.fit_normalizer(flat, floor=0.01)
@@ -267,7 +266,7 @@ def _character_features(reference: Reference, frames: Frame, positions: Array) -
 
 def free_row(
     key: Key,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     reference: Reference,
     frames: Frame,
     *,
@@ -278,7 +277,7 @@ def free_row(
 
     Args:
       key: Consumed; of the pairs for diversity.
-      bones: The skeleton.
+      skeleton: The skeleton.
       reference: What to compare with.
       frames: Rollouts [characters, ticks, ...].
       fps: Frames a second.
@@ -297,7 +296,7 @@ def free_row(
             f"{frames.root_position.shape[0]} rollouts in {groups} groups: expected a "
             "number that they divide"
         )
-    positions = positions_of(bones, frames)
+    positions = positions_of(skeleton, frames)
     height = reference.root_height
     diverged = np.asarray(
         health.has_diverged(positions, fps=fps, min_root=0.1, max_root=2.5 * height)
@@ -315,7 +314,7 @@ def free_row(
     distance = [
         frechet.frechet_distance(frechet.moments(x), reference.moments) for x in parts
     ]
-    feet = positions[..., jnp.array(bones.feet), :]
+    feet = positions[..., jnp.array(skeleton.feet), :]
     feet = feet.at[..., 1].add(-reference.toe_height)
     speed = jnp.linalg.norm(frames.velocity, axis=-1).mean(axis=1)
     return row | {

@@ -110,7 +110,7 @@ class Run:
 
     Attributes:
       folder: The folder.
-      bones: The skeleton.
+      skeleton: The skeleton.
       train: Training frames.
       held_out: Frames that no network saw.
       source: The data, and its licence.
@@ -118,7 +118,7 @@ class Run:
     """
 
     folder: Path
-    bones: Skeleton
+    skeleton: Skeleton
     train: PoseData
     held_out: PoseData
     source: str
@@ -133,7 +133,7 @@ class Run:
     def embedding(self) -> aamdm_embedding.Config:
         """Sizes of the autoencoder."""
         return aamdm_embedding.Config(
-            num_joints=self.bones.num_joints, fps=self.train.fps
+            num_joints=self.skeleton.num_joints, fps=self.train.fps
         )
 
 
@@ -237,17 +237,17 @@ def load_run(folder: Path) -> Run:
     if not isinstance(value["source"], str):
         raise ValueError(f"{path}: field 'source' is no text: {value['source']!r:.80}")
     try:
-        bones = runs.skeleton_from_json(value["skeleton"])
+        skeleton = runs.skeleton_from_json(value["skeleton"])
     except (KeyError, ValueError) as error:
         raise ValueError(f"{path}: field 'skeleton': {error}") from None
-    frames = _read_frames(folder / "frames.npz", bones, fps=float(value["fps"]))
+    frames = _read_frames(folder / "frames.npz", skeleton, fps=float(value["fps"]))
     try:
         train, held_out = aamdm_data.split_ends(frames, value["held_out"])
     except ValueError as error:
         raise ValueError(f"{folder}: {error}") from None
     return Run(
         folder=folder,
-        bones=bones,
+        skeleton=skeleton,
         train=train,
         held_out=held_out,
         source=value["source"],
@@ -255,7 +255,7 @@ def load_run(folder: Path) -> Run:
     )
 
 
-def _read_frames(path: Path, bones: Skeleton, *, fps: float) -> PoseData:
+def _read_frames(path: Path, skeleton: Skeleton, *, fps: float) -> PoseData:
     """The frames of a run folder; raises unless its arrays agree."""
     arrays = files.read_arrays(path, name=str(path), what="frame")
     wanted = {"poses": ("f", 2), "paths": ("f", 2), "offsets": ("i", 1)}
@@ -264,7 +264,7 @@ def _read_frames(path: Path, bones: Skeleton, *, fps: float) -> PoseData:
     number = offsets[-1] if offsets.size else 0
     if offsets.size < 2 or offsets[0] != 0 or (np.diff(offsets) < 1).any():
         raise ValueError(f"{path}: field 'offsets' should ascend from 0")
-    features = {"poses": pose.pose_layout(bones.num_joints).size, "paths": 12}
+    features = {"poses": pose.pose_layout(skeleton.num_joints).size, "paths": 12}
     for name, size in features.items():
         shape = arrays[name].shape
         if shape != (number, size):
@@ -299,7 +299,7 @@ def train_autoencoder(run: Run, budget: Budget) -> Autoencoder:
     loss = functools.partial(
         aamdm_embedding.loss,
         statistics=statistics,
-        parents=run.bones.parents,
+        parents=run.skeleton.parents,
         config=config,
     )
     optimizer = make_optimizer(budget)

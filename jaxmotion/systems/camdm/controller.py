@@ -27,7 +27,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmotion.control import inertia
 from jaxmotion.control.rollout import Controller
 from jaxmotion.diffusion import schedule
-from jaxmotion.motion import features, skeleton, spring, trajectory
+from jaxmotion.motion import features, spring, trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.typing import Key, Params
 
@@ -101,8 +102,8 @@ class CharacterState:
       guided: Plans that are still to be guided.
     """
 
-    past: skeleton.Motion
-    plan: skeleton.Motion
+    past: Motion
+    plan: Motion
     cursor: Int[Array, "*batch"]
     velocity: Float[Array, "*batch 2"]
     acceleration: Float[Array, "*batch 2"]
@@ -134,12 +135,12 @@ class Frame:
 
 
 def init_state(
-    bones: skeleton.Skeleton, past: skeleton.Motion, *, config: camdm_model.Config
+    skeleton: Skeleton, past: Motion, *, config: camdm_model.Config
 ) -> CharacterState:
     """State of a character that has shown `past` and has no plan yet.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       past: At least `config.past` displayed poses of one character, world.
       config: The method.
 
@@ -157,12 +158,12 @@ def init_state(
     step = (position[-1] - position[0]) / (config.past - 1)
     ahead = jnp.arange(1, config.future + 1, dtype=position.dtype)[:, None]
     level = step * jnp.array([1.0, 0.0, 1.0])
-    plan = skeleton.Motion(
+    plan = Motion(
         root_position=position[-1:] + ahead * level[None],
         joint_rotation=jnp.repeat(past.joint_rotation[-1:], config.future, axis=0),
         fps=past.fps,
     )
-    facing = trajectory.root_trajectory(bones, past).facing[-1]
+    facing = trajectory.root_trajectory(skeleton, past).facing[-1]
     velocity = level[::2] * config.fps
     return CharacterState(
         past=past,
@@ -236,12 +237,12 @@ __all__ = [
 
 
 def plan_frame(
-    bones: skeleton.Skeleton, past: skeleton.Motion, *, config: camdm_model.Config
+    skeleton: Skeleton, past: Motion, *, config: camdm_model.Config
 ) -> trajectory.PlanarFrame:
     """Frame of the next plan: at the last displayed pose.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       past: Displayed poses, world.
       config: Says whether the frame turns with the character.
 
@@ -249,13 +250,13 @@ def plan_frame(
       The frame. With heading "random" its axes are the world's, as in the release.
     """
     last = jax.tree.map(lambda x: x[-1:], past)
-    here = trajectory.root_trajectory(bones, last)
+    here = trajectory.root_trajectory(skeleton, last)
     facing = here.facing[0] if config.heading == "facing" else jnp.array([0.0, 1.0])
     return trajectory.PlanarFrame(origin=here.position[0], facing=facing)
 
 
 def wanted_trajectory(
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     state: CharacterState,
     command: trajectory.Command,
     *,
@@ -265,7 +266,7 @@ def wanted_trajectory(
     """Steps 1a to 1c: the user's path, blended with the model's own.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       state: The character's state.
       command: What the user wants.
       config: The method.
@@ -295,7 +296,7 @@ def wanted_trajectory(
     if not control.extend:
         return desired
     own = trajectory.extend(
-        trajectory.root_trajectory(bones, state.plan),
+        trajectory.root_trajectory(skeleton, state.plan),
         control.apply,
         reuse=control.reuse,
     )
@@ -313,7 +314,7 @@ def wanted_trajectory(
 def replan(
     sample: camdm_model.Plan,
     key: Key,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     state: CharacterState,
     command: trajectory.Command,
     *,
@@ -326,7 +327,7 @@ def replan(
     Args:
       sample: From `camdm.planner`.
       key: Consumed.
-      bones: The skeleton.
+      skeleton: The skeleton.
       state: The character's state.
       command: What the user wants now.
       config: The method.
@@ -337,8 +338,8 @@ def replan(
     Returns:
       The state with the plan, none of it displayed yet.
     """
-    frame = plan_frame(bones, state.past, config=config)
-    wanted = wanted_trajectory(bones, state, command, config=config, control=control)
+    frame = plan_frame(skeleton, state.past, config=config)
+    wanted = wanted_trajectory(skeleton, state, command, config=config, control=control)
     is_new = is_new_style(state, command, control=control)
     left = jnp.where(is_new, control.guided_plans, state.guided)
     condition = camdm_model.Condition(
@@ -419,7 +420,7 @@ def advance(
 
 def controller(
     params: Params,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     *,
     config: camdm_model.Config,
     control: Control | None = None,
@@ -429,7 +430,7 @@ def controller(
 
     Args:
       params: The network's parameters.
-      bones: The skeleton.
+      skeleton: The skeleton.
       config: The method.
       control: Constants; None for the defaults.
       table: Schedule; None for the cosine one of `config.num_steps`.
@@ -449,7 +450,7 @@ def controller(
         return lambda key, state, command: replan(
             sample,
             key,
-            bones,
+            skeleton,
             state,
             command,
             config=config,

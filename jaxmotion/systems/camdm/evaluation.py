@@ -7,12 +7,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxmotion.data.clips import Clips
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmotion import reporting
 from jaxmotion.data import selection, windows
+from jaxmotion.data.clips import Clips
 from jaxmotion.data.windows import EvalWindows as Windows
 from jaxmotion.evaluation import (
     diversity,
@@ -26,7 +25,8 @@ from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
 from jaxmotion.evaluators.style import Recognized, in_batches, recognized
-from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.motion import trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import release as camdm_release
 from jaxmotion.systems.camdm import steering as camdm_steering
@@ -158,14 +158,14 @@ _COLUMNS = {
 
 
 @jax.jit
-def _metrics(bones: skeleton.Skeleton, height: Array, x: Windows) -> dict[str, Array]:
+def _metrics(skeleton: Skeleton, height: Array, x: Windows) -> dict[str, Array]:
     return locomotion.locomotion_metrics(
-        bones, x.motion, x.velocity, x.facing, contact_height=height
+        skeleton, x.motion, x.velocity, x.facing, contact_height=height
     )
 
 
 def metric_row(
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     found: Windows,
     hits: np.ndarray | None,
     *,
@@ -174,7 +174,7 @@ def metric_row(
     """All columns but the Fréchet distances, with intervals over clips or rollouts.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       found: Windows.
       hits: From `recognized`; None to leave style accuracy out.
       height: Below it a foot joint should not move, metres.
@@ -182,7 +182,7 @@ def metric_row(
     Returns:
       Columns; angles in degrees.
     """
-    run = functools.partial(_metrics, bones, jnp.float32(height))
+    run = functools.partial(_metrics, skeleton, jnp.float32(height))
     values = in_batches(run, found)
     row = {}
     if hits is not None:
@@ -197,7 +197,7 @@ def metric_row(
 
 
 def rollout_health(
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     frames: camdm_controller.Frame,
     *,
     fps: float,
@@ -206,7 +206,7 @@ def rollout_health(
     """How many rollouts diverged or froze; bounds as in `evaluation.health`.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       frames: Displayed frames [characters, ticks, ...].
       fps: Frames a second.
       height: Root height of the standing character, metres; half of it and 1.5
@@ -218,10 +218,10 @@ def rollout_health(
 
     @jax.jit
     def run(x: camdm_controller.Frame) -> tuple[Array, Array]:
-        motion = skeleton.Motion(
+        motion = Motion(
             root_position=x.root_position, joint_rotation=x.joint_rotation, fps=fps
         )
-        positions = skeleton.joint_positions(bones, motion)
+        positions = joint_positions(skeleton, motion)
         diverged = health.has_diverged(
             positions, fps=fps, min_root=0.5 * height, max_root=1.5 * height
         )
@@ -235,15 +235,13 @@ def rollout_health(
     }
 
 
-def repeat_diversity(
-    bones: skeleton.Skeleton, found: Windows, *, repeats: int
-) -> table.Cell:
+def repeat_diversity(skeleton: Skeleton, found: Windows, *, repeats: int) -> table.Cell:
     """Intra-style variance over characters of one style under one control.
 
     Windows of the same time are compared in the frame of the root.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       found: Windows of rollouts in which every `repeats` neighbouring characters
         share style and commands.
       repeats: Characters a style.
@@ -252,35 +250,35 @@ def repeat_diversity(
       Square metres, with an interval over styles.
     """
     local = in_batches(
-        jax.jit(functools.partial(style_evaluator.recognizer_input, bones)),
+        jax.jit(functools.partial(style_evaluator.recognizer_input, skeleton)),
         found.motion,
     )
     characters = int(found.group.max()) + 1
-    shape = (characters // repeats, repeats, -1, bones.num_joints, 3)
+    shape = (characters // repeats, repeats, -1, skeleton.num_joints, 3)
     local = jnp.asarray(local).reshape(shape)
     return table.cell(jax.vmap(diversity.intra_style_variance)(local))
 
 
-def contact_height(bones: skeleton.Skeleton, real: Windows) -> float:
+def contact_height(skeleton: Skeleton, real: Windows) -> float:
     """Height below which toes should not move.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       real: Windows of real clips.
 
     Returns:
       Where toes rest (their first percentile), and one centimetre more, as the paper's
       "below, e.g., 1 cm"; metres.
     """
-    feet = jnp.array(bones.feet)
+    feet = jnp.array(skeleton.feet)
     toes = in_batches(
-        jax.jit(lambda m: skeleton.joint_positions(bones, m)[..., feet, :]), real.motion
+        jax.jit(lambda m: joint_positions(skeleton, m)[..., feet, :]), real.motion
     )
     return float(np.percentile(toes[..., 1], 1)) + 0.01
 
 
 def evaluation_table(
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     real: Windows,
     dense: Windows,
     made: Windows,
@@ -293,7 +291,7 @@ def evaluation_table(
     """The table, and what belongs beside it.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       real: Windows of held-out clips, one behind the other.
       dense: Windows of training clips with a short stride: the reference.
       made: Windows of the rollouts.
@@ -307,24 +305,24 @@ def evaluation_table(
       Rows "held-out (ground truth)", "training half vs half (noise floor)" and
       "rollouts"; and the contact height, window counts and health of the rollouts.
     """
-    height = contact_height(bones, real)
-    real_feature, real_hits = recognized(bones, real, recognizer)
-    made_feature, made_hits = recognized(bones, made, recognizer)
-    reference, _ = recognized(bones, dense, recognizer)
+    height = contact_height(skeleton, real)
+    real_feature, real_hits = recognized(skeleton, real, recognizer)
+    made_feature, made_hits = recognized(skeleton, made, recognizer)
+    reference, _ = recognized(skeleton, dense, recognizer)
     own = random_half(np.asarray(dense.group), np.asarray(dense.label), seed)
     count = min(len(real_feature), len(made_feature), int(own.sum()), int((~own).sum()))
     distances = functools.partial(frechet_cells, count=count, seed=seed)
     rows = {
-        TRUTH: metric_row(bones, real, real_hits, height=height)
+        TRUTH: metric_row(skeleton, real, real_hits, height=height)
         | distances(real_feature, reference),
         "training half vs half (noise floor)": distances(
             reference[own], reference[~own]
         ),
-        ROLLOUTS: metric_row(bones, made, made_hits, height=height)
+        ROLLOUTS: metric_row(skeleton, made, made_hits, height=height)
         | distances(made_feature, reference),
     }
     if repeats > 1:
-        found = repeat_diversity(bones, made, repeats=repeats)
+        found = repeat_diversity(skeleton, made, repeats=repeats)
         rows[ROLLOUTS]["diversity_m2"] = found
     root = float(np.median(np.asarray(real.motion.root_position)[..., 1]))
     return rows, {
@@ -332,7 +330,7 @@ def evaluation_table(
         "windows": {"held_out": len(real_hits), "rollouts": len(made_hits)},
         "fid_windows": count,
         "fid_reference_windows": len(reference),
-        "health": rollout_health(bones, frames, fps=made.motion.fps, height=root),
+        "health": rollout_health(skeleton, frames, fps=made.motion.fps, height=root),
     }
 
 
@@ -374,7 +372,7 @@ def steer_one(
     to_style: str | None = None,
     speed: float | None = None,
     seed: int = 0,
-) -> tuple[skeleton.Motion, Float[Array, "frames 2"]]:
+) -> tuple[Motion, Float[Array, "frames 2"]]:
     """Steers one character from a pose of the training clips.
 
     Args:
@@ -405,7 +403,7 @@ def steer_one(
     frames = camdm_steering.steered_rollouts(
         run.params, jax.random.key(seed), states, commands, model=model
     )
-    motion = skeleton.Motion(
+    motion = Motion(
         root_position=frames.root_position[0],
         joint_rotation=frames.joint_rotation[0],
         fps=model.config.fps,
@@ -413,7 +411,7 @@ def steer_one(
     return motion, frames.desired_velocity[0]
 
 
-def own_starts(run: Run, *, number: int, seed: int = 0) -> skeleton.Motion:
+def own_starts(run: Run, *, number: int, seed: int = 0) -> Motion:
     """Poses that the model itself stands in: a start without any recorded frame.
 
     Characters of each style stand still for twelve seconds; of sixteen the calmest are
@@ -445,12 +443,12 @@ def own_starts(run: Run, *, number: int, seed: int = 0) -> skeleton.Motion:
         frames = camdm_steering.steered_rollouts(
             run.params, jax.random.key(seed), states, commands, model=model, chunk=4
         )
-        past = skeleton.Motion(
+        past = Motion(
             root_position=frames.root_position[:, -model.config.past :],
             joint_rotation=frames.joint_rotation[:, -model.config.past :],
             fps=model.config.fps,
         )
-        positions = skeleton.joint_positions(model.bones, past)
+        positions = joint_positions(model.skeleton, past)
         unrest = jnp.mean(jnp.abs(jnp.diff(positions, axis=1)), axis=(1, 2, 3))
         calmest = jnp.argsort(unrest)[:number]
         motions = jax.tree.map(lambda x, i=calmest: x[i], past)
@@ -507,15 +505,15 @@ def evaluate_run(
         frames, jnp.asarray(labels), fps=fps, skip=SKIP
     )
     rows, report = evaluation_table(
-        model.bones, real, dense, made, frames, judge, repeats=repeats
+        model.skeleton, real, dense, made, frames, judge, repeats=repeats
     )
-    styles = camdm_release.style_features(model.bones, run.train, judge, field=field)
+    styles = camdm_release.style_features(model.skeleton, run.train, judge, field=field)
     for name, whole in (
         (TRUTH, camdm_release.of_clips(run.held_out, field=field)),
         (ROLLOUTS, camdm_release.of_rollouts(frames, commands, fps=fps)),
     ):
-        values = camdm_release.metrics(model.bones, whole)
-        fid = camdm_release.distances(model.bones, whole, judge, styles)
+        values = camdm_release.metrics(model.skeleton, whole)
+        fid = camdm_release.distances(model.skeleton, whole, judge, styles)
         rows[name] |= camdm_release.row(values | {"fid": fid})
     return rows, report | {
         "source": model.source,
@@ -546,10 +544,10 @@ def recognizer(
       ValueError: if the evaluator does not fit the run; names the field.
     """
     model = run.model
-    kind, labels, joints = "style", model.labels, model.bones.names
+    kind, labels, joints = "style", model.labels, model.skeleton.names
     classes: tuple[int, ...] = ()
     if evaluator is not None and evaluator.kind == "style_release":
-        style_evaluator.released_joints(model.bones)  # raises unless it has them
+        style_evaluator.released_joints(model.skeleton)  # raises unless it has them
         kind, joints = evaluator.kind, evaluator.joints
         if set(labels) <= set(evaluator.labels):  # a run may have fewer styles
             classes = tuple(evaluator.labels.index(name) for name in labels)

@@ -9,7 +9,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
-from jaxmotion.motion import features, skeleton, trajectory
+from jaxmotion.motion import features, trajectory
+from jaxmotion.motion.skeleton import (
+    Motion,
+    Skeleton,
+    joint_positions,
+    joint_velocities,
+)
 from jaxmotion.systems.camdm.model import (
     Condition,
     Config,
@@ -21,12 +27,12 @@ from jaxmotion.typing import Key, Params
 
 
 def mean_rotations(
-    bones: skeleton.Skeleton, motion: skeleton.Motion, *, config: Config
+    skeleton: Skeleton, motion: Motion, *, config: Config
 ) -> tuple[float, ...]:
     """Mean of the rotations' features over frames, each seen from its own facing.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       motion: Frames of it, world.
       config: Says how rotations are laid out.
 
@@ -34,8 +40,8 @@ def mean_rotations(
       `Config.rotation_mean`.
     """
 
-    def local(pose: skeleton.Motion) -> Array:
-        path = trajectory.root_trajectory(bones, pose)
+    def local(pose: Motion) -> Array:
+        path = trajectory.root_trajectory(skeleton, pose)
         frame = trajectory.PlanarFrame(origin=path.position[0], facing=path.facing[0])
         return features.motion_features(
             features.to_frame(pose, frame), rotation_layout=config.rotation_layout
@@ -48,8 +54,8 @@ def mean_rotations(
 
 def example(
     key: Key,
-    bones: skeleton.Skeleton,
-    window: skeleton.Motion,
+    skeleton: Skeleton,
+    window: Motion,
     label: Int[Array, ""],
     *,
     config: Config,
@@ -58,7 +64,7 @@ def example(
 
     Args:
       key: Consumed.
-      bones: The skeleton.
+      skeleton: The skeleton.
       window: Past and future frames, in the world.
       label: Style.
       config: The method.
@@ -70,7 +76,7 @@ def example(
     """
     key_turn, key_course, key_keep = jax.random.split(key, 3)
     last = config.past - 1
-    course = trajectory.root_trajectory(bones, window)
+    course = trajectory.root_trajectory(skeleton, window)
     if config.heading == "facing":
         facing = course.facing[last]
     else:
@@ -94,9 +100,9 @@ def example(
 def loss(
     params: Params,
     key: Key,
-    batch: tuple[skeleton.Motion, Int[Array, " batch"]],
+    batch: tuple[Motion, Int[Array, " batch"]],
     *,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """The training loss of a batch of windows.
@@ -105,7 +111,7 @@ def loss(
       params: The network's parameters.
       key: Consumed.
       batch: Windows of `config.window` frames, and their styles.
-      bones: The skeleton.
+      skeleton: The skeleton.
       config: The method.
 
     Returns:
@@ -117,9 +123,9 @@ def loss(
     size = labels.shape[0]
     key_example, key_t, key_noise, key_drop = jax.random.split(key, 4)
     keys = jax.random.split(key_example, size)
-    condition, x_0 = jax.vmap(lambda k, w, c: example(k, bones, w, c, config=config))(
-        keys, windows, labels
-    )
+    condition, x_0 = jax.vmap(
+        lambda k, w, c: example(k, skeleton, w, c, config=config)
+    )(keys, windows, labels)
     table = schedule.cosine_schedule(config.num_steps)
     t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
     noise = jax.random.normal(key_noise, x_0.shape)
@@ -132,7 +138,7 @@ def loss(
         train=config.dropout > 0,
         rngs={"dropout": key_drop},
     )
-    terms = loss_terms(bones, prediction, x_0, config=config)
+    terms = loss_terms(skeleton, prediction, x_0, config=config)
     weights = {
         "data": config.weight_data,
         "velocity": config.weight_velocity,
@@ -144,7 +150,7 @@ def loss(
 
 
 def loss_terms(
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     prediction: Float[Array, "*batch frames features"],
     target: Float[Array, "*batch frames features"],
     *,
@@ -156,7 +162,7 @@ def loss_terms(
     stands where the target's is slower than `config.contact_speed`, at any height.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       prediction: Predicted features.
       target: True features.
       config: The method.
@@ -166,17 +172,15 @@ def loss_terms(
     """
     every = jnp.ones(target.shape[:-1], bool)
     predicted, wanted = (
-        skeleton.joint_positions(bones, to_motion(x, config=config))
+        joint_positions(skeleton, to_motion(x, config=config))
         for x in (prediction, target)
     )
     unit = jnp.full(config.num_features, 1.0 / config.rotation_scale)
     unit = jnp.broadcast_to(unit.at[-6:].set(1.0), target.shape)
     prediction, target = prediction * unit, target * unit
     flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
-    feet = jnp.array(bones.feet)
-    speed = jnp.linalg.norm(
-        skeleton.joint_velocities(wanted[..., feet, :], config.fps), axis=-1
-    )
+    feet = jnp.array(skeleton.feet)
+    speed = jnp.linalg.norm(joint_velocities(wanted[..., feet, :], config.fps), axis=-1)
     stands = jnp.pad(
         speed <= config.contact_speed, [(0, 0)] * (speed.ndim - 2) + [(0, 1), (0, 0)]
     )

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.learning import checkpoint, runs
-from jaxmotion.motion import features, rotation, skeleton, trajectory
+from jaxmotion.motion import features, rotation, trajectory
 from jaxmotion.motion.skeleton import MAX_METRES, Motion, Skeleton
 from jaxmotion.networks import transformer
 from jaxmotion.systems.camdm import network as camdm_network
@@ -201,7 +201,7 @@ def init(key: Key, config: Config) -> Params:
 
 
 def to_features(
-    motion: skeleton.Motion, *, config: Config
+    motion: Motion, *, config: Config
 ) -> Float[Array, "*batch frames features"]:
     """Features of a motion in the frame of a plan.
 
@@ -225,7 +225,7 @@ def _mean(config: Config, rotations: Array) -> Array:
 
 def to_motion(
     poses: Float[Array, "*batch frames features"], *, config: Config
-) -> skeleton.Motion:
+) -> Motion:
     """Inverse of `to_features`; rotations are made orthonormal.
 
     Args:
@@ -307,7 +307,7 @@ class Model:
 
     Attributes:
       config: The method.
-      bones: The skeleton that it was trained on.
+      skeleton: The skeleton that it was trained on.
       labels: Names of the styles.
       source: The data, and its licence.
       starts: Poses to start from, [labels, number, past, ...], at the origin facing +z;
@@ -316,7 +316,7 @@ class Model:
     """
 
     config: Config
-    bones: Skeleton
+    skeleton: Skeleton
     labels: tuple[str, ...]
     source: str
     starts: Motion | None = None
@@ -352,7 +352,7 @@ def to_json(model: Model) -> dict[str, Any]:
     value = {
         "system": "camdm",
         "config": dataclasses.asdict(model.config),
-        "skeleton": runs.skeleton_to_json(model.bones),
+        "skeleton": runs.skeleton_to_json(model.skeleton),
         "labels": list(model.labels),
         "source": model.source,
     }
@@ -424,10 +424,10 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
             made[field] = make(value[field])
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{where}: field {field!r}: {error}") from error
-    model = Model(bones=made.pop("skeleton"), **made)
+    model = Model(skeleton=made.pop("skeleton"), **made)
     config = model.config
     for name, found, expected in (
-        ("skeleton", model.bones.num_joints, config.num_joints),
+        ("skeleton", model.skeleton.num_joints, config.num_joints),
         ("labels", len(model.labels), config.num_labels),
     ):
         if found != expected:

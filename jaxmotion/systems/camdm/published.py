@@ -28,7 +28,7 @@ STYLES = "100style_conditions.json"
 def load(
     path: str | os.PathLike,
     *,
-    bones: Skeleton,
+    skeleton: Skeleton,
     labels: tuple[str, ...] | None = None,
 ) -> tuple[Model, Params]:
     """Reads released weights; runs no code of the file.
@@ -38,7 +38,7 @@ def load(
 
     Args:
       path: The checkpoint or ONNX file.
-      bones: The skeleton that it was trained on, its joints in the same order.
+      skeleton: The skeleton that it was trained on, its joints in the same order.
       labels: Names of the styles; None for those of "100style_conditions.json" beside
         the file.
 
@@ -59,9 +59,9 @@ def load(
     number, _ = layers.shape("embed_style.action_embedding", 2)
     hidden, _ = layers.shape("seqEncoder.layers.0.linear1.weight", 2)
     depth = layers.count("seqEncoder.layers.")
-    _check_skeleton(path, bones, features, stated)
+    _check_skeleton(path, skeleton, features, stated)
     config = camdm_model.Config(
-        num_joints=bones.num_joints,
+        num_joints=skeleton.num_joints,
         num_labels=number,
         past=stated["past"],
         future=stated["future"],
@@ -98,7 +98,7 @@ def load(
     if len(labels) != number:
         raise ValueError(f"{path}: {number} styles, but {len(labels)} names of styles")
     source = "100STYLE (CC BY 4.0); weights released with CAMDM"
-    return Model(config=config, bones=bones, labels=labels, source=source), params
+    return Model(config=config, skeleton=skeleton, labels=labels, source=source), params
 
 
 def _object(value: Any) -> dict[str, Any]:
@@ -139,19 +139,19 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _check_skeleton(
-    path: Path, bones: Skeleton, features: int, stated: dict[str, Any]
+    path: Path, skeleton: Skeleton, features: int, stated: dict[str, Any]
 ) -> None:
-    if features != 6 * (bones.num_joints + 1):
+    if features != 6 * (skeleton.num_joints + 1):
         raise ValueError(
             f"{path}: the model has {features / 6 - 1:g} joints, the skeleton "
-            f"{bones.num_joints}"
+            f"{skeleton.num_joints}"
         )
     plain = lambda name: name.lower().split(":")[-1].replace("_", "")  # noqa: E731
     expected = stated["joints"]
-    if expected is not None and list(map(plain, expected)) != plain_names(bones):
+    if expected is not None and list(map(plain, expected)) != plain_names(skeleton):
         raise ValueError(
             f"{path}: the skeleton's joints should be {', '.join(expected)}, found "
-            f"{', '.join(bones.names)}"
+            f"{', '.join(skeleton.names)}"
         )
 
 

@@ -17,7 +17,8 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import frechet, table
 from jaxmotion.evaluators.style import Recognized, in_batches, recognized
-from jaxmotion.motion import facing, skeleton, trajectory
+from jaxmotion.motion import facing, trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import steering as camdm_steering
 
@@ -27,10 +28,10 @@ LOW = 0.01  # metres above the clip's lowest toe, exclusive
 _TOES = ("lefttoebase", "righttoebase", "lefttoe", "righttoe")
 
 
-def toe_joints(bones: skeleton.Skeleton) -> tuple[int, ...]:
+def toe_joints(skeleton: Skeleton) -> tuple[int, ...]:
     """ToeBase and Toe of both sides, which the scripts look for; else the feet."""
-    plain = facing.plain_names(bones)
-    return tuple(plain.index(name) for name in _TOES if name in plain) or bones.feet
+    plain = facing.plain_names(skeleton)
+    return tuple(plain.index(name) for name in _TOES if name in plain) or skeleton.feet
 
 
 def _is_own(frames: Count, number: int) -> Bool[Array, " number"]:
@@ -109,15 +110,15 @@ def orientation_error(
 
 
 def clip_metrics(
-    bones: skeleton.Skeleton,
-    motion: skeleton.Motion,
+    skeleton: Skeleton,
+    motion: Motion,
     frames: Count | None = None,
     command: trajectory.Command | None = None,
 ) -> dict[str, Float[Array, ""]]:
     """All of one clip, which `jax.vmap` maps over padded ones.
 
     Args:
-      bones: Its shoulders are found by name.
+      skeleton: Its shoulders are found by name.
       motion: [frames, ...], world, metres.
       frames: That are the clip's own; None for all.
       command: Told in each frame, unsmoothed; None for clips that nobody steered.
@@ -126,8 +127,8 @@ def clip_metrics(
       slide and coherence, and with a command trajectory, and orientation if the
       skeleton has shoulders; radians.
     """
-    positions = skeleton.joint_positions(bones, motion)
-    root, toes = positions[:, 0], positions[:, jnp.array(toe_joints(bones))]
+    positions = joint_positions(skeleton, motion)
+    root, toes = positions[:, 0], positions[:, jnp.array(toe_joints(skeleton))]
     found = {
         "slide": foot_slide(toes, root, frames),
         "coherence": coherence(positions, frames),
@@ -135,8 +136,8 @@ def clip_metrics(
     if command is None:
         return found
     found["trajectory"] = trajectory_error(command.velocity, root[:, ::2], frames)
-    if facing.shoulder_joints(bones) is not None:
-        faced = facing.body_facing(bones, positions)
+    if facing.shoulder_joints(skeleton) is not None:
+        faced = facing.body_facing(skeleton, positions)
         found["orientation"] = orientation_error(command.facing, faced, frames)
     return found
 
@@ -210,7 +211,7 @@ class Recordings:
         recording.
     """
 
-    motion: skeleton.Motion
+    motion: Motion
     frames: Int[Array, " recordings"]
     label: Int[Array, " recordings"]
     command: trajectory.Command | None
@@ -224,7 +225,7 @@ def of_clips(clips: Clips, *, field: str) -> Recordings:
     place = np.minimum(np.arange(frames.max()), frames[:, None] - 1)
     place = offsets[:-1, None] + place
     return Recordings(
-        motion=skeleton.Motion(
+        motion=Motion(
             root_position=clips.root_position[place],
             joint_rotation=clips.joint_rotation[place],
             fps=clips.fps,
@@ -246,7 +247,7 @@ def of_rollouts(
     characters, ticks = commands.label.shape
     label = commands.label[:, 0]
     return Recordings(
-        motion=skeleton.Motion(
+        motion=Motion(
             root_position=frames.root_position,
             joint_rotation=frames.joint_rotation,
             fps=fps,
@@ -259,34 +260,34 @@ def of_rollouts(
 
 
 def style_features(
-    bones: skeleton.Skeleton, clips: Clips, recognizer: Recognized, *, field: str
+    skeleton: Skeleton, clips: Clips, recognizer: Recognized, *, field: str
 ) -> Groups:
     """Features of the training clips by style: what Fréchet distances are taken to."""
     found = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field=field)
-    features, _ = recognized(bones, found, recognizer)
+    features, _ = recognized(skeleton, found, recognizer)
     number = len(clips.names(field))
     return in_groups(features, np.asarray(found.label), number)
 
 
 @jax.jit
-def _metrics(bones: skeleton.Skeleton, x: tuple) -> dict[str, Array]:
-    return jax.vmap(functools.partial(clip_metrics, bones))(*x)
+def _metrics(skeleton: Skeleton, x: tuple) -> dict[str, Array]:
+    return jax.vmap(functools.partial(clip_metrics, skeleton))(*x)
 
 
-def metrics(bones: skeleton.Skeleton, found: Recordings) -> dict[str, np.ndarray]:
+def metrics(skeleton: Skeleton, found: Recordings) -> dict[str, np.ndarray]:
     """`camdm_release.clip_metrics` of each recording."""
-    run = functools.partial(_metrics, bones)
+    run = functools.partial(_metrics, skeleton)
     return in_batches(run, (found.motion, found.frames, found.command), size=16)
 
 
 def distances(
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     found: Recordings,
     recognizer: Recognized,
     styles: Groups,
 ) -> np.ndarray:
     """Fréchet distance of each recording to its style; NaN for a single window."""
-    features, _ = recognized(bones, found.windows, recognizer)
+    features, _ = recognized(skeleton, found.windows, recognizer)
     groups = in_groups(features, np.asarray(found.windows.group), found.label.size)
     return np.asarray(frechet_distances(groups, styles, found.label))
 

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion import reporting
 from jaxmotion.data import windows
 from jaxmotion.evaluation import by_frame, locomotion, table
 from jaxmotion.evaluators.style import in_batches
@@ -33,15 +32,15 @@ def _row(
     """Metrics of windows and their clip or rollout."""
     # Over half a second, so that the sway of the hips does not count.
     half = round(0.5 * run.model.config.fps)
-    feet = jnp.array(run.model.bones.feet)
+    feet = jnp.array(run.model.skeleton.feet)
 
     @jax.jit
     def measure(x: windows.EvalWindows) -> dict[str, jax.Array]:
-        positions = skeleton.joint_positions(run.model.bones, x.motion)
+        positions = skeleton.joint_positions(run.model.skeleton, x.motion)
         path = positions[..., 0, ::2]
         way = jnp.linalg.norm(path[..., half:, :] - path[..., :-half, :], axis=-1)
         metrics = locomotion.locomotion_metrics(
-            run.model.bones, x.motion, x.velocity, x.facing, contact_height=height
+            run.model.skeleton, x.motion, x.velocity, x.facing, contact_height=height
         )
         names = ("slide_speed", "slide_seconds", "skate_ratio", "jerk")
         return {name: metrics[name] for name in names} | {
@@ -111,7 +110,7 @@ def speed_table(
         )
         for name, clips in (("held-out", run.held_out), ("training", run.train))
     }
-    height = camdm_evaluation.contact_height(model.bones, real["held-out"])
+    height = camdm_evaluation.contact_height(model.skeleton, real["held-out"])
     rest = height - 0.01
     measured = {
         name: (*_row(run, found, height=height, rest=rest), np.asarray(found.label))
@@ -156,8 +155,8 @@ def speed_table(
             fps=fps,
         )
         plans[f"told {speed:g} m/s"] = by_frame.by_frame(
-            skeleton.joint_positions(model.bones, motion),
-            model.bones.feet,
+            skeleton.joint_positions(model.skeleton, motion),
+            model.skeleton.feet,
             by_frame.frames_since(frames.planned)[:, SKIP:],
             fps,
             num_places=(control or camdm_controller.Control()).apply,

@@ -19,7 +19,8 @@ from jaxtyping import Array, Int
 from jaxmotion.control import presets, rollout
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
-from jaxmotion.motion import features, skeleton, trajectory
+from jaxmotion.motion import features, trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm.model import Model
@@ -75,7 +76,7 @@ def rollout_windows(
         return x.reshape(characters * number, windows.EVAL_WINDOW, *x.shape[2:])
 
     return windows.EvalWindows(
-        motion=skeleton.Motion(
+        motion=Motion(
             root_position=cut(frames.root_position),
             joint_rotation=cut(frames.joint_rotation),
             fps=fps,
@@ -164,19 +165,17 @@ def own_states(
     )
 
 
-def at_origin(model: Model, motion: skeleton.Motion) -> skeleton.Motion:
+def at_origin(model: Model, motion: Motion) -> Motion:
     """A motion moved so that its last pose stands at the origin and faces +z."""
-    path = trajectory.root_trajectory(model.bones, motion)
+    path = trajectory.root_trajectory(model.skeleton, motion)
     frame = trajectory.PlanarFrame(origin=path.position[-1], facing=path.facing[-1])
     return features.to_frame(motion, frame)
 
 
-def _states_at_origin(
-    model: Model, motions: skeleton.Motion
-) -> camdm_controller.CharacterState:
-    def state(motion: skeleton.Motion) -> camdm_controller.CharacterState:
+def _states_at_origin(model: Model, motions: Motion) -> camdm_controller.CharacterState:
+    def state(motion: Motion) -> camdm_controller.CharacterState:
         local = at_origin(model, motion)
-        return camdm_controller.init_state(model.bones, local, config=model.config)
+        return camdm_controller.init_state(model.skeleton, local, config=model.config)
 
     return jax.jit(jax.vmap(state))(motions)
 
@@ -257,7 +256,7 @@ def steered_rollouts(
         key,
         states,
         commands,
-        model.bones,
+        model.skeleton,
         config=model.config,
         control=control,
         chunk=chunk,
@@ -271,11 +270,13 @@ def _rollouts(
     key: Key,
     states: camdm_controller.CharacterState,
     commands: trajectory.Command,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     *,
     config: camdm_model.Config,
     control: camdm_controller.Control | None,
     chunk: int | None,
 ) -> camdm_controller.Frame:
-    driver = camdm_controller.controller(params, bones, config=config, control=control)
+    driver = camdm_controller.controller(
+        params, skeleton, config=config, control=control
+    )
     return rollout.rollout(driver, key, states, commands, chunk=chunk)[1]

@@ -107,7 +107,7 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
         config = dataclasses.replace(config, rotation_mean=mean)
     return Model(
         config=config,
-        bones=clips.skeleton,
+        skeleton=clips.skeleton,
         labels=clips.names(field),
         source=clips.source,
     )
@@ -223,7 +223,7 @@ def start(
         max_norm=max_norm or None,
     )
     objective = functools.partial(
-        camdm_loss.loss, bones=model.bones, config=model.config
+        camdm_loss.loss, skeleton=model.skeleton, config=model.config
     )
     update = training.make_update(objective, transformation, ema_decay=ema)
     if devices > jax.device_count():
@@ -348,8 +348,8 @@ def check_clips(model: camdm_model.Model, clips: Clips, field: str) -> None:
       ValueError: names what differs.
     """
     pairs = {
-        "joints": (model.bones.names, clips.skeleton.names),
-        "parents": (model.bones.parents, clips.skeleton.parents),
+        "joints": (model.skeleton.names, clips.skeleton.names),
+        "parents": (model.skeleton.parents, clips.skeleton.parents),
         f"names of {field!r}": (model.labels, clips.names(field)),
         "fps": (model.config.fps, clips.fps),
     }

@@ -22,7 +22,8 @@ from jaxmotion.evaluation import table
 from jaxmotion.evaluation.transitions import transition
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.style import Recognized
-from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.motion import trajectory
+from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import release as camdm_release
@@ -139,7 +140,7 @@ def without(changes: Changes) -> Changes:
 
 
 def find_changes(
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     frames: camdm_controller.Frame,
     changes: Changes,
     recognizer: Recognized,
@@ -149,7 +150,7 @@ def find_changes(
     """Whether each window about or behind the command shows the new style.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       frames: Displayed frames [characters, ticks, ...].
       changes: That they were made for.
       recognizer: Of styles.
@@ -166,7 +167,7 @@ def find_changes(
         cut = jax.tree.map(lambda x: x[:, first:last], frames)  # noqa: B023
         label = jnp.asarray(changes.new)
         made = camdm_steering.rollout_windows(cut, label, fps=fps, skip=0)
-        found.append(style_evaluator.recognized(bones, made, recognizer)[1] > 0.5)
+        found.append(style_evaluator.recognized(skeleton, made, recognizer)[1] > 0.5)
     return np.stack(found, axis=1), centres / fps
 
 
@@ -192,8 +193,8 @@ def transition_row(
       limit; of the four seconds behind the command what `metric_row` measures; and of
       the whole rollout slide and coherence of CAMDM's release.
     """
-    bones, fps = run.model.bones, run.model.config.fps
-    found, centres = find_changes(bones, frames, changes, recognizer, fps=fps)
+    skeleton, fps = run.model.skeleton, run.model.config.fps
+    found, centres = find_changes(skeleton, frames, changes, recognizer, fps=fps)
     done = transition(
         jnp.asarray(found), jnp.asarray(centres, jnp.float32), limit=changes.limit
     )
@@ -213,11 +214,11 @@ def transition_row(
     )
     owner = changes.replication[np.asarray(made.group)]
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
-    motion = camdm_evaluation.metric_row(bones, grouped, None, height=height)
+    motion = camdm_evaluation.metric_row(skeleton, grouped, None, height=height)
     row |= {name: motion[name] for name in MOTION}
     # Of its changes of style the release measures neither direction nor facing.
     whole = camdm_release.of_rollouts(frames, changes.commands, fps=fps)
-    values = camdm_release.metrics(bones, dataclasses.replace(whole, command=None))
+    values = camdm_release.metrics(skeleton, dataclasses.replace(whole, command=None))
     return row | camdm_release.row(values, changes.replication)
 
 
@@ -249,7 +250,7 @@ def evaluate_transitions(
     real = windows.eval_windows(
         run.held_out, stride=windows.EVAL_WINDOW, field=run.field
     )
-    height = camdm_evaluation.contact_height(run.model.bones, real)
+    height = camdm_evaluation.contact_height(run.model.skeleton, real)
 
     def row(own: Changes, control: camdm_controller.Control) -> dict[str, table.Cell]:
         frames = camdm_steering.steered_rollouts(
@@ -282,7 +283,7 @@ def clip_accuracy(run: Run, recognizer: Recognized) -> table.Cell:
       Per cent, over clips.
     """
     real = windows.eval_windows(run.held_out, stride=STRIDE, field=run.field)
-    _, hits = style_evaluator.recognized(run.model.bones, real, recognizer)
+    _, hits = style_evaluator.recognized(run.model.skeleton, real, recognizer)
     return table.cell(
         table.group_means(hits, real.group), scale=100.0, bounds=(0.0, 1.0)
     )

@@ -19,7 +19,7 @@ from jaxmotion.evaluators import action as action_evaluator
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
 from jaxmotion.learning import checkpoint, runs
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm.data import ActionArrays, ActionRun
 from jaxmotion.typing import Key, Params
@@ -139,7 +139,7 @@ def real_positions(
       Positions, metres.
     """
     motions = emdm_data.sample_motions(key, part, actions)
-    return skeleton.joint_positions(part.clips.skeleton, motions)
+    return joint_positions(part.clips.skeleton, motions)
 
 
 def moments(params: Params, run: ActionRun) -> Callable[[Key, Array], frechet.Moments]:
@@ -179,8 +179,8 @@ def scorer(
       `score(key, positions, actions) -> scores`. The actions are in ascending order,
       each as often as the others.
     """
-    config, bones = recognizer_config(run), run.clips.skeleton
-    feet = jnp.asarray(bones.feet)
+    config, skeleton = recognizer_config(run), run.clips.skeleton
+    feet = jnp.asarray(skeleton.feet)
 
     @jax.jit
     def score(
@@ -225,12 +225,12 @@ def ground_height(run: ActionRun) -> float:
     Returns:
       The height.
     """
-    motion = skeleton.Motion(
+    motion = Motion(
         root_position=run.clips.root_position,
         joint_rotation=run.clips.joint_rotation,
         fps=run.clips.fps,
     )
-    positions = skeleton.joint_positions(run.clips.skeleton, motion)
+    positions = joint_positions(run.clips.skeleton, motion)
     return float(jnp.median(jnp.min(positions[..., 1], axis=-1)))
 
 

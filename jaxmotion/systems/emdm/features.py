@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxmotion.motion import features, skeleton
+from jaxmotion.motion import features
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.systems.emdm.loss import Geometry
 
 
@@ -23,22 +24,22 @@ class Representation:
     """What turns motions of one skeleton into features and back.
 
     Attributes:
-      bones: The skeleton.
+      skeleton: The skeleton.
       normalizer: Mean and deviation of the features.
       fps: Frames a second.
     """
 
-    bones: skeleton.Skeleton
+    skeleton: Skeleton
     normalizer: features.Normalizer
     fps: float = jax.tree.static()
 
     @property
     def num_features(self) -> int:
         """Channels of a frame."""
-        return 6 * (self.bones.num_joints + 1)
+        return 6 * (self.skeleton.num_joints + 1)
 
 
-def _raw(motion: skeleton.Motion) -> Array:
+def _raw(motion: Motion) -> Array:
     """Features before they are standardised; the first step is from the origin."""
     raw = features.motion_features(motion)
     place = raw[..., -6:-3]
@@ -47,13 +48,11 @@ def _raw(motion: skeleton.Motion) -> Array:
     return jnp.concatenate([raw[..., :-6], root, raw[..., -3:]], axis=-1)
 
 
-def fit(
-    bones: skeleton.Skeleton, motions: skeleton.Motion, *, floor: float = 0.01
-) -> Representation:
+def fit(skeleton: Skeleton, motions: Motion, *, floor: float = 0.01) -> Representation:
     """Mean and deviation of features: of each root channel, one for all rotations.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       motions: Motions of the training data, batch first, from
         `features.to_first_pose`.
       floor: Least deviation, metres or entries of rotation matrices.
@@ -68,14 +67,14 @@ def fit(
     root = jnp.concatenate([found.std[-6:-3], jnp.ones(3)])
     std = jnp.maximum(jnp.concatenate([rotations, root]), floor)
     return Representation(
-        bones=bones,
+        skeleton=skeleton,
         normalizer=features.Normalizer(mean=found.mean, std=std),
         fps=motions.fps,
     )
 
 
 def to_features(
-    motion: skeleton.Motion, representation: Representation
+    motion: Motion, representation: Representation
 ) -> Float[Array, "*batch frames features"]:
     """Features of motions that `features.to_first_pose` has moved.
 
@@ -91,7 +90,7 @@ def to_features(
 
 def to_motion(
     x: Float[Array, "*batch frames features"], representation: Representation
-) -> skeleton.Motion:
+) -> Motion:
     """Inverse of `to_features`; rotations are made orthonormal.
 
     Args:
@@ -119,12 +118,12 @@ def geometry(representation: Representation, *, relative: bool) -> Geometry:
       Joint positions by forward kinematics; toes and their parents as feet; frame
       differences of rotations only, as released.
     """
-    bones = representation.bones
-    feet = [j for foot in bones.feet for j in (bones.parents[foot], foot)]
+    skeleton = representation.skeleton
+    feet = [j for foot in skeleton.feet for j in (skeleton.parents[foot], foot)]
 
     def positions(x: Array) -> Array:
         motion = to_motion(x, representation)
-        found = skeleton.joint_positions(bones, motion)
+        found = joint_positions(skeleton, motion)
         return found - found[..., :1, :] if relative else found
 
     return Geometry(

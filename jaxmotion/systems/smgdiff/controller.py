@@ -26,8 +26,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.control import inertia
 from jaxmotion.control.rollout import Controller
-from jaxmotion.motion import ground, skeleton, trajectory
+from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff.guidance import Plan
 from jaxmotion.systems.smgdiff.model import Condition, Config
@@ -97,11 +98,11 @@ class Frame:
     planned: Bool[Array, "*batch"]
 
 
-def init_state(bones: skeleton.Skeleton, past: Scene, *, config: Config) -> PlayerState:
+def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerState:
     """State of a player that has shown `past` and has no plan yet.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       past: At least `config.past` displayed frames, world.
       config: The method.
 
@@ -128,7 +129,7 @@ def init_state(bones: skeleton.Skeleton, past: Scene, *, config: Config) -> Play
         cursor=jnp.zeros((), jnp.int32),
         command=trajectory.Command(
             velocity=step[::2] * config.fps,
-            facing=trajectory.root_trajectory(bones, past.motion).facing[-1],
+            facing=trajectory.root_trajectory(skeleton, past.motion).facing[-1],
             label=jnp.full((), -1, jnp.int32),
         ),
     )
@@ -169,7 +170,7 @@ __all__ = [
 def wanted_trajectory(
     generate: Generate,
     key: Key,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     state: PlayerState,
     command: trajectory.Command,
     *,
@@ -181,7 +182,7 @@ def wanted_trajectory(
     Args:
       generate: From `smgdiff_trajectory`.
       key: Consumed.
-      bones: The skeleton.
+      skeleton: The skeleton.
       state: The player's state.
       command: What the user wants.
       config: The method.
@@ -190,8 +191,8 @@ def wanted_trajectory(
     Returns:
       The path of the next `config.future` frames, in the frame of the plan.
     """
-    frame = smgdiff_scene.plan_frame(bones, state.past.motion)
-    past = trajectory.root_trajectory(bones, state.past.motion)
+    frame = smgdiff_scene.plan_frame(skeleton, state.past.motion)
+    past = trajectory.root_trajectory(skeleton, state.past.motion)
     wish = Wish(
         past=trajectory.to_local(past, frame),
         velocity=ground.into_frame(command.velocity, frame.facing),
@@ -199,7 +200,7 @@ def wanted_trajectory(
     )
     wanted = generate(key, wish)
     own = trajectory.extend(
-        trajectory.root_trajectory(bones, state.plan.motion),
+        trajectory.root_trajectory(skeleton, state.plan.motion),
         control.apply,
         reuse=control.reuse,
     )
@@ -241,11 +242,11 @@ def replan(
       The state with the plan, none of it displayed yet.
     """
     key_path, key_motion = jax.random.split(key)
-    bones = representation.bones
+    skeleton = representation.skeleton
     wanted = wanted_trajectory(
-        generate, key_path, bones, state, command, config=config, control=control
+        generate, key_path, skeleton, state, command, config=config, control=control
     )
-    frame = smgdiff_scene.plan_frame(bones, state.past.motion)
+    frame = smgdiff_scene.plan_frame(skeleton, state.past.motion)
     past = smgdiff_scene.to_frame(state.past, frame)
     condition = Condition(
         past=smgdiff_scene.to_features(past, representation),

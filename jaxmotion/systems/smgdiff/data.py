@@ -140,18 +140,18 @@ def fit_representation(
     number = arrays.index.starts.shape[0]
     chosen = np.unique(np.linspace(0, number - 1, windows_used).astype(int))
     scenes, _ = all_scenes(arrays, jnp.asarray(chosen))
-    data, bones = arrays.data, arrays.data.clips.skeleton
+    data, skeleton = arrays.data, arrays.data.clips.skeleton
 
     @jax.jit
     @jax.vmap
     def local(scene: Scene) -> Scene:
         frame = smgdiff_scene.plan_frame(
-            bones, jax.tree.map(lambda x: x[:past], scene.motion)
+            skeleton, jax.tree.map(lambda x: x[:past], scene.motion)
         )
         return smgdiff_scene.to_frame(scene, frame)
 
     return smgdiff_scene.fit(
-        bones, local(scenes), joints=data.joints, radius=data.radius
+        skeleton, local(scenes), joints=data.joints, radius=data.radius
     )
 
 

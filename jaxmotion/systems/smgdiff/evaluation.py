@@ -22,8 +22,9 @@ from jaxmotion.evaluation import ball, frechet, locomotion
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
-from jaxmotion.motion import ground, rotation, skeleton, trajectory
+from jaxmotion.motion import ground, rotation, trajectory
 from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
@@ -83,9 +84,9 @@ def recognizer_input(
     Returns:
       Metres; three channels a joint, and three of the ball, no longer than the reach.
     """
-    bones = representation.bones
-    joints = style_evaluator.recognizer_input(bones, scene.motion)
-    facing = trajectory.root_trajectory(bones, scene.motion).facing
+    skeleton = representation.skeleton
+    joints = style_evaluator.recognizer_input(skeleton, scene.motion)
+    facing = trajectory.root_trajectory(skeleton, scene.motion).facing
     away = scene.ball - scene.motion.root_position
     away = away.at[..., ::2].set(ground.into_frame(away[..., ::2], facing))
     length = jnp.linalg.norm(away, axis=-1, keepdims=True)
@@ -119,7 +120,7 @@ def make_judge(
     """
     config = style_evaluator.RecognizerConfig(
         num_classes=num_labels,
-        num_joints=representation.bones.num_joints + 1,
+        num_joints=representation.skeleton.num_joints + 1,
         frames=scenes.ball.shape[-2],
     )
     x = jax.jit(recognizer_input)(scenes, representation)
@@ -154,7 +155,7 @@ def scorer(judge: Judge, limits: Thresholds) -> Score:
       plan, as the scenes), labels the skills.
     """
     representation = judge.representation
-    bones = representation.bones
+    skeleton = representation.skeleton
 
     @jax.jit
     def score(
@@ -167,7 +168,7 @@ def scorer(judge: Judge, limits: Thresholds) -> Score:
         moments = frechet.moments(features)
         velocity = jnp.gradient(wanted.position, axis=-2) * representation.fps
         body = locomotion.locomotion_metrics(
-            bones,
+            skeleton,
             scenes.motion,
             velocity,
             wanted.facing,
@@ -208,9 +209,9 @@ def contact_scores(
       Touches and missed ones a minute, missed part of the touches, distance at touches,
       penetration of the ground and of the ball, acceleration without a touch.
     """
-    bones, fps = representation.bones, representation.fps
+    skeleton, fps = representation.skeleton, representation.fps
     joints = jnp.array(representation.joints)
-    places = skeleton.joint_positions(bones, scenes.motion)[..., joints, :]
+    places = joint_positions(skeleton, scenes.motion)[..., joints, :]
     at = dict(threshold=limits.acceleration)
     count = ball.touch_count(
         scenes.ball, places, fps, max_distance=limits.distance, **at
@@ -280,11 +281,11 @@ def situations(data: BallClips, model: Model, *, number: int, seed: int) -> Situ
 @functools.partial(jax.jit, static_argnames=("config",))
 def _situations(scenes: Scene, labels: Array, representation, config) -> Situations:
     matrix = trajectory.smoothing_matrices(config.window, (10.0,))[0]
-    last, bones = config.past - 1, representation.bones
+    last, skeleton = config.past - 1, representation.skeleton
 
     @jax.vmap
     def one(scene: Scene, label: Array) -> Situations:
-        course = trajectory.root_trajectory(bones, scene.motion)
+        course = trajectory.root_trajectory(skeleton, scene.motion)
         path = trajectory.smooth(course.position, matrix)
         path = path + (course.position[last] - path[last])[None]
         facing = trajectory.smooth(course.facing, matrix)
@@ -294,7 +295,7 @@ def _situations(scenes: Scene, labels: Array, representation, config) -> Situati
             scene, wanted, label, representation=representation, config=config
         )
         past = jax.tree.map(lambda x: x[: config.past], scene.motion)
-        frame = smgdiff_scene.plan_frame(bones, past)
+        frame = smgdiff_scene.plan_frame(skeleton, past)
         local = smgdiff_scene.to_frame(scene, frame)
         return Situations(
             condition=condition,
@@ -348,13 +349,13 @@ def limits(data: BallClips, model: Model) -> Thresholds:
       the ball's radius and 7 cm (half a foot, and 2 cm); and an acceleration of 12
       metres a second squared, a change of 0.4 m/s within a frame of 1/30 s.
     """
-    feet = jnp.array(model.representation.bones.feet)
-    motion = skeleton.Motion(
+    feet = jnp.array(model.representation.skeleton.feet)
+    motion = Motion(
         root_position=data.clips.root_position[::10],
         joint_rotation=data.clips.joint_rotation[::10],
         fps=data.clips.fps,
     )
-    places = jax.jit(skeleton.joint_positions)(data.clips.skeleton, motion)
+    places = jax.jit(joint_positions)(data.clips.skeleton, motion)
     heights = np.asarray(places[:, feet, 1])
     return Thresholds(
         acceleration=12.0,
@@ -425,7 +426,7 @@ def make_setting(
         evaluator,
         kind="ball",
         labels=model.labels,
-        joints=model.representation.bones.names,
+        joints=model.representation.skeleton.names,
         fps=model.config.fps,
         frames=model.config.future,
     )
@@ -552,7 +553,7 @@ def train_ball(
         params=judge.params,
         field=smgdiff_data.FIELD,
         labels=model.labels,
-        joints=model.representation.bones.names,
+        joints=model.representation.skeleton.names,
         fps=model.config.fps,
         frames=frames,
         source=train.clips.source,

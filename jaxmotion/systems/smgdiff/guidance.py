@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmotion.diffusion import chain, guidance, schedule
-from jaxmotion.motion import contact, skeleton
+from jaxmotion.motion import contact
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.systems.smgdiff.model import Condition, Config, network
 from jaxmotion.systems.smgdiff.scene import Representation, to_scene
 from jaxmotion.typing import Key, Objective, Params
@@ -105,12 +106,12 @@ def contact_objective(
 
     Source: SMGDiff, eq. 10-12.
     """
-    bones, joints = representation.bones, representation.joints
+    skeleton, joints = representation.skeleton, representation.joints
 
     def objective(x_0: Float[Array, "future features"], /) -> Float[Array, ""]:
         scene, stands = to_scene(x_0, start, representation)
-        places = skeleton.joint_positions(bones, scene.motion)
-        known = {foot: stands[..., i] for i, foot in enumerate(bones.feet)}
+        places = joint_positions(skeleton, scene.motion)
+        known = {foot: stands[..., i] for i, foot in enumerate(skeleton.feet)}
         grounded = [known.get(j, jnp.zeros(stands.shape[:-1])) for j in joints]
         gate = contact.ball_contact_gate(
             scene.ball, representation.fps, threshold=guided.min_acceleration

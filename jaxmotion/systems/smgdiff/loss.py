@@ -9,8 +9,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
-from jaxmotion.motion import ball, features, skeleton, trajectory
+from jaxmotion.motion import ball, features, trajectory
 from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.motion.trajectory import smooth_course
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff.model import Condition, Config, network
@@ -43,7 +44,7 @@ def situation(
     """
     last = config.past - 1
     past = jax.tree.map(lambda x: x[: config.past], window)
-    frame = smgdiff_scene.plan_frame(representation.bones, past.motion)
+    frame = smgdiff_scene.plan_frame(representation.skeleton, past.motion)
     wanted = trajectory.to_local(course, frame)
     local = smgdiff_scene.to_frame(window, frame)
     past = jax.tree.map(lambda x: x[: config.past], local)
@@ -76,7 +77,7 @@ def example(
     Returns:
       The condition, and the features of the future.
     """
-    course = trajectory.root_trajectory(representation.bones, window.motion)
+    course = trajectory.root_trajectory(representation.skeleton, window.motion)
     wanted = smooth_course(key, course, last=config.past - 1)
     return situation(
         window, wanted, label, representation=representation, config=config
@@ -159,13 +160,13 @@ def loss_terms(
     Source: SMGDiff, eq. 6-9; position_velocity from CAMDM; those of the ball are ours.
     """
     every = jnp.ones(target.shape[:-1], bool)
-    bones = representation.bones
+    skeleton = representation.skeleton
 
     predicted, wanted = (
-        skeleton.joint_positions(bones, smgdiff_scene.to_motion(x, representation))
+        joint_positions(skeleton, smgdiff_scene.to_motion(x, representation))
         for x in (prediction, target)
     )
-    names = smgdiff_scene.feature_layout(bones, representation.joints)
+    names = smgdiff_scene.feature_layout(skeleton, representation.joints)
     guess, truth = (
         features.unpack(names, features.denormalize(representation.normalizer, x))
         for x in (prediction, target)
@@ -175,7 +176,7 @@ def loss_terms(
     ball_error = _ball_place(guess) - _ball_place(truth)
     none = jnp.zeros_like(ball_error)
     flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
-    feet = jnp.array(bones.feet)
+    feet = jnp.array(skeleton.feet)
     return {
         "data": losses.masked_mse(prediction, target, every),
         "velocity": losses.velocity_loss(prediction, target, every),

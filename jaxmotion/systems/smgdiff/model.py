@@ -218,7 +218,7 @@ def to_json(model: Model) -> dict[str, Any]:
         "config": dataclasses.asdict(model.config),
         "paths": dataclasses.asdict(model.paths),
         "representation": {
-            "skeleton": runs.skeleton_to_json(features.bones),
+            "skeleton": runs.skeleton_to_json(features.skeleton),
             "mean": numbers(features.normalizer.mean),
             "std": numbers(features.normalizer.std),
             "joints": list(features.joints),
@@ -247,14 +247,14 @@ def _numbers(name: str, value: Any, *, least: float) -> list[int | float]:
 def _representation(value: Any) -> Representation:
     if not isinstance(value, dict):
         raise ValueError(f"a JSON {type(value).__name__}, expected an object")
-    bones = runs.skeleton_from_json(value["skeleton"])
+    skeleton = runs.skeleton_from_json(value["skeleton"])
     joints = value["joints"]
     right = isinstance(joints, list) and all(type(x) is int for x in joints)
-    if not right or not all(0 <= x < bones.num_joints for x in joints):
+    if not right or not all(0 <= x < skeleton.num_joints for x in joints):
         raise ValueError(
-            f"joints is {joints!r:.60}, expected numbers below {bones.num_joints}"
+            f"joints is {joints!r:.60}, expected numbers below {skeleton.num_joints}"
         )
-    size = feature_layout(bones, tuple(joints)).size
+    size = feature_layout(skeleton, tuple(joints)).size
     # A feature that never varies has a tiny deviation, but not none.
     for name, least in (("mean", -1e6), ("std", 1e-12)):
         if len(_numbers(name, value[name], least=least)) != size:
@@ -263,7 +263,7 @@ def _representation(value: Any) -> Representation:
     for name in scalars:
         _numbers(name, [value[name]], least=1e-6)
     return Representation(
-        bones=bones,
+        skeleton=skeleton,
         normalizer=Normalizer(
             mean=jnp.asarray(value["mean"], jnp.float32),
             std=jnp.asarray(value["std"], jnp.float32),

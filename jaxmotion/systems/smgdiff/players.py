@@ -16,8 +16,9 @@ from jaxtyping import Array, Float
 
 from jaxmotion.control import rollout
 from jaxmotion.evaluation import diversity
-from jaxmotion.motion import ground, skeleton, trajectory
+from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.evaluation import Setting, Situations
@@ -39,12 +40,12 @@ def wishes(known: Situations, model: Model) -> Wish:
     Returns:
       Wishes in the frames of the plans.
     """
-    bones, config = model.representation.bones, model.config
+    skeleton, config = model.representation.skeleton, model.config
 
     def one(known: Situations) -> Wish:
         end = known.future.motion.root_position[-1, ::2]
         return Wish(
-            past=trajectory.root_trajectory(bones, known.past.motion),
+            past=trajectory.root_trajectory(skeleton, known.past.motion),
             velocity=end * config.fps / config.future,
             label=known.label,
         )
@@ -84,14 +85,16 @@ def player(
         config=model.config,
         control=control,
     )
-    bones = model.representation.bones
+    skeleton = model.representation.skeleton
 
     @jax.jit
     def play(key: Key, known: Situations) -> Scene:
         known = jax.tree.map(lambda x: jnp.repeat(x, repeats, axis=0), known)
         wish = wishes(known, model)
         states = jax.vmap(
-            lambda past: smgdiff_controller.init_state(bones, past, config=model.config)
+            lambda past: smgdiff_controller.init_state(
+                skeleton, past, config=model.config
+            )
         )(known.past)
         every = lambda x: jnp.repeat(x[:, None], ticks, axis=1)  # noqa: E731
         commands = trajectory.Command(
@@ -117,7 +120,7 @@ def to_scene(frames: smgdiff_controller.Frame, model: Model) -> Scene:
     Returns:
       The scene.
     """
-    motion = skeleton.Motion(
+    motion = Motion(
         root_position=frames.root_position,
         joint_rotation=frames.joint_rotation,
         fps=model.config.fps,
@@ -172,7 +175,7 @@ def score_players(
 
 
 def _diversity(scene: Scene, model: Model, repeats: int) -> Array:
-    places = skeleton.joint_positions(model.representation.bones, scene.motion)
+    places = joint_positions(model.representation.skeleton, scene.motion)
     groups = places.reshape(-1, repeats, *places.shape[1:])
     return jnp.mean(jax.vmap(diversity.intra_style_variance)(groups))
 

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxmotion.motion import ball, contact, features, rotation, skeleton
+from jaxmotion.motion import ball, contact, features, rotation
 from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.trajectory import PlanarFrame, root_trajectory
 
 # Channels that vary alike: x and z of a place or a velocity, of any direction, more
@@ -31,7 +32,7 @@ class Representation:
     """What turns scenes of one skeleton into features and back.
 
     Attributes:
-      bones: The skeleton; its feet are what stands on the ground.
+      skeleton: The skeleton; its feet are what stands on the ground.
       normalizer: Mean and deviation of the features.
       joints: Joints that may touch the ball.
       fps: Frames a second.
@@ -40,7 +41,7 @@ class Representation:
       contact_speed: A foot slower than this stands, metres a second.
     """
 
-    bones: skeleton.Skeleton
+    skeleton: Skeleton
     normalizer: features.Normalizer
     joints: tuple[int, ...] = jax.tree.static()
     fps: float = jax.tree.static()
@@ -50,12 +51,12 @@ class Representation:
 
 
 def feature_layout(
-    bones: skeleton.Skeleton, joints: tuple[int, ...]
+    skeleton: Skeleton, joints: tuple[int, ...]
 ) -> features.FeatureLayout:
     """Names of the slices of a frame: 147 + 7 + 8 for SMPL with four feet.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       joints: Joints that may touch the ball.
 
     Returns:
@@ -65,17 +66,17 @@ def feature_layout(
     """
     return features.feature_layout(
         root=3,
-        rotations=6 * bones.num_joints,
+        rotations=6 * skeleton.num_joints,
         ball=ball.NUM_FEATURES,
-        ground=len(bones.feet),
+        ground=len(skeleton.feet),
         touch=len(joints),
     )
 
 
 def _raw(scene: Scene, representation: Representation) -> Array:
     """Features before they are standardised."""
-    bones, motion = representation.bones, scene.motion
-    feet = skeleton.joint_positions(bones, motion)[..., jnp.array(bones.feet), :]
+    skeleton, motion = representation.skeleton, scene.motion
+    feet = joint_positions(skeleton, motion)[..., jnp.array(skeleton.feet), :]
     stands = contact.foot_contacts(
         feet, motion.fps, max_speed=representation.contact_speed
     )
@@ -91,11 +92,11 @@ def _raw(scene: Scene, representation: Representation) -> Array:
         "ground": stands.astype(scene.ball.dtype),
         "touch": scene.touch,
     }
-    return features.pack(feature_layout(bones, representation.joints), parts)
+    return features.pack(feature_layout(skeleton, representation.joints), parts)
 
 
 def fit(
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     scenes: Scene,
     *,
     joints: tuple[int, ...],
@@ -105,7 +106,7 @@ def fit(
     """Mean of each feature, and one deviation for those of a kind.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       scenes: Windows of the training data, batch first, seen from `plan_frame`.
       joints: Joints that may touch the ball.
       radius: Of the ball, metres.
@@ -114,17 +115,17 @@ def fit(
     Returns:
       The representation.
     """
-    size = feature_layout(bones, joints).size
+    size = feature_layout(skeleton, joints).size
     unit = features.Normalizer(mean=jnp.zeros(size), std=jnp.ones(size))
     plain = Representation(
-        bones=bones,
+        skeleton=skeleton,
         normalizer=unit,
         joints=joints,
         fps=scenes.motion.fps,
         radius=radius,
     )
     found = features.fit_normalizer(_raw(scenes, plain), floor=0.0)
-    std = features.unpack(feature_layout(bones, joints), found.std)
+    std = features.unpack(feature_layout(skeleton, joints), found.std)
     groups = {name: (slice(0, part.size),) for name, part in std.items()}
     groups |= {"root": _ROOT, "ball": _BALL}
     for name, slices in groups.items():
@@ -134,23 +135,23 @@ def fit(
     return dataclasses.replace(
         plain,
         normalizer=features.Normalizer(
-            mean=found.mean, std=features.pack(feature_layout(bones, joints), std)
+            mean=found.mean, std=features.pack(feature_layout(skeleton, joints), std)
         ),
     )
 
 
-def plan_frame(bones: skeleton.Skeleton, past: skeleton.Motion) -> PlanarFrame:
+def plan_frame(skeleton: Skeleton, past: Motion) -> PlanarFrame:
     """Frame of the next plan: at the last displayed pose, +z where it faces.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       past: Displayed poses, world.
 
     Returns:
       The frame.
     """
     last = jax.tree.map(lambda x: x[-1:], past)
-    here = root_trajectory(bones, last)
+    here = root_trajectory(skeleton, last)
     return PlanarFrame(origin=here.position[0], facing=here.facing[0])
 
 
@@ -180,9 +181,7 @@ def from_frame(scene: Scene, frame: PlanarFrame) -> Scene:
     return _move(scene, features.from_frame(scene.motion, frame), frame, out=True)
 
 
-def _move(
-    scene: Scene, motion: skeleton.Motion, frame: PlanarFrame, *, out: bool
-) -> Scene:
+def _move(scene: Scene, motion: Motion, frame: PlanarFrame, *, out: bool) -> Scene:
     return dataclasses.replace(
         scene, motion=motion, ball=ball.move_points(scene.ball, frame, out=out)
     )
@@ -207,13 +206,13 @@ def to_features(
 
 
 def _parts(x: Array, representation: Representation) -> dict[str, Array]:
-    names = feature_layout(representation.bones, representation.joints)
+    names = feature_layout(representation.skeleton, representation.joints)
     return features.unpack(names, features.denormalize(representation.normalizer, x))
 
 
 def to_motion(
     x: Float[Array, "*batch frames features"], representation: Representation
-) -> skeleton.Motion:
+) -> Motion:
     """The person of some features; rotations are made orthonormal.
 
     Args:
@@ -225,7 +224,7 @@ def to_motion(
     """
     parts = _parts(x, representation)
     rot6d = parts["rotations"].reshape(*x.shape[:-1], -1, 6)
-    return skeleton.Motion(
+    return Motion(
         root_position=parts["root"],
         joint_rotation=rotation.rot6d_from_matrix(rotation.matrix_from_rot6d(rot6d)),
         fps=representation.fps,

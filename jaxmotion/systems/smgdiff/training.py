@@ -313,7 +313,9 @@ def _fit(
         )
     else:
         loss = functools.partial(
-            smgdiff_trajectory.loss, bones=representation.bones, config=model.paths
+            smgdiff_trajectory.loss,
+            skeleton=representation.skeleton,
+            config=model.paths,
         )
 
     def sample_batch(key: Key, arrays: smgdiff_data.SceneArrays) -> tuple[Any, Any]:

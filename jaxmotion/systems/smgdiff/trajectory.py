@@ -21,7 +21,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import losses
-from jaxmotion.motion import ground, skeleton, trajectory
+from jaxmotion.motion import ground, trajectory
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.systems.smgdiff.network import CHANNELS, TrajectoryGenerator
 from jaxmotion.typing import Key, Params
 
@@ -128,8 +129,8 @@ def _apply(params: Params, x_t: Array, t: Array, wish: Wish, config: Config) -> 
 
 
 def example(
-    bones: skeleton.Skeleton,
-    window: skeleton.Motion,
+    skeleton: Skeleton,
+    window: Motion,
     label: Int[Array, ""],
     *,
     config: Config,
@@ -137,7 +138,7 @@ def example(
     """One training example: the wish is the mean velocity of what then happened.
 
     Args:
-      bones: The skeleton.
+      skeleton: The skeleton.
       window: Past and future frames, world.
       label: Skill.
       config: The method.
@@ -145,7 +146,7 @@ def example(
     Returns:
       The wish, and the path of the future.
     """
-    course = trajectory.root_trajectory(bones, window)
+    course = trajectory.root_trajectory(skeleton, window)
     last = config.past - 1
     here = trajectory.PlanarFrame(
         origin=course.position[last], facing=course.facing[last]
@@ -163,9 +164,9 @@ def example(
 def loss(
     params: Params,
     key: Key,
-    batch: tuple[skeleton.Motion, Int[Array, " batch"]],
+    batch: tuple[Motion, Int[Array, " batch"]],
     *,
-    bones: skeleton.Skeleton,
+    skeleton: Skeleton,
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """Error of the path and of its displacements.
@@ -174,7 +175,7 @@ def loss(
       params: The network's parameters.
       key: Consumed.
       batch: Windows, and their skills.
-      bones: The skeleton.
+      skeleton: The skeleton.
       config: The method.
 
     Returns:
@@ -184,7 +185,7 @@ def loss(
     """
     windows, labels = batch
     key_t, key_noise = jax.random.split(key)
-    wish, path = jax.vmap(lambda w, c: example(bones, w, c, config=config))(
+    wish, path = jax.vmap(lambda w, c: example(skeleton, w, c, config=config))(
         windows, labels
     )
     x_0 = _pack(path, config)

@@ -105,10 +105,10 @@ def test_the_file_becomes_clips_with_a_ball(tmp_path):
     np.testing.assert_array_equal(clips.labels["skill"], [1, 2, 0])
     assert (clips.fps, found.radius) == (30.0, 0.112)
     assert "Apache-2.0" in clips.source
-    bones = clips.skeleton
-    assert bones.names == tuple(NAMES[joint] for joint in BODY)
-    assert [bones.names[foot] for foot in bones.feet] == ["L_Toe", "R_Toe"]
-    assert [bones.names[j] for j in found.joints] == ["L_Wrist", "R_Wrist"]
+    skeleton = clips.skeleton
+    assert skeleton.names == tuple(NAMES[joint] for joint in BODY)
+    assert [skeleton.names[foot] for foot in skeleton.feet] == ["L_Toe", "R_Toe"]
+    assert [skeleton.names[j] for j in found.joints] == ["L_Wrist", "R_Wrist"]
     np.testing.assert_allclose(
         found.position, y_up(fields["ball_position"][FRAMES]), atol=1e-6
     )

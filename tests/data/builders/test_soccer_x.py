@@ -194,9 +194,9 @@ BAD = {
 def test_bad_sequences_are_named_with_the_field(case):
     change, message = BAD[case]
     data = as_bytes(change(sequence(33, 0)))
-    bones = soccer_x.read_skeleton("s.npz", as_bytes({"offsets": OFFSETS}))
+    skeleton = soccer_x.read_skeleton("s.npz", as_bytes({"offsets": OFFSETS}))
     with pytest.raises(ValueError, match=f"a/trick_1.npz: {message}"):
-        soccer_x.read_sequence("a/trick_1.npz", data, bones)
+        soccer_x.read_sequence("a/trick_1.npz", data, skeleton)
 
 
 def test_bad_skeletons_are_named(tmp_path):

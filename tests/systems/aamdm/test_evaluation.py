@@ -29,7 +29,7 @@ def run():
     data, _ = aamdm_data.pose_data(person.clips((400,)), fps=FPS)
     return aamdm_training.Run(
         folder=Path("none"),
-        bones=person.skeleton(),
+        skeleton=person.skeleton(),
         train=data,
         held_out=data,
         source="made in the tests",
@@ -39,7 +39,7 @@ def run():
 
 @functools.cache
 def yardstick():
-    return aamdm_evaluation.make_reference(run().bones, run().train)
+    return aamdm_evaluation.make_reference(run().skeleton, run().train)
 
 
 @functools.cache
@@ -62,7 +62,7 @@ def real(number, ticks):
 def row_of(frames, groups=1, against=None):
     return aamdm_evaluation.free_row(
         jax.random.key(0),
-        run().bones,
+        run().skeleton,
         against or yardstick(),
         frames,
         fps=FPS,

@@ -49,7 +49,7 @@ def run(data, tmp_path_factory, quick_compile):
 def test_clips_are_chosen_mirrored_described_and_split(run, data):
     assert run.train.offsets.tolist() == [0, 68, 136, 204, 272]
     assert run.held_out.offsets.tolist() == [0, 32, 64, 96, 128]
-    assert run.bones.names == person.NAMES and run.source == "made in the tests"
+    assert run.skeleton.names == person.NAMES and run.source == "made in the tests"
     assert run.embedding.num_joints == 6 and run.embedding.fps == 60.0
     assert run.config["data"] == [str(data)] and run.config["mirrored"] is True
     assert len(run.config["clips"]) == 4

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from jaxmotion.control import rollout
-from jaxmotion.motion import features, rotation, skeleton, trajectory
+from jaxmotion.motion import features, rotation, trajectory
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
@@ -37,7 +38,7 @@ def obedient(height):
             root = jnp.stack(
                 [x, jnp.broadcast_to(height(condition, scale), x.shape), z]
             )
-            motion = skeleton.Motion(
+            motion = Motion(
                 root_position=root.T,
                 joint_rotation=rotation.rot6d_from_matrix(joints.set(facing)),
                 fps=config.fps,
@@ -76,18 +77,18 @@ def steady(characters, ticks):
     return ahead, ahead.copy(), np.zeros((characters, ticks), int)
 
 
-def states_of(bones, characters, config=CONFIG, **walk):
+def states_of(skeleton, characters, config=CONFIG, **walk):
     past = tiny.walk(config.past + 3, fps=config.fps, **walk)
-    state = camdm_controller.init_state(bones, past, config=config)
+    state = camdm_controller.init_state(skeleton, past, config=config)
     return jax.tree.map(lambda x: jnp.stack([x] * characters), state)
 
 
-def roll(bones, commands, control=CONTROL, config=CONFIG, params=None, **walk):
-    states = states_of(bones, commands.label.shape[0], config, **walk)
+def roll(skeleton, commands, control=CONTROL, config=CONFIG, params=None, **walk):
+    states = states_of(skeleton, commands.label.shape[0], config, **walk)
 
     def run(params, key, states, commands):
         made = camdm_controller.controller(
-            params, bones, config=config, control=control
+            params, skeleton, config=config, control=control
         )
         return rollout.rollout(made, key, states, commands)
 
@@ -101,20 +102,20 @@ def planned_ticks(frames, character=0):
 # When it plans
 
 
-def test_it_plans_when_told_or_after_m_frames(bones, use):
+def test_it_plans_when_told_or_after_m_frames(skeleton, use):
     use(scale_as_height)
     velocity, facing, label = steady(4, 17)
     velocity[1, 3:] = [0.5, 1.0]
     facing[2, 7:] = [1.0, 0.0]
     label[3, 10:] = 1
-    frames = roll(bones, commands_of(velocity, facing, label))[1]
+    frames = roll(skeleton, commands_of(velocity, facing, label))[1]
     assert planned_ticks(frames, 0) == [0, 5, 10, 15]
     assert planned_ticks(frames, 1) == [0, 3, 8, 13]
     assert planned_ticks(frames, 2) == [0, 5, 7, 12]
     assert planned_ticks(frames, 3) == [0, 5, 10, 15]
 
     eager = dataclasses.replace(CONTROL, replan_on_change=False)
-    frames = roll(bones, commands_of(velocity, facing, label), eager)[1]
+    frames = roll(skeleton, commands_of(velocity, facing, label), eager)[1]
     for character in range(4):
         assert planned_ticks(frames, character) == [0, 5, 10, 15]
 
@@ -127,7 +128,7 @@ def heights(frames, character):
     ("guided_plans", "replan_on_change"), [(0, True), (1, True), (1, False), (2, False)]
 )
 def test_guidance_only_in_the_first_plans_after_a_style_change(
-    bones, use, guided_plans, replan_on_change
+    skeleton, use, guided_plans, replan_on_change
 ):
     """Character 0 changes its style at tick 7; 1 never; 2 changes with its first plan.
 
@@ -143,7 +144,7 @@ def test_guidance_only_in_the_first_plans_after_a_style_change(
         replan_on_change=replan_on_change,
         guidance_scale=0.7,
     )
-    frames = roll(bones, commands_of(velocity, facing, label), control)[1]
+    frames = roll(skeleton, commands_of(velocity, facing, label), control)[1]
     first = 7 if replan_on_change else 10
     guided = range(first, first + 5 * guided_plans)
     found = heights(frames, 0)
@@ -153,7 +154,7 @@ def test_guidance_only_in_the_first_plans_after_a_style_change(
         assert set(heights(frames, other)) <= {-1.0, 1.0}
 
 
-def test_a_released_character_starts_with_guided_plans(bones, use):
+def test_a_released_character_starts_with_guided_plans(skeleton, use):
     """Two of them; the first style is then no change of style without the option."""
     use(scale_as_height)
     released = camdm_controller.RELEASED
@@ -162,16 +163,16 @@ def test_a_released_character_starts_with_guided_plans(bones, use):
         control = dataclasses.replace(
             released, apply=5, reuse=6, seam=0.0, guide_start=start
         )
-        frames = roll(bones, commands_of(*steady(1, 15)), control)[1]
+        frames = roll(skeleton, commands_of(*steady(1, 15)), control)[1]
         want = [np.float32(0.5) if i in ticks else -1 for i in range(15)]
         assert heights(frames, 0) == want
 
 
-def test_a_second_change_guides_again(bones, use):
+def test_a_second_change_guides_again(skeleton, use):
     use(scale_as_height)
     velocity, facing, label = steady(1, 20)
     label[0, 4:9] = 1
-    frames = roll(bones, commands_of(velocity, facing, label))[1]
+    frames = roll(skeleton, commands_of(velocity, facing, label))[1]
     guided = {*range(4, 9), *range(9, 14)}
     found = np.asarray(heights(frames, 0))
     assert np.flatnonzero(found != -1).tolist() == sorted(guided)
@@ -180,11 +181,11 @@ def test_a_second_change_guides_again(bones, use):
 # What it is fed
 
 
-def test_displayed_poses_are_fed_back(bones, use):
+def test_displayed_poses_are_fed_back(skeleton, use):
     """Each plan stands 1 cm above the last displayed pose that it was given."""
     use(lambda condition, scale: condition.past[-1, -5] + 0.01)
-    states, frames = roll(bones, commands_of(*steady(1, 12)))
-    start = states_of(bones, 1).past.root_position[0, -1, 1]
+    states, frames = roll(skeleton, commands_of(*steady(1, 12)))
+    start = states_of(skeleton, 1).past.root_position[0, -1, 1]
     expected = start + 0.01 * (1 + np.arange(12) // 5)
     np.testing.assert_allclose(frames.root_position[0, :, 1], expected, atol=1e-5)
     last = slice(-CONFIG.past, None)
@@ -197,7 +198,7 @@ def test_displayed_poses_are_fed_back(bones, use):
 
 
 @pytest.mark.parametrize("heading", ["facing", "random"])
-def test_the_past_is_seen_from_the_last_pose(bones, use, heading):
+def test_the_past_is_seen_from_the_last_pose(skeleton, use, heading):
     seen = []
 
     def height(condition, scale):
@@ -213,7 +214,7 @@ def test_the_past_is_seen_from_the_last_pose(bones, use, heading):
     config = tiny.config(heading=heading)
     velocity, facing, label = steady(1, 1)
     frames = roll(
-        bones, commands_of(velocity, facing, label + 1), config=config, start=2.0
+        skeleton, commands_of(velocity, facing, label + 1), config=config, start=2.0
     )
     jax.block_until_ready(frames)
     jax.effects_barrier()
@@ -221,9 +222,9 @@ def test_the_past_is_seen_from_the_last_pose(bones, use, heading):
     assert label == 1 and keep
     motion = features.motion_from_features(jnp.asarray(past), config.fps)
     np.testing.assert_allclose(motion.root_position[-1, ::2], 0.0, atol=1e-6)
-    yaw = trajectory.root_trajectory(bones, motion).facing[-1]
+    yaw = trajectory.root_trajectory(skeleton, motion).facing[-1]
     original = tiny.walk(config.past + 3, start=2.0)
-    world = trajectory.root_trajectory(bones, original).facing[-1]
+    world = trajectory.root_trajectory(skeleton, original).facing[-1]
     expected = [0.0, 1.0] if heading == "facing" else world
     np.testing.assert_allclose(yaw, expected, atol=1e-5)
 
@@ -232,7 +233,7 @@ def test_the_past_is_seen_from_the_last_pose(bones, use, heading):
 
 
 @pytest.mark.parametrize("heading", ["facing", "random"])
-def test_a_model_that_obeys_goes_where_it_is_told(bones, use, heading):
+def test_a_model_that_obeys_goes_where_it_is_told(skeleton, use, heading):
     """Then it reaches the commanded velocity and facing, from any start."""
     use(lambda condition, scale: jnp.float32(0.9))
     velocity, facing, label = steady(2, 90)
@@ -240,17 +241,17 @@ def test_a_model_that_obeys_goes_where_it_is_told(bones, use, heading):
     facing[:, :] = [0.6, -0.8]
     config = tiny.config(heading=heading)
     _, frames = roll(
-        bones, commands_of(velocity, facing, label), config=config, start=1
+        skeleton, commands_of(velocity, facing, label), config=config, start=1
     )
     ground = np.asarray(frames.root_position)[..., ::2]
     found = (ground[:, -1] - ground[:, -16]) * 2
     np.testing.assert_allclose(found, [[-1.2, 0.3]] * 2, atol=0.02)
-    motion = skeleton.Motion(
+    motion = Motion(
         root_position=frames.root_position,
         joint_rotation=frames.joint_rotation,
         fps=config.fps,
     )
-    course = trajectory.root_trajectory(bones, motion)
+    course = trajectory.root_trajectory(skeleton, motion)
     np.testing.assert_allclose(course.facing[:, -1], [[0.6, -0.8]] * 2, atol=0.02)
     np.testing.assert_allclose(frames.desired_velocity[:, -1], found, atol=0.02)
     np.testing.assert_allclose(
@@ -258,14 +259,14 @@ def test_a_model_that_obeys_goes_where_it_is_told(bones, use, heading):
     )
 
 
-def test_without_extension_the_users_path_alone_is_wanted(bones):
-    state = jax.tree.map(lambda x: x[0], states_of(bones, 1))
+def test_without_extension_the_users_path_alone_is_wanted(skeleton):
+    state = jax.tree.map(lambda x: x[0], states_of(skeleton, 1))
     velocity, facing, label = (x[0, 0] for x in steady(1, 1))
     command = commands_of(velocity, facing, label)
 
     def wanted(**changes):
         return camdm_controller.wanted_trajectory(
-            bones,
+            skeleton,
             state,
             command,
             config=CONFIG,
@@ -273,7 +274,7 @@ def test_without_extension_the_users_path_alone_is_wanted(bones):
         )
 
     alone, blended = wanted(extend=False), wanted()
-    own = trajectory.root_trajectory(bones, state.plan)
+    own = trajectory.root_trajectory(skeleton, state.plan)
     # The blend begins near the model's own path and ends on the user's.
     gap = lambda a, b, i: np.abs(a.position[i] - b.position[i]).max()  # noqa: E731
     assert gap(blended, own, 0) < gap(blended, alone, 0) + 1e-6
@@ -281,16 +282,16 @@ def test_without_extension_the_users_path_alone_is_wanted(bones):
     np.testing.assert_allclose(blended.facing[-1], alone.facing[-1], atol=1e-6)
 
 
-def test_following_returns_to_the_commanded_path(bones, use):
+def test_following_returns_to_the_commanded_path(skeleton, use):
     """A model that stays behind: with `follow` it is asked for more than without."""
     use(lambda condition, scale: jnp.float32(0.9))
-    state = jax.tree.map(lambda x: x[0], states_of(bones, 1))
+    state = jax.tree.map(lambda x: x[0], states_of(skeleton, 1))
     away = dataclasses.replace(state, anchor=state.anchor + jnp.array([0.5, -0.25]))
     command = commands_of(*(x[0, 0] for x in steady(1, 1)))
 
     def wanted(state, follow):
         return camdm_controller.wanted_trajectory(
-            bones,
+            skeleton,
             state,
             command,
             config=CONFIG,
@@ -307,7 +308,7 @@ def test_following_returns_to_the_commanded_path(bones, use):
 # Seams
 
 
-def test_seams_are_continuous_in_position_and_velocity(bones, monkeypatch):
+def test_seams_are_continuous_in_position_and_velocity(skeleton, monkeypatch):
     """A plan that jumps by 0.1 m and turns by 0.3 rad, at two rates of frames.
 
     With a seam the first differences at the jump shrink with the frame time, and the
@@ -326,9 +327,7 @@ def test_seams_are_continuous_in_position_and_velocity(bones, monkeypatch):
                 joints = jnp.broadcast_to(jnp.eye(3), (60, 5, 3, 3)).at[:, 0].set(turn)
                 rot6d = rotation.rot6d_from_matrix(joints)
                 return features.motion_features(
-                    skeleton.Motion(
-                        root_position=root, joint_rotation=rot6d, fps=config.fps
-                    ),
+                    Motion(root_position=root, joint_rotation=rot6d, fps=config.fps),
                     rotation_layout=config.rotation_layout,
                 )
 
@@ -338,8 +337,8 @@ def test_seams_are_continuous_in_position_and_velocity(bones, monkeypatch):
         commands = commands_of(*steady(1, 10))
         for seam in (0.0, 0.2) if fps == 120.0 else (0.2,):
             control = dataclasses.replace(CONTROL, apply=30, seam=seam)
-            _, frames = roll(bones, commands, control, config)
-            before = states_of(bones, 1, config).past
+            _, frames = roll(skeleton, commands, control, config)
+            before = states_of(skeleton, 1, config).past
             root = jnp.concatenate([before.root_position, frames.root_position], 1)[0]
             turns = jnp.concatenate([before.joint_rotation, frames.joint_rotation], 1)
             turns = turns[0, :, 0]
@@ -372,9 +371,9 @@ WITH_SEAM = dataclasses.replace(CONTROL, seam=0.2)
 
 @functools.cache
 def program(characters, chunk):
-    def run(params, bones, key, states, commands):
+    def run(params, skeleton, key, states, commands):
         made = camdm_controller.controller(
-            params, bones, config=CONFIG, control=WITH_SEAM
+            params, skeleton, config=CONFIG, control=WITH_SEAM
         )
         return rollout.rollout(made, key, states, commands, chunk=chunk)
 
@@ -382,15 +381,15 @@ def program(characters, chunk):
 
 
 @pytest.fixture(scope="module")
-def whole(params, bones):
+def whole(params, skeleton):
     commands = commands_of(*turning(4, 9))
-    states = states_of(bones, 4)
-    return program(4, None)(params, bones, jax.random.key(0), states, commands)
+    states = states_of(skeleton, 4)
+    return program(4, None)(params, skeleton, jax.random.key(0), states, commands)
 
 
-def test_chunks_and_batches_change_nothing(params, bones, whole):
-    states, commands = states_of(bones, 4), commands_of(*turning(4, 9))
-    chunked = program(4, 2)(params, bones, jax.random.key(0), states, commands)
+def test_chunks_and_batches_change_nothing(params, skeleton, whole):
+    states, commands = states_of(skeleton, 4), commands_of(*turning(4, 9))
+    chunked = program(4, 2)(params, skeleton, jax.random.key(0), states, commands)
     for a, b in zip(jax.tree.leaves(chunked), jax.tree.leaves(whole), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-5)
     assert np.abs(whole[1].root_position[1] - whole[1].root_position[0]).max() > 1e-2
@@ -398,13 +397,13 @@ def test_chunks_and_batches_change_nothing(params, bones, whole):
     assert np.abs(whole[1].root_position[2] - whole[1].root_position[3]).max() > 1e-2
 
 
-def test_256_characters_at_a_time_are_256_alone(params, bones):
+def test_256_characters_at_a_time_are_256_alone(params, skeleton):
     """Over the first plan; later ones repeat what rounding there was."""
     number, ticks = 256, CONTROL.apply
     commands = commands_of(*turning(number, ticks))
-    states = states_of(bones, number)
+    states = states_of(skeleton, number)
     alone, together = (
-        program(number, chunk)(params, bones, jax.random.key(0), states, commands)[1]
+        program(number, chunk)(params, skeleton, jax.random.key(0), states, commands)[1]
         for chunk in (1, number)
     )
     assert np.asarray(alone.planned)[:, 0].all()
@@ -414,18 +413,18 @@ def test_256_characters_at_a_time_are_256_alone(params, bones):
     assert np.asarray(alone.root_position).std(axis=0).max() > 1e-2
 
 
-def test_live_ticks_are_the_rollout(params, bones, whole):
+def test_live_ticks_are_the_rollout(params, skeleton, whole):
     commands = commands_of(*turning(4, 9))
 
     def live(params, key, state, command):
         made = camdm_controller.controller(
-            params, bones, config=CONFIG, control=WITH_SEAM
+            params, skeleton, config=CONFIG, control=WITH_SEAM
         )
         return rollout.tick(made, key, state, command)
 
     live = jax.jit(live)
     own_key = jax.random.fold_in(jax.random.key(0), 2)
-    state = jax.tree.map(lambda x: x[2], states_of(bones, 4))
+    state = jax.tree.map(lambda x: x[2], states_of(skeleton, 4))
     for i in range(9):
         command = jax.tree.map(lambda x, i=i: x[2, i], commands)
         state, frame = live(params, jax.random.fold_in(own_key, i), state, command)
@@ -434,7 +433,7 @@ def test_live_ticks_are_the_rollout(params, bones, whole):
             np.testing.assert_allclose(a, b, atol=2e-5)
 
 
-def test_a_turned_world_gives_the_turned_motion(params, bones, whole):
+def test_a_turned_world_gives_the_turned_motion(params, skeleton, whole):
     """With heading "facing" the whole run-time is equivariant on the ground."""
     x, z, yaw = 3.0, -2.0, 2.0
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
@@ -444,12 +443,12 @@ def test_a_turned_world_gives_the_turned_motion(params, bones, whole):
         facing=jnp.array([np.sin(yaw), np.cos(yaw)], jnp.float32),
     )
     past = features.from_frame(tiny.walk(CONFIG.past + 3), frame)
-    state = camdm_controller.init_state(bones, past, config=CONFIG)
+    state = camdm_controller.init_state(skeleton, past, config=CONFIG)
     states = jax.tree.map(lambda x: jnp.stack([x] * 4), state)
     commands = commands_of(velocity @ axes.T, facing @ axes.T, label)
-    _, frames = program(4, None)(params, bones, jax.random.key(0), states, commands)
+    _, frames = program(4, None)(params, skeleton, jax.random.key(0), states, commands)
     moved = features.from_frame(
-        skeleton.Motion(
+        Motion(
             root_position=whole[1].root_position,
             joint_rotation=whole[1].joint_rotation,
             fps=CONFIG.fps,
@@ -463,13 +462,13 @@ def test_a_turned_world_gives_the_turned_motion(params, bones, whole):
 # Bad input
 
 
-def test_too_short_a_past_is_named(bones):
+def test_too_short_a_past_is_named(skeleton):
     with pytest.raises(ValueError, match="past has 3 frames, expected 4"):
-        camdm_controller.init_state(bones, tiny.walk(3), config=CONFIG)
+        camdm_controller.init_state(skeleton, tiny.walk(3), config=CONFIG)
 
 
 @pytest.mark.parametrize("apply", [0, CONFIG.future + 1])
-def test_more_frames_than_a_plan_has_cannot_be_played(params, bones, apply):
+def test_more_frames_than_a_plan_has_cannot_be_played(params, skeleton, apply):
     control = dataclasses.replace(CONTROL, apply=apply)
     with pytest.raises(ValueError, match=f"apply is {apply}, expected 1..12"):
-        camdm_controller.controller(params, bones, config=CONFIG, control=control)
+        camdm_controller.controller(params, skeleton, config=CONFIG, control=control)

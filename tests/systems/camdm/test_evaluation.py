@@ -46,7 +46,7 @@ def evaluated(kind):
         frames, jnp.asarray(LABELS), fps=30.0, skip=60
     )
     return camdm_evaluation.evaluation_table(
-        run.model.bones, real, dense, made, frames, recognizer, repeats=repeats
+        run.model.skeleton, real, dense, made, frames, recognizer, repeats=repeats
     )
 
 
@@ -94,7 +94,7 @@ def test_health_counts_who_stands_although_told_to_walk():
         **{**vars(frames), "root_position": broken}
     )
     found = camdm_evaluation.rollout_health(
-        run.model.bones, frames, fps=30.0, height=0.95
+        run.model.skeleton, frames, fps=30.0, height=0.95
     )
     assert found == dict(diverged=1, frozen=0, rollouts=1)
 
@@ -120,14 +120,14 @@ def test_diversity_is_zero_for_characters_that_do_the_same():
     windows = camdm_steering.rollout_windows(
         same, jnp.asarray(LABELS), fps=30.0, skip=60
     )
-    found = camdm_evaluation.repeat_diversity(run.model.bones, windows, repeats=2)
+    found = camdm_evaluation.repeat_diversity(run.model.skeleton, windows, repeats=2)
     assert found.value == pytest.approx(0.0, abs=1e-9) and found.samples == 2
     assert evaluated("walking")[0]["rollouts"]["diversity_m2"].value > 1e-4
 
 
 def test_a_row_without_recogniser_lacks_style_accuracy_only():
     run, _, real, _ = parts()
-    row = camdm_evaluation.metric_row(run.model.bones, real, None, height=0.04)
+    row = camdm_evaluation.metric_row(run.model.skeleton, real, None, height=0.04)
     expected = dict(evaluated("walking")[0][TRUTH])
     for column in ("style_accuracy_%", "fid"):
         del expected[column]

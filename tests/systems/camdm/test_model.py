@@ -11,7 +11,8 @@ from scipy.ndimage import gaussian_filter1d
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
-from jaxmotion.motion import features, skeleton, trajectory
+from jaxmotion.motion import features, trajectory
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("quick_compile")
 
 
 def window_of(walker, config, start=7):
-    return skeleton.Motion(
+    return Motion(
         root_position=walker.root_position[start : start + config.window],
         joint_rotation=walker.joint_rotation[start : start + config.window],
         fps=walker.fps,
@@ -32,10 +33,10 @@ def window_of(walker, config, start=7):
 def make_examples(config):
     """Jitted: examples of one window for many keys."""
 
-    def run(keys, bones, window):
+    def run(keys, skeleton, window):
         label = jnp.ones((), jnp.int32)
         return jax.vmap(
-            lambda key: camdm_loss.example(key, bones, window, label, config=config)
+            lambda key: camdm_loss.example(key, skeleton, window, label, config=config)
         )(keys)
 
     return jax.jit(run)
@@ -91,16 +92,16 @@ def test_smoothing_is_scipys_filter_with_reflecting_borders(frames):
 
 
 @CONFIGS
-def test_the_last_past_pose_is_at_the_origin_and_heights_stay(walker, bones, config):
+def test_the_last_past_pose_is_at_the_origin_and_heights_stay(walker, skeleton, config):
     window = window_of(walker, config)
-    condition, x_0 = make_examples(config)(many(8), bones, window)
+    condition, x_0 = make_examples(config)(many(8), skeleton, window)
     poses = jnp.concatenate([condition.past, x_0], axis=1)
     motion = features.motion_from_features(poses, config.fps)
     last = motion.root_position[:, config.past - 1]
     np.testing.assert_allclose(last[:, ::2], 0.0, atol=1e-6)
     for height in motion.root_position[..., 1]:
         np.testing.assert_allclose(height, window.root_position[:, 1], atol=1e-6)
-    facing = trajectory.root_trajectory(bones, motion).facing[:, config.past - 1]
+    facing = trajectory.root_trajectory(skeleton, motion).facing[:, config.past - 1]
     yaw = np.arctan2(facing[:, 0], facing[:, 1])
     if config.heading == "facing":
         np.testing.assert_allclose(yaw, 0.0, atol=1e-5)
@@ -109,28 +110,30 @@ def test_the_last_past_pose_is_at_the_origin_and_heights_stay(walker, bones, con
 
 
 @CONFIGS
-def test_an_example_is_the_window_moved_as_a_whole(walker, bones, config):
+def test_an_example_is_the_window_moved_as_a_whole(walker, skeleton, config):
     """Distances between all joints of all frames are those of the window."""
     window = window_of(walker, config)
-    condition, x_0 = make_examples(config)(many(8), bones, window)
+    condition, x_0 = make_examples(config)(many(8), skeleton, window)
     poses = np.concatenate([condition.past[3], x_0[3]])
     places = reference.joint_positions(
-        bones.offsets, bones.parents, poses, config.rotation_layout
+        skeleton.offsets, skeleton.parents, poses, config.rotation_layout
     ).reshape(-1, 3)
-    original = np.asarray(skeleton.joint_positions(bones, window)).reshape(-1, 3)
+    original = np.asarray(joint_positions(skeleton, window)).reshape(-1, 3)
     distances = lambda x: np.linalg.norm(x[:, None] - x[None], axis=-1)  # noqa: E731
     np.testing.assert_allclose(distances(places), distances(original), atol=1e-5)
 
 
-def test_random_yaws_are_uniform(walker, bones):
-    condition, x_0 = make_examples(RANDOM)(many(512), bones, window_of(walker, RANDOM))
+def test_random_yaws_are_uniform(walker, skeleton):
+    condition, x_0 = make_examples(RANDOM)(
+        many(512), skeleton, window_of(walker, RANDOM)
+    )
     yaw = np.arctan2(x_0[:, -1, -6], x_0[:, -1, -4])
     for k in (1, 2):
         # The mean of n unit vectors of random direction has variance 1 / n.
         assert abs(np.exp(1j * k * yaw).mean()) * np.sqrt(512) < 4.0
 
 
-def test_a_facing_example_does_not_see_where_the_world_is(walker, bones):
+def test_a_facing_example_does_not_see_where_the_world_is(walker, skeleton):
     window = window_of(walker, FACING)
     for seed in range(3):
         x, z, yaw = np.random.default_rng(seed).normal(size=3) * 5
@@ -139,18 +142,18 @@ def test_a_facing_example_does_not_see_where_the_world_is(walker, bones):
             facing=jnp.array([np.sin(yaw), np.cos(yaw)], jnp.float32),
         )
         moved = features.from_frame(window, frame)
-        expected = make_examples(FACING)(many(8), bones, window)
-        found = make_examples(FACING)(many(8), bones, moved)
+        expected = make_examples(FACING)(many(8), skeleton, window)
+        found = make_examples(FACING)(many(8), skeleton, moved)
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, atol=3e-5)
 
 
-def test_paths_and_facings_are_smoothed_as_often_as_they_should(walker, bones):
+def test_paths_and_facings_are_smoothed_as_often_as_they_should(walker, skeleton):
     """Each of 512 examples is one of the six; how often is binomial."""
     count = 512
     window = window_of(walker, FACING, start=200)
-    condition, _ = make_examples(FACING)(many(count), bones, window)
-    course = trajectory.root_trajectory(bones, window)
+    condition, _ = make_examples(FACING)(many(count), skeleton, window)
+    course = trajectory.root_trajectory(skeleton, window)
     last = FACING.past - 1
     position, facing = (
         np.asarray(x, np.float64) for x in (course.position, course.facing)
@@ -215,7 +218,7 @@ def terms(config):
     return jax.jit(functools.partial(camdm_loss.loss_terms, config=config))
 
 
-def batch_features(bones, walker, config):
+def batch_features(skeleton, walker, config):
     starts = (3, 30, 200, 250)
     poses = [
         features.motion_features(
@@ -229,19 +232,19 @@ def batch_features(bones, walker, config):
 @pytest.mark.parametrize(
     ("layout", "scale"), [("rows", 1.0), ("columns", 1.0), ("rows", 4.0)]
 )
-def test_loss_terms_are_the_oracles(walker, bones, layout, scale):
+def test_loss_terms_are_the_oracles(walker, skeleton, layout, scale):
     """Whatever the factor on the rotations, losses are of the rotations themselves."""
     config = tiny.config(rotation_layout=layout, contact_speed=1.2)
-    target = batch_features(bones, walker, config)
+    target = batch_features(skeleton, walker, config)
     noise = np.random.default_rng(0).normal(0, 0.2, target.shape)
     prediction = target + jnp.asarray(noise, jnp.float32)
     scaled = dataclasses.replace(config, rotation_scale=scale)
     enlarge = lambda x: x.at[..., :-6].multiply(scale)  # noqa: E731
-    found = terms(scaled)(bones, enlarge(prediction), enlarge(target))
+    found = terms(scaled)(skeleton, enlarge(prediction), enlarge(target))
     expected = reference.loss_terms(
-        np.asarray(bones.offsets, np.float64),
-        bones.parents,
-        bones.feet,
+        np.asarray(skeleton.offsets, np.float64),
+        skeleton.parents,
+        skeleton.feet,
         np.asarray(prediction, np.float64),
         np.asarray(target, np.float64),
         layout=layout,
@@ -254,10 +257,10 @@ def test_loss_terms_are_the_oracles(walker, bones, layout, scale):
         np.testing.assert_allclose(found[name], value, rtol=1e-4, err_msg=name)
 
 
-def camdm_turned(bones, window, frame, layout):
+def camdm_turned(skeleton, window, frame, layout):
     """Rotations of one pose, turned so that it faces +z."""
     pose = jax.tree.map(lambda x: x[frame : frame + 1], window)
-    facing = trajectory.root_trajectory(bones, pose).facing[0]
+    facing = trajectory.root_trajectory(skeleton, pose).facing[0]
     here = trajectory.PlanarFrame(origin=jnp.zeros(2), facing=facing)
     local = features.to_frame(pose, here)
     return features.motion_features(local, rotation_layout=layout)[0, :-6]
@@ -265,15 +268,15 @@ def camdm_turned(bones, window, frame, layout):
 
 @pytest.mark.parametrize("layout", ["rows", "columns"])
 @pytest.mark.parametrize("centred", [True, False])
-def test_features_and_back(walker, bones, layout, centred):
+def test_features_and_back(walker, skeleton, layout, centred):
     config = tiny.config(rotation_layout=layout, rotation_scale=3.0, heading="facing")
     window, mean = window_of(walker, config), np.zeros(30)
     if centred:
-        found = camdm_loss.mean_rotations(bones, window, config=config)
+        found = camdm_loss.mean_rotations(skeleton, window, config=config)
         config = dataclasses.replace(config, rotation_mean=found)
         mean = np.mean(
             [
-                np.asarray(camdm_turned(bones, window, frame, layout))
+                np.asarray(camdm_turned(skeleton, window, frame, layout))
                 for frame in range(config.window)
             ],
             axis=0,
@@ -292,22 +295,22 @@ def test_features_and_back(walker, bones, layout, centred):
     assert found.fps == config.fps
 
 
-def test_losses_are_zero_at_the_target(walker, bones):
-    target = batch_features(bones, walker, FACING)
-    found = terms(FACING)(bones, target, target)
+def test_losses_are_zero_at_the_target(walker, skeleton):
+    target = batch_features(skeleton, walker, FACING)
+    found = terms(FACING)(skeleton, target, target)
     for name in ("data", "velocity", "position", "position_velocity"):
         assert found[name] == 0, name
     still = jnp.repeat(target[:, :1], target.shape[1], axis=1)
-    assert all(value == 0 for value in terms(FACING)(bones, still, still).values())
+    assert all(value == 0 for value in terms(FACING)(skeleton, still, still).values())
 
 
-def test_gradients_at_the_target_are_finite(walker, bones):
+def test_gradients_at_the_target_are_finite(walker, skeleton):
     """Where a norm or a Gram-Schmidt of nothing could give NaN."""
-    target = batch_features(bones, walker, FACING)
+    target = batch_features(skeleton, walker, FACING)
     total = jax.jit(
         jax.grad(
             lambda p: sum(
-                camdm_loss.loss_terms(bones, p, target, config=FACING).values()
+                camdm_loss.loss_terms(skeleton, p, target, config=FACING).values()
             )
         )
     )
@@ -323,7 +326,7 @@ class Recorder:
         return jnp.zeros_like(x_t)
 
 
-def test_the_loss_weighs_its_terms_and_draws_all_steps(walker, bones, monkeypatch):
+def test_the_loss_weighs_its_terms_and_draws_all_steps(walker, skeleton, monkeypatch):
     recorder = Recorder()
     monkeypatch.setattr(camdm_loss, "network", lambda config: recorder)
     config = tiny.config(
@@ -339,7 +342,7 @@ def test_the_loss_weighs_its_terms_and_draws_all_steps(walker, bones, monkeypatc
 
     def run(key):
         value, parts = camdm_loss.loss(
-            {}, key, (windows, labels), bones=bones, config=config
+            {}, key, (windows, labels), skeleton=skeleton, config=config
         )
         return value, parts, recorder.x_t, recorder.t, recorder.condition
 
@@ -363,24 +366,26 @@ def test_the_loss_weighs_its_terms_and_draws_all_steps(walker, bones, monkeypatc
     assert len(condition) == 5
 
 
-def test_dropout_is_on_in_training(walker, bones, monkeypatch):
+def test_dropout_is_on_in_training(walker, skeleton, monkeypatch):
     recorder = Recorder()
     monkeypatch.setattr(camdm_loss, "network", lambda config: recorder)
     config = tiny.config(dropout=0.1)
     windows = jax.tree.map(lambda x: x[None], window_of(walker, config))
     batch = (windows, jnp.zeros(1, jnp.int32))
     jax.eval_shape(
-        lambda key: camdm_loss.loss({}, key, batch, bones=bones, config=config)[0],
+        lambda key: camdm_loss.loss({}, key, batch, skeleton=skeleton, config=config)[
+            0
+        ],
         jax.random.key(0),
     )
     assert recorder.train is True
 
 
-def test_the_position_term_is_a_mean_over_xyz(walker, bones):
+def test_the_position_term_is_a_mean_over_xyz(walker, skeleton):
     """A root 0.5 m too high is wrong in one coordinate of three, at every joint."""
-    target = batch_features(bones, walker, FACING)
+    target = batch_features(skeleton, walker, FACING)
     lifted = target.at[..., -5].add(0.5)
-    found = terms(FACING)(bones, lifted, target)
+    found = terms(FACING)(skeleton, lifted, target)
     np.testing.assert_allclose(found["position"], 0.25 / 3, rtol=1e-4)
     every = jnp.ones(target.shape[:-1], bool)
     np.testing.assert_allclose(
@@ -391,9 +396,12 @@ def test_the_position_term_is_a_mean_over_xyz(walker, bones):
 # Sampler
 
 
-def condition_of(walker, bones, config, key=0):
+def condition_of(walker, skeleton, config, key=0):
     condition, _ = jax.jit(functools.partial(camdm_loss.example, config=config))(
-        jax.random.key(key), bones, window_of(walker, config), jnp.ones((), jnp.int32)
+        jax.random.key(key),
+        skeleton,
+        window_of(walker, config),
+        jnp.ones((), jnp.int32),
     )
     return dataclasses.replace(condition, keep_past=jnp.ones((), bool))
 
@@ -408,8 +416,8 @@ def plan_of(config, step="ancestral", guided=False):
 
 
 @pytest.fixture(scope="module")
-def situation(walker, bones):
-    return condition_of(walker, bones, FACING)
+def situation(walker, skeleton):
+    return condition_of(walker, skeleton, FACING)
 
 
 @pytest.mark.parametrize("scale", [None, 0.7])

@@ -66,7 +66,7 @@ def path(peer, tmp_path):
 
 
 def load(path, joints=4):
-    return camdm_published.load(path, bones=skeleton(joints), labels=STYLES)
+    return camdm_published.load(path, skeleton=skeleton(joints), labels=STYLES)
 
 
 def inputs(seed=0, batch=3):
@@ -149,7 +149,7 @@ def onnx(peer, tmp_path, monkeypatch):
 def test_an_onnx_file_predicts_what_pytorch_does(peer, onnx):
     names = onnx.read_bytes()
     assert b"onnx::MatMul" in names and b"linear1.weight" not in names
-    model, params = camdm_published.load(onnx, bones=skeleton())
+    model, params = camdm_published.load(onnx, skeleton=skeleton())
     assert model.labels == STYLES and model.config.past == 5
     check(peer, model, params)
 
@@ -167,11 +167,11 @@ def test_what_lies_beside_an_onnx_file_must_fit(onnx):
         before = path.read_text()
         path.write_text(json.dumps(json.loads(before) | change))
         with pytest.raises(ValueError, match=message):
-            camdm_published.load(onnx, bones=skeleton())
+            camdm_published.load(onnx, skeleton=skeleton())
         path.write_text(before)
     (onnx.parent / "100style_conditions.json").write_text("[]")
     with pytest.raises(ValueError, match="100style_conditions.json: expected a JSON"):
-        camdm_published.load(onnx, bones=skeleton())
+        camdm_published.load(onnx, skeleton=skeleton())
 
 
 def test_every_misfit_is_named(peer, tmp_path):
@@ -195,9 +195,9 @@ def test_skeleton_and_styles_must_fit(path):
     with pytest.raises(ValueError, match="the model has 4 joints, the skeleton 5"):
         load(path, joints=5)
     with pytest.raises(ValueError, match="3 styles, but 1 names"):
-        camdm_published.load(path, bones=skeleton(), labels=("Old",))
+        camdm_published.load(path, skeleton=skeleton(), labels=("Old",))
     with pytest.raises(FileNotFoundError, match="no 100style_conditions.json beside"):
-        camdm_published.load(path, bones=skeleton())
+        camdm_published.load(path, skeleton=skeleton())
 
 
 def test_numbers_that_are_not_finite_are_refused(peer, tmp_path):

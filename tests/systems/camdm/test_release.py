@@ -12,7 +12,7 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import clip_motion
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.style import RecognizerConfig
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import release as camdm_release
 from jaxmotion.systems.camdm import steering as camdm_steering
 from tests.protocols import samples
@@ -35,7 +35,7 @@ def rollouts():
 def scored():
     """The row of the rollouts."""
     return camdm_release.row(
-        camdm_release.metrics(samples.run().model.bones, recordings())
+        camdm_release.metrics(samples.run().model.skeleton, recordings())
     )
 
 
@@ -45,12 +45,14 @@ def recordings():
 
 
 def joints(motion):
-    return skeleton.joint_positions(samples.run().model.bones, motion)
+    return joint_positions(samples.run().model.skeleton, motion)
 
 
 def of_scripts(motion, command=None):
     told = () if command is None else (command.velocity, command.facing)
-    return oracle.camdm_release(samples.run().model.bones.names, joints(motion), *told)
+    return oracle.camdm_release(
+        samples.run().model.skeleton.names, joints(motion), *told
+    )
 
 
 def test_rollouts_are_measured_whole_against_what_was_told():
@@ -60,7 +62,7 @@ def test_rollouts_are_measured_whole_against_what_was_told():
     wanted = []
     for i in range(3):
         motion, command = jax.tree.map(lambda x, i=i: x[i], (frames, commands))
-        motion = skeleton.Motion(
+        motion = Motion(
             root_position=motion.root_position, joint_rotation=motion.joint_rotation
         )
         wanted.append(of_scripts(motion, command))
@@ -100,27 +102,27 @@ def test_distances_are_of_each_recording_to_its_style(monkeypatch):
     rng = np.random.default_rng(0)
     table = rng.normal(size=(500, 8)).astype(np.float32)
 
-    def recognized(bones, found, recognizer):
+    def recognized(skeleton, found, recognizer):
         seen = np.asarray(joints(found.motion))[..., 0, 0].sum(-1)
         chosen = table[np.abs(seen * 1000).astype(int) % 500]
         return chosen + 0.5 * np.asarray(found.label)[:, None], None
 
     monkeypatch.setattr(camdm_release, "recognized", recognized)
-    clips, bones = samples.clips(), samples.run().model.bones
+    clips, skeleton = samples.clips(), samples.run().model.skeleton
     judge = style_evaluator.Recognized(
         params={}, config=RecognizerConfig(num_classes=2, num_joints=22)
     )
-    styles = camdm_release.style_features(bones, clips, judge, field="style")
-    found = camdm_release.distances(bones, recordings(), judge, styles)
+    styles = camdm_release.style_features(skeleton, clips, judge, field="style")
+    found = camdm_release.distances(skeleton, recordings(), judge, styles)
     dense = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field="style")
-    reference, _ = recognized(bones, dense, None)
+    reference, _ = recognized(skeleton, dense, None)
     frames, commands = rollouts()
     for i, label in enumerate(LABELS):
         own = jax.tree.map(lambda x, i=i: x[i : i + 1], frames)
         made = camdm_steering.rollout_windows(
             own, jnp.asarray([label]), fps=30.0, skip=0
         )
-        rows, _ = recognized(bones, made, None)
+        rows, _ = recognized(skeleton, made, None)
         assert len(rows) == 2  # 150 frames
         data = reference[np.asarray(dense.label) == label]
         assert found[i] == pytest.approx(
@@ -146,12 +148,14 @@ def test_features_are_512_and_found_by_style():
         jax.random.key(0), run.train, field="style", num_steps=2, batch=4
     )
     styles = camdm_release.style_features(
-        run.model.bones, run.train, recognizer, field="style"
+        run.model.skeleton, run.train, recognizer, field="style"
     )
     assert isinstance(styles, camdm_release.Groups)
     # Four seconds of 30 frames are two windows of 60.
     label = np.asarray(run.train.labels["style"])
     np.testing.assert_array_equal(styles.count, 2 * np.bincount(label))
     assert styles.rows.shape[-1] == 512
-    found = camdm_release.distances(run.model.bones, recordings(), recognizer, styles)
+    found = camdm_release.distances(
+        run.model.skeleton, recordings(), recognizer, styles
+    )
     assert found.shape == (3,) and np.isfinite(found).all() and (found > 0).all()

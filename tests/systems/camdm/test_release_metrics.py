@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.data import procedural
-from jaxmotion.motion import skeleton
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.camdm import release as camdm_release
 from tests.reference import metrics as oracle
@@ -44,7 +44,7 @@ def clip(seed, frames=70, speed=1.2):
     step = speed / 30 * np.stack([np.sin(yaw), np.cos(yaw)], -1)
     path = np.cumsum(step, axis=0)
     height = 0.9 + 0.02 * np.sin(np.arange(frames))
-    return skeleton.Motion(
+    return Motion(
         root_position=jnp.asarray(
             np.stack([path[:, 0], height, path[:, 1]], -1), jnp.float32
         ),
@@ -65,26 +65,26 @@ def commands(seed, frames=70):
     )
 
 
-def released(bones, motion, command):
+def released(skeleton, motion, command):
     """The oracle on the very same arrays, through kinematics of its own."""
     rotations = np.float64(motion.joint_rotation)
     joints = [
         kinematics.world_transforms(
-            np.float64(bones.offsets),
-            bones.parents,
+            np.float64(skeleton.offsets),
+            skeleton.parents,
             root,
             [kinematics.gram_schmidt(r) for r in rotations[f]],
         )[:, :3, 3]
         for f, root in enumerate(np.float64(motion.root_position))
     ]
-    names = [name.split(":")[-1] for name in bones.names]
+    names = [name.split(":")[-1] for name in skeleton.names]
     told = (np.asarray(command.velocity), np.asarray(command.facing))
     return oracle.camdm_release(names, np.stack(joints), *told)
 
 
 @jax.jit
-def measured(bones, motion, frames, command):
-    return camdm_release.clip_metrics(bones, motion, frames, command)
+def measured(skeleton, motion, frames, command):
+    return camdm_release.clip_metrics(skeleton, motion, frames, command)
 
 
 def degrees(found):
@@ -95,10 +95,10 @@ def degrees(found):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("names", [BONES.names, STYLE100], ids=["mixamo", "100style"])
 def test_all_columns_are_those_of_the_scripts(names, seed):
-    bones = dataclasses.replace(BONES, names=names)
+    skeleton = dataclasses.replace(BONES, names=names)
     motion, command = clip(seed), commands(seed)
-    found = degrees(measured(bones, motion, jnp.array(70), command))
-    wanted = released(bones, motion, command)
+    found = degrees(measured(skeleton, motion, jnp.array(70), command))
+    wanted = released(skeleton, motion, command)
     assert set(found) == set(wanted)
     for name, value in wanted.items():
         assert found[name] == pytest.approx(value, rel=1e-5, abs=1e-5), name
@@ -114,8 +114,8 @@ def test_frames_that_pad_a_clip_and_a_rigs_prefix_change_nothing():
     longer = jax.tree.map(lambda *x: jnp.concatenate(x), motion, rest)
     told = jax.tree.map(lambda *x: jnp.concatenate(x), command, commands(8, frames=20))
     names = tuple(f"mixamorig:{name}" for name in BONES.names)
-    bones = dataclasses.replace(BONES, names=names)
-    found = degrees(measured(bones, longer, jnp.array(50), told))
+    skeleton = dataclasses.replace(BONES, names=names)
+    found = degrees(measured(skeleton, longer, jnp.array(50), told))
     for name, value in wanted.items():
         assert found[name] == pytest.approx(value, rel=1e-5, abs=1e-5), name
 
@@ -197,10 +197,10 @@ def test_a_root_that_stands_still_divides_by_a_centimetre():
 def test_what_nobody_steers_has_no_errors_of_angle():
     found = camdm_release.clip_metrics(BONES, clip(5))
     assert set(found) == {"slide", "coherence"}
-    bones = dataclasses.replace(
+    skeleton = dataclasses.replace(
         BONES, names=tuple(name.replace("Shoulder", "Clavicle") for name in BONES.names)
     )
-    found = camdm_release.clip_metrics(bones, clip(5), None, commands(5))
+    found = camdm_release.clip_metrics(skeleton, clip(5), None, commands(5))
     assert set(found) == {"slide", "coherence", "trajectory"}
 
 

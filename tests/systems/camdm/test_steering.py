@@ -109,7 +109,7 @@ def test_characters_start_at_the_origin_facing_ahead_in_poses_of_the_data(run):
     )
     past = states.past
     assert past.root_position.shape == (4, run.model.config.past, 3)
-    path = trajectory.root_trajectory(run.model.bones, past)
+    path = trajectory.root_trajectory(run.model.skeleton, past)
     np.testing.assert_allclose(path.position[:, -1], 0.0, atol=1e-5)
     facing = np.broadcast_to([0.0, 1.0], (4, 2))
     np.testing.assert_allclose(path.facing[:, -1], facing, atol=1e-5)
@@ -134,7 +134,7 @@ def test_characters_start_in_poses_of_the_models_own(run):
     value = camdm_model.to_json(dataclasses.replace(run.model, starts=starts))
     model = camdm_model.from_json(json.loads(json.dumps(value)), where="here")
     states = camdm_steering.own_states(model, LABELS, seed=1)
-    path = trajectory.root_trajectory(model.bones, states.past)
+    path = trajectory.root_trajectory(model.skeleton, states.past)
     np.testing.assert_allclose(path.position[:, -1], 0.0, atol=1e-5)
     np.testing.assert_allclose(path.facing[:, -1, 1], 1.0, atol=1e-5)
     # Rotations below the root tell whose pose it is.
@@ -192,7 +192,7 @@ def steered(chunk):
 def test_rollouts_show_a_frame_a_tick_from_where_they_start(run):
     _, frames = steered(None)
     assert frames.root_position.shape == (4, 36, 3)
-    assert frames.joint_rotation.shape == (4, 36, run.model.bones.num_joints, 6)
+    assert frames.joint_rotation.shape == (4, 36, run.model.skeleton.num_joints, 6)
     assert frames.planned[:, 0].all() and frames.planned.mean() < 0.3
     assert np.isfinite(np.asarray(frames.root_position)).all()
     # The springs take up the commanded 1 m/s along +z, whatever the start pose did.

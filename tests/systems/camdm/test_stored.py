@@ -15,9 +15,12 @@ from tests import tiny
 
 
 @pytest.fixture
-def model(bones, config):
+def model(skeleton, config):
     return camdm_model.Model(
-        config=config, bones=bones, labels=tiny.STYLES, source="tests (no licence)"
+        config=config,
+        skeleton=skeleton,
+        labels=tiny.STYLES,
+        source="tests (no licence)",
     )
 
 
@@ -28,8 +31,8 @@ def test_json_and_back(model):
     assert hash(found.config) == hash(model.config)
     assert (found.labels, found.source) == (model.labels, model.source)
     for field in ("parents", "names", "feet"):
-        assert getattr(found.bones, field) == getattr(model.bones, field)
-    np.testing.assert_array_equal(found.bones.offsets, model.bones.offsets)
+        assert getattr(found.skeleton, field) == getattr(model.skeleton, field)
+    np.testing.assert_array_equal(found.skeleton.offsets, model.skeleton.offsets)
 
 
 def test_labels_by_name(model):

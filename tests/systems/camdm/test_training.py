@@ -19,7 +19,7 @@ def first(tmp_path):
     clips = tiny.clips()
     model = camdm_model.Model(
         config=tiny.config(),
-        bones=clips.skeleton,
+        skeleton=clips.skeleton,
         labels=clips.names("style"),
         source=clips.source,
     )

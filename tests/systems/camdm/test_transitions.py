@@ -70,8 +70,8 @@ def planted(changes, delays):
 def sees_height(monkeypatch):
     """A recogniser that finds the new style in windows that are high throughout."""
 
-    def recognized(bones, found, recognizer):
-        del bones, recognizer
+    def recognized(skeleton, found, recognizer):
+        del skeleton, recognizer
         high = np.asarray(found.motion.root_position)[..., 1].min(axis=1) > 5
         return np.zeros((len(high), 2)), high.astype(np.float32)
 
@@ -95,15 +95,15 @@ def test_planted_changes_are_found_at_their_time(changes):
     assert set(camdm_transitions.MOTION) < set(row)
     assert row["foot_slide_m/s"].value >= 0
     # What CAMDM's release measures of changes of style, of the whole rollout.
-    bones = samples.run().model.bones
+    skeleton = samples.run().model.skeleton
     wanted = []
     for i in range(4):
         motion = Motion(
             root_position=frames.root_position[i],
             joint_rotation=frames.joint_rotation[i],
         )
-        joints = joint_positions(bones, motion)
-        wanted.append(oracle.camdm_release(bones.names, joints))
+        joints = joint_positions(skeleton, motion)
+        wanted.append(oracle.camdm_release(skeleton.names, joints))
     released = {name: row[f"{name}_camdm_release"] for name in wanted[0]}
     for name, cell in released.items():
         mean = np.mean([x[name] for x in wanted])
@@ -116,7 +116,7 @@ def test_windows_are_where_they_say(changes):
     run = samples.run()
     frames = planted(changes, [12, 12, 12, 12])
     found, centres = camdm_transitions.find_changes(
-        run.model.bones, frames, changes, JUDGE, fps=FPS
+        run.model.skeleton, frames, changes, JUDGE, fps=FPS
     )
     np.testing.assert_allclose(centres, np.arange(0, 61, 3) / 30)
     np.testing.assert_array_equal(found, (centres >= 1.4)[None].repeat(4, 0))

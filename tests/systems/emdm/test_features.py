@@ -166,5 +166,5 @@ def test_positions_have_the_gradient_of_finite_differences(representation, relat
 
 def test_a_representation_goes_through_jit(representation):
     again = jax.jit(lambda r: jax.tree.map(lambda x: 1.0 * x, r))(representation)
-    assert again.fps == 30.0 and again.bones.names == tiny.NAMES
-    assert isinstance(again.bones, skeleton.Skeleton)
+    assert again.fps == 30.0 and again.skeleton.names == tiny.NAMES
+    assert isinstance(again.skeleton, skeleton.Skeleton)

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.motion import rotation, skeleton, trajectory
+from jaxmotion.motion import rotation, trajectory
 from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
 from jaxmotion.systems.smgdiff import model as smgdiff_model
@@ -77,13 +78,13 @@ def condition(scenes, representation, config):
 
 def test_smpl_with_four_feet_has_162_channels():
     """147 of the body, 7 of the ball, 4 + 4 contacts (FACTS 4.2)."""
-    bones = skeleton.Skeleton(
+    skeleton = Skeleton(
         offsets=jnp.zeros((24, 3)),
         parents=(-1, *range(23)),
         names=tuple(f"j{i}" for i in range(24)),
         feet=(7, 8, 10, 11),
     )
-    names = smgdiff_scene.feature_layout(bones, (7, 8, 10, 11))
+    names = smgdiff_scene.feature_layout(skeleton, (7, 8, 10, 11))
     assert names.size == 162
     assert dict((n, (a, b)) for n, a, b in names.fields)["ball"] == (147, 154)
 
@@ -101,7 +102,7 @@ def test_a_scene_comes_back_from_its_features(scenes, representation):
         atol=1e-5,
     )
     np.testing.assert_allclose(found.touch, scenes.touch, atol=1e-6)
-    feet = skeleton.joint_positions(tiny.skeleton(), scenes.motion)[..., FEET, :]
+    feet = joint_positions(tiny.skeleton(), scenes.motion)[..., FEET, :]
     speed = np.linalg.norm(np.diff(np.float64(feet), axis=1), axis=-1) * 30
     inner = np.asarray(stands)[:, :-1]
     clear = np.abs(speed - 0.3) > 1e-3

@@ -44,7 +44,7 @@ def test_a_model_comes_back(model):
             getattr(model.representation.normalizer, name),
         )
     assert found.representation.joints == (2, 4)
-    assert found.representation.bones.names == tiny.NAMES
+    assert found.representation.skeleton.names == tiny.NAMES
 
 
 def test_skills_have_numbers(model):

@@ -97,7 +97,7 @@ def test_training_makes_paths_of_what_was_seen():
     motions = [tiny.walk(16, speed=s, start=a) for s in (0.5, 1.5) for a in (0.0, 2.0)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *motions), jnp.array([0, 0, 1, 1])
     loss = functools.partial(
-        smgdiff_trajectory.loss, bones=tiny.skeleton(), config=CONFIG
+        smgdiff_trajectory.loss, skeleton=tiny.skeleton(), config=CONFIG
     )
 
     def step(params, key):
