@@ -49,7 +49,7 @@ class Config:
 
     Attributes:
       steps: Diffusion steps of the sampler.
-      updates: Optimiser steps of the training chunk.
+      updates: Optimizer steps of the training chunk.
       batch: Windows of an update.
       characters: Of the rollout.
       seconds: Length of the rollout.

@@ -1,9 +1,9 @@
 """Diversity of many rollouts from one start state under the same commands.
 
-Columns: world_m is the mean distance in metres of a joint in one rollout to the same
+Columns: world_m is the mean distance in meters of a joint in one rollout to the same
 joint in another, over pairs, frames and joints; pose_m the same with joints relative to
 the root and turned to face +z; diversity_m the metric of that name, the mean Euclidean
-distance in metres of whole poses of the same time; variance_m2 is CAMDM's metric 4.
+distance in meters of whole poses of the same time; variance_m2 is CAMDM's metric 4.
 
 Examples:
   python benchmarks/diversity.py --rollouts 64 256 1024 4096
@@ -52,7 +52,7 @@ class Config:
         changes nothing. Less than 1 frees the motion from its past.
       style: Style; None for the model's first.
       preset: Commands: forward, strafe or stop_and_go.
-      speed: Metres a second; None for the style's median.
+      speed: Meters per second; None for the style's median.
       seconds: Length of a rollout.
       every: Keep every so many frames, from the last one backwards.
       sets: Sets of rollouts, with seeds seed, seed + 1 and so on.

@@ -58,7 +58,7 @@ class Config:
     is from the 25th to the 75th percentile. It is judged by wall clock, and only on an
     idle machine: two threads that wait for each other suffer out of proportion when
     another process takes a core, PyTorch's much more than ours. With one thread it is
-    judged by processor time, which hardly depends on the neighbours.
+    judged by processor time, which hardly depends on the neighbors.
 
     Attributes:
       steps: Diffusion steps.

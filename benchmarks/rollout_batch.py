@@ -42,7 +42,7 @@ class Config:
     """Rollouts of a character, for several numbers of characters.
 
     All seconds and characters of a rollout are one compiled program ("traces" counts
-    how often it was traced). Frames a second are those of all characters together;
+    how often it was traced). Frames per second are those of all characters together;
     "x real time" is how much faster than its clock each character runs.
 
     Attributes:
@@ -187,7 +187,7 @@ def compare_loops(
       limit: Seconds for each loop.
 
     Returns:
-      Frames a second and ratios by name, and metrics for the gate.
+      Frames per second and ratios by name, and metrics for the gate.
     """
     alone = [row["frames_per_second"] for row in rows if row["characters"] == 1]
     found, metrics = {}, []

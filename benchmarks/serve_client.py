@@ -60,7 +60,7 @@ def timing(
 
     Returns:
       Received and expected frames; percentiles, milliseconds: of the jitter, which is
-      |interval - 1/fps| of neighbours, and of the lateness against the schedule of the
+      |interval - 1/fps| of neighbors, and of the lateness against the schedule of the
       frame that was the earliest for its number.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Updates a second of several models trained as one program, and one after another.
+"""Updates per second of several models trained as one program, and one after another.
 
 Models of the same sizes can be trained by one program that maps an update over their
 parameters (`jax.vmap`); they see the same batches. A small model leaves most of a large
@@ -50,7 +50,7 @@ COLUMNS = {
 class Config:
     """Training of several models at once against one after another.
 
-    Updates a second are of single models: five models that each make one update a
+    Updates per second are of single models: five models that each make one update a
     second make five. The ratio is the median over rounds of how much faster training
     together is, with its 10th and 90th percentile.
 
@@ -59,7 +59,7 @@ class Config:
         on random windows).
       width: Channels; a row each.
       models: Models.
-      updates: Optimiser steps of a call.
+      updates: Optimizer steps of a call.
       batch: Windows of an update.
       rounds: Timed rounds; each has all models' updates both ways.
       limit: Seconds to time for, at most.

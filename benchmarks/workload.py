@@ -28,7 +28,7 @@ class Load:
       controller: Makes the run-time of parameters.
       start: States and commands of a number of characters.
       plans: How often networks made something, in all frames together.
-      fps: Ticks a second.
+      fps: Ticks per second.
       config: Of the system.
       joints: Of the skeleton.
     """

@@ -134,7 +134,7 @@ def _show(load: workload.Load, decode: Callable, joints: int, state: Any) -> Any
 
 
 def python_loop(load: workload.Load, *, limit_s: float, glue: bool) -> float:
-    """Frames a second of one character in a Python loop over its jitted networks.
+    """Frames per second of one character in a Python loop over its jitted networks.
 
     The loops over frames and over steps are Python. The networks are jitted, and so are
     the posterior of a step and the placing of a pose, which the library jits itself.
@@ -146,7 +146,7 @@ def python_loop(load: workload.Load, *, limit_s: float, glue: bool) -> float:
         the last one. Without it that is called operation by operation.
 
     Returns:
-      Frames a second.
+      Frames per second.
     """
     config, table, nets = load.config, load.config.table(), _networks(load)
     states, commands = load.start(1)

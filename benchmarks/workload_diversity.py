@@ -50,7 +50,7 @@ class Load:
 
 
 class Motions(NamedTuple):
-    """Kept frames: joints in the world, and relative to the root, facing +z; metres."""
+    """Kept frames: joints in the world, and relative to the root, facing +z; meters."""
 
     world: Float[Array, "rollouts frames joints 3"]
     pose: Float[Array, "rollouts frames joints 3"]
@@ -87,7 +87,7 @@ def make_load(
       run: Exported file of the procedural walker, or a run folder.
       style: Its style; None for the first.
       preset: Of `presets.PRESETS`.
-      speed: Metres a second; None for the style's median.
+      speed: Meters per second; None for the style's median.
       seconds: Length of the rollouts.
       seed: Of the start pose.
 
@@ -269,7 +269,7 @@ def measure(
       num_pairs: Random pairs of each mean.
 
     Returns:
-      Metres, and square metres.
+      Meters, and square meters.
     """
     found = _measure(key, motions, num_pairs)
     # Compiled functions return dictionaries in alphabetical order.

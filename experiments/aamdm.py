@@ -39,7 +39,7 @@ class Train:
       rows: What to train; none: all rows of both tables. "aamdm" alone is the system.
       field: Label field by which clips are chosen.
       labels: Labels of the clips to use; none: all clips.
-      fps: Frames a second to which clips are resampled.
+      fps: Frames per second to which clips are resampled.
       held_out: Part of each clip, at its end, kept for evaluation.
       mirror: Add a mirrored copy of every clip.
       autoencoder_steps: Updates of the pose autoencoder.
@@ -50,7 +50,7 @@ class Train:
         dearer since they run through windows.
       full_pose_steps: Updates of the diffusion model of the full-pose row, which are
         dearer: in about the same time.
-      batch: Windows an update.
+      batch: Windows per update.
       width: Channels of the networks of AAMDM and AMDM (Learned Motion Matching has
         512, Motion VAE 256, as published).
       schedule: Of the noise.
@@ -95,7 +95,7 @@ class Evaluate:
       rollouts: Characters; a multiple of 4.
       seconds: Length of each rollout, seconds (the paper: 1000 frames).
       preset: Commands of the steered rollouts.
-      speed: Metres a second that are commanded.
+      speed: Meters per second that are commanded.
       scale: Strength of AAMDM's guidance, epsilon of eq. 13.
       amdm_scale: Likewise, of AMDM's.
       long_minutes: Length of the long rollouts of the row "aamdm"; 0 for none.
@@ -129,7 +129,7 @@ class Rollout:
       steered: Whether it is steered.
       seconds: Length.
       preset: Commands.
-      speed: Metres a second that are commanded.
+      speed: Meters per second that are commanded.
       scale: Strength of the guidance, epsilon of eq. 13.
       out: Folder; None for <run>/rollout.
       seed: Of the start pose and the noise.
@@ -215,7 +215,7 @@ def evaluate(args: Evaluate) -> None:
     table, report = tables.evaluate(run, args, out)
     here = results.Measured(path=out / "metrics.json", rows=table, about=report)
     report["claims"] = verdicts.lines(paper.TABLES, {paper.RUN: here})
-    note = "div and fid are of joint positions in the character's axes: no recogniser."
+    note = "div and fid are of joint positions in the character's axes: no recognizer."
     reporting.write_table(out, table, report, (note,))
     for line in report["claims"]:
         print(line)

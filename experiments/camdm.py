@@ -54,7 +54,7 @@ class Train:
       held_out: Fraction of clips kept for evaluation, in (0, 1).
       held_out_clips: Keep these clips for evaluation, by name, instead of a fraction.
       mirror: Add a mirrored copy of every training clip.
-      steps: Optimiser steps of the whole run.
+      steps: Optimizer steps of the whole run.
       batch: Windows a step (of 55 frames: 10 past, 45 future).
       optimizer: "muon" or "adamw".
       learning_rate: Peak of its rate; cosine to a tenth.
@@ -212,13 +212,13 @@ class Evaluate:
       rollouts: Characters; spread evenly over the styles.
       seconds: Length of each rollout, seconds; 4 at least.
       preset: Commands.
-      speed: Metres a second; None for each style's own median walking speed.
+      speed: Meters per second; None for each style's own median walking speed.
       contents: Contents of the clips to compare with; none: all of the run's.
       chunk: Characters to run at a time, at most.
-      recognizer_steps: Updates of the style recogniser, if it is trained here.
-      evaluator: File of a frozen style recogniser, from evaluator.py; None trains one
+      recognizer_steps: Updates of the style recognizer, if it is trained here.
+      evaluator: File of a frozen style recognizer, from evaluator.py; None trains one
         here.
-      seed: Of poses, noise, recogniser and subsets.
+      seed: Of poses, noise, recognizer and subsets.
     """
 
     run: Path = Path("runs/camdm")
@@ -246,7 +246,7 @@ class Speeds:
       data: Clips; None for those that the run was trained on.
       out: Folder for metrics.json and table.md; None for <run>/speeds.
       style: Style of all characters; None for the first.
-      speeds: Metres per second; 0 to stand.
+      speeds: Meters per second; 0 to stand.
       rollouts: Characters per speed.
       seconds: Length of each rollout, seconds.
       follow: Half-life in which a character that left its course returns, seconds; 0
@@ -278,7 +278,7 @@ class Rollout:
       to_style: Change to this style at half time; None to keep it.
       seconds: Length, seconds.
       preset: Commands.
-      speed: Metres a second; None for the style's own median speed.
+      speed: Meters per second; None for the style's own median speed.
       out: Folder; None for <run>/rollout (beside an exported file).
       seed: Of the start pose and the noise.
     """
@@ -406,7 +406,7 @@ class Import:
         beside the weights.
       data: Clips from prepare_data.py to start from and compare with, where a command
         is given no others.
-      scale: Metres per unit of the BVH file.
+      scale: Meters per unit of the BVH file.
       out: File to write; parameters are stored as float32.
     """  # noqa: E501
 

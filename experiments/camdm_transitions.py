@@ -1,9 +1,9 @@
 """CAMDM's changes of style: how many succeed, how soon, with and without guidance.
 
-Characters walk in one style, are told another, and a recogniser looks for it in what
+Characters walk in one style, are told another, and a recognizer looks for it in what
 follows: the paper's tables 2 and 4, where people judged. Rows are the run-time's
 constants of the paper, of its release, without guidance on the past, and characters who
-were told nothing, in whom what is found is a mistake of the recogniser's.
+were told nothing, in whom what is found is a mistake of the recognizer's.
 
 Examples:
   python experiments/camdm_transitions.py --run runs/camdm
@@ -49,10 +49,10 @@ class Config:
         median speed.
       contents: Contents of the clips to start from; none: all of the run's.
       chunk: Characters to run at a time, at most.
-      recognizer_steps: Updates of the style recogniser, if it is trained here.
-      evaluator: File of a frozen style recogniser, from evaluator.py; None trains one
+      recognizer_steps: Updates of the style recognizer, if it is trained here.
+      evaluator: File of a frozen style recognizer, from evaluator.py; None trains one
         here.
-      seed: Of poses, noise and recogniser.
+      seed: Of poses, noise and recognizer.
     """
 
     run: Path = Path("runs/camdm")
@@ -99,7 +99,7 @@ def measure(args: Config) -> None:
         "arguments": camdm_training.arguments_json(args),
         "source": run.model.source,
         "rollouts": int(changes.old.size),
-        "recognised_in_clips_%": camdm_transitions.clip_accuracy(run, judge).value,
+        "recognized_in_clips_%": camdm_transitions.clip_accuracy(run, judge).value,
         "evaluator": frozen.describe(
             judge.params,
             evaluator,
@@ -112,7 +112,7 @@ def measure(args: Config) -> None:
         f"{len(run.model.labels)} styles, {args.replications} times.",
         # Without the clips of Fréchet distances: there are none.
         frozen.note({k: report["evaluator"][k] for k in ("fingerprint", "origin")}),
-        f"It is right in {report['recognised_in_clips_%']:.1f} % of the windows of "
+        f"It is right in {report['recognized_in_clips_%']:.1f} % of the windows of "
         "held-out clips.",
     )
     reporting.write_table(out, rows, report, notes)

@@ -1,6 +1,6 @@
 """Puts a synthetic soccer ball beside recorded locomotion, as SMGDiff's training data.
 
-The person is as recorded, under the recording's licence: what this script writes stays
+The person is as recorded, under the recording's license: what this script writes stays
 out of the repository as well.
 
 Example:
@@ -31,7 +31,7 @@ _FAR, _NEAR = (2.5, 5.0), (0.4, 0.8)
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Synthesises skills from labelled clips of one skeleton.
+    """Synthesises skills from labeled clips of one skeleton.
 
     Attributes:
       data: Clips from prepare_data.py.

@@ -47,7 +47,7 @@ class Train:
         "released" with CLIP, "unit" with the other encoders, which no release has.
       unseen: "content/style" pairs whose clips are kept for evaluation (texts).
       frames: Longest motion; None for 60 (actions) or 120 (texts).
-      fps: Frames a second; None for 15 (actions) or 20 (texts).
+      fps: Frames per second; None for 15 (actions) or 20 (texts).
       held_out: Part of the clips kept for evaluation.
       steps: Updates of each GAN.
       ddpm_steps: Updates of each diffusion model, which are cheaper.
@@ -125,9 +125,9 @@ class Evaluate:
       long_replications: Likewise, of rows with 500 network calls and more.
       scale: Of classifier-free guidance; None for 1 (actions) or 2.5 (texts), the
         paper's.
-      evaluator_steps: Updates of the evaluator; None for 1500 of the recogniser of
+      evaluator_steps: Updates of the evaluator; None for 1500 of the recognizer of
         actions, 600 of the text-motion evaluator, whose updates are ten times as dear.
-      evaluator: File of a frozen recogniser of actions, from evaluator.py; None trains
+      evaluator: File of a frozen recognizer of actions, from evaluator.py; None trains
         one here.
       matcher: Published weights of the text-motion evaluator (finest.tar), beside them
         mean.npy and std.npy of its meta folder; None trains one here.

@@ -1,4 +1,4 @@
-"""Frozen evaluators: train a recogniser once, and judge everybody's motions by it.
+"""Frozen evaluators: train a recognizer once, and judge everybody's motions by it.
 
 Examples:
   python experiments/evaluator.py train --kind style --data data/bandai2.npz --out evaluators/bandai2_style.npz
@@ -34,7 +34,7 @@ from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a recogniser on the training part of clips, and write it to a file.
+    """Train a recognizer on the training part of clips, and write it to a file.
 
     The defaults split clips as the systems' own `train` do, so that what a run held out
     its evaluator never saw; give the options that the run was trained with.
@@ -44,14 +44,14 @@ class Train:
     Attributes:
       kind: "style" for camdm.py, "action" for emdm.py, "ball" for smgdiff.py.
       data: Clips from prepare_data.py or dribble.py; one file, but for actions.
-      label: Field of the clips that is recognised; None for style, content or skill.
+      label: Field of the clips that is recognized; None for style, content or skill.
       out: File to write.
       contents: Contents of the clips to use (style); None for those of camdm.py, none:
         all clips.
       merge: Labels that name the same action as others, "old=new" (action); None for
         those of emdm.py.
       least: Fewest clips of an action (action); None for 10.
-      fps: Frames a second that clips are resampled to (action); None for 15.
+      fps: Frames per second that clips are resampled to (action); None for 15.
       frames: Frames that are judged at a time (action, ball); None for 60 or 45.
       held_out: Part of the clips or recordings that accuracy is measured on, in (0, 1).
       updates: Of the training; None for 1500, or 800 (ball).
@@ -169,7 +169,7 @@ def check(args: Train) -> None:
 
 
 def train(args: Train) -> None:
-    """Writes the file, and says how well it recognises."""
+    """Writes the file, and says how well it recognizes."""
     check(args)
     loop.check_writable(args.out.parent)
     begun = time.perf_counter()

@@ -4,8 +4,8 @@ The file holds clips, for ballplay and soccer_x with a ball, or for humanml3d an
 feature vectors with captions.
 
 The sets are third-party recordings: get them from their publishers, mind their
-licences, and keep what this script writes out of the repository. World coordinates
-(metres, y up) stay as published.
+licenses, and keep what this script writes out of the repository. World coordinates
+(meters, y up) stay as published.
 
 Example:
   python experiments/prepare_data.py procedural --out data/walker.npz
@@ -57,7 +57,7 @@ class Config:
     manual_dir: Path | None = None
     """Folder with the files as their publisher lays them out (zips or unzipped)."""
     fps: float | None = None
-    """Frames a second of the result; other rates are resampled. By default 30, for
+    """Frames per second of the result; other rates are resampled. By default 30, for
     humanact12 its own 20; sets with captions keep theirs."""
     mirror: bool = False
     """Add the left-right mirror image of every clip (style100: of symmetric styles,
@@ -69,7 +69,7 @@ class Config:
     seed: int = 0
     """Seed of the procedural walker."""
     cut_fps: float = 20.0
-    """Frames a second by which the times of captions cut clips; the released loaders
+    """Frames per second by which the times of captions cut clips; the released loaders
     take 20 for kit_ml too, whose rate is 12.5."""
 
 
@@ -100,8 +100,8 @@ def check_config(config: Config) -> None:
         )
     if config.source in BALL_SOURCES and (config.mirror or config.fps is not None):
         raise ValueError(
-            f"{config.source} is read at 30 frames a second, since touches of the ball "
-            "cannot be resampled: --mirror and --fps do not apply"
+            f"{config.source} is read at 30 frames per second, since touches of the "
+            "ball cannot be resampled: --mirror and --fps do not apply"
         )
     if config.source != "procedural":
         if config.manual_dir is None:
@@ -175,7 +175,7 @@ def at_rate(clips: Clips, fps: float) -> Clips:
 
     Args:
       clips: The clips.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       The clips themselves if they have that rate.

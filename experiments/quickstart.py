@@ -38,7 +38,7 @@ from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm import training as camdm_training
 
-# Seconds, direction of travel and facing (degrees from +z towards +x), m/s, style.
+# Seconds, direction of travel and facing (degrees from +z toward +x), m/s, style.
 COURSE = (
     (1.0, 0, 0, 0.0, "neutral"),
     (2.5, 0, 0, 1.4, "neutral"),
@@ -60,7 +60,7 @@ SWAGGER = Gait(
     arm_out=0.5,
     elbow=0.6,
 )
-# Optimiser steps of a row of losses.
+# Optimizer steps of a row of losses.
 CHUNK = 50
 SIZE = camdm_training.PRESETS["small"] | dict(width=128, hidden=512)
 
@@ -77,7 +77,7 @@ class Config:
       train: Teach the procedural walker a style first; the options below are its own.
       from_scratch: Start from random parameters and train for 4000 steps (about 12
         minutes on two cores) instead of starting from the shipped model.
-      steps: Optimiser steps, rounded down to fifties; None for 400, or 4000 from
+      steps: Optimizer steps, rounded down to fifties; None for 400, or 4000 from
         scratch.
       batch: Windows a step.
       minutes: Minutes of walking to generate.
@@ -162,7 +162,7 @@ def start_model(args: Config, clips, key):
 
 
 def steps_of(args: Config) -> int:
-    """Optimiser steps; whole chunks."""
+    """Optimizer steps; whole chunks."""
     default = 4000 if args.from_scratch else 400
     steps = default if args.steps is None else args.steps
     if steps < CHUNK:

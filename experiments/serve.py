@@ -123,8 +123,8 @@ def serve(args: Config) -> None:
     simulation.warm(characters)
     seconds = time.perf_counter() - begin
     print(
-        f"{len(characters.joints)} joints, {characters.fps:g} frames a second, labels "
-        f"{', '.join(characters.labels)}; compiled in {seconds:.0f} s"
+        f"{len(characters.joints)} joints, {characters.fps:g} frames per second, "
+        f"labels {', '.join(characters.labels)}; compiled in {seconds:.0f} s"
     )
     # What was loaded stays: the collector need not look through it during a tick.
     gc.collect()

@@ -48,7 +48,7 @@ class Train:
       steps: Updates of a motion model.
       draft_steps: Updates before these in which displacements hardly count.
       path_steps: Updates of a trajectory generator.
-      batch: Windows an update.
+      batch: Windows per update.
       learning_rate: Peak of Muon's rate; cosine to a twentieth.
       seed: Of everything random.
       override: Go on with these settings where a stage began with others.
@@ -91,13 +91,13 @@ class Evaluate:
       rate: w_r of DSG.
       last_sigma: Length of the last step a channel; None for the released code's.
       min_acceleration: A ball that accelerates more is being touched, m/s^2 (paper 2).
-      max_distance: From here on a joint is too far from the ball's centre, metres
+      max_distance: From here on a joint is too far from the ball's center, meters
         (paper 0.1, less than a ball's radius).
-      recognizer_steps: Updates of the recogniser of skills, if it is trained here.
-      evaluator: File of a frozen recogniser with ball, from evaluator.py; None trains
+      recognizer_steps: Updates of the recognizer of skills, if it is trained here.
+      evaluator: File of a frozen recognizer with ball, from evaluator.py; None trains
         one here.
       chunk: Plans or players at a time.
-      seed: Of windows, noise and recogniser.
+      seed: Of windows, noise and recognizer.
     """
 
     run: Path = Path("runs/smgdiff")
@@ -225,7 +225,7 @@ def evaluate(args: Evaluate) -> None:
     run = smgdiff_training.load_run(args.run)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
-    cli.announce("compiling the recogniser and each row's plans", 40)
+    cli.announce("compiling the recognizer and each row's plans", 40)
     setting = smgdiff_evaluation.make_setting(
         run.train,
         run.held_out,

@@ -7,7 +7,7 @@ tables learn the step, and are then rolled out from the same starts.
 Example: python experiments/squ9.py --out runs/squ9
 
 Source: Li et al. 2024 (AAMDM), section 4.2 and figure 4. The numbers of the toy
-(centres -1, 0, 1, deviation 0.1, uniform modes) are ours, since the paper gives none.
+(centers -1, 0, 1, deviation 0.1, uniform modes) are ours, since the paper gives none.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.viz import scatter
 
-CENTRES = np.stack(np.meshgrid(*2 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(9, 2)
+CENTERS = np.stack(np.meshgrid(*2 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(9, 2)
 SIGMA = 0.1
 SCALE = float(np.sqrt(2 / 3 + SIGMA**2))  # standard deviation of a coordinate
 
@@ -41,7 +41,7 @@ class Config:
     Attributes:
       out: Folder for scores.json and squ9.png.
       steps: Updates of each model; the GAN makes twice as many.
-      batch: Windows an update.
+      batch: Windows per update.
       width: Channels of hidden layers.
       sequences: Rollouts of each model.
       length: Steps of a rollout.
@@ -62,7 +62,7 @@ def sequences(key: jax.Array, number: int, length: int) -> jax.Array:
     key_mode, key_point = jax.random.split(key)
     mode = jax.random.randint(key_mode, (number, length), 0, 9)
     noise = jax.random.normal(key_point, (number, length, 2))
-    return (jnp.asarray(CENTRES, jnp.float32)[mode] + SIGMA * noise) / SCALE
+    return (jnp.asarray(CENTERS, jnp.float32)[mode] + SIGMA * noise) / SCALE
 
 
 def fit(update, state, key, *, steps: int, batch: int, window: int):
@@ -172,7 +172,7 @@ def main() -> None:
         seconds[name] = round(time.perf_counter() - before, 1)
         print(f"{name}: trained and rolled out in {seconds[name]} s")
     scores = {
-        name: modes.mode_scores(x, CENTRES, sigma=SIGMA) for name, x in points.items()
+        name: modes.mode_scores(x, CENTERS, sigma=SIGMA) for name, x in points.items()
     }
     heads = list(next(iter(scores.values())))
     print(" " * 8 + "".join(f"{head:>28}" for head in heads))
@@ -190,7 +190,7 @@ def main() -> None:
     scatter.write_scatter(
         args.out / "squ9.png",
         {name: x.reshape(-1, 2) for name, x in points.items()},
-        marks=CENTRES,
+        marks=CENTERS,
         title=f"{args.sequences} rollouts of {args.length} steps",
     )
     print(f"done in {report['seconds']} s: see {args.out}")

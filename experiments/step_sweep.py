@@ -52,7 +52,7 @@ class Config:
         not trained again; one of another budget, seed or data is refused.
       replications: Sets of samples of each model, each with noise of its own;
         intervals run over these.
-      evaluator: File of a frozen recogniser, from evaluator.py; None trains one, with
+      evaluator: File of a frozen recognizer, from evaluator.py; None trains one, with
         the budget's updates. aamdm has none.
       seed: Of parameters, batches, poses, noise and evaluators.
     """
@@ -71,14 +71,14 @@ class Config:
 
 
 def load_evaluator(args: Config, kind: frozen.Kind | None) -> frozen.Evaluator | None:
-    """The frozen recogniser that the arguments name.
+    """The frozen recognizer that the arguments name.
 
     Args:
       args: Of the command line.
       kind: That the system needs; None for none.
 
     Returns:
-      The recogniser; None if it is to be trained.
+      The recognizer; None if it is to be trained.
 
     Raises:
       ValueError: if there is no such file, or it is of another kind.
@@ -86,7 +86,7 @@ def load_evaluator(args: Config, kind: frozen.Kind | None) -> frozen.Evaluator |
     if args.evaluator is None:
         return None
     if kind is None:
-        raise ValueError(f"evaluator: {args.system} is judged without a recogniser")
+        raise ValueError(f"evaluator: {args.system} is judged without a recognizer")
     found = frozen.load(args.evaluator)
     if found.kind != kind:
         raise ValueError(

@@ -27,10 +27,10 @@ class Ball:
     """A ball beside a motion.
 
     Attributes:
-      position: World position of its centre, metres.
+      position: World position of its center, meters.
       touch: Which of the joints touch it.
       joints: Joints that may touch it.
-      radius: Metres.
+      radius: Meters.
     """
 
     position: Float[np.ndarray, "frames 3"]
@@ -56,10 +56,10 @@ def write_rollout(
       folder: Where to; made if missing.
       skeleton: The skeleton.
       motion: Frames of one character, world.
-      desired_velocity: What was commanded, metres a second; its integral is drawn as
+      desired_velocity: What was commanded, meters per second; its integral is drawn as
         the commanded path. None if nothing was.
       title: Of the pictures.
-      caption: Below them: the source of the data and its licence.
+      caption: Below them: the source of the data and its license.
       name: Of the files, without their ends.
       ball: What the person plays with; None for nothing.
 
@@ -92,7 +92,7 @@ def write_rollout(
 
 
 def _write_ball(path: Path, ball: Ball, fps: float) -> None:
-    """Time, position in metres, and whether something touches it, one frame a line."""
+    """Time, position in meters, and whether something touches it, one frame a line."""
     lines = ["seconds,x,y,z,touch"]
     for frame, (place, touch) in enumerate(zip(ball.position, ball.touch, strict=True)):
         numbers = ",".join(f"{value:.4f}" for value in place)

@@ -39,7 +39,7 @@ def scene(frames: int = 40, **how) -> Scene:
 
 
 def clips(num_frames: int = 80) -> BallClips:
-    """Eight recordings: four of dribbling, four with the ball thirty metres away."""
+    """Eight recordings: four of dribbling, four with the ball thirty meters away."""
     both = selection.concatenate([tiny.clips(num_frames), tiny.clips(num_frames)])
     far = np.repeat([0, 1], both.num_clips // 2)
     both = dataclasses.replace(

@@ -17,7 +17,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 @pytest.fixture(scope="module")
 def quick_compile():
-    """Compiles whole training and control programs a third as long, unoptimised.
+    """Compiles whole training and control programs a third as long, unoptimized.
 
     For modules whose subject is not the arithmetic of a single function.
     """

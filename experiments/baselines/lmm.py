@@ -7,7 +7,7 @@ Source: Holden et al. 2020, "Learned Motion Matching", and its released code: th
 linear layers in the stepper, five in the projector, queries with noise of a random
 size. Differs: the projector looks at the path alone (there also at feet and hips), it
 is asked at random moments, on average every 0.2 s (there every 0.1 s), and its frame
-is taken up by half instead of by inertialised blending.
+is taken up by half instead of by inertialized blending.
 """
 
 import dataclasses

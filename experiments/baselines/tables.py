@@ -70,7 +70,7 @@ def measure(
     reference: aamdm_evaluation.Reference,
     args: Any,
 ) -> Row:
-    """One row: free, steered, and frames a second."""
+    """One row: free, steered, and frames per second."""
     fps, ticks = run.train.fps, round(args.seconds * run.train.fps)
     skip = round(fps)
     given = aamdm_evaluation.commands(

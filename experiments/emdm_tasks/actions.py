@@ -21,7 +21,7 @@ from jaxmotion.systems.emdm.data import ActionArrays
 
 
 def make_judge(args: Any) -> Judge:
-    """The recogniser of a run, and real motions' scores.
+    """The recognizer of a run, and real motions' scores.
 
     Motions made from nothing are compared with real ones of all actions; they have no
     accuracy and no multimodality.

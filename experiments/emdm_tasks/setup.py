@@ -144,7 +144,7 @@ def _prepare_texts(args: Any) -> emdm_training.Task:
 
 
 def _text_motions(args: Any, fps: float) -> TextMotions:
-    """Text motions of a file of them, or of labelled clips."""
+    """Text motions of a file of them, or of labeled clips."""
     if len(args.data) == 1 and text_motion_io.is_text_motions(args.data[0]):
         return text_motion_io.load_text_motions(args.data[0])
     clips = selection.concatenate([clips_io.load_clips(path) for path in args.data])

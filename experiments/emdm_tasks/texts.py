@@ -33,7 +33,7 @@ def make_judge(args: Any) -> Judge:
 
     Raises:
       ValueError: if the run has other data, there are too few samples, or a
-        recogniser of actions is given.
+        recognizer of actions is given.
     """
     if args.evaluator is not None:
         raise ValueError(

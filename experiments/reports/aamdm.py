@@ -23,7 +23,7 @@ FPS = Column(
     here="fps",
     better="higher",
     kind="time",
-    note="frames a second at batch 1, this machine, no interval",
+    note="frames per second at batch 1, this machine, no interval",
 )
 _SKATING = "MANN's measure, a threshold of ours"
 _ROWS = {
@@ -79,7 +79,7 @@ TABLE_1 = Table(
             column="DIV",
             pairs=below("AAMDM", _OTHERS),
             where="section 4.1.1, table 1",
-            towards="Dataset",
+            toward="Dataset",
         ),
         Claim(
             words="MVAE has a lower FID than LMM",
@@ -183,7 +183,7 @@ TABLE_2 = Table(
             column="DIV",
             pairs=below("2 + 2", ("2 + 3", "2 + 4", "2 + 10")),
             where="section 4.3, table 2",
-            towards="Dataset",
+            toward="Dataset",
         ),
         Claim(
             words="more draft steps are slower (2, 3, 4, 10)",

@@ -50,7 +50,7 @@ FID = Column(
     better="lower",
     judged=True,
     note="of each rollout to its style, divided by the features' number, as the "
-    "released code computes it; of another recogniser, so that only rows compare",
+    "released code computes it; of another recognizer, so that only rows compare",
 )
 SLIDE = Column(
     name="Ft. Slid.",
@@ -86,8 +86,8 @@ DURATION = Column(
     here="transition_frames",
     better="lower",
     judged=True,
-    note="frames at 30 a second, failures counted as 120; by a recogniser of windows "
-    "of 2 s, dated to their centre, where people judged",
+    note="frames at 30 a second, failures counted as 120; by a recognizer of windows "
+    "of 2 s, dated to their center, where people judged",
 )
 SUCCESS = Column(
     name="Succ. Rate",

@@ -32,7 +32,7 @@ class Column:
       better: Where good values lie; "real" is near those of recorded motion.
       kind: "mean" has an interval of 95 %, or none; "time" has the middle half of the
         calls, or none; "count" is a number of the samples.
-      judged: A recogniser's: values of two recognisers do not compare.
+      judged: A recognizer's: values of two recognizers do not compare.
       scale: Factor from the unit here to the paper's.
       note: What differs from the paper's metric.
     """
@@ -72,10 +72,10 @@ class Claim:
     Attributes:
       words: The claim.
       column: Name of the column.
-      pairs: Rows (smaller, larger); with `towards`, (nearer, farther).
+      pairs: Rows (smaller, larger); with `toward`, (nearer, farther).
       where: Section or table of the paper.
       factor: The larger is at least so many times the smaller.
-      towards: Row that the nearer is nearer to; None to compare values.
+      toward: Row that the nearer is nearer to; None to compare values.
     """
 
     words: str
@@ -83,13 +83,13 @@ class Claim:
     pairs: tuple[tuple[str, str], ...]
     where: str
     factor: float = 1.0
-    towards: str | None = None
+    toward: str | None = None
 
     @property
     def rows(self) -> tuple[str, ...]:
         """All rows that it speaks of, each once."""
         names = [name for pair in self.pairs for name in pair]
-        return tuple(dict.fromkeys([*names, *filter(None, [self.towards])]))
+        return tuple(dict.fromkeys([*names, *filter(None, [self.toward])]))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -155,7 +155,7 @@ class Absent:
 
 
 def chain(*names: str) -> tuple[tuple[str, str], ...]:
-    """Pairs of neighbours of rows whose values rise.
+    """Pairs of neighbors of rows whose values rise.
 
     Args:
       names: Rows, the smallest first.

@@ -30,7 +30,7 @@ ACTION = source(
 )
 TEXT = source("emdm_text", "--task text --rows emdm ddpm_1000")
 NOTHING = source("emdm_none", "--task none --rows emdm ddpm_1000")
-_JUDGE = "of another recogniser"
+_JUDGE = "of another recognizer"
 R1, R2, R3 = (
     Column(
         name=f"Top {n}",
@@ -195,7 +195,7 @@ TABLE_3 = Table(
             where="section 4.4, table 3",
         ),
         Claim(
-            words="EMDM's actions are recognised more often than MDM's",
+            words="EMDM's actions are recognized more often than MDM's",
             column="ACC",
             pairs=(("MDM", "EMDM (Ours)"),),
             where="table 3",
@@ -205,7 +205,7 @@ TABLE_3 = Table(
             column="MM",
             pairs=(("EMDM (Ours)", "MDM"),),
             where="table 3",
-            towards="Real",
+            toward="Real",
         ),
         Claim(
             words="EMDM is at least 100 times as fast as MDM (our bar; the table "
@@ -242,7 +242,7 @@ TABLE_B6 = Table(
             column="Diversity",
             pairs=(("EMDM (Ours)", "MDM"),),
             where="table B6",
-            towards="Real",
+            toward="Real",
         ),
         Claim(
             words="EMDM is at least 110 times as fast as MDM (our bar: half of "

@@ -48,7 +48,7 @@ _FEWER = (
         column="Diversity",
         pairs=chain("10 steps", "5 steps", "1 step"),
         where="section 5.1, table 4",
-        towards="Real",
+        toward="Real",
     ),
     Claim(
         words="with 1 step multimodality is lower than with 10",

@@ -45,7 +45,7 @@ TABLE_D7 = Table(
             column="Diversity",
             pairs=(("EMDM (Ours)", "MDM, 10 of DDIM"),),
             where="table D7",
-            towards="Real",
+            toward="Real",
         ),
         Claim(
             words="EMDM takes less time than ten steps of DDIM",
@@ -84,7 +84,7 @@ TABLE_D8 = Table(
             column="Diversity",
             pairs=(("EMDM (Ours)", "Naive DDGAN"),),
             where="table D8",
-            towards="Real",
+            toward="Real",
         ),
     ),
     note=NOTE,

@@ -228,7 +228,7 @@ def source_lines(found: Found, judged: set[Source]) -> list[str]:
 
     Args:
       found: All that was measured.
-      judged: Sources with values of a recogniser.
+      judged: Sources with values of a recognizer.
 
     Returns:
       The lines.

@@ -28,7 +28,7 @@ class Measured:
 
     @property
     def judge(self) -> tuple[str, str] | None:
-        """Fingerprints of the recogniser and of the clips that distances refer to."""
+        """Fingerprints of the recognizer and of the clips that distances refer to."""
         found = self.about.get("evaluator")
         names = ("fingerprint", "reference_clips")
         if not isinstance(found, dict) or not all(name in found for name in names):
@@ -131,9 +131,9 @@ def _data(about: dict[str, Any], evaluator: Any) -> str:
         return str(about["source"])
     run = about.get("run")
     files = run.get("data", []) if isinstance(run, dict) else []
-    # Data and licence of whom the recogniser was trained on, where nothing else says.
+    # Data and license of whom the recognizer was trained on, where nothing else says.
     told = evaluator.get("recognizer") if isinstance(evaluator, dict) else None
-    parts = [", ".join(str(x) for x in files), f"recogniser: {told}" if told else ""]
+    parts = [", ".join(str(x) for x in files), f"recognizer: {told}" if told else ""]
     return "; ".join(filter(None, parts)) or NOT_RECORDED
 
 
@@ -149,7 +149,7 @@ def provenance(measured: Measured, *, judged: bool) -> dict[str, str]:
 
     Args:
       measured: Of the file.
-      judged: Whether a recogniser had a part in it.
+      judged: Whether a recognizer had a part in it.
 
     Returns:
       Texts by heading; "not recorded" for what it does not say.

@@ -25,7 +25,7 @@ PATHS = _source("paths")
 STEPS = _source("steps", " --stages motion_2 motion_4 motion_8 motion_16 motion_32")
 
 FID = Column(
-    name="FID", here="FID", better="lower", judged=True, note="of another recogniser"
+    name="FID", here="FID", better="lower", judged=True, note="of another recognizer"
 )
 SLIDE = Column(
     name="Ft. Slid.",

@@ -30,8 +30,8 @@ RULE = (
     "Intervals are those of the file, of 95 %. Counts have Wilson's. Times have what "
     "their column says, and those without spread a factor of "
     f"{TIME_FACTOR:g} either way; others without an interval decide nothing.",
-    "Rows of several files that a recogniser judged are compared only if the files "
-    "name the same recogniser and reference clips.",
+    "Rows of several files that a recognizer judged are compared only if the files "
+    "name the same recognizer and reference clips.",
     "Intervals run over replications, clips or rollouts with one training of each "
     "row: what another seed of training would change is not in them.",
 )
@@ -155,12 +155,12 @@ def compare(claim: Claim, intervals: dict[str, Ends]) -> dict[tuple[str, str], b
     """
     answers = {}
     for pair in claim.pairs:
-        names = (*pair, claim.towards) if claim.towards else pair
+        names = (*pair, claim.toward) if claim.toward else pair
         if not all(name in intervals for name in names):
             continue
         known = [intervals[name] for name in names]
         answers[pair] = (
-            nearer(*known) if claim.towards else ordered(*known, claim.factor)
+            nearer(*known) if claim.toward else ordered(*known, claim.factor)
         )
     return answers
 

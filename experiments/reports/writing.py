@@ -27,7 +27,7 @@ ABSENT = tuple(what for module, _ in PAPERS.values() for what in module.ABSENT)
 SOURCES = tuple(
     dict.fromkeys(table.source_of(row) for table in TABLES for row in table.rows)
 )
-# Those with values of a recogniser.
+# Those with values of a recognizer.
 JUDGED = {
     table.source_of(row)
     for table in TABLES
@@ -144,7 +144,7 @@ def _json(
                 "column": claim.column,
                 "pairs": claim.pairs,
                 "factor": claim.factor,
-                "towards": claim.towards,
+                "toward": claim.toward,
                 "verdict": decision.verdict,
                 "reason": decision.reason,
             }

@@ -40,7 +40,7 @@ class ControlledSimulation:
           first: State of the controller that every character begins with.
           arrays: Picks what to show of a controller's frame, by name.
           labels: Names of the styles or skills.
-          fps: Ticks a second.
+          fps: Ticks per second.
         """
         self.fps, self.labels = fps, labels
         self.joints, self.parents = skeleton.names, skeleton.parents

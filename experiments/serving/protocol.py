@@ -17,10 +17,10 @@ The server sends one line when it is connected to,
 
   {"hello": {"version": 1, "fps": 30.0, "joints": [names], "parents": [-1, 0, ...],
              "offsets": [[x, y, z], ...], "labels": [names],
-             "units": "metres, y up; rotations 6D two columns"}}
+             "units": "meters, y up; rotations 6D two columns"}}
   - offsets: of each joint in its parent's frame.
 
-and then one line a tick, fps times a second:
+and then one line a tick, fps times per second:
 
   {"tick": 7, "time": 0.233, "root": [x, y, z], "rotations": [[6], ...], "late": 0}
   - tick: from 0. time: tick / fps, seconds.
@@ -53,7 +53,7 @@ VERSION = 1
 MAX_LINE = 4096
 MAX_SPEED = 20.0
 FACING_LENGTHS = (1e-3, 1e3)
-UNITS = "metres, y up; rotations 6D two columns"
+UNITS = "meters, y up; rotations 6D two columns"
 # Characters of a client's own text that an error repeats.
 _QUOTED = 40
 
@@ -67,7 +67,7 @@ class Command:
     """What a client asks of its character.
 
     Attributes:
-      velocity: Wanted velocity (x, z), metres a second, world.
+      velocity: Wanted velocity (x, z), meters per second, world.
       facing: Wanted facing (x, z), unit length, world.
       label: Name of the style or skill; None in systems without any.
     """
@@ -247,11 +247,11 @@ def frame_line(
     Args:
       tick: Its number.
       frame: Its arrays by name; at least "root" and "rotations".
-      fps: Ticks a second.
+      fps: Ticks per second.
       late: Ticks so far without a frame.
 
     Returns:
-      One line; metres to a hundredth of a millimetre.
+      One line; meters to a hundredth of a millimeter.
 
     Raises:
       ValueError: if a number is not finite.

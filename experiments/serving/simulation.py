@@ -11,10 +11,10 @@ class Simulation(Protocol):
     """One kind of character, of which each client has its own state.
 
     Attributes:
-      fps: Ticks a second.
+      fps: Ticks per second.
       joints: Names of the joints.
       parents: Parent of each joint; -1 for the root.
-      offsets: Position of each joint in its parent's frame, metres, [joints, 3].
+      offsets: Position of each joint in its parent's frame, meters, [joints, 3].
       labels: Names of the styles or skills.
     """
 

@@ -137,6 +137,6 @@ def report(model: Model, scene: Any, touch: np.ndarray) -> None:
     away = jnp.linalg.norm((scene.ball - scene.motion.root_position)[:, ::2], axis=-1)
     print(
         f"ball {float(jnp.median(away)):.2f} m from the root (median), nearest foot "
-        f"{float(jnp.min(nearest)):.2f} m from its centre, "
+        f"{float(jnp.min(nearest)):.2f} m from its center, "
         f"{int(np.any(touch, axis=1).sum())} frames with a touch"
     )

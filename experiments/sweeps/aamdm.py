@@ -33,7 +33,7 @@ AMOUNTS = {
     "generator_updates": Amount(
         quick=3000, full=8000, meaning="updates of each denoising-diffusion GAN"
     ),
-    "batch": Amount(quick=64, full=64, meaning="windows an update"),
+    "batch": Amount(quick=64, full=64, meaning="windows per update"),
     "width": Amount(quick=256, full=256, meaning="channels of the networks"),
     "held_out": Amount(
         quick=0.1, full=0.1, meaning="part of each clip, at its end, for evaluation"
@@ -208,7 +208,7 @@ def bench(job: Job) -> Bench:
             "samples": f"{budget['characters']} rollouts of {budget['seconds']:g} s, "
             f"free and steered (preset {PRESET!r}, {SPEED:g} m/s); Fréchet distances "
             f"of every fifth frame to those of {run.train.num_frames} training "
-            "frames, no recogniser; other intervals over rollouts",
+            "frames, no recognizer; other intervals over rollouts",
             "rollouts": setting.rollouts,
             "frames_of_a_rollout": setting.ticks,
         },

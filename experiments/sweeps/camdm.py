@@ -30,8 +30,8 @@ from sweeps.points import Point
 from sweeps.system import GROUND_TRUTH, NOISE_FLOOR, Bench, Job, Row, System
 
 AMOUNTS = {
-    "updates": Amount(quick=900, full=11000, meaning="optimiser updates of each model"),
-    "batch": Amount(quick=48, full=48, meaning="windows an update"),
+    "updates": Amount(quick=900, full=11000, meaning="optimizer updates of each model"),
+    "batch": Amount(quick=48, full=48, meaning="windows per update"),
     "width": Amount(quick=128, full=192, meaning="channels of a token"),
     "depth": Amount(quick=4, full=4, meaning="layers"),
     "warmup": Amount(quick=100, full=300, meaning="updates of linear rise of the rate"),
@@ -45,7 +45,7 @@ AMOUNTS = {
         training=False,
     ),
     "recognizer_updates": Amount(
-        quick=400, full=1500, meaning="updates of the style recogniser", training=False
+        quick=400, full=1500, meaning="updates of the style recognizer", training=False
     ),
     "chunk": Amount(
         quick=10, full=10, meaning="characters to run at a time", training=False
@@ -117,10 +117,10 @@ class Judge:
       recognizer: Of styles.
       reference: Features of the training windows.
       styles: The same by style, one window behind the other.
-      height: Below it a foot joint should not move, metres.
-      root: Median height of the root, metres.
+      height: Below it a foot joint should not move, meters.
+      root: Median height of the root, meters.
       count: Windows of each Fréchet distance.
-      labels: Style of each character; those of one style are neighbours.
+      labels: Style of each character; those of one style are neighbors.
     """
 
     recognizer: style_evaluator.Recognized
@@ -133,7 +133,7 @@ class Judge:
 
 
 def _judge(job: Job, run: camdm_training.Run) -> tuple[Judge, dict[str, Row]]:
-    """Trains the recogniser; scores the clips."""
+    """Trains the recognizer; scores the clips."""
     skeleton, field = run.model.skeleton, run.field
     styles, budget = len(run.model.labels), job.budget
     ticks = round(budget["seconds"] * run.model.config.fps)

@@ -45,7 +45,7 @@ AMOUNTS = {
     "recognizer_updates": Amount(
         quick=500,
         full=1500,
-        meaning="updates of the action recogniser, which the folder of models keeps",
+        meaning="updates of the action recognizer, which the folder of models keeps",
     ),
 }
 ROW = "emdm"

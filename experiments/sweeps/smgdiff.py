@@ -26,7 +26,7 @@ AMOUNTS = {
         full=3500,
         meaning="updates before these in which displacements hardly count",
     ),
-    "batch": Amount(quick=48, full=48, meaning="windows an update"),
+    "batch": Amount(quick=48, full=48, meaning="windows per update"),
     "width": Amount(quick=128, full=192, meaning="channels of a token"),
     "depth": Amount(quick=4, full=4, meaning="layers"),
     "held_out": Amount(
@@ -39,7 +39,7 @@ AMOUNTS = {
         training=False,
     ),
     "recognizer_updates": Amount(
-        quick=300, full=800, meaning="updates of the skill recogniser", training=False
+        quick=300, full=800, meaning="updates of the skill recognizer", training=False
     ),
     "chunk": Amount(quick=4, full=4, meaning="plans to make at a time", training=False),
     "rollout_seconds": Amount(

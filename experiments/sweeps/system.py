@@ -31,7 +31,7 @@ class Job:
       budget: Numbers, from `budgets.resolve`.
       replications: Of the evaluation.
       seed: Of everything random.
-      evaluator: A frozen recogniser; None to train one.
+      evaluator: A frozen recognizer; None to train one.
     """
 
     points: tuple[Point, ...]
@@ -76,7 +76,7 @@ class System:
       bench: Prepares the evaluation of trained models.
       quality: Column of the plot, lower is better.
       sample: What one sample is, for the time at batch 1.
-      judge: Kind of its recogniser; None if it is judged without one.
+      judge: Kind of its recognizer; None if it is judged without one.
     """
 
     data: tuple[Path, ...]

@@ -1,4 +1,4 @@
-"""Inertialised seams: a new chunk starts where and as the displayed motion was.
+"""Inertialized seams: a new chunk starts where and as the displayed motion was.
 
 Instead of cross-fading two animations, the difference between what was displayed and
 the new target is faded out. A difference x with velocity v follows the quintic whose

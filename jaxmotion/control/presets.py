@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxmotion.motion.trajectory import Command
 
-# Seconds, direction of travel and facing in degrees from +z towards +x, part of speed.
+# Seconds, direction of travel and facing in degrees from +z toward +x, part of speed.
 _Segment = tuple[float, float, float, float]
 
 
@@ -68,8 +68,8 @@ def preset_commands(
     Args:
       name: One of `PRESETS`.
       seconds: Length.
-      fps: Ticks a second.
-      speed: Metres a second.
+      fps: Ticks per second.
+      speed: Meters per second.
       label: Style.
 
     Returns:
@@ -83,8 +83,8 @@ def preset_commands(
         raise ValueError(f"unknown preset {name!r}: there are {', '.join(PRESETS)}")
     if not (np.isfinite(seconds * fps) and seconds * fps >= 1 and speed >= 0):
         raise ValueError(
-            f"{seconds} s at {fps} ticks a second and {speed} m/s: expected a tick or "
-            "more, and a speed that is not negative"
+            f"{seconds} s at {fps} ticks per second and {speed} m/s: expected a tick "
+            "or more, and a speed that is not negative"
         )
     if label < 0:
         raise ValueError(f"label is {label}, expected 0 or more")
@@ -101,7 +101,7 @@ def segment_commands(
     """Commands of segments, one per tick; they begin again at their end.
 
     Args:
-      segments: Seconds, direction of travel and facing in degrees from +z towards +x,
+      segments: Seconds, direction of travel and facing in degrees from +z toward +x,
         speed in m/s, label.
       seconds: Length of the result.
       fps: Ticks per second.

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmotion.data import clips_io, npz
 from jaxmotion.data.clips import Clips, take_clips
 from jaxmotion.motion.ball import Scene
-from jaxmotion.motion.skeleton import MAX_METRES, Motion
+from jaxmotion.motion.skeleton import MAX_METERS, Motion
 
 _FIELDS = {
     "ball_position": ("f", 2),
@@ -33,10 +33,10 @@ class BallClips:
 
     Attributes:
       clips: The person.
-      position: World position of the ball's centre in every frame, metres, y up.
+      position: World position of the ball's center in every frame, meters, y up.
       touch: Which of `joints` touch the ball in every frame.
       joints: Joints that may touch the ball (feet, or hands).
-      radius: Of the ball, metres.
+      radius: Of the ball, meters.
     """
 
     clips: Clips
@@ -58,11 +58,11 @@ def ball_clips(
 
     Args:
       clips: The person.
-      position: World position of the ball's centre in every frame, metres; its shape,
+      position: World position of the ball's center in every frame, meters; its shape,
         [frames, 3], is checked here, since it may come from a file.
       touch: Which of the joints touch the ball in every frame, [frames, touching].
       joints: Joints that may touch the ball.
-      radius: Of the ball, metres.
+      radius: Of the ball, meters.
 
     Returns:
       The clips with the ball.
@@ -78,12 +78,12 @@ def ball_clips(
             raise ValueError(
                 f"field {name!r} has shape {found.shape}, expected {shape}"
             )
-    inside = np.abs(position) <= MAX_METRES
+    inside = np.abs(position) <= MAX_METERS
     if not inside.all():
         frame = int(np.argwhere(~inside)[0, 0])
         raise ValueError(
             f"field 'ball_position' of frame {frame} is {position[frame].tolist()}, "
-            f"expected numbers within {MAX_METRES:g} m"
+            f"expected numbers within {MAX_METERS:g} m"
         )
     if not joints or not all(0 <= j < clips.skeleton.num_joints for j in joints):
         raise ValueError(

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmotion.data.bvh_text import Bvh, BvhError, parse_bvh, read_bvh, write_bvh
-from jaxmotion.motion.skeleton import MAX_METRES, Motion, Skeleton
+from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton
 
 __all__ = [
     "Bvh",
@@ -154,33 +154,33 @@ def motion_from_bvh(
 ) -> tuple[Skeleton, Motion]:
     """Skeleton and motion of a parsed file.
 
-    World coordinates stay as published (nothing is centred, turned or put on the
+    World coordinates stay as published (nothing is centerd, turned or put on the
     floor). Joints outside the subtree of `root` are dropped; the motion of its
     ancestors is composed into it. A bone that has position channels gets their mean.
 
     Args:
       bvh: A parsed file, y up.
       root: Name of the joint that becomes joint 0; by default the file's ROOT.
-      scale: Metres per unit of the file; 0.01 for centimetres.
+      scale: Meters per unit of the file; 0.01 for centimeters.
       feet: Names of the joints whose contact counts, left before right.
-      tolerance: Largest change of a bone's offset within the clip, metres.
+      tolerance: Largest change of a bone's offset within the clip, meters.
 
     Returns:
-      The skeleton (root offset zero) and the motion at 1 / frame_time frames a second.
+      The skeleton (root offset zero) and the motion, 1 / frame_time frames per second.
 
     Raises:
       BvhError: for an unknown joint name, a bone whose length changes, or a position
-        beyond `MAX_METRES`.
+        beyond `MAX_METERS`.
     """
     top = 0 if root is None else _require_joint(bvh, root)
     positions, rotations = bvh_transforms(bvh)
-    inside = np.abs(positions) * scale <= MAX_METRES
+    inside = np.abs(positions) * scale <= MAX_METERS
     if not inside.all():
         frame, joint, axis = np.argwhere(~inside)[0].tolist()
         raise BvhError(
             f"{bvh.name}: {bvh.names[joint]!r} is {positions[frame, joint, axis]:g} "
             f"from its parent along {'xyz'[axis]} in frame {frame} (OFFSET or position "
-            f"channels), expected less than {MAX_METRES / scale:g}"
+            f"channels), expected less than {MAX_METERS / scale:g}"
         )
     position, turn = _world(bvh.parents, positions, rotations, top)
     joints = _subtree(bvh, top)
@@ -278,7 +278,7 @@ def bvh_from_motion(
     Args:
       skeleton: The bones.
       motion: Frames of that skeleton, without batch axes.
-      scale: Units of the file per metre; 100 for centimetres.
+      scale: Units of the file per meter; 100 for centimeters.
       name: Name for messages.
 
     Returns:

@@ -3,7 +3,7 @@
 A file is a HIERARCHY of joints (OFFSET, CHANNELS, children, End Sites) and a MOTION
 block of one row of channel values a frame. Files of the wild differ in channel order,
 in which joints have position channels, in line ends and spacing, and in frame rate:
-all of that is kept as it is. Units are the file's own (mostly centimetres, degrees).
+all of that is kept as it is. Units are the file's own (mostly centimeters, degrees).
 """
 
 import dataclasses

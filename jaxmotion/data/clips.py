@@ -22,15 +22,15 @@ class Clips:
     """Ragged clips with labels.
 
     Attributes:
-      root_position: World position of the root in every frame, metres, y up.
+      root_position: World position of the root in every frame, meters, y up.
       joint_rotation: Parent-local rotations, two columns each.
       offsets: First frame of each clip, and the number of frames at the end.
       labels: One integer a clip for each label field ("style", "content", ...).
       skeleton: The bones all clips share.
-      fps: Frames a second of all clips.
+      fps: Frames per second of all clips.
       label_names: For each label field, the name of each integer.
       clip_names: One name a clip.
-      source: Where the data came from and its licence, for tables and cards.
+      source: Where the data came from and its license, for tables and cards.
     """
 
     root_position: Float[Array, "frames 3"]
@@ -81,7 +81,7 @@ def check_skeletons(
     Args:
       skeletons: One skeleton a clip.
       names: One name a clip.
-      tolerance: Largest difference between the offsets of two skeletons, metres.
+      tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Raises:
       ValueError: names the two clips and the joint.
@@ -118,7 +118,7 @@ def _check_motions(
         if motion.fps != motions[0].fps:
             raise ValueError(
                 f"clips {names[0]!r} and {name!r} have different rates: "
-                f"{motions[0].fps:g} and {motion.fps:g} frames a second"
+                f"{motions[0].fps:g} and {motion.fps:g} frames per second"
             )
         for field in ("root_position", "joint_rotation"):
             finite = np.isfinite(np.asarray(getattr(motion, field)))
@@ -145,8 +145,8 @@ def clips_from_motions(
       names: One name a clip.
       labels: For each label field, the label of each clip in words.
       label_names: Order of the words of a field; by default those that occur, sorted.
-      source: Where the data came from and its licence.
-      tolerance: Largest difference between the offsets of two skeletons, metres.
+      source: Where the data came from and its license.
+      tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Returns:
       The clips.

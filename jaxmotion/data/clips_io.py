@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmotion.data import npz
 from jaxmotion.data.clips import Clips
-from jaxmotion.motion.skeleton import MAX_METRES, Skeleton, check_skeleton
+from jaxmotion.motion.skeleton import MAX_METERS, Skeleton, check_skeleton
 
 _FORMAT = "jaxmotion-clips"
 _VERSION = 1
@@ -122,11 +122,11 @@ def _check_fields(path: str, fields: dict[str, np.ndarray]) -> None:
                 f"{shape}"
             )
     position = fields["root_position"]
-    inside = np.abs(_single(position)) <= MAX_METRES
+    inside = np.abs(_single(position)) <= MAX_METERS
     if not inside.all():
         index = np.argwhere(~inside)[0].tolist()
         raise ValueError(
-            f"{path}: field 'root_position' is not within {MAX_METRES:g} m at {index}: "
+            f"{path}: field 'root_position' is not within {MAX_METERS:g} m at {index}: "
             f"found {position[tuple(index)]}"
         )
     _check_rotations(path, _single(fields["joint_rotation"]))

@@ -7,7 +7,7 @@ places it rolls as a ball does (`rolling`), and a chain of them is a dribble
 learned from this is how feet and ball go together in place and time, not how a person
 runs after a ball. Beside other clips a ball lies, far away or in front of the feet.
 
-Touches are labelled by a rule of distance as in SMGDiff, but only about the frame in
+Touches are labeled by a rule of distance as in SMGDiff, but only about the frame in
 which the ball is pushed.
 """
 
@@ -68,7 +68,7 @@ def dribble_clips(
     position = [_on_ground(s.ball, people[n], settings.radius) for n, s in found]
     touch = [_touches(people[n], s, settings.radius) for n, s in found]
     return ball_clips(
-        _labelled(_stretches(clips, found), skill, seed),
+        _labeled(_stretches(clips, found), skill, seed),
         np.concatenate(position),
         np.concatenate(touch),
         joints=clips.skeleton.feet,
@@ -124,7 +124,7 @@ def _stretches(clips: Clips, found: list[tuple[int, Segment]]) -> Clips:
     )
 
 
-def _labelled(clips: Clips, skill: str, seed: int) -> Clips:
+def _labeled(clips: Clips, skill: str, seed: int) -> Clips:
     """The same clips, all of one skill, with their ball among the sources."""
     if "skill" in clips.labels:
         raise ValueError("the clips have a label field 'skill' already")
@@ -158,14 +158,14 @@ def resting_clips(
       clips: Any motion.
       skill: Label of all clips in a new field "skill".
       distance: Least and largest distance of the ball from where the root comes
-        nearest to it on the ground plane, metres. (2.5, 5) is a ball off which the
+        nearest to it on the ground plane, meters. (2.5, 5) is a ball off which the
         person is; (0.4, 0.8) one in front of the feet.
       seed: Of the places; each clip has its own random numbers.
       angle: Largest angle between the clip's mean facing and the ball's direction,
         radians; pi for anywhere.
-      travel: Clips whose root goes farther from its mean place are left out, metres.
-      radius: Of the ball, metres.
-      thickness: Of foot and shank about their bones, metres.
+      travel: Clips whose root goes farther from its mean place are left out, meters.
+      radius: Of the ball, meters.
+      thickness: Of foot and shank about their bones, meters.
 
     Returns:
       The clips, whole, without any touch.
@@ -195,7 +195,7 @@ def resting_clips(
         raise ValueError(f"no place for a ball beside {clips.num_clips} clips")
     position = np.concatenate(list(places.values()))
     return ball_clips(
-        _labelled(take_clips(clips, list(places)), skill, seed),
+        _labeled(take_clips(clips, list(places)), skill, seed),
         position,
         np.zeros((len(position), len(clips.skeleton.feet)), bool),
         joints=clips.skeleton.feet,
@@ -204,7 +204,7 @@ def resting_clips(
 
 
 def _mean_yaws(clips: Clips) -> Float[np.ndarray, "clips"]:
-    """Mean facing of each clip, radians from +z towards +x."""
+    """Mean facing of each clip, radians from +z toward +x."""
     facing = np.asarray(hip_facing(clips.skeleton, clips.joint_rotation), np.float64)
     x, z = np.add.reduceat(facing, np.asarray(clips.offsets)[:-1], axis=0).T
     return np.arctan2(x, z)

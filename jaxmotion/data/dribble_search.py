@@ -1,7 +1,7 @@
 """Chains of touches of a ball beside a recorded person, found by chance.
 
 A chain grows from touch to touch. Of the touches that follow within the time allowed,
-those are kept to which the ball can roll without meeting a leg and towards which the
+those are kept to which the ball can roll without meeting a leg and toward which the
 foot can push it. One of them is taken at random; where no way leads on, another one is
 tried, and the longest chain is kept.
 """
@@ -27,7 +27,7 @@ class Segment:
 
     Attributes:
       start: First frame.
-      ball: Its centre on the ground plane, metres.
+      ball: Its center on the ground plane, meters.
       touch_frames: Frames of the touches, counted from `start`.
       touch_feet: Which of the feet touches.
     """
@@ -68,7 +68,7 @@ def next_touches(
       body: The clip.
       touches: All of the clip.
       now: The touch that sends it.
-      arrive: Velocity with which the ball came to it, metres a second.
+      arrive: Velocity with which the ball came to it, meters per second.
       settings: What a ball may do.
 
     Returns:

@@ -19,11 +19,11 @@ def _require(holds: bool | np.bool_, settings: "Dribble", name: str, rule: str) 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Dribble:
-    """How a ball is dribbled; metres, seconds.
+    """How a ball is dribbled; meters, seconds.
 
     Attributes:
       radius: Of the ball.
-      deceleration: Of the rolling ball, metres a second squared.
+      deceleration: Of the rolling ball, meters per second squared.
       thickness: Of foot and shank about their bones: how high a standing toe joint is
         above the ground, and how far from it the ball's surface is when they touch.
       max_height: Of a touching toe above the ground.
@@ -79,9 +79,9 @@ class Touches:
     Attributes:
       frame: Of each touch.
       foot: Which of the feet touches.
-      place: Of the ball's centre on the ground plane, metres.
+      place: Of the ball's center on the ground plane, meters.
       direction: Of the toe's velocity on the ground plane.
-      speed: Of the toe on the ground plane, metres a second.
+      speed: Of the toe on the ground plane, meters per second.
     """
 
     frame: Int[np.ndarray, "touches"]
@@ -135,7 +135,7 @@ def is_free(
 
     Args:
       body: The clip.
-      place: Of the ball's centre on the ground plane, metres.
+      place: Of the ball's center on the ground plane, meters.
       frames: Of the clip.
       near: Whether a touch is so near in time that a leg may come nearer.
       settings: What is clear and what is near.

@@ -18,8 +18,8 @@ class Footsteps:
     """Feet over time; left foot first.
 
     Attributes:
-      toe: [F, 2, 3] toe joints, metres.
-      yaw: [F, 2] direction of each foot, radians from +z towards +x.
+      toe: [F, 2, 3] toe joints, meters.
+      yaw: [F, 2] direction of each foot, radians from +z toward +x.
       contact: [F, 2] whether the foot stands.
       swing: [F, 2] progress of the swing in 0..1; 0 while standing.
       phase: [F] stride phase, radians; pi more with every step.
@@ -61,10 +61,10 @@ def _turned(yaw: float, x: float, z: float) -> np.ndarray:
     return np.stack([c * x + s * z, -s * x + c * z], axis=-1)
 
 
-# More steps a second for each metre a second sideways, and each radian a second.
+# More steps per second for each meter a second sideways, and each radian a second.
 _ASIDE_PACE, _TURN_PACE = 1.0, 0.3
 
-# A foot on the ground: its toe (x, z), metres, and its direction, radians.
+# A foot on the ground: its toe (x, z), meters, and its direction, radians.
 _Placed = tuple[np.ndarray, float]
 
 
@@ -227,19 +227,19 @@ def plan_footsteps(
     """Plans the steps of one walk.
 
     Args:
-      path: [F, 2] ground position (x, z) of the body, metres.
+      path: [F, 2] ground position (x, z) of the body, meters.
       yaw: [F] its facing, radians.
-      fps: Frames a second.
-      cadence: Steps a second at no speed.
-      cadence_slope: More steps a second for each metre a second.
+      fps: Frames per second.
+      cadence: Steps per second at no speed.
+      cadence_slope: More steps per second for each meter a second.
       double_support: Part of a step in which both feet stand.
-      width: Between the feet, metres.
-      toe_ahead: Of the body when standing, metres.
-      toe_height: Of a standing toe joint, metres.
-      lift: Of a swinging toe, metres.
+      width: Between the feet, meters.
+      toe_ahead: Of the body when standing, meters.
+      toe_height: Of a standing toe joint, meters.
+      lift: Of a swinging toe, meters.
       toe_out: Of each foot, radians.
       generator: Of the small variations.
-      jitter: Standard deviation of the landing points, metres.
+      jitter: Standard deviation of the landing points, meters.
 
     Returns:
       The feet in every frame.
@@ -248,7 +248,7 @@ def plan_footsteps(
     speed = np.linalg.norm(velocity, axis=-1)
     aside = np.abs(velocity[:, 0] * np.cos(yaw) - velocity[:, 1] * np.sin(yaw))
     turning = np.abs(np.gradient(yaw)) * fps
-    # Steps a second: quicker sideways and in turns, where a step reaches less far.
+    # Steps per second: quicker sideways and in turns, where a step reaches less far.
     pace = cadence + cadence_slope * speed + _ASIDE_PACE * aside + _TURN_PACE * turning
     # Sideways the feet are set so far apart that the one behind does not overtake.
     widths = np.maximum(width, aside / pace + 0.7 * width)

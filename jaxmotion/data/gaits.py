@@ -5,12 +5,12 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Gait:
-    """A manner of walking; angles in radians, lengths in metres.
+    """A manner of walking; angles in radians, lengths in meters.
 
     Attributes:
-      max_speed: Metres a second.
-      cadence: Steps a second at no speed.
-      cadence_slope: More steps a second for each metre a second.
+      max_speed: Meters per second.
+      cadence: Steps per second at no speed.
+      cadence_slope: More steps per second for each meter a second.
       double_support: Part of a step with both feet down.
       width: Between the feet.
       lift: Of a swinging toe.

@@ -155,7 +155,7 @@ def mirror_plan(
       skeleton: The bones; they may be asymmetric by up to the tolerance.
       pairs: Names of left and right joints; by default from Left/Right, _L/_R, l/r.
       motion: Reference frames, as varied as possible, without batch axes.
-      tolerance: Largest asymmetry of a bone's offset, metres.
+      tolerance: Largest asymmetry of a bone's offset, meters.
 
     Returns:
       The plan.

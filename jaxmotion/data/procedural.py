@@ -48,11 +48,11 @@ def follow_commands(
     Args:
       commands: One a frame; the body starts at the origin, at rest, facing as the
         first command.
-      fps: Frames a second.
+      fps: Frames per second.
       half_life: Of the springs, seconds.
 
     Returns:
-      Ground positions (x, z), metres, and facings.
+      Ground positions (x, z), meters, and facings.
     """
 
     def move(carry: tuple, command: Command) -> tuple[tuple, tuple]:
@@ -101,7 +101,7 @@ def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> 
         ignored.
       gait: The manner. Speeds above its max_speed look rushed; far above, legs are too
         short for the steps.
-      fps: Frames a second.
+      fps: Frames per second.
       seed: Of the small variations between steps.
 
     Returns:
@@ -151,8 +151,8 @@ def random_commands(
     Args:
       generator: Of everything.
       frames: Length.
-      fps: Frames a second.
-      max_speed: Metres a second; sideways and backwards half of it.
+      fps: Frames per second.
+      max_speed: Meters per second; sideways and backwards half of it.
 
     Returns:
       One command a frame, label 0.
@@ -195,7 +195,7 @@ def make_clips(
       seed: Of everything; the same seed gives the same clips.
       minutes: Of all clips together, rounded up to whole clips of each gait.
       gaits: Manners by name; None for all of `GAITS`.
-      fps: Frames a second.
+      fps: Frames per second.
       clip_seconds: Length of each clip.
 
     Returns:

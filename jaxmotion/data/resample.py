@@ -54,7 +54,7 @@ def resample(motion: Motion, fps: float) -> Motion:
 
     Args:
       motion: Frames, with any batch axes.
-      fps: Frames a second that are wanted.
+      fps: Frames per second that are wanted.
 
     Returns:
       The motion at that rate.
@@ -71,7 +71,7 @@ def resample(motion: Motion, fps: float) -> Motion:
     ratio = motion.fps / fps
     if not 1 / 16 <= ratio <= 16:
         raise ValueError(
-            f"resampling from {motion.fps:g} to {fps:g} frames a second is more than "
+            f"resampling from {motion.fps:g} to {fps:g} frames per second is more than "
             "a factor of 16; is one of them wrong?"
         )
     if ratio == 1.0:
@@ -121,7 +121,7 @@ def resample_clips(clips: Clips, fps: float) -> Clips:
 
     Args:
       clips: The clips.
-      fps: Frames a second, at most 16 times and at least 1/16 of theirs.
+      fps: Frames per second, at most 16 times and at least 1/16 of theirs.
 
     Returns:
       The clips; a clip's first frame stays its first.

@@ -5,7 +5,7 @@ friction does:
 
     x(t) = v t - a t^2 / 2    until it stops at t = v / a                         (1)
 
-It has to be `d` metres away after `t` seconds. It arrives rolling, with v = d / t +
+It has to be `d` meters away after `t` seconds. It arrives rolling, with v = d / t +
 a t / 2 at the start and v - a t >= 0 at the end, if d >= a t^2 / 2. Otherwise it stops
 there early, with v = sqrt(2 a d), and lies.
 
@@ -38,12 +38,12 @@ def start_speed(
     """Speed with which a ball has to leave to be somewhere in time.
 
     Args:
-      distance: Metres to roll.
+      distance: Meters to roll.
       seconds: Time to do so, positive; the ball may be early.
-      deceleration: Of a rolling ball, positive, metres a second squared.
+      deceleration: Of a rolling ball, positive, meters per second squared.
 
     Returns:
-      Metres a second.
+      Meters per second.
     """
     rolls = distance / seconds + deceleration * seconds / 2
     stops = np.sqrt(2 * deceleration * distance)
@@ -59,13 +59,13 @@ def roll(
     """Where a ball is on its way to a place: (1).
 
     Args:
-      displacement: From where it starts to that place, metres on the ground.
+      displacement: From where it starts to that place, meters on the ground.
       seconds: Time of arrival, positive; the ball may stop there before.
-      deceleration: Of a rolling ball, positive, metres a second squared.
+      deceleration: Of a rolling ball, positive, meters per second squared.
       times: Between 0 and `seconds`.
 
     Returns:
-      Displacement at those times, metres.
+      Displacement at those times, meters.
     """
     distance = np.linalg.norm(displacement, axis=-1)
     speed = start_speed(distance, seconds, deceleration)[..., None]
@@ -83,12 +83,12 @@ def end_velocities(
     """Velocities of a ball that leaves, and of one that has arrived.
 
     Args:
-      displacement: From where it starts to where it has to be, metres on the ground.
+      displacement: From where it starts to where it has to be, meters on the ground.
       seconds: Time of arrival, positive.
-      deceleration: Of a rolling ball, positive, metres a second squared.
+      deceleration: Of a rolling ball, positive, meters per second squared.
 
     Returns:
-      Metres a second; the second is zero where the ball stopped on the way.
+      Meters per second; the second is zero where the ball stopped on the way.
     """
     distance = np.linalg.norm(displacement, axis=-1)
     speed = start_speed(distance, seconds, deceleration)
@@ -99,7 +99,7 @@ def end_velocities(
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Body:
-    """What a ball meets of one clip; metres, metres a second.
+    """What a ball meets of one clip; meters, meters per second.
 
     Attributes:
       ground: Height of the ground.
@@ -108,7 +108,7 @@ class Body:
       velocity: Of the toes, on the ground plane.
       standing: Which of them stand.
       legs: Both ends of the bones from toe to ankle and from ankle to knee.
-      fps: Frames a second.
+      fps: Frames per second.
     """
 
     ground: float
@@ -125,7 +125,7 @@ def bodies(clips: Clips, *, thickness: float) -> list[Body]:
 
     Args:
       clips: At least two frames a clip.
-      thickness: How high the joint of a standing toe is above the ground, metres.
+      thickness: How high the joint of a standing toe is above the ground, meters.
 
     Returns:
       One body a clip.
@@ -203,11 +203,11 @@ def ground_height(
     """Height at which toes stand: few of those that stand are lower.
 
     Args:
-      heights: Of the toes, metres.
+      heights: Of the toes, meters.
       standing: Which of them stand; where none does, all count.
 
     Returns:
-      The fifth percentile, metres: a lowest foot that no outlier pulls down.
+      The fifth percentile, meters: a lowest foot that no outlier pulls down.
     """
     return float(np.percentile(heights[standing] if standing.any() else heights, 5))
 
@@ -219,11 +219,11 @@ def leg_distances(
     """Distance from a point to the nearest bone of the legs in the same frame.
 
     Args:
-      ball: The centre of the ball, metres.
-      legs: Both ends of each bone, metres.
+      ball: The center of the ball, meters.
+      legs: Both ends of each bone, meters.
 
     Returns:
-      Metres.
+      Meters.
     """
     start, along = legs[:, :, 0], legs[:, :, 1] - legs[:, :, 0]
     square = np.maximum(np.sum(along**2, axis=-1), 1e-12)

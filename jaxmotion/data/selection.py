@@ -182,7 +182,7 @@ def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
 
     Args:
       parts: Sets of clips with the same label fields and rate.
-      tolerance: Largest difference between the offsets of two skeletons, metres.
+      tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Returns:
       One set with the first part's skeleton; its source lists those of the parts.
@@ -199,7 +199,7 @@ def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
             raise ValueError(f"label fields differ: {fields} and {found}")
     rates = {part.fps for part in parts}
     if len(rates) > 1:
-        raise ValueError(f"rates differ: {sorted(rates)} frames a second")
+        raise ValueError(f"rates differ: {sorted(rates)} frames per second")
     check_skeletons(
         [part.skeleton for part in parts],
         [part.clip_names[0] for part in parts],
@@ -241,7 +241,7 @@ def label_speeds(clips: Clips, *, field: str) -> Float[Array, " labels"]:
       field: Label field that is the style.
 
     Returns:
-      Metres a second; 0 for a style without clips.
+      Meters per second; 0 for a style without clips.
     """
     step = np.diff(np.asarray(clips.root_position)[:, ::2], axis=0)
     speed = np.linalg.norm(step, axis=-1) * clips.fps

@@ -30,7 +30,7 @@ def upsample(motion: Motion, fps: float) -> Motion:
 
     Args:
       motion: One clip.
-      fps: Frames a second that are wanted.
+      fps: Frames per second that are wanted.
 
     Returns:
       The motion; the same one if it has that rate. Its last frame is the last that is
@@ -43,8 +43,8 @@ def upsample(motion: Motion, fps: float) -> Motion:
     frames = motion.root_position.shape[0]
     if not (np.isfinite(fps) and motion.fps <= fps <= 16 * motion.fps):
         raise ValueError(
-            f"{motion.fps:g} frames a second cannot be resampled to {fps:g}: expected "
-            "a rate that is as high or up to 16 times as high"
+            f"{motion.fps:g} frames per second cannot be resampled to {fps:g}: "
+            "expected a rate that is as high or up to 16 times as high"
         )
     if fps == motion.fps:
         return motion
@@ -104,7 +104,7 @@ def least_frames(fps: float) -> int:
     """Frames that a clip needs to have a simulation bone.
 
     Args:
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       The longest window of the filters.

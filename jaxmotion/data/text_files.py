@@ -127,7 +127,7 @@ def cut_recording(
       name: Name of the recording.
       features: Its frames.
       captions: Its captions.
-      cut_fps: Frames a second by which times become frames.
+      cut_fps: Frames per second by which times become frames.
       min_frames: Fewest frames of a clip.
       max_frames: Most frames of a clip.
 

@@ -24,7 +24,7 @@ class TextMotions:
     """Ragged clips with captions, on the host.
 
     Attributes:
-      features: Feature vectors of all clips behind each other, not normalised.
+      features: Feature vectors of all clips behind each other, not normalized.
       offsets: First frame of each clip, and the number of frames at the end.
       mean: Of each feature, over frames.
       std: Of each feature (or of its group), positive.
@@ -33,9 +33,9 @@ class TextMotions:
       caption_clip: The clip of each caption, ascending.
       split: Number of each clip's split.
       clip_names: One name a clip.
-      fps: Frames a second.
+      fps: Frames per second.
       split_names: Name of each split.
-      source: Where the data came from and its licence.
+      source: Where the data came from and its license.
     """
 
     features: Float[np.ndarray, "frames features"]
@@ -219,8 +219,8 @@ def text_motions(
       names: One name a clip.
       mean: Mean of each feature; without it and std, those of the training clips.
       std: Standard deviation of each feature.
-      fps: Frames a second.
-      source: Where the data came from and its licence.
+      fps: Frames per second.
+      source: Where the data came from and its license.
 
     Returns:
       The clips, in the order given.

@@ -17,9 +17,9 @@ TOE_HEIGHT = 0.03
 TOE_AHEAD = 0.14
 _ANKLE_UP = 0.07
 _HIP_SIDE, _HIP_DOWN = 0.09, 0.05
-# Least distance from hip to ankle, metres: a folded knee.
+# Least distance from hip to ankle, meters: a folded knee.
 _SHORTEST = 0.15
-# Least height of the pelvis, metres: a deep squat.
+# Least height of the pelvis, meters: a deep squat.
 _LOWEST = 0.5
 # Foot (left, right) and its thigh.
 _LEGS = ((0, 14), (1, 18))
@@ -159,14 +159,14 @@ def solve_pose(
     """Root positions and local rotations of the whole body.
 
     Args:
-      path: [F, 2] ground position of the body, metres.
+      path: [F, 2] ground position of the body, meters.
       yaw: [F] its facing, radians.
       steps: Where the feet are.
       gait: The manner.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
-      [F, 3] metres, and [F, 22, 3, 3] parent-local rotation matrices.
+      [F, 3] meters, and [F, 22, 3, 3] parent-local rotation matrices.
 
     Raises:
       ValueError: if the legs do not reach the steps; names the first such frame.
@@ -254,7 +254,7 @@ def _foot(
 def _leg_lengths(
     root: np.ndarray, pelvis: np.ndarray, steps: Footsteps, fps: float
 ) -> np.ndarray:
-    """Distance from hip to ankle that each leg must bridge, [F, 2] metres."""
+    """Distance from hip to ankle that each leg must bridge, [F, 2] meters."""
     far = []
     for foot, thigh in _LEGS:
         hip = root + pelvis @ np.array(_BONES[thigh][2])

@@ -26,7 +26,7 @@ class WindowIndex:
     Attributes:
       starts: First frame of each window, counted over all clips.
       clips: The clip of each window.
-      length: Frames a window.
+      length: Frames per window.
     """
 
     starts: Int[Array, "windows"]
@@ -41,7 +41,7 @@ def window_starts(
 
     Args:
       offsets: First frame of each clip, and the number of frames at the end.
-      length: Frames a window.
+      length: Frames per window.
       stride: Frames between the starts of windows of one clip.
 
     Returns:
@@ -67,7 +67,7 @@ def window_index(
 
     Args:
       clips: The clips.
-      length: Frames a window.
+      length: Frames per window.
       stride: Frames between the starts of windows of one clip.
       short: What to do with clips shorter than a window.
 
@@ -146,7 +146,7 @@ class EvalWindows:
 
     Attributes:
       motion: Windows of 60 frames, world.
-      velocity: Wanted velocity in each frame, metres a second.
+      velocity: Wanted velocity in each frame, meters per second.
       facing: Wanted facing in each frame.
       label: Style of each window.
       group: Clip or rollout of each window.

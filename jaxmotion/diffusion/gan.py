@@ -1,4 +1,4 @@
-"""Denoising-diffusion GANs: pairs of neighbouring noise levels, and their losses.
+"""Denoising-diffusion GANs: pairs of neighboring noise levels, and their losses.
 
 A generator predicts x_0 from x_t and a latent; its x_{t-1} is drawn from the posterior.
 A discriminator tells pairs (x_{t-1}, x_t) of the data from such pairs. Because the
@@ -31,7 +31,7 @@ def q_pair(
     x_0: Float[Array, "*shape"],
     t: Int[Array, "*#batch"],
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
-    """A pair of neighbouring noise levels of the same clean sample.
+    """A pair of neighboring noise levels of the same clean sample.
 
     The noise of the second step is independent of that of the first.
 

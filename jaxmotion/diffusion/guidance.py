@@ -21,7 +21,7 @@ def classifier_free(
 
     x_0 = null + scale * (conditional - null): 0 ignores the condition, 1 is the plain
     conditional denoiser, more exaggerates it. Both predictions come from one call of
-    the network, vectorised over the two conditions, with one key, so that a stochastic
+    the network, vectorized over the two conditions, with one key, so that a stochastic
     denoiser draws the same latent for both.
 
     Args:

@@ -175,7 +175,7 @@ def vp_schedule(
     Raises:
       ValueError: if an argument is out of range.
 
-    Source: Song et al. 2021, eq. 32-33; discretised as in Xiao et al. 2022 (DDGAN) and
+    Source: Song et al. 2021, eq. 32-33; discretized as in Xiao et al. 2022 (DDGAN) and
     the released code of EMDM. Differs: those give the clean sample a variance of 1e-8.
     """
     _check_num_steps(num_steps)
@@ -296,7 +296,7 @@ def q_sample(
 
     Args:
       schedule: Table of T steps.
-      x_0: Clean sample, in normalised units.
+      x_0: Clean sample, in normalized units.
       t: Step in 0..T, a scalar or one for each index of x_0's leading axes. Steps out
         of range clamp, they do not raise.
       noise: Standard normal noise.
@@ -357,7 +357,7 @@ def posterior(
 
     Args:
       schedule: Table of T steps.
-      x_0: Clean sample (or its prediction), in normalised units.
+      x_0: Clean sample (or its prediction), in normalized units.
       x_t: Sample at step t.
       t: Step in 1..T, a scalar or one for each index of x_0's leading axes. Steps out
         of range clamp, they do not raise.
@@ -393,7 +393,7 @@ def noise_from_x0(
 
     Args:
       schedule: Table of T steps.
-      x_0: Clean sample, in normalised units.
+      x_0: Clean sample, in normalized units.
       x_t: Sample at step t.
       t: Step in 1..T (at 0 there is no noise to find), a scalar or one for each index
         of x_0's leading axes. Steps out of range clamp, they do not raise.

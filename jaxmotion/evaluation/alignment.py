@@ -28,7 +28,7 @@ def heading_error(
       actual: Ground directions of any length.
 
     Returns:
-      Angle in [-pi, pi] radians, positive from +z towards +x.
+      Angle in [-pi, pi] radians, positive from +z toward +x.
 
     Source: own.
     """
@@ -50,11 +50,11 @@ def trajectory_error(
     speed is below `min_speed` are left out; the part that remains is returned.
 
     Args:
-      wanted_velocity: Velocity (x, z) that the user asked for in each frame, metres a
+      wanted_velocity: Velocity (x, z) that the user asked for in each frame, meters a
         second; the last is not used.
-      position: Root position (x, z) in each frame, metres.
-      fps: Frames a second.
-      min_speed: Metres a second.
+      position: Root position (x, z) in each frame, meters.
+      fps: Frames per second.
+      min_speed: Meters per second.
 
     Returns:
       Mean error in [0, pi] radians (zero where no frame remains), and the part of the

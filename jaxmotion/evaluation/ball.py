@@ -1,6 +1,6 @@
 """Figures of a person with a ball: who moves it, how near, and what passes through it.
 
-World positions in metres, y up, the ball given by its centre. What is a mean over
+World positions in meters, y up, the ball given by its center. What is a mean over
 events or frames comes as a total and what to divide it by, so that clips are joined by
 adding both.
 """
@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from jaxmotion.motion.ball import ball_accelerations
 from jaxmotion.motion.spring import Scalar
 
-_MILLIMETRES = 1000.0
+_MILLIMETERS = 1000.0
 
 
 class TouchEvents(NamedTuple):
@@ -40,7 +40,7 @@ class TouchCount(NamedTuple):
 
 
 class Depth(NamedTuple):
-    """Millimetres: mean over the frames, and that of the worst frame."""
+    """Millimeters: mean over the frames, and that of the worst frame."""
 
     mean: Float[Array, "*batch"]
     largest: Float[Array, "*batch"]
@@ -50,15 +50,15 @@ class Depth(NamedTuple):
 def touch_events(
     ball: Float[Array, "*batch frames 3"], fps: Scalar, *, threshold: Scalar
 ) -> TouchEvents:
-    """When the ball is pushed: frames of large acceleration, neighbours as one event.
+    """When the ball is pushed: frames of large acceleration, neighbors as one event.
 
     The ground pushes too. A ball in flight accelerates by 9.8: below that threshold the
     flight and the kicks at its two ends are a single event. A bounce is one as well.
 
     Args:
-      ball: Positions, metres.
-      fps: Frames a second.
-      threshold: Metres a second squared, exclusive. The paper's 2 is a second
+      ball: Positions, meters.
+      fps: Frames per second.
+      threshold: Meters per second squared, exclusive. The paper's 2 is a second
         difference of 2.2 mm at 30 fps, which noise in a recording exceeds.
 
     Returns:
@@ -84,19 +84,19 @@ def foot_ball_distance(
     *,
     threshold: Scalar,
 ) -> Tally:
-    """How near the nearest joint comes to the ball's centre when the ball is pushed.
+    """How near the nearest joint comes to the ball's center when the ball is pushed.
 
     Of each event of `touch_events` the smallest distance of any joint, over the event's
     frames and one frame on either side.
 
     Args:
-      ball: Positions, metres.
-      joints: World positions of the joints that may touch it (feet, or hands), metres.
-      fps: Frames a second.
-      threshold: Acceleration of an event, metres a second squared, exclusive.
+      ball: Positions, meters.
+      joints: World positions of the joints that may touch it (feet, or hands), meters.
+      fps: Frames per second.
+      threshold: Acceleration of an event, meters per second squared, exclusive.
 
     Returns:
-      Metres, added over events, and the number of events. A touch by the surface of a
+      Meters, added over events, and the number of events. A touch by the surface of a
       foot leaves the ball's radius and half a foot.
 
     Raises:
@@ -124,11 +124,11 @@ def touch_count(
     above `max_distance`. Divide by the minutes for touches a minute.
 
     Args:
-      ball: Positions, metres.
-      joints: World positions of the joints that may touch it, metres.
-      fps: Frames a second.
-      threshold: Acceleration of an event, metres a second squared, exclusive.
-      max_distance: From a joint to the ball's centre, metres, inclusive: the ball's
+      ball: Positions, meters.
+      joints: World positions of the joints that may touch it, meters.
+      fps: Frames per second.
+      threshold: Acceleration of an event, meters per second squared, exclusive.
+      max_distance: From a joint to the ball's center, meters, inclusive: the ball's
         radius, half a foot, and a margin.
 
     Returns:
@@ -159,17 +159,17 @@ def untouched_acceleration(
     """How much the ball accelerates while no joint is near it.
 
     Over the frames in which, as in the frames before and after, every joint is farther
-    than `max_distance`. A rolling ball is slowed by a few tenths of a metre a second
+    than `max_distance`. A rolling ball is slowed by a few tenths of a meter a second
     squared, a flying one falls with 9.8: compare with real motions.
 
     Args:
-      ball: Positions, metres.
-      joints: World positions of the joints that may touch it, metres.
-      fps: Frames a second.
-      max_distance: From a joint to the ball's centre, metres, inclusive.
+      ball: Positions, meters.
+      joints: World positions of the joints that may touch it, meters.
+      fps: Frames per second.
+      max_distance: From a joint to the ball's center, meters, inclusive.
 
     Returns:
-      Length of the acceleration in metres a second squared, added over these frames,
+      Length of the acceleration in meters per second squared, added over these frames,
       and their number.
 
     Raises:
@@ -190,12 +190,12 @@ def ground_penetration(
     """How deep the ball's lowest point lies below the ground.
 
     Args:
-      ball: Positions, metres.
-      radius: Of the ball, metres.
-      ground: Height of the ground, metres.
+      ball: Positions, meters.
+      radius: Of the ball, meters.
+      ground: Height of the ground, meters.
 
     Returns:
-      Millimetres, not negative: mean over all frames, and largest.
+      Millimeters, not negative: mean over all frames, and largest.
     """
     return _depth(radius + ground - ball[..., 1])
 
@@ -212,28 +212,28 @@ def joint_penetration(
     Joints lie inside the limbs, hence zero here does not yet keep their surface out.
 
     Args:
-      ball: Positions, metres.
-      joints: World positions of the joints, metres.
-      radius: Of the ball, metres.
+      ball: Positions, meters.
+      joints: World positions of the joints, meters.
+      radius: Of the ball, meters.
 
     Returns:
-      Millimetres, not negative: mean over all frames, and largest.
+      Millimeters, not negative: mean over all frames, and largest.
     """
     return _depth(radius - _nearest(ball, joints))
 
 
-def _depth(metres: Float[Array, "*batch frames"]) -> Depth:
-    depth = _MILLIMETRES * jnp.maximum(metres, 0.0)
+def _depth(meters: Float[Array, "*batch frames"]) -> Depth:
+    depth = _MILLIMETERS * jnp.maximum(meters, 0.0)
     return Depth(mean=jnp.mean(depth, axis=-1), largest=jnp.max(depth, axis=-1))
 
 
 def _nearest(ball: Array, joints: Array) -> Float[Array, "*batch frames"]:
-    """Distance of the nearest joint to the ball's centre, metres."""
+    """Distance of the nearest joint to the ball's center, meters."""
     return jnp.min(jnp.linalg.norm(joints - ball[..., None, :], axis=-1), axis=-1)
 
 
 def _least_nearby(values: Float[Array, "*batch frames"]) -> Array:
-    """The least of each frame and its neighbours."""
+    """The least of each frame and its neighbors."""
     none = jnp.full_like(values[..., :1], jnp.inf)
     padded = jnp.concatenate([none, values, none], axis=-1)
     sides = jnp.minimum(padded[..., :-2], padded[..., 2:])

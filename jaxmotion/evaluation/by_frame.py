@@ -49,12 +49,12 @@ def by_frame(
     jerk of frames 5, 6 and 7 (as 1 : 2 : 1) and in the slide of frame 5.
 
     Args:
-      positions: World, metres.
+      positions: World, meters.
       feet: Joints whose sliding counts.
       place: Of each frame, in 0..num_places-1; others are left out.
       fps: Frames per second.
       num_places: Length of the result.
-      contact_height: A foot joint below this height should not move, metres.
+      contact_height: A foot joint below this height should not move, meters.
 
     Returns:
       Means over the batch and time.

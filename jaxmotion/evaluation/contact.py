@@ -1,4 +1,4 @@
-"""Feet that slide on the ground. Heights are y above the ground at y = 0, metres."""
+"""Feet that slide on the ground. Heights are y above the ground at y = 0, meters."""
 
 from typing import NamedTuple
 
@@ -25,10 +25,10 @@ def foot_steps(
     """Distance on the ground from each frame to the next.
 
     Args:
-      foot_positions: World positions, metres.
+      foot_positions: World positions, meters.
 
     Returns:
-      Metres.
+      Meters.
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -45,19 +45,19 @@ def slide_distance(
     *,
     max_height: Scalar = 0.01,
 ) -> Slide:
-    """Metres that the toes slide for each second that they are low.
+    """Meters that the toes slide for each second that they are low.
 
     Over all feet and all frames in which a foot is lower than `max_height`: the
     horizontal distance to the next frame, summed, divided by the time summed. To join
     clips, weight their speeds with their seconds.
 
     Args:
-      foot_positions: World positions of the toes, metres, ground at y = 0.
-      fps: Frames a second.
-      max_height: Metres, exclusive ("below, e.g., 1 cm" in the paper).
+      foot_positions: World positions of the toes, meters, ground at y = 0.
+      fps: Frames per second.
+      max_height: Meters, exclusive ("below, e.g., 1 cm" in the paper).
 
     Returns:
-      Speed in metres a second (zero where no foot is ever low) and the seconds that
+      Speed in meters per second (zero where no foot is ever low) and the seconds that
       feet were low, added over feet.
 
     Raises:
@@ -68,9 +68,9 @@ def slide_distance(
     """
     steps = foot_steps(foot_positions)
     is_low = foot_positions[..., :-1, :, 1] < max_height
-    metres = jnp.sum(jnp.where(is_low, steps, 0.0), axis=(-2, -1))
+    meters = jnp.sum(jnp.where(is_low, steps, 0.0), axis=(-2, -1))
     seconds = jnp.sum(is_low, axis=(-2, -1)) / fps
-    speed = metres / jnp.where(seconds > 0, seconds, 1.0)
+    speed = meters / jnp.where(seconds > 0, seconds, 1.0)
     return Slide(speed=speed, seconds=seconds)
 
 
@@ -88,10 +88,10 @@ def skate_ratio(
     and moves faster than `min_speed` on the ground.
 
     Args:
-      foot_positions: World positions of feet or toes, metres, ground at y = 0.
-      fps: Frames a second.
-      max_height: Metres, exclusive.
-      min_speed: Metres a second, exclusive. The source's 2.5 cm a frame at 20 fps.
+      foot_positions: World positions of feet or toes, meters, ground at y = 0.
+      fps: Frames per second.
+      max_height: Meters, exclusive.
+      min_speed: Meters per second, exclusive. The source's 2.5 cm a frame at 20 fps.
 
     Returns:
       Ratio in [0, 1].
@@ -123,10 +123,10 @@ def skating_frame_ratio(
     if that exceeds `min_speed`.
 
     Args:
-      foot_positions: World positions of feet or toes, metres, ground at y = 0.
-      fps: Frames a second.
-      height: H, metres.
-      min_speed: Metres a second, exclusive; ours, since the source sums the measure.
+      foot_positions: World positions of feet or toes, meters, ground at y = 0.
+      fps: Frames per second.
+      height: H, meters.
+      min_speed: Meters per second, exclusive; ours, since the source sums the measure.
 
     Returns:
       Ratio in [0, 1].

@@ -146,12 +146,12 @@ def joint_distance(
 
     Args:
       key: Consumed.
-      positions: Joint positions, metres, in the frame they are to be compared in:
+      positions: Joint positions, meters, in the frame they are to be compared in:
         world for the whole rollout, root-local for the pose alone.
       num_pairs: Pairs to draw.
 
     Returns:
-      Metres.
+      Meters.
 
     Raises:
       ValueError: if there are fewer than two samples.
@@ -178,11 +178,11 @@ def intra_style_variance(
     the repeats, unbiased, averaged over frames and joints.
 
     Args:
-      positions: Joint positions, metres, in the frame they are to be compared in:
+      positions: Joint positions, meters, in the frame they are to be compared in:
         world for the whole rollout, root-local for the pose alone.
 
     Returns:
-      Variance, square metres (summed over the three axes).
+      Variance, square meters (summed over the three axes).
 
     Raises:
       ValueError: if there are fewer than two repeats.

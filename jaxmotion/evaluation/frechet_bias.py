@@ -59,7 +59,7 @@ def subset_sizes(count: int, *, number: int = 15, least: int) -> tuple[int, ...]
     if number < 2 or not 2 <= least <= count - number + 1:
         raise ValueError(
             f"{number} sizes from {least} to {count} samples: expected 2 sizes or "
-            "more, from 2 samples or more, and a sample between neighbours"
+            "more, from 2 samples or more, and a sample between neighbors"
         )
     step = (count - least) / (number - 1)
     return tuple(round(least + i * step) for i in range(number))

@@ -45,11 +45,11 @@ def diverged_frames(
     """Which frames are outside what a body can show.
 
     Args:
-      positions: World positions of the joints, metres; joint 0 is the root.
-      fps: Frames a second.
-      min_root: Lowest root height, metres.
-      max_root: Highest root height, metres.
-      max_speed: Of any joint, metres a second.
+      positions: World positions of the joints, meters; joint 0 is the root.
+      fps: Frames per second.
+      min_root: Lowest root height, meters.
+      max_root: Highest root height, meters.
+      max_speed: Of any joint, meters per second.
 
     Returns:
       True where a number is not finite, the root is outside its heights, or a joint
@@ -77,11 +77,11 @@ def has_diverged(
     """Whether any frame is outside what a body can show.
 
     Args:
-      positions: World positions of the joints, metres; joint 0 is the root.
-      fps: Frames a second.
-      min_root: Lowest root height, metres.
-      max_root: Highest root height, metres.
-      max_speed: Of any joint, metres a second.
+      positions: World positions of the joints, meters; joint 0 is the root.
+      fps: Frames per second.
+      min_root: Lowest root height, meters.
+      max_root: Highest root height, meters.
+      max_speed: Of any joint, meters per second.
 
     Returns:
       True where a number is not finite, the root is outside its heights, or a joint is
@@ -110,12 +110,12 @@ def frozen_frames(
     above `commanded`: a statue is frozen whether it stands or glides.
 
     Args:
-      positions: World positions of the joints, metres; joint 0 is the root.
-      wanted_velocity: Velocity (x, z) asked for in each frame, metres a second.
-      fps: Frames a second.
+      positions: World positions of the joints, meters; joint 0 is the root.
+      wanted_velocity: Velocity (x, z) asked for in each frame, meters per second.
+      fps: Frames per second.
       seconds: Length of a window.
-      min_speed: Metres a second.
-      commanded: Metres a second.
+      min_speed: Meters per second.
+      commanded: Meters per second.
 
     Returns:
       True for all frames of frozen windows; never behind the last whole window.
@@ -154,12 +154,12 @@ def is_frozen(
     """Whether a character stops moving its limbs for some seconds while told to travel.
 
     Args:
-      positions: World positions of the joints, metres; joint 0 is the root.
-      wanted_velocity: Velocity (x, z) asked for in each frame, metres a second.
-      fps: Frames a second.
+      positions: World positions of the joints, meters; joint 0 is the root.
+      wanted_velocity: Velocity (x, z) asked for in each frame, meters per second.
+      fps: Frames per second.
       seconds: Length of a window of `frozen_frames`.
-      min_speed: Metres a second.
-      commanded: Metres a second.
+      min_speed: Meters per second.
+      commanded: Meters per second.
 
     Returns:
       True where any window is frozen; never for motions shorter than a window.
@@ -185,7 +185,7 @@ def time_to_failure(failed: Bool[Array, "*batch frames"], *, fps: float) -> Expo
     Args:
       failed: Frames that diverged or are frozen: `diverged_frames | frozen_frames`, or
         one of both.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       Whether any frame failed, and the minutes up to the first that did, it included,

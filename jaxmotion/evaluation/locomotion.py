@@ -28,12 +28,12 @@ def locomotion_metrics(
     Args:
       skeleton: The skeleton; its feet are the joints whose sliding counts.
       motion: Windows [windows, frames, ...], world.
-      wanted_velocity: Velocity asked for in each frame, metres a second.
+      wanted_velocity: Velocity asked for in each frame, meters per second.
       wanted_facing: Facing asked for in each frame.
-      contact_height: A foot joint below this height should not move, metres.
+      contact_height: A foot joint below this height should not move, meters.
 
     Returns:
-      trajectory_error and orientation_error in radians; slide_speed in metres a second
+      trajectory_error and orientation_error in radians; slide_speed in m/s
       over slide_seconds of low feet; skate_ratio; acceleration, m/s^2; jerk, m/s^3.
     """
     fps = motion.fps

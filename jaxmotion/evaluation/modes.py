@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 def mode_scores(
     points: Float[np.ndarray, "sequences steps axes"],
-    centres: Float[np.ndarray, "modes axes"],
+    centers: Float[np.ndarray, "modes axes"],
     *,
     sigma: float,
     share: float = 0.01,
@@ -18,26 +18,26 @@ def mode_scores(
 
     Args:
       points: Rollouts.
-      centres: Centres of the modes.
+      centers: Centers of the modes.
       sigma: Standard deviation of a mode in each axis.
       share: A mode counts as covered at a step if at least this share of that step's
-        points is within 3 sigma of its centre.
+        points is within 3 sigma of its center.
 
     Returns:
       least_modes_covered: fewest modes covered at any step.
       least_within_3_sigma: least share of points at any step within 3 sigma of some
-        centre.
+        center.
       within_3_sigma: the same over all steps.
-      spread: standard deviation of a coordinate about the nearest centre, of points
+      spread: standard deviation of a coordinate about the nearest center, of points
         within 3 sigma, over sigma (1 for the data, but for the cut; 0 if none).
       kl_to_uniform: divergence in nats of the nearest modes' histogram from uniform.
       transition_distance: total variation between the frequencies of pairs of
-        neighbouring modes and uniform ones.
+        neighboring modes and uniform ones.
     """
-    distance = np.linalg.norm(points[..., None, :] - centres, axis=-1)
+    distance = np.linalg.norm(points[..., None, :] - centers, axis=-1)
     nearest, least = distance.argmin(axis=-1), distance.min(axis=-1)
     inside = least <= 3 * sigma
-    number = len(centres)
+    number = len(centers)
     counts = np.stack(
         [np.mean(inside & (nearest == mode), axis=0) for mode in range(number)]
     )
@@ -46,7 +46,7 @@ def mode_scores(
     pairs = np.zeros((number, number))
     np.add.at(pairs, (nearest[:, :-1].ravel(), nearest[:, 1:].ravel()), 1.0)
     pairs /= pairs.sum()
-    offset = points[inside] - np.asarray(centres)[nearest[inside]]
+    offset = points[inside] - np.asarray(centers)[nearest[inside]]
     return {
         "least_modes_covered": float((counts >= share).sum(axis=0).min()),
         "least_within_3_sigma": float(inside.mean(axis=0).min()),

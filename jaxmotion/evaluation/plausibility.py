@@ -1,8 +1,8 @@
 """Bodies that sink into the ground, hover above it or slide on it.
 
-Millimetres, y up. The source takes the vertices of a body's surface; a skeleton has
+Millimeters, y up. The source takes the vertices of a body's surface; a skeleton has
 none, so joints stand in for them. Joints lie inside the body: the lowest one of a
-person who stands is a few centimetres above the soles (4.2 in the bandai_namco data).
+person who stands is a few centimeters above the soles (4.2 in the bandai_namco data).
 Give that height as the ground's, or standing counts as floating.
 
 Source: Yuan et al. 2023 (PhysDiff), metrics Penetrate, Float and Skate, of which Zhou
@@ -16,11 +16,11 @@ from jaxtyping import Array, Float
 from jaxmotion.evaluation import contact
 from jaxmotion.motion.spring import Scalar
 
-_MILLIMETRES = 1000.0
+_MILLIMETERS = 1000.0
 
 
 def _lowest(positions: Float[Array, "*batch frames joints 3"], ground: Scalar) -> Array:
-    """Height of the lowest joint of each frame above the ground, metres."""
+    """Height of the lowest joint of each frame above the ground, meters."""
     return jnp.min(positions[..., 1], axis=-1) - ground
 
 
@@ -37,17 +37,17 @@ def penetration(
     whole depth counts.
 
     Args:
-      positions: World positions, metres.
-      ground: Height that the lowest joint has when the body stands, metres.
-      tolerance: Depth that is no penetration, metres, inclusive.
+      positions: World positions, meters.
+      ground: Height that the lowest joint has when the body stands, meters.
+      tolerance: Depth that is no penetration, meters, inclusive.
 
     Returns:
-      Millimetres, not negative.
+      Millimeters, not negative.
 
     Source: Yuan et al. 2023 (PhysDiff), with joints instead of vertices.
     """
     depth = -_lowest(positions, ground)
-    return _MILLIMETRES * jnp.mean(jnp.where(depth > tolerance, depth, 0.0), axis=-1)
+    return _MILLIMETERS * jnp.mean(jnp.where(depth > tolerance, depth, 0.0), axis=-1)
 
 
 @jax.jit
@@ -64,17 +64,17 @@ def floating(
     with real motions.
 
     Args:
-      positions: World positions, metres.
-      ground: Height that the lowest joint has when the body stands, metres.
-      tolerance: Height that is no floating, metres, inclusive.
+      positions: World positions, meters.
+      ground: Height that the lowest joint has when the body stands, meters.
+      tolerance: Height that is no floating, meters, inclusive.
 
     Returns:
-      Millimetres, not negative.
+      Millimeters, not negative.
 
     Source: Yuan et al. 2023 (PhysDiff), with joints instead of vertices.
     """
     height = _lowest(positions, ground)
-    return _MILLIMETRES * jnp.mean(jnp.where(height > tolerance, height, 0.0), axis=-1)
+    return _MILLIMETERS * jnp.mean(jnp.where(height > tolerance, height, 0.0), axis=-1)
 
 
 @jax.jit
@@ -91,12 +91,12 @@ def skating(
     distance a frame, hence compare only motions of one frame rate.
 
     Args:
-      foot_positions: World positions of feet or toes, metres.
-      ground: Height that these joints have when the body stands, metres.
-      tolerance: Height up to which a foot touches the ground, metres, inclusive.
+      foot_positions: World positions of feet or toes, meters.
+      ground: Height that these joints have when the body stands, meters.
+      tolerance: Height up to which a foot touches the ground, meters, inclusive.
 
     Returns:
-      Millimetres a frame; zero where no foot touches the ground in two such frames.
+      Millimeters a frame; zero where no foot touches the ground in two such frames.
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -107,4 +107,4 @@ def skating(
     touches = foot_positions[..., 1] - ground <= tolerance
     slides = touches[..., 1:, :] & touches[..., :-1, :]
     total = jnp.sum(jnp.where(slides, steps, 0.0), axis=(-2, -1))
-    return _MILLIMETRES * total / jnp.maximum(jnp.sum(slides, axis=(-2, -1)), 1)
+    return _MILLIMETERS * total / jnp.maximum(jnp.sum(slides, axis=(-2, -1)), 1)

@@ -27,11 +27,11 @@ def acceleration(
     does: compare with the data's own value.
 
     Args:
-      positions: World positions of the joints, metres.
-      fps: Frames a second.
+      positions: World positions of the joints, meters.
+      fps: Frames per second.
 
     Returns:
-      Metres a second squared.
+      Meters per second squared.
 
     Raises:
       ValueError: if there are fewer than three frames.
@@ -51,11 +51,11 @@ def jerk(
     Third differences times fps^3.
 
     Args:
-      positions: World positions of the joints, metres.
-      fps: Frames a second.
+      positions: World positions of the joints, meters.
+      fps: Frames per second.
 
     Returns:
-      Metres a second cubed.
+      Meters per second cubed.
 
     Raises:
       ValueError: if there are fewer than four frames.

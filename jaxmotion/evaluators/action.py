@@ -1,4 +1,4 @@
-"""Training of the action recogniser on whole motions, and its use on others.
+"""Training of the action recognizer on whole motions, and its use on others.
 
 The published one draws the recurrent states before the first frame from N(0, 1) at each
 call, so that even real motions get other features each time. Here the draw is made from
@@ -25,7 +25,7 @@ from jaxmotion.typing import Key, Params
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ActionRecognizerConfig:
-    """Size of the recogniser.
+    """Size of the recognizer.
 
     Attributes:
       num_classes: Classes.
@@ -60,7 +60,7 @@ def action_recognizer_input(
       motion: Frames of it.
 
     Returns:
-      Metres; three channels a joint.
+      Meters; three channels a joint.
     """
     root = trajectory.root_trajectory(skeleton, motion)
     frame = trajectory.PlanarFrame(
@@ -82,7 +82,7 @@ def released_input(
       motion: Frames of it.
 
     Returns:
-      Metres; three channels a joint.
+      Meters; three channels a joint.
     """
     positions = joint_positions(skeleton, motion)
     positions = positions - positions[..., :1, :1, :]
@@ -119,7 +119,7 @@ def recognize_actions(
     """Features and logits of motions.
 
     Args:
-      params: The recogniser's parameters.
+      params: The recognizer's parameters.
       key: Consumed by the states before the first frame; the same key, batch size and
         motions give the same features.
       x: Motions, as `action_recognizer_input` makes them.
@@ -142,7 +142,7 @@ def action_recognizer_loss(
     """Cross entropy of a batch.
 
     Args:
-      params: The recogniser's parameters.
+      params: The recognizer's parameters.
       key: Consumed by the states before the first frame.
       batch: Motions, as `action_recognizer_input` makes them, and their classes.
       config: Its size.
@@ -165,7 +165,7 @@ def train_action_recognizer(
     batch: int = 32,
     learning_rate: float = 3e-3,
 ) -> tuple[Params, dict[str, Array]]:
-    """Trains a recogniser as one compiled program.
+    """Trains a recognizer as one compiled program.
 
     Args:
       key: Consumed.

@@ -1,6 +1,6 @@
-"""Frozen evaluators: a trained recogniser in one file, with all that its use needs.
+"""Frozen evaluators: a trained recognizer in one file, with all that its use needs.
 
-Fréchet distances and accuracies compare only where the same recogniser looked at the
+Fréchet distances and accuracies compare only where the same recognizer looked at the
 motions. One that is trained anew for each table is another one on another machine, so
 tables print its fingerprint, and whoever wants to compare uses one file.
 """
@@ -45,19 +45,19 @@ _FIELDS = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Evaluator:
-    """A recogniser, what it looks at, and how it came about.
+    """A recognizer, what it looks at, and how it came about.
 
     Attributes:
-      kind: "style" (CAMDM's recogniser, of windows of a label), "action" (EMDM's GRU),
+      kind: "style" (CAMDM's recognizer, of windows of a label), "action" (EMDM's GRU),
         "ball" (SMGDiff's, of skills with a ball), or "style_release" (the classifier
         released with CAMDM).
-      params: Of the recogniser.
+      params: Of the recognizer.
       field: Label field of the clips that the classes are from.
       labels: Names of the classes, in their order.
       joints: Names of the skeleton's joints, in their order.
-      fps: Frames a second.
+      fps: Frames per second.
       frames: Frames of what it looks at.
-      source: Data that it was trained on, and their licence.
+      source: Data that it was trained on, and their license.
       clips: Fingerprint of the training clips.
       seed: Of parameters and batches.
       updates: Of its training.
@@ -81,7 +81,7 @@ class Evaluator:
 
     @property
     def config(self) -> Config:
-        """Size of the recogniser."""
+        """Size of the recognizer."""
         classes, joints = len(self.labels), len(self.joints)
         if self.kind == "action":
             return action_evaluator.ActionRecognizerConfig(
@@ -237,7 +237,7 @@ def params_for(
       kind: That the run needs.
       labels: Classes of the run.
       joints: Joint names of the run's skeleton.
-      fps: Frames a second of the run.
+      fps: Frames per second of the run.
       frames: Frames that are judged at a time.
 
     Returns:
@@ -288,7 +288,7 @@ def describe(
     """Who judged a table, for what stands beside it.
 
     Args:
-      params: Of the recogniser that judged.
+      params: Of the recognizer that judged.
       evaluator: The frozen evaluator that they are of; None if they were trained for
         this table.
       reference: Fingerprint of the clips that Fréchet distances refer to.
@@ -316,7 +316,7 @@ def note(description: dict[str, Any]) -> str:
     Returns:
       The line.
     """
-    line = f"Recogniser {description['fingerprint']} ({description['origin']})"
+    line = f"Recognizer {description['fingerprint']} ({description['origin']})"
     if "reference_clips" in description:
         line += f"; Fréchet distances to clips {description['reference_clips']}"
     return f"{line}."

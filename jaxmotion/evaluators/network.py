@@ -1,4 +1,4 @@
-"""A convolutional recogniser of style, and the features for Fréchet distances.
+"""A convolutional recognizer of style, and the features for Fréchet distances.
 
 Two residual convolutions over time, then three linear layers; the 512 activations
 before the last are the features. Differs from the released one: layer and group norms
@@ -112,11 +112,11 @@ class Recognizer(nn.Module):
     def __call__(
         self, x: Float[Array, "batch frames channels"], *, train: bool = False
     ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
-        """Recognises windows.
+        """Recognizes windows.
 
         Args:
-          x: Joint positions, root-relative and facing +z in each frame, metres;
-            all windows of the length that it was initialised with.
+          x: Joint positions, root-relative and facing +z in each frame, meters;
+            all windows of the length that it was initialized with.
           train: Whether to drop; needs rngs={"dropout": key}.
 
         Returns:
@@ -160,10 +160,10 @@ class ActionRecognizer(nn.Module):
         x: Float[Array, "batch frames channels"],
         state: Float[Array, "batch 2 hidden"],
     ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
-        """Recognises motions.
+        """Recognizes motions.
 
         Args:
-          x: Joint positions in the frame of the first pose, metres; any length.
+          x: Joint positions in the frame of the first pose, meters; any length.
           state: States of the lower and the upper layer before the first frame.
 
         Returns:
@@ -340,7 +340,7 @@ class Matcher(nn.Module):
         length (there 196 frames).
 
         Args:
-          features: Normalised to mean 0 and deviation 1, without contact labels.
+          features: Normalized to mean 0 and deviation 1, without contact labels.
           frames: Of each motion, at least `UNIT`.
           train: Whether to drop; needs rngs={"dropout": key}.
           padding: What is seen beyond the whole movements: "zeros", or "kept", what is

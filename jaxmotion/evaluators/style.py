@@ -1,4 +1,4 @@
-"""Training of the style recogniser on clips, and its use on motions.
+"""Training of the style recognizer on clips, and its use on motions.
 
 Source: released feature extractor of CAMDM (Chen et al. 2024): windows of 60 frames,
 cross entropy, Adam 1e-3.
@@ -28,7 +28,7 @@ from jaxmotion.typing import Key, Params
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RecognizerConfig:
-    """Size of the recogniser.
+    """Size of the recognizer.
 
     Attributes:
       num_classes: Classes.
@@ -113,7 +113,7 @@ def released_input(
       motion: Frames of it, at 30 a second.
 
     Returns:
-      Metres; three channels a joint.
+      Meters; three channels a joint.
 
     Raises:
       ValueError: as of `released_joints`.
@@ -142,7 +142,7 @@ def recognizer_input(
       motion: Frames of it.
 
     Returns:
-      Metres; three channels a joint, the root's height in place of its zeros.
+      Meters; three channels a joint, the root's height in place of its zeros.
     """
     positions = joint_positions(skeleton, motion)
     facing = trajectory.root_trajectory(skeleton, motion).facing
@@ -196,7 +196,7 @@ def recognizer_loss(
     """Cross entropy of a batch.
 
     Args:
-      params: The recogniser's parameters.
+      params: The recognizer's parameters.
       key: Consumed by dropout.
       batch: Windows of `recognizer_input`, and their classes.
       config: Its size.
@@ -220,7 +220,7 @@ def recognize(
     """Features and logits of windows.
 
     Args:
-      params: The recogniser's parameters.
+      params: The recognizer's parameters.
       x: Windows of `recognizer_input`.
       config: Its size.
 
@@ -240,7 +240,7 @@ def train_recognizer(
     batch: int = 128,
     learning_rate: float = 1e-3,
 ) -> tuple[Params, dict[str, Array]]:
-    """Trains a recogniser as one compiled program.
+    """Trains a recognizer as one compiled program.
 
     Args:
       key: Consumed.
@@ -248,7 +248,7 @@ def train_recognizer(
       labels: Their classes.
       config: Its size.
       num_steps: Updates.
-      batch: Windows an update, drawn with replacement.
+      batch: Windows per update, drawn with replacement.
       learning_rate: Of Adam, with cosine decay to a tenth.
 
     Returns:
@@ -286,7 +286,7 @@ def train_classifier(
       loss: Loss of a batch of samples and classes.
       data: Samples, and their classes.
       num_steps: Updates.
-      batch: Samples an update, drawn with replacement.
+      batch: Samples per update, drawn with replacement.
       learning_rate: Of Adam, with cosine decay to a tenth.
       weight_decay: Decoupled.
       max_norm: Clip the gradient to this global norm; None to leave it.
@@ -335,7 +335,7 @@ def in_batches(function: Callable[[Any], Any], x: Any, *, size: int = 256) -> An
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Recognized:
-    """A style recogniser and its size.
+    """A style recognizer and its size.
 
     Attributes:
       params: Its parameters.
@@ -351,17 +351,17 @@ class Recognized:
 def fit_recognizer(
     key: Key, clips: Clips, *, field: str, num_steps: int = 1500, batch: int = 128
 ) -> Recognized:
-    """Trains the style recogniser on windows with a stride of 10 frames.
+    """Trains the style recognizer on windows with a stride of 10 frames.
 
     Args:
       key: Consumed.
       clips: Training clips.
       field: Label field that is the style.
       num_steps: Updates.
-      batch: Windows an update.
+      batch: Windows per update.
 
     Returns:
-      The recogniser.
+      The recognizer.
     """
     found = data_windows(clips, stride=10, field=field)
     config = RecognizerConfig(
@@ -380,7 +380,7 @@ def fit_recognizer(
 def recognized(
     skeleton: Skeleton, found: Windows, recognizer: Recognized
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Features of windows, and whether each one's style is recognised.
+    """Features of windows, and whether each one's style is recognized.
 
     Args:
       skeleton: The skeleton.

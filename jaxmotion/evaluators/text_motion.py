@@ -97,7 +97,7 @@ class Pairs:
     """Motions, and in the same row a sentence that describes each.
 
     Attributes:
-      features: Normalised features, without contact labels.
+      features: Normalized features, without contact labels.
       frames: Of each motion, at least 4.
       vectors: Word vectors.
       tags: One-hot parts of speech, in the order of `TAGS`.
@@ -278,9 +278,9 @@ def word_vectors(words: Sequence[str]) -> Float[np.ndarray, "words 300"]:
     size = 2 * WORD_SIZE
     digests = [hashlib.shake_256(word.encode()).digest(size) for word in words]
     numbers = np.frombuffer(b"".join(digests), "<u2").reshape(-1, WORD_SIZE)
-    centred = (numbers.astype(np.float64) + 0.5) / 2**16 - 0.5
-    norm = np.linalg.norm(centred, axis=-1, keepdims=True)
-    return (_NORM * centred / norm).astype(np.float32)
+    centerd = (numbers.astype(np.float64) + 0.5) / 2**16 - 0.5
+    norm = np.linalg.norm(centerd, axis=-1, keepdims=True)
+    return (_NORM * centerd / norm).astype(np.float32)
 
 
 def word_class(word: str, part_of_speech: str) -> str:

@@ -21,7 +21,7 @@ class GanState:
     """All that an adversarial run needs to go on.
 
     Attributes:
-      generator: Its parameters, their average, its optimiser.
+      generator: Its parameters, their average, its optimizer.
       discriminator: The same; the average is not used.
     """
 

@@ -7,7 +7,7 @@ means differ where the samples of a batch have different lengths:
     average="samples"   every sample counts the same: the mean over its own frames
                         first, then over the batch (released code of MDM, CAMDM, EMDM)
 
-"Displacement" is the difference of neighbouring frames, in the unit of the input per
+"Displacement" is the difference of neighboring frames, in the unit of the input per
 frame: the losses of MDM and CAMDM are written so, with weight 1.
 """
 
@@ -49,7 +49,7 @@ def masked_mse(
 
 
 def displacement(x: Float[Array, "*batch frames n"]) -> Array:
-    """Difference of neighbouring frames.
+    """Difference of neighboring frames.
 
     Args:
       x: Frames.
@@ -100,14 +100,14 @@ def foot_slide_loss(
     stances.
 
     Args:
-      foot_positions: Predicted world positions, metres.
+      foot_positions: Predicted world positions, meters.
       contact: Whether the foot stands between this frame and the next (the last
         frame's value is unused).
       mask: Frames that count; both of a pair must.
       average: See the module.
 
     Returns:
-      Mean squared displacement, square metres per frame squared.
+      Mean squared displacement, square meters per frame squared.
 
     Source: MDM, eq. 4; released code of CAMDM.
     """

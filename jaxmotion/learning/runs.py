@@ -27,9 +27,9 @@ class Budget:
 
     Attributes:
       steps: Updates.
-      batch: Samples an update (papers: 64).
+      batch: Samples per update (papers: 64).
       optimizer: "muon" or "adamw" with cosine decay, AAMDM's "radam" or EMDM's "adam".
-      learning_rate: Of the optimiser.
+      learning_rate: Of the optimizer.
       ema: Decay of the parameters' moving average.
       chunk: Updates of one compiled call, at most.
       save_every: Updates between checkpoints.
@@ -167,13 +167,13 @@ def check_made(
 
 
 def make_optimizer(budget: Budget) -> training.Optimizer:
-    """The optimiser of a budget.
+    """The optimizer of a budget.
 
     Args:
       budget: How a stage is trained.
 
     Returns:
-      The optimiser.
+      The optimizer.
     """
     constant = {"radam": training.radam, "adam": training.gan_adam}
     if budget.optimizer in constant:
@@ -400,7 +400,7 @@ _LIMITS: dict[str, tuple[float | int, float | int]] = {
     **dict.fromkeys(("drop_past", "drop_condition", "own_previous"), (0, 1)),
     "dropout": (0, math.nextafter(1, 0)),
     "fps": (1e-3, 1000),
-    **dict.fromkeys(("rotation_scale", "metres", "contact_speed"), (1e-6, 1e6)),
+    **dict.fromkeys(("rotation_scale", "meters", "contact_speed"), (1e-6, 1e6)),
     # In features of any scale.
     "rotation_mean": (-1e6, 1e6),
 }

@@ -33,7 +33,7 @@ class TrainState:
       step: Updates made.
       params: Parameters.
       ema_params: Their exponential moving average: what evaluation uses.
-      opt_state: The optimiser's state.
+      opt_state: The optimizer's state.
     """
 
     step: Int[Array, ""]
@@ -55,7 +55,7 @@ class Loss(Protocol):
 
 @runtime_checkable
 class Update(Protocol):
-    """One optimiser step."""
+    """One optimizer step."""
 
     def __call__(self, state: Any, key: Key, batch: Any, /) -> tuple[Any, Info]:
         """Returns the next state and named values to report."""
@@ -82,7 +82,7 @@ def adamw_cosine(
       max_norm: Clip the gradient to this global norm; None to leave it.
 
     Returns:
-      The optimiser.
+      The optimizer.
 
     Source: released code of CAMDM: 1e-4, no decay, cosine to a tenth.
     """
@@ -112,7 +112,7 @@ def muon_cosine(
       max_norm: Clip the gradient to this global norm; None to leave it.
 
     Returns:
-      The optimiser.
+      The optimizer.
 
     Source: Jordan et al. 2024, "Muon"; the scale of 0.2 from Liu et al. 2025, "Muon is
     Scalable for LLM Training". Not in the paper of CAMDM: ours, for short runs.
@@ -123,13 +123,13 @@ def muon_cosine(
 
 
 def radam(*, learning_rate: float = 1e-4) -> optax.GradientTransformation:
-    """Rectified Adam at a constant rate, AAMDM's optimiser.
+    """Rectified Adam at a constant rate, AAMDM's optimizer.
 
     Args:
       learning_rate: The rate.
 
     Returns:
-      The optimiser.
+      The optimizer.
 
     Source: Liu et al. 2020; Li et al. 2024 (AAMDM), section 4.
     """
@@ -143,7 +143,7 @@ def gan_adam(*, learning_rate: float = 1e-4) -> optax.GradientTransformation:
       learning_rate: The rate.
 
     Returns:
-      The optimiser.
+      The optimizer.
 
     Source: released code of EMDM (generator 2e-5, discriminator 1.25e-4).
     """

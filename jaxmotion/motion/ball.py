@@ -28,7 +28,7 @@ _TINY = 1e-12
 # 1.4 m away at reach 2 m. A network's w of a ball that is far away is some hundredths,
 # and its quotient anywhere about the root.
 MIN_CONTROL, FULL_CONTROL = 0.1, 0.3
-# A quotient so far from where the velocity leads (metres) is trusted wholly, twice as
+# A quotient so far from where the velocity leads (meters) is trusted wholly, twice as
 # far not at all: a ball does not jump, and a network's does where w is wrong.
 _JUMP = 0.5
 NUM_FEATURES = 7
@@ -41,7 +41,7 @@ class Scene:
 
     Attributes:
       motion: The person.
-      ball: Position of the ball's centre in the same frame, metres.
+      ball: Position of the ball's center in the same frame, meters.
       touch: Which joints touch the ball; 0 or 1, or a model's guess between.
     """
 
@@ -57,9 +57,9 @@ def control_weight(
     """How much the person controls the ball: w of (1), kept in 0..1.
 
     Args:
-      ball: World position of the ball, metres.
-      root: World position of the root, metres.
-      reach: Distance on the ground at which control ends, metres.
+      ball: World position of the ball, meters.
+      root: World position of the root, meters.
+      reach: Distance on the ground at which control ends, meters.
 
     Returns:
       1 above or below the root, 0 from the reach on.
@@ -79,11 +79,11 @@ def ball_velocities(
     """Velocity with which the ball arrived in each frame.
 
     Args:
-      ball: Positions, metres.
-      fps: Frames a second.
+      ball: Positions, meters.
+      fps: Frames per second.
 
     Returns:
-      Metres a second; the first frame's is that of the second.
+      Meters per second; the first frame's is that of the second.
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -100,12 +100,12 @@ def ball_accelerations(
     """Second difference of the ball's position about each frame.
 
     Args:
-      ball: Positions, metres.
-      fps: Frames a second.
+      ball: Positions, meters.
+      fps: Frames per second.
 
     Returns:
-      Metres a second squared; zero in the first and the last frame, which have no
-      neighbour.
+      Meters per second squared; zero in the first and the last frame, which have no
+      neighbor.
 
     Raises:
       ValueError: if there are fewer than three frames.
@@ -135,10 +135,10 @@ def encode_ball(
     """Features of a ball: (1).
 
     Args:
-      ball: Positions, metres.
-      velocity: Of the ball, metres a second.
-      root: Positions of the root, metres.
-      reach: Distance on the ground at which control ends, metres.
+      ball: Positions, meters.
+      velocity: Of the ball, meters per second.
+      root: Positions of the root, meters.
+      reach: Distance on the ground at which control ends, meters.
 
     Returns:
       Weighted place relative to the root 3, velocity 3, weight 1.
@@ -159,11 +159,11 @@ def place_ball(
 
     Args:
       features: Of the ball, perhaps from a network.
-      root: Positions of the root, metres.
+      root: Positions of the root, meters.
       least_weight: Weights below are taken to be this.
 
     Returns:
-      Positions of the ball, metres; wrong where the true weight is below the least.
+      Positions of the ball, meters; wrong where the true weight is below the least.
 
     Source: SMGDiff, eq. 2; the clamp is ours.
     """
@@ -187,12 +187,12 @@ def decode_ball(
 
     Args:
       features: Of the ball, perhaps from a network.
-      root: Positions of the root, metres.
-      start: Where the ball was in the frame before the first, metres.
-      fps: Frames a second.
+      root: Positions of the root, meters.
+      start: Where the ball was in the frame before the first, meters.
+      fps: Frames per second.
 
     Returns:
-      Positions of the ball, metres.
+      Positions of the ball, meters.
 
     Source: SMGDiff, eq. 2, made safe.
     """
@@ -224,12 +224,12 @@ def move_points(
     """Points seen from a ground frame, or back in the world; heights stay.
 
     Args:
-      points: Positions, metres.
+      points: Positions, meters.
       frame: One for all frames.
       out: From the frame to the world, instead of into the frame.
 
     Returns:
-      Positions, metres.
+      Positions, meters.
     """
     facing = jnp.broadcast_to(frame.facing[..., None, :], points[..., ::2].shape)
     origin = frame.origin[..., None, :]

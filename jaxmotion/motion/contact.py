@@ -23,11 +23,11 @@ def foot_contacts(
     speed with which it was reached.
 
     Args:
-      foot_positions: World positions, metres, y up.
-      fps: Frames a second.
-      max_speed: Metres a second, in space (not only on the ground). CAMDM's foot loss
+      foot_positions: World positions, meters, y up.
+      fps: Frames per second.
+      max_speed: Meters per second, in space (not only on the ground). CAMDM's foot loss
         has 0.01 m a frame at 30 fps, which is 0.3.
-      max_height: Metres above the ground; infinite, that is no test of height, as in
+      max_height: Meters above the ground; infinite, that is no test of height, as in
         CAMDM's foot loss.
 
     Returns:
@@ -54,9 +54,9 @@ def ball_contact_gate(
     """Frames in which something must have pushed the ball.
 
     Args:
-      ball: Positions of the ball's centre, metres.
-      fps: Frames a second.
-      threshold: Least acceleration, metres a second squared. The paper's 2 is 2.2 mm
+      ball: Positions of the ball's center, meters.
+      fps: Frames per second.
+      threshold: Least acceleration, meters per second squared. The paper's 2 is 2.2 mm
         of second difference at 30 fps, which a model's jitter exceeds; a ball that
         flies falls with 9.8.
 
@@ -86,19 +86,19 @@ def ball_contact_loss(
 
     Distances of joints that stand on the ground count `grounded_weight` times, so that
     the lifted foot is chosen. The gate, the choice and the comparison are constants of
-    the gradient, which is zero where a joint is at the ball's centre.
+    the gradient, which is zero where a joint is at the ball's center.
 
     Args:
-      joints: World positions of the joints that may touch, metres.
-      ball: World positions of the ball's centre, metres.
+      joints: World positions of the joints that may touch, meters.
+      ball: World positions of the ball's center, meters.
       grounded: Whether each joint stands, 0 to 1.
       gate: Frames of a touch.
-      max_distance: Weighted distances up to here count as a touch, metres.
+      max_distance: Weighted distances up to here count as a touch, meters.
       grounded_weight: At least 1.
 
     Returns:
       Sum over frames of the weighted distances (whole) that exceed `max_distance`,
-      metres.
+      meters.
 
     Source: SMGDiff, eq. 11-12, with the missing norm; the quotient there divides a
     frame's term by one.

@@ -1,4 +1,4 @@
-"""Motion as flat features, their normalisation, and changes of ground frame.
+"""Motion as flat features, their normalization, and changes of ground frame.
 
 A network sees a frame as one vector, whose slices a `FeatureLayout` names. CAMDM's is
 the 6D rotation of each joint followed by a pseudo-joint (x, y, z, 0, 0, 0) with the
@@ -152,7 +152,7 @@ def fit_normalizer(
         finite (they map to zero).
 
     Returns:
-      The normaliser.
+      The normalizer.
 
     Source: own.
     """
@@ -178,7 +178,7 @@ def normalize(
       x: Features in their own units.
 
     Returns:
-      Normalised features.
+      Normalized features.
 
     Source: own.
     """
@@ -193,7 +193,7 @@ def denormalize(
 
     Args:
       normalizer: Fitted on the training data.
-      x: Normalised features.
+      x: Normalized features.
 
     Returns:
       Features in their own units.
@@ -299,7 +299,7 @@ def motion_features(
     """CAMDM's features: 6D of each joint, then the root as (x, y, z, 0, 0, 0).
 
     Args:
-      motion: Frames; positions in metres.
+      motion: Frames; positions in meters.
       rotation_layout: First two "rows" of each matrix, as in the released code, or its
         first two "columns".
 
@@ -332,7 +332,7 @@ def motion_from_features(
     Args:
       features: (J + 1) * 6 numbers a frame, as a network predicts them; the last three
         are ignored.
-      fps: Frames a second.
+      fps: Frames per second.
       rotation_layout: As in `motion_features`.
 
     Returns:

@@ -1,6 +1,6 @@
 """Directions on the ground plane as unit vectors (x, z), never as stored angles.
 
-An angle here is a yaw: it turns +z towards +x, so the direction of yaw a is
+An angle here is a yaw: it turns +z toward +x, so the direction of yaw a is
 (sin a, cos a). Differences of directions come from atan2 of their cross and dot
 products, which wraps by itself; nothing needs to be unwrapped.
 """
@@ -43,7 +43,7 @@ def turn(
 
     Args:
       vector: Ground vectors (x, z).
-      yaw: Angle in radians; positive turns +z towards +x.
+      yaw: Angle in radians; positive turns +z toward +x.
 
     Returns:
       Vectors of the same length.
@@ -65,7 +65,7 @@ def angle_from_to(
       end: Directions of any length; a zero vector counts as +z.
 
     Returns:
-      Angle in [-pi, pi] radians, positive from +z towards +x.
+      Angle in [-pi, pi] radians, positive from +z toward +x.
 
     Source: own.
     """

@@ -170,7 +170,7 @@ def features_from_joints(
       layout: The joints.
 
     Returns:
-      One vector a frame but for the last one, not normalised.
+      One vector a frame but for the last one, not normalized.
 
     Raises:
       ValueError: if the number of joints is not the layout's, or there are fewer than
@@ -218,7 +218,7 @@ def joints_from_features(
     them and may contradict it where a network has made them.
 
     Args:
-      features: Vectors, not normalised.
+      features: Vectors, not normalized.
       layout: The joints.
 
     Returns:

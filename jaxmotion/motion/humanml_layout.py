@@ -70,7 +70,7 @@ class Layout:
 _X, _Y, _Z, _ROOT = (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)
 _RIGHT, _DOWN = (-1, 0, 0), (0, -1, 0)  # +x is to the left of who faces +z
 
-# 22 joints of SMPL, 20 frames a second, metres.
+# 22 joints of SMPL, 20 frames per second, meters.
 HUMANML3D = Layout(
     chains=(
         (0, 2, 5, 8, 11),
@@ -89,7 +89,7 @@ HUMANML3D = Layout(
     contact_threshold=0.002,
 )
 
-# 21 joints, 12.5 frames a second; the published data are in millimetres of the model.
+# 21 joints, 12.5 frames per second; the published data are in millimeters of the model.
 # Their rest directions put right hip and shoulder at +x, opposite to where they are.
 KIT_ML = Layout(
     chains=(

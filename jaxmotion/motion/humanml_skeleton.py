@@ -124,10 +124,10 @@ def mapped_joints(
 
     Args:
       mapping: From `joint_mapping`.
-      positions: World positions, metres.
+      positions: World positions, meters.
 
     Returns:
-      World positions, metres.
+      World positions, meters.
     """
     # In full precision also where matrix products are rounded by default.
     return jnp.einsum("kj,...jc->...kc", mapping, positions, precision="highest")
@@ -183,8 +183,8 @@ def motion_from_joints(
     approximated. In rest the person stands as a T and faces +z.
 
     Args:
-      positions: World positions of HumanML3D's joints, metres, y up.
-      fps: Frames a second.
+      positions: World positions of HumanML3D's joints, meters, y up.
+      fps: Frames per second.
 
     Returns:
       A skeleton with the joints `SMPL_JOINTS`, and the motion.

@@ -19,10 +19,10 @@ def path_offsets(fps: float) -> tuple[int, ...]:
     """How many frames ahead the path is looked at.
 
     Args:
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
-      Three numbers of frames; 20, 40, 60 at 60 frames a second.
+      Three numbers of frames; 20, 40, 60 at 60 frames per second.
 
     Source: Li et al. 2024 (AAMDM), section 3.6.
     """
@@ -37,7 +37,7 @@ def query(path: Trajectory, frame: PlanarFrame) -> Float[Array, "*batch 12"]:
       frame: Where the character is now.
 
     Returns:
-      Three positions (x, z), metres, then three facings (x, z), in the axes of the
+      Three positions (x, z), meters, then three facings (x, z), in the axes of the
       frame.
 
     Source: Li et al. 2024 (AAMDM), section 3.6.
@@ -54,7 +54,7 @@ def path_features(bone: Trajectory, *, fps: float) -> Float[Array, "frames 12"]:
 
     Args:
       bone: Simulation bone of one clip, world.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       One row a frame, as `query`.

@@ -3,12 +3,12 @@
 A *simulation bone* on the ground carries the character: a smooth path with a facing
 (`data.simulation` makes it). With J joints a pose vector has, in this order,
 
-    position              [J, 3]  local translations, metres
+    position              [J, 3]  local translations, meters
     rotation              [J, 6]  local rotations, two columns each
-    velocity              [J, 3]  of the local translations, metres a second
-    angular_velocity      [J, 3]  of the local rotations, radians a second
-    root_velocity         [3]     of the bone, in its own axes, metres a second
-    root_angular_velocity [3]     of the bone, in its own axes, radians a second
+    velocity              [J, 3]  of the local translations, meters per second
+    angular_velocity      [J, 3]  of the local rotations, radians per second
+    root_velocity         [3]     of the bone, in its own axes, meters per second
+    root_angular_velocity [3]     of the bone, in its own axes, radians per second
     contact               [2]     whether the left and the right toe stand, 0 or 1
 
 that is 15 J + 8 numbers: 338 for LaFAN1's 22 joints. Joint 0 is local to the bone, the
@@ -30,8 +30,8 @@ from jaxmotion.motion.features import FeatureLayout, feature_layout, pack, unpac
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.trajectory import PlanarFrame, Trajectory
 
-CONTACT_SPEED = 0.15  # metres a second
-_CONTACT_FILTER = 6  # frames of the median at 60 frames a second
+CONTACT_SPEED = 0.15  # meters per second
+_CONTACT_FILTER = 6  # frames of the median at 60 frames per second
 
 
 def pose_layout(num_joints: int) -> FeatureLayout:
@@ -57,7 +57,7 @@ def pose_layout(num_joints: int) -> FeatureLayout:
 
 
 def _central(step: Float[Array, "steps *shape"]) -> Float[Array, "steps+1 *shape"]:
-    """Central differences from steps between neighbours; ends are extrapolated."""
+    """Central differences from steps between neighbors; ends are extrapolated."""
     middle = 0.5 * (step[1:] + step[:-1])
     if middle.shape[0] < 2:  # nothing to extrapolate from
         return jnp.concatenate([step[:1], middle, step[-1:]])
@@ -67,7 +67,7 @@ def _central(step: Float[Array, "steps *shape"]) -> Float[Array, "steps+1 *shape
 
 
 def _angular(matrix: Array, fps: float) -> Array:
-    """Angular velocity in the axes of the parent, radians a second."""
+    """Angular velocity in the axes of the parent, radians per second."""
     turn = matrix[1:] @ jnp.swapaxes(matrix[:-1], -1, -2)
     return _central(rotation_vector.from_matrix(turn) * fps)
 
@@ -154,11 +154,11 @@ def character_transforms(
 
     Args:
       parents: Parent of each joint, -1 for joint 0.
-      position: Local translations, metres.
+      position: Local translations, meters.
       rot6d: Local rotations, two columns each; made orthonormal.
 
     Returns:
-      Positions, metres, and rotation matrices.
+      Positions, meters, and rotation matrices.
 
     Source: F of Li et al. 2024 (AAMDM), eq. 1.
     """
@@ -182,9 +182,9 @@ def advance_frame(
 
     Args:
       frame: Where it is, world.
-      velocity: In its own axes, metres a second; the vertical part is not used.
-      angular_velocity: In its own axes, radians a second; the vertical part counts.
-      fps: Frames a second.
+      velocity: In its own axes, meters per second; the vertical part is not used.
+      angular_velocity: In its own axes, radians per second; the vertical part counts.
+      fps: Frames per second.
 
     Returns:
       Where it is one frame later.
@@ -211,7 +211,7 @@ def place(
       num_joints: J.
 
     Returns:
-      Root positions, metres, and parent-local rotations, two columns each: the fields
+      Root positions, meters, and parent-local rotations, two columns each: the fields
       of a `Motion`.
 
     Source: Li et al. 2024 (AAMDM), section 3.6.
@@ -242,7 +242,7 @@ def integrate_root(
       poses: Pose vectors, one a frame.
       frame: The simulation bone of the first frame.
       num_joints: J.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       The simulation bone of every frame, world.
@@ -273,7 +273,7 @@ def motion_from_poses(
       poses: Pose vectors, one a frame.
       frame: The simulation bone of the first frame.
       num_joints: J.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       The motion, world.

@@ -4,7 +4,7 @@ Conventions: column vectors (`v' = R v`), right-handed axes, y up. A 6D rotation
 orthonormal 3-vectors of the matrix (Zhou et al. 2019). The library stores the first two
 *columns*, `[c1, c2]`; CAMDM, MDM, EMDM and AMDM store the first two *rows*, which are
 the columns of the inverse: `rot6d_rows_to_columns` converts. Quaternions are wxyz. Yaw
-is the angle about +y that turns +z towards +x.
+is the angle about +y that turns +z toward +x.
 
 Gradients stay finite at the singularities (a zero vector, the identity, a half turn):
 each uses the double `where`, because the gradient of the branch that is not taken must
@@ -240,7 +240,7 @@ def quaternion_from_matrix(
 
 @jax.jit
 def matrix_from_yaw(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
-    """Rotation about +y; positive yaw turns +z towards +x.
+    """Rotation about +y; positive yaw turns +z toward +x.
 
     Args:
       yaw: Angle in radians.

@@ -6,7 +6,7 @@ parent p of joint j (column vectors):
     R_g[0] = R[0]           p[0] = root position
     R_g[j] = R_g[p] R[j]    p[j] = p[p] + R_g[p] offset[j]
 
-Units: metres, seconds; world axes y up, right-handed.
+Units: meters, seconds; world axes y up, right-handed.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from jaxmotion.motion import rotation
 
 # Beyond it float32 resolves 6 cm at best: no position of a character.
-MAX_METRES = 1e6
+MAX_METERS = 1e6
 
 
 @jax.tree_util.register_dataclass
@@ -30,7 +30,7 @@ class Skeleton:
     """Bones of one character.
 
     Attributes:
-      offsets: Joint position in its parent's frame, metres. The root's is unused.
+      offsets: Joint position in its parent's frame, meters. The root's is unused.
       parents: Parent of each joint; -1 for the root, else smaller than the joint.
       names: One name a joint.
       feet: Joints whose contact with the ground counts (toes, left before right).
@@ -71,9 +71,9 @@ class Motion:
     """Frames of one character (or, with leading axes, of many).
 
     Attributes:
-      root_position: World position of the root joint, metres, y up.
+      root_position: World position of the root joint, meters, y up.
       joint_rotation: Parent-local rotations as two columns; the root's is global.
-      fps: Frames a second.
+      fps: Frames per second.
     """
 
     root_position: Float[Array, "*batch frames 3"]
@@ -117,11 +117,11 @@ def check_skeleton(*, offsets: Any, parents: Any, names: Any, feet: Any) -> None
         raise ValueError(f"offsets should be {count} rows of 3 numbers") from None
     if found.shape != (count, 3):
         raise ValueError(f"offsets have shape {found.shape}, expected {(count, 3)}")
-    if not (np.abs(found) <= MAX_METRES).all():
-        joint = int(np.argwhere(~(np.abs(found) <= MAX_METRES))[0, 0])
+    if not (np.abs(found) <= MAX_METERS).all():
+        joint = int(np.argwhere(~(np.abs(found) <= MAX_METERS))[0, 0])
         raise ValueError(
             f"offset of joint {joint} is {found[joint].tolist()}, expected numbers "
-            f"within {MAX_METRES:g} m"
+            f"within {MAX_METERS:g} m"
         )
     if len(names) != count:
         raise ValueError(f"{len(names)} names for {count} joints")
@@ -203,11 +203,11 @@ def global_transforms(
 
     Args:
       skeleton: The bones.
-      root_position: World position of the root, metres.
+      root_position: World position of the root, meters.
       joint_rotation: Parent-local rotations, two columns each.
 
     Returns:
-      Positions in metres, and rotation matrices.
+      Positions in meters, and rotation matrices.
 
     Raises:
       ValueError: if the number of rotations is not the skeleton's number of joints.
@@ -239,11 +239,11 @@ def forward_kinematics(
 
     Args:
       skeleton: The bones.
-      root_position: World position of the root, metres.
+      root_position: World position of the root, meters.
       joint_rotation: Parent-local rotations, two columns each.
 
     Returns:
-      Positions, metres.
+      Positions, meters.
 
     Raises:
       ValueError: if the number of rotations is not the skeleton's number of joints.
@@ -263,7 +263,7 @@ def joint_positions(
       motion: Frames of that skeleton.
 
     Returns:
-      Positions, metres.
+      Positions, meters.
 
     Raises:
       ValueError: if the motion has another number of joints.
@@ -282,7 +282,7 @@ def from_root(
       joint: Where to.
 
     Returns:
-      Metres; zeros for the root.
+      Meters; zeros for the root.
     """
     chain = []
     while joint > 0:
@@ -301,13 +301,13 @@ def from_root(
 def joint_velocities(
     positions: Float[Array, "*batch frames joints 3"], fps: float
 ) -> Float[Array, "*batch frames-1 joints 3"]:
-    """Velocity of each joint between neighbouring frames.
+    """Velocity of each joint between neighboring frames.
 
     Args:
-      positions: World positions, metres.
-      fps: Frames a second.
+      positions: World positions, meters.
+      fps: Frames per second.
 
     Returns:
-      Forward differences, metres a second.
+      Forward differences, meters per second.
     """
     return (positions[..., 1:, :, :] - positions[..., :-1, :, :]) * fps

@@ -1,6 +1,6 @@
 """Critically damped springs in closed form.
 
-A critically damped spring towards g obeys x'' = -2 y x' - y^2 (x - g). With
+A critically damped spring toward g obeys x'' = -2 y x' - y^2 (x - g). With
 d = x - g and s = v + y d its solution is
 
     x(t) = g + e^{-yt} (d + s t)        v(t) = e^{-yt} (v - y s t)            (1)
@@ -38,7 +38,7 @@ def spring(
     half_life: Scalar,
     dt: Scalar | Float[Array, "*#shape"],
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
-    """Moves a value towards a goal as a critically damped spring does.
+    """Moves a value toward a goal as a critically damped spring does.
 
     Args:
       x: Value now, in any unit.
@@ -69,13 +69,13 @@ def velocity_spring(
     half_life: Scalar,
     dt: Scalar | Float[Array, "*#shape"],
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "*shape"]]:
-    """Moves a position whose velocity is a spring towards a goal velocity.
+    """Moves a position whose velocity is a spring toward a goal velocity.
 
     Args:
-      x: Position, metres.
-      v: Velocity, metres a second.
-      a: Acceleration, metres a second squared.
-      goal_velocity: Velocity it tends to, metres a second.
+      x: Position, meters.
+      v: Velocity, meters per second.
+      a: Acceleration, meters per second squared.
+      goal_velocity: Velocity it tends to, meters per second.
       half_life: Seconds; below 1e-5 counts as 1e-5 (at once).
       dt: Seconds to move on, not negative. An array gives many times at once.
 
@@ -107,11 +107,11 @@ def facing_spring(
     half_life: Scalar,
     dt: Scalar | Float[Array, "*batch"],
 ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
-    """Turns a facing direction towards a goal along the shorter arc.
+    """Turns a facing direction toward a goal along the shorter arc.
 
     Args:
       facing: Unit vectors (x, z); a zero vector counts as +z.
-      turn_rate: Radians a second, positive from +z towards +x.
+      turn_rate: Radians per second, positive from +z toward +x.
       goal: Unit vectors to come to rest at; a zero vector counts as +z.
       half_life: Seconds; below 1e-5 counts as 1e-5 (at once).
       dt: Seconds to move on, not negative.

@@ -35,7 +35,7 @@ class PlanarFrame:
     """A frame on the ground.
 
     Attributes:
-      origin: World position (x, z), metres.
+      origin: World position (x, z), meters.
       facing: World direction (x, z) of the frame's +z, unit length.
     """
 
@@ -49,7 +49,7 @@ class Trajectory:
     """A path on the ground.
 
     Attributes:
-      position: Root position (x, z) of each frame, metres.
+      position: Root position (x, z) of each frame, meters.
       facing: Facing (x, z) of each frame, unit length.
     """
 
@@ -63,7 +63,7 @@ class Command:
     """What the user asks for in one tick.
 
     Attributes:
-      velocity: Wanted velocity (x, z), metres a second, world.
+      velocity: Wanted velocity (x, z), meters per second, world.
       facing: Wanted facing (x, z), unit length, world.
       label: Style or skill.
     """
@@ -115,13 +115,13 @@ def desired_trajectory(
 
     Args:
       frame: Where the character is and faces, world.
-      velocity: Its velocity, metres a second, world.
+      velocity: Its velocity, meters per second, world.
       command: Wanted velocity and facing.
       num_frames: Length of the path; frame i is (i + 1) / fps seconds ahead.
-      fps: Frames a second.
+      fps: Frames per second.
       half_life: Of both springs, seconds.
-      acceleration: Metres a second squared, world; zero if not given.
-      turn_rate: Of the facing, radians a second; zero if not given.
+      acceleration: Meters per second squared, world; zero if not given.
+      turn_rate: Of the facing, radians per second; zero if not given.
 
     Returns:
       The path, world.
@@ -350,10 +350,10 @@ def integrate_path(
     """Path of a point that starts at the origin and moves with given velocities.
 
     Args:
-      velocity: Metres a second, one a frame.
-      fps: Frames a second.
+      velocity: Meters per second, one a frame.
+      fps: Frames per second.
 
     Returns:
-      Positions after each frame, metres.
+      Positions after each frame, meters.
     """
     return jnp.cumsum(velocity, axis=-2) / fps

@@ -6,7 +6,7 @@ epsilon 1e-5) and exact GELU:
     h = norm_1(x + out(softmax(q k^T / sqrt(d)) v))        q, k, v = projections of x
     y = norm_2(h + W_2 gelu(W_1 h))
 
-EMDM's has SELU in its place. With norm="pre" the branches read normalised tokens and
+EMDM's has SELU in its place. With norm="pre" the branches read normalized tokens and
 add to plain ones, which trains several times faster from scratch (Xiong et al. 2020,
 "On Layer Normalization in the Transformer Architecture"):
 
@@ -84,7 +84,7 @@ def add_rows(
 
 
 def fold_frames(x: Float[Array, "*batch frames features"], n: int) -> Array:
-    """Puts n neighbouring frames into one row.
+    """Puts n neighboring frames into one row.
 
     Args:
       x: Frames; their number is a multiple of n.
@@ -150,7 +150,7 @@ def unfold_frames(
 
     Without a margin this is the inverse of `fold_frames`, and the motion may jump
     where one token ends and the next begins: nothing but the network's own effort
-    joins them. With one, neighbours predict the same frames and are cross-faded.
+    joins them. With one, neighbors predict the same frames and are cross-faded.
 
     Args:
       x: Outputs, n + 2 margin frames of features in each token.

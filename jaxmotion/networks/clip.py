@@ -133,7 +133,7 @@ class ClipText(nn.Module):
             takes the largest id of a row: with its vocabulary the same place.)
 
         Returns:
-          One vector a text, not normalised.
+          One vector a text, not normalized.
 
         Raises:
           ValueError: at trace time, if the rows are longer than the context.

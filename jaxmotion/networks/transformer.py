@@ -13,7 +13,7 @@ first layer's projections of them, the embeddings of all steps), `denoise` the r
 last layer is computed for the output tokens only. `__call__` composes the two.
 
 With `frames_per_token` = n > 1 (not in the paper) each token of the four frame streams
-holds n neighbouring frames; 5 leaves 31 tokens, for machines without an accelerator.
+holds n neighboring frames; 5 leaves 31 tokens, for machines without an accelerator.
 
 Source: Chen et al. 2024 (CAMDM), section 3.2 and figure 2; sizes of the released code.
 """
@@ -127,7 +127,7 @@ class CamdmTransformer(nn.Module):
 
         Args:
           past: Features of the last displayed poses.
-          path: Ground positions (x, z) of the future, metres from the last pose.
+          path: Ground positions (x, z) of the future, meters from the last pose.
           facing: 6D rotations of the future facings.
           label: Style.
           keep_past: Where False the past is zeroed (its token is then the bias),
@@ -233,7 +233,7 @@ class CamdmTransformer(nn.Module):
           x_t: Noisy features.
           t: Step in 1..T.
           past: Features of the last displayed poses.
-          path: Ground positions of the future, metres.
+          path: Ground positions of the future, meters.
           facing: 6D rotations of the future facings.
           label: Style.
           keep_past: False for the null condition.

@@ -346,7 +346,7 @@ def _forward(
 def encode(
     model: ClipModel, texts: Sequence[str], *, max_tokens: int | None = None
 ) -> Float[np.ndarray, "texts dimensions"]:
-    """Vectors of texts, not normalised: what EMDM and MDM take as condition.
+    """Vectors of texts, not normalized: what EMDM and MDM take as condition.
 
     Args:
       model: The text tower.

@@ -1,6 +1,6 @@
 """Hashed n-grams: a sentence as a vector without any trained weights.
 
-The features of a sentence are its words (without case), its pairs of neighbouring
+The features of a sentence are its words (without case), its pairs of neighboring
 words, with an edge before the first and after the last, and the groups of three
 letters of its words. Each adds its value, with a sign, to one of D components:
 

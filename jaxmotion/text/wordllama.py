@@ -68,7 +68,7 @@ def load_wordllama() -> WordLlama:
 def encode(
     model: WordLlama, texts: Sequence[str]
 ) -> Float[np.ndarray, "texts dimensions"]:
-    """Means of token embeddings, not normalised (their length is about 4).
+    """Means of token embeddings, not normalized (their length is about 4).
 
     Args:
       model: Embeddings and tokenizer.

@@ -17,7 +17,7 @@ _GROUND, _TILE, _INK, _FAINT = "#f6f8fa", "#dde4ec", "#20262e", "#707884"
 _PATH_COLORS = (drawing.COMMANDED, drawing.WALKED)
 _TOUCH, _BALL = "#2fae4a", "#e8e4da"
 _SHADOW = 0.3
-# Trunk, head and feet are of many capsules: metres over which their light is smoothed.
+# Trunk, head and feet are of many capsules: meters over which their light is smoothed.
 _SOFT = {
     bodies.MIDDLE: 0.07,
     bodies.SKIN: 0.02,
@@ -25,7 +25,7 @@ _SOFT = {
     bodies.RIGHT_DARK: 0.02,
 }
 _TONES = 4
-_MARK = 0.05  # radius of the mark of a joint in contact, metres
+_MARK = 0.05  # radius of the mark of a joint in contact, meters
 # Drawn so many times larger in both directions, then averaged.
 _FINE = 2
 
@@ -68,7 +68,7 @@ def fit_text(text: str, width: int, *, size: int, least: int) -> tuple[str, int]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Page:
-    """Size, texts as (text, font size, upper left corner, colour), and room left."""
+    """Size, texts as (text, font size, upper left corner, color), and room left."""
 
     width: int
     height: int
@@ -80,7 +80,7 @@ class _Page:
 def _page(
     title: str, caption: str, lines: list[tuple[str, str]], width: int, height: int
 ) -> _Page:
-    """Title above, caption below, and above that what the lines' colours mean."""
+    """Title above, caption below, and above that what the lines' colors mean."""
     margin = max(width // 60, 3)
     room = width - 2 * margin
     texts, keys = [], []
@@ -133,7 +133,7 @@ class _Scene:
 
     @property
     def reach(self) -> float:
-        """How far around the target the ground is drawn, metres."""
+        """How far around the target the ground is drawn, meters."""
         return 0.85 * self.camera.distance
 
 
@@ -144,9 +144,9 @@ def _fade(scene: _Scene, points: np.ndarray, frame: int) -> np.ndarray:
     return np.clip((1.0 - far) / 0.6, 0.0, 1.0)
 
 
-def tiles(centre: np.ndarray, reach: float) -> np.ndarray:
-    """Every other square metre of the ground around a point: corners [n, 4, 3]."""
-    low, high = np.floor(centre - reach), np.ceil(centre + reach)
+def tiles(center: np.ndarray, reach: float) -> np.ndarray:
+    """Every other square meter of the ground around a point: corners [n, 4, 3]."""
+    low, high = np.floor(center - reach), np.ceil(center + reach)
     x, z = np.meshgrid(
         np.arange(low[0], high[0]), np.arange(low[2], high[2]), indexing="ij"
     )
@@ -190,7 +190,7 @@ def _draw_lines(
 
 
 def _capsules(scene: _Scene, frame: int) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Ends [S, 2, 3] and radii [S, 2] of body, marks and ball, metres, and colours."""
+    """Ends [S, 2, 3] and radii [S, 2] of body, marks and ball, meters, and colors."""
     ends, radii = [scene.body.points[frame, scene.body.ends]], [scene.body.radii]
     colors = list(scene.body.colors)
     if scene.contacts is not None:
@@ -277,7 +277,7 @@ def _draw(scene: _Scene, frame: int) -> Image.Image:
 
 
 def _palette(scene: _Scene) -> np.ndarray:
-    """The colours of a GIF [n, 3]; each with what lies between it and the ground."""
+    """The colors of a GIF [n, 3]; each with what lies between it and the ground."""
     ramps = [(_TILE, _TONES), (_INK, 6), (_FAINT, 2)]
     ramps += [(color, 4) for _, color in scene.paths]
     found = [_mix(_GROUND, _GROUND, 0.0)]
@@ -290,7 +290,7 @@ def _palette(scene: _Scene) -> np.ndarray:
 
 
 class _Quantizer:
-    """Nearest colours of a palette, not dithered, looked up by 6 bits per channel."""
+    """Nearest colors of a palette, not dithered, looked up by 6 bits per channel."""
 
     def __init__(self, palette: np.ndarray):
         self.palette = palette.astype(np.uint8)
@@ -351,25 +351,25 @@ def save_gif(
 ) -> None:
     """Writes an animated GIF whose camera follows the character.
 
-    The ground grid has metre squares and stands still, so that sliding feet show.
+    The ground grid has meter squares and stands still, so that sliding feet show.
 
     Args:
       path: File to write.
-      positions: [F, J, 3] world positions, metres, y up.
+      positions: [F, J, 3] world positions, meters, y up.
       fps: Of the motion.
-      names: Joint names, to find the head and colour left and right; None for guesses
-        and grey.
+      names: Joint names, to find the head and color left and right; None for guesses
+        and gray.
       commanded: [F, 2] commanded path (x, z), or None.
       walked: [F, 2] walked path, or None.
       feet: Joints to mark while they are in contact.
       contact: [F, feet] bool, or None.
-      ball: [F, 3] world position of a ball's centre, or None.
-      radius: Of the ball, metres.
+      ball: [F, 3] world position of a ball's center, or None.
+      radius: Of the ball, meters.
       title: Above the picture, in one line: shrunk, then elided.
-      caption: Below it, small: the source of the data and its licence.
+      caption: Below it, small: the source of the data and its license.
       every: Draw every so many frames; the speed stays true. None for at most 20
         pictures per second.
-      azimuth: Of the camera, degrees about +y. None for one towards which the
+      azimuth: Of the camera, degrees about +y. None for one toward which the
         character comes, all in all.
       elevation: Of the camera, degrees.
       size: Width and height, or the side of a square, pixels.

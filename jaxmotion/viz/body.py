@@ -15,7 +15,7 @@ from jaxmotion.viz.figure import LEFT, MIDDLE, RIGHT
 
 LEFT_DARK, RIGHT_DARK, SKIN = "#174f8c", "#942020", "#c9a084"
 
-# Thigh and shank of the adult whose measures stand below, metres.
+# Thigh and shank of the adult whose measures stand below, meters.
 _LEG = 0.87
 _SIDES = (
     re.compile(r"(left|right)", re.IGNORECASE),
@@ -30,9 +30,9 @@ class Body:
     """Capsules between points.
 
     Attributes:
-      points: [F, P, 3] world, metres: the joints, then what is added.
+      points: [F, P, 3] world, meters: the joints, then what is added.
       ends: [S, 2] the points that each capsule joins; twice the same for a ball.
-      radii: [S, 2] at both ends, metres.
+      radii: [S, 2] at both ends, meters.
       colors: S.
     """
 
@@ -43,10 +43,10 @@ class Body:
 
 
 def bone_colors(names: tuple[str, ...] | None, number: int) -> list[str]:
-    """Blue for the left side, red for the right, grey for the rest and without names.
+    """Blue for the left side, red for the right, gray for the rest and without names.
 
     Returns:
-      One colour a joint, for the bone that ends at it.
+      One color a joint, for the bone that ends at it.
     """
 
     def color(name: str) -> str:
@@ -64,7 +64,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 class _Builder:
-    """Collects points and capsules; `s` are metres of this body in one of the adult."""
+    """Collects points and capsules; `s` are meters of this body in one of the adult."""
 
     def __init__(self, positions: np.ndarray, scale: float):
         self.points = list(np.moveaxis(positions, 1, 0))
@@ -165,9 +165,9 @@ def build(
     """The body of a motion.
 
     Args:
-      positions: [F, J, 3] world positions of the joints, metres, y up.
+      positions: [F, J, 3] world positions of the joints, meters, y up.
       names: To find the head and tell left from right; None for guesses from the
-        tree, and grey.
+        tree, and gray.
     """
     up_tree = np.array([max(p, 0) for p in parents])
     skeleton = np.linalg.norm(positions - positions[:, up_tree], axis=-1)

@@ -16,9 +16,9 @@ class Camera:
     """Where each frame is seen from.
 
     Attributes:
-      axes: [3, 3] right, up and towards the viewer, rows.
-      targets: [F, 3] what the middle of the picture shows, world, metres.
-      distance: From the target, metres.
+      axes: [3, 3] right, up and toward the viewer, rows.
+      targets: [F, 3] what the middle of the picture shows, world, meters.
+      distance: From the target, meters.
       focal: Pixels.
       middle: Pixel (x, y) of the target.
     """
@@ -35,12 +35,12 @@ class Camera:
         """Pixels of world points.
 
         Args:
-          points: [..., 3] metres.
+          points: [..., 3] meters.
           frame: Of the camera; an array of frames must broadcast against `points`.
 
         Returns:
-          [..., 2] pixels from the upper left; [...] pixels a metre there; [...] metres
-          towards the viewer, seen from the target.
+          [..., 2] pixels from the upper left; [...] pixels a meter there; [...] meters
+          toward the viewer, seen from the target.
         """
         local = (points - self.targets[frame]) @ self.axes.T
         near = local[..., 2]

@@ -1,4 +1,4 @@
-"""What pictures share: the view, colours, checks; and plots of paths and sweeps.
+"""What pictures share: the view, colors, checks; and plots of paths and sweeps.
 
 Figures are made without pyplot, so that neither a display is needed nor the backend of
 a notebook changed.
@@ -48,9 +48,9 @@ def check_motion(
     """Raises unless a motion can be drawn.
 
     Args:
-      positions: [F, J, 3] world positions, metres.
+      positions: [F, J, 3] world positions, meters.
       parents: Parent of each joint.
-      fps: Frames a second.
+      fps: Frames per second.
       paths: Ground paths [F, 2] by name; None for one that is not drawn.
 
     Returns:
@@ -87,7 +87,7 @@ def check_ball(ball: np.ndarray | None, frames: int) -> np.ndarray | None:
     """Raises unless a ball can be drawn.
 
     Args:
-      ball: [F, 3] world position of its centre, metres; None for no ball.
+      ball: [F, 3] world position of its center, meters; None for no ball.
       frames: F.
 
     Returns:
@@ -108,28 +108,28 @@ def check_ball(ball: np.ndarray | None, frames: int) -> np.ndarray | None:
 
 
 def view_axes(*, azimuth: float, elevation: float) -> np.ndarray:
-    """Right, up and towards the viewer of a view in the world, rows of [3, 3].
+    """Right, up and toward the viewer of a view in the world, rows of [3, 3].
 
     Args:
       azimuth: Degrees about +y; 0 looks along -z (a character that faces +z walks
-        towards the viewer).
+        toward the viewer).
       elevation: Degrees above the ground.
     """
     a, e = np.deg2rad([azimuth, elevation])
     right = [np.cos(a), 0.0, -np.sin(a)]
     up = [-np.sin(e) * np.sin(a), np.cos(e), -np.sin(e) * np.cos(a)]
-    towards = [np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)]
-    return np.array([right, up, towards])
+    toward = [np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)]
+    return np.array([right, up, toward])
 
 
 def on_ground(path: np.ndarray) -> np.ndarray:
     """World points of a ground path.
 
     Args:
-      path: [F, 2] (x, z) metres.
+      path: [F, 2] (x, z) meters.
 
     Returns:
-      [F, 3] metres, y = 0.
+      [F, 3] meters, y = 0.
     """
     path = np.asarray(path, float)
     return np.stack([path[:, 0], np.zeros(len(path)), path[:, 1]], axis=-1)
@@ -146,8 +146,8 @@ def plot_paths(
 
     Args:
       path: File to write; its ending says the format.
-      commanded: [F, 2] (x, z) metres.
-      walked: [F, 2] metres.
+      commanded: [F, 2] (x, z) meters.
+      walked: [F, 2] meters.
       title: Above the picture.
 
     Raises:

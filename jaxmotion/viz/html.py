@@ -42,8 +42,8 @@ const button = document.getElementById("play");
 const frames = data.positions.length;
 slider.max = frames - 1;
 let frame = 0, playing = true, azimuth = 0.6, elevation = 0.35, zoom = 1;
-function project(p, centre) {
-  const x = p[0] - centre[0], y = p[1] - 0.85, z = p[2] - centre[2];
+function project(p, center) {
+  const x = p[0] - center[0], y = p[1] - 0.85, z = p[2] - center[2];
   const right = x * Math.cos(azimuth) - z * Math.sin(azimuth);
   const depth = x * Math.sin(azimuth) + z * Math.cos(azimuth);
   const up = y * Math.cos(elevation) - depth * Math.sin(elevation);
@@ -66,10 +66,10 @@ function shaded(a, b, ra, rb, color) {
   capsule(lit(a, 0.5 * ra), lit(b, 0.5 * rb), 0.86 * ra, 0.86 * rb, color);
   capsule(lit(a, ra), lit(b, rb), 0.5 * ra, 0.5 * rb, "#ffffff2a");
 }
-function line(points, centre, color, width) {
+function line(points, center, color, width) {
   pen.strokeStyle = color; pen.lineWidth = width; pen.beginPath();
   points.forEach((p, i) => {
-    const q = project(p, centre);
+    const q = project(p, center);
     if (i) pen.lineTo(q[0], q[1]); else pen.moveTo(q[0], q[1]);
   });
   pen.stroke();
@@ -167,16 +167,16 @@ def save_html(
 
     Args:
       path: File to write.
-      positions: [F, J, 3] world positions, metres, y up.
-      names: Joint names, to find the head and colour left and right; None for guesses
-        and grey.
+      positions: [F, J, 3] world positions, meters, y up.
+      names: Joint names, to find the head and color left and right; None for guesses
+        and gray.
       commanded: [F, 2] commanded path (x, z), or None.
       walked: [F, 2] walked path, or None.
-      ball: [F, 3] world position of a ball's centre, or None.
+      ball: [F, 3] world position of a ball's center, or None.
       touch: [F] whether something touches the ball (its rim is red then), or None.
-      radius: Of the ball, metres.
+      radius: Of the ball, meters.
       title: Above the picture; escaped, like the caption.
-      caption: Below it, small: the source of the data and its licence.
+      caption: Below it, small: the source of the data and its license.
 
     Raises:
       ValueError: if an array has a wrong shape or is not finite; names it.

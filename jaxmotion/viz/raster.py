@@ -3,14 +3,14 @@
 import numpy as np
 from PIL import Image, ImageFilter
 
-# Shades of each colour, dark to light.
+# Shades of each color, dark to light.
 LEVELS = 6
 # Where the light is from the camera: left of, above and behind it.
 LIGHT = np.array([-0.42, 0.78, 0.46])
 
 
 def shades(color: tuple[int, int, int] | np.ndarray) -> np.ndarray:
-    """A colour from its shade to its light, [LEVELS, 3] of 0 to 255."""
+    """A color from its shade to its light, [LEVELS, 3] of 0 to 255."""
     at = np.linspace(0.0, 1.0, LEVELS)[:, None]
     base = np.array(color, float)
     dark, light = base * 0.52, base + 0.38 * (255 - base)
@@ -27,15 +27,15 @@ def capsules(
     height: int,
     soft: dict[int, float],
 ) -> np.ndarray:
-    """Which shade of which colour each pixel shows.
+    """Which shade of which color each pixel shows.
 
     Depth, like the rest, is in pixels: a parallel projection around the body.
 
     Args:
-      ends: [S, 2, 3] right, down and towards the viewer.
+      ends: [S, 2, 3] right, down and toward the viewer.
       radii: [S, 2].
-      colors: [S] number of the colour.
-      soft: Over how many pixels the light is smoothed, of colours where it is.
+      colors: [S] number of the color.
+      soft: Over how many pixels the light is smoothed, of colors where it is.
 
     Returns:
       [height, width] 1 + color * LEVELS + shade; 0 where nothing is.
@@ -95,7 +95,7 @@ def capsules(
 
 
 def _soften(bright: np.ndarray, where: np.ndarray, blur: float) -> None:
-    """Smooths the light on one colour, in place: many capsules become one surface."""
+    """Smooths the light on one color, in place: many capsules become one surface."""
     rows, columns = where.any(axis=1).nonzero()[0], where.any(axis=0).nonzero()[0]
     if not len(rows):
         return

@@ -35,21 +35,21 @@ def write_scatter(
       OSError: if the file cannot be written.
     """
     path = figure.check_writable(path)
-    centre = (marks.max(axis=0) + marks.min(axis=0)) / 2
-    reach = 1.5 * max(float(np.abs(marks - centre).max()), 1e-6)
+    center = (marks.max(axis=0) + marks.min(axis=0)) / 2
+    reach = 1.5 * max(float(np.abs(marks - center).max()), 1e-6)
     canvas = Figure(figsize=(3 * len(clouds), 3.4), layout="constrained")
     canvas.suptitle(title)
     generator = np.random.default_rng(seed)
     for axes, (name, points) in zip(
         canvas.subplots(1, len(clouds), squeeze=False)[0], clouds.items(), strict=True
     ):
-        inside = (np.abs(points - centre) <= reach).all(axis=-1)
+        inside = (np.abs(points - center) <= reach).all(axis=-1)
         drawn = generator.permutation(points[inside])[:shown]
         axes.plot(*drawn.T, ".", markersize=1, alpha=0.3, color=figure.LEFT)
         axes.plot(*marks.T, "x", markersize=6, color=figure.RIGHT)
         axes.set(
-            xlim=(centre[0] - reach, centre[0] + reach),
-            ylim=(centre[1] - reach, centre[1] + reach),
+            xlim=(center[0] - reach, center[0] + reach),
+            ylim=(center[1] - reach, center[1] + reach),
             aspect="equal",
             title=name if inside.all() else f"{name} ({(~inside).mean():.0%} outside)",
         )

@@ -35,7 +35,7 @@ SCRIPTS = {
 
 @pytest.fixture(scope="module")
 def load():
-    """Imports a module of the folder, as a script there finds its neighbours."""
+    """Imports a module of the folder, as a script there finds its neighbors."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(FOLDER))
         yield importlib.import_module
@@ -52,7 +52,7 @@ def run_script(name, *arguments):
         capture_output=True,
         text=True,
         check=True,
-        # Their times do not matter here: unoptimised programs compile in a third.
+        # Their times do not matter here: unoptimized programs compile in a third.
         env=os.environ
         | {"JAX_PLATFORMS": "cpu", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
     ).stdout

@@ -27,7 +27,7 @@ TICKS = 10
 
 @pytest.fixture(scope="module")
 def load():
-    """Imports a module of the folder, as a script there finds its neighbours."""
+    """Imports a module of the folder, as a script there finds its neighbors."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(FOLDER))
         yield importlib.import_module
@@ -137,7 +137,7 @@ def test_help_has_an_example_and_says_what_the_columns_are(load, monkeypatch, ca
     for text in (
         "python benchmarks/diversity.py",
         "default: runs/benchmarks",
-        "metres",
+        "meters",
     ):
         assert text in printed
 

@@ -34,7 +34,7 @@ def test_programs_run_as_they_stand(tmp_path):
     """In a process and a folder of their own, one after the other."""
     programs = blocks("python")
     assert len(programs) == 4
-    # Whether they run is the question: unoptimised programs compile in a third.
+    # Whether they run is the question: unoptimized programs compile in a third.
     environment = os.environ | {
         "PYTHONPATH": str(ROOT),
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",

@@ -15,7 +15,7 @@ def commands(name, seconds=60.0, **changes):
 
 
 def degrees(direction):
-    """From +z towards +x, in (-180, 180]."""
+    """From +z toward +x, in (-180, 180]."""
     return np.rad2deg(np.arctan2(direction[..., 0], direction[..., 1]))
 
 

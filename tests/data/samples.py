@@ -56,7 +56,7 @@ def clips() -> Clips:
             "content": ["turn-left"] * 3 + ["walk"] * 5,
         },
         label_names={"style": ("young", "old", "unused")},
-        source="made up (no licence)",
+        source="made up (no license)",
     )
 
 

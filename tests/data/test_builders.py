@@ -246,7 +246,7 @@ LeanLeft,leans,N,n,none
 
 
 def style_files() -> dict[str, str]:
-    """100STYLE with three styles, 60 frames a second, a finger to be dropped."""
+    """100STYLE with three styles, 60 frames per second, a finger to be dropped."""
     rows = [f"{style},{cells}" for style, cells in CUTS.items()]
     files = {
         "100STYLE/Frame_Cuts.csv": "\n".join([CUTS_HEADER, *rows]) + "\n",
@@ -326,7 +326,7 @@ def test_style100_mirrors_symmetric_styles_under_the_same_label(tmp_path):
         (("4,13", "4,99"), "Old_BR.bvh: the cut 4..99"),
         (("4,13", "13,4"), "Old_BR.bvh: the cut 13..4"),
         (("n,Y", "n,maybe"), "Dataset_List.csv, line 2: column 4"),
-        (("0.0166666667", "0.02"), "Old_BR.bvh: 50 frames a second, expected 60"),
+        (("0.0166666667", "0.02"), "Old_BR.bvh: 50 frames per second, expected 60"),
         (("LeftToe", "LeftFin"), "Old_BR.bvh: no toes"),
     ],
 )

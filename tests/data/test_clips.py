@@ -206,7 +206,7 @@ def test_concatenate_merges_labels_by_name():
     assert both.names("style") == ("young", "old", "unused", "new")
     np.testing.assert_array_equal(both.labels["style"], [1, 0] * 4 + [1, 3])
     np.testing.assert_array_equal(both.labels["content"][-2:], [1, 1])
-    assert both.source == "made up (no licence); two"
+    assert both.source == "made up (no license); two"
     assert both.clip_names[-2:] == ("a", "b")
     for i in (7, 8, 9):
         part, j = (clips, i) if i < 8 else (other, i - 8)

@@ -90,7 +90,7 @@ def test_between_pushes_the_ball_rolls_straight_and_friction_alone_slows_it():
         for a, b in zip(ends[:-1], ends[1:], strict=True):
             velocity = part.velocity[a:b]
             speed = np.linalg.norm(velocity, axis=-1)
-            # On one line, forwards. Millimetres of single precision.
+            # On one line, forwards. Millimeters of single precision.
             ahead = velocity @ velocity[0] / max(speed[0], 1e-9)
             np.testing.assert_allclose(ahead, speed, atol=1e-3)
             change = np.diff(speed) * FPS
@@ -117,9 +117,7 @@ def test_legs_never_come_into_the_ball():
             leg = part.joints[:, [toe, toe - 1, toe - 2]]
             # Bones as many points.
             share = np.linspace(0.0, 1.0, 41)[:, None]
-            points = (
-                leg[:, :-1, None] + share * (leg[:, 1:] - leg[:, :-1])[:, :, None]
-            )
+            points = leg[:, :-1, None] + share * (leg[:, 1:] - leg[:, :-1])[:, :, None]
             away = np.linalg.norm(points - part.ball[:, None, None], axis=-1)
             away = away.min(axis=(1, 2))
             assert away[~near].min() > RADIUS + SETTINGS.thickness - 1e-4

@@ -54,13 +54,13 @@ def test_feet_alternate_at_the_cadence(speed):
     order = np.argsort(np.concatenate([left, right]))
     side = np.repeat([0, 1], [left.size, right.size])[order]
     assert np.all(side[1:] != side[:-1])
-    # Steps a second as commanded, to half a frame of rounding a step.
+    # Steps per second as commanded, to half a frame of rounding a step.
     between = np.diff(np.sort(np.concatenate([left, right])))
     assert abs(between.mean() - FPS / (1.2 + 0.6 * speed)) <= 0.5
     assert found.contact.any(axis=1).all(), "somebody always stands"
 
 
-def test_the_stance_is_centred_under_the_body():
+def test_the_stance_is_centerd_under_the_body():
     speed = 1.0
     path, yaw = straight(speed)
     found = plan(path, yaw)

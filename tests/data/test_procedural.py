@@ -266,7 +266,7 @@ def test_the_same_seed_gives_the_same_clips_and_another_seed_others():
     assert np.abs(np.asarray(first.root_position - other.root_position)).max() > 0.01
 
 
-def test_clips_are_labelled_and_finite():
+def test_clips_are_labeled_and_finite():
     some = {name: gaits.GAITS[name] for name in ("proud", "zombie")}
     clips = procedural.make_clips(seed=0, minutes=0.5, gaits=some, clip_seconds=5.0)
     assert clips.num_clips == 6 and clips.num_frames == 6 * 150

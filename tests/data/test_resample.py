@@ -84,7 +84,7 @@ def test_nonsense_is_refused():
 
 @pytest.mark.parametrize("fps", [10.0, 12.5, 30.0, 50.0])
 def test_clips_are_resampled_one_by_one(fps):
-    """Also those of one frame: none may take frames of its neighbours."""
+    """Also those of one frame: none may take frames of its neighbors."""
     motions = [samples.motion(n, i) for i, n in enumerate((1, 10, 1, 4, 10, 4))]
     given = clips_from_motions(
         motions,

@@ -190,7 +190,7 @@ def test_bone_is_the_filtered_path_of_scipy():
 
 @pytest.mark.parametrize("fps", [30.0, 60.0])
 def test_sway_of_steps_is_taken_out(fps):
-    # Four steps a second, with hips that turn and a chest that swings.
+    # Four steps per second, with hips that turn and a chest that swings.
     time = np.arange(2 * int(fps)) / fps
     sway = np.sin(8 * np.pi * time)
     position = np.stack([0.03 * sway, 1.1 * time], axis=-1)

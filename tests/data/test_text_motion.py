@@ -31,7 +31,7 @@ def motions(**changes):
         "mean": np.arange(WIDTH) - 2.0,
         "std": np.arange(WIDTH) + 1.0,
         "fps": 20.0,
-        "source": "made up (no licence)",
+        "source": "made up (no license)",
     }
     rest = {
         "features": frames(),

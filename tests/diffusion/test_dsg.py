@@ -296,7 +296,7 @@ MEAN, VARIANCE = 1.5, 0.3
 
 
 def test_guidance_lowers_the_objective_and_the_noise_alone_does_not():
-    """Samples of a Gaussian, drawn towards a point at two deviations; paired z-scores.
+    """Samples of a Gaussian, drawn toward a point at two deviations; paired z-scores.
 
     The last step has no length, so that what is seen comes from the step before.
     """

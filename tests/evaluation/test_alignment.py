@@ -20,7 +20,7 @@ def test_heading_error_wraps():
 
 
 def test_trajectory_error_of_a_known_path():
-    # Walks at 1 m/s towards yaw -3.1, wanted 3.1; then stands; then is not wanted.
+    # Walks at 1 m/s toward yaw -3.1, wanted 3.1; then stands; then is not wanted.
     fps, yaw = 30.0, -3.1
     speed = np.array([1.0] * 10 + [0.0] * 5 + [1.0] * 5 + [0.0])
     step = np.outer(speed, [np.sin(yaw), np.cos(yaw)]) / fps

@@ -135,7 +135,7 @@ def test_acceleration_of_an_untouched_ball():
     assert count == 29
     expected = 28 * 9.81 + (2 * 5.0 * FPS - 9.81)
     np.testing.assert_allclose(total, expected, rtol=1e-4)
-    # A joint at the bounce takes out that frame and its neighbours, and no more.
+    # A joint at the bounce takes out that frame and its neighbors, and no more.
     near = joints.at[15, 0].set(ball[15] + jnp.array([0.0, 0.15, 0.0]))
     total, count = measure.untouched_acceleration(ball, near, FPS, max_distance=0.2)
     assert count == 26

@@ -21,7 +21,7 @@ FPS = 30.0
 
 
 def angle(a, b):
-    """From one direction (x, z) to another, by complex numbers, towards +x."""
+    """From one direction (x, z) to another, by complex numbers, toward +x."""
     return cmath.phase(complex(b[1], b[0]) / complex(a[1], a[0]))
 
 
@@ -144,22 +144,22 @@ def test_frozen_and_diverged(seed):
 
 def test_mode_scores():
     rng = np.random.default_rng(0)
-    centres = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, 2.0]])
+    centers = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, 2.0]])
     mode = rng.choice(3, size=(200, 4), p=[0.5, 0.3, 0.2])
-    points = centres[mode] + 0.2 * rng.standard_t(3, size=(200, 4, 2))
+    points = centers[mode] + 0.2 * rng.standard_t(3, size=(200, 4, 2))
     near = np.zeros((200, 4), int)
     inside = np.zeros((200, 4), bool)
     off = []
     for i, t in np.ndindex(200, 4):
-        gaps = [np.hypot(*(points[i, t] - c)) for c in centres]
+        gaps = [np.hypot(*(points[i, t] - c)) for c in centers]
         near[i, t], inside[i, t] = int(np.argmin(gaps)), min(gaps) <= 0.6
         if inside[i, t]:
-            off += list(points[i, t] - centres[near[i, t]])
+            off += list(points[i, t] - centers[near[i, t]])
     shares = np.array([np.mean(near == k) for k in range(3)])
     pairs = np.zeros((3, 3))
     for i, t in np.ndindex(200, 3):
         pairs[near[i, t], near[i, t + 1]] += 1 / 600
-    found = modes.mode_scores(points, centres, sigma=0.2)
+    found = modes.mode_scores(points, centers, sigma=0.2)
     for name, want in {
         "least_modes_covered": 3,
         "within_3_sigma": inside.mean(),

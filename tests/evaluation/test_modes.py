@@ -5,13 +5,13 @@ import pytest
 
 from jaxmotion.evaluation import modes
 
-CENTRES = np.stack(np.meshgrid(*2 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(9, 2)
+CENTERS = np.stack(np.meshgrid(*2 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(9, 2)
 
 
 def points(choose, *, number=4000, steps=6, sigma=0.1):
     rng = np.random.default_rng(0)
     mode = choose(rng, (number, steps))
-    return CENTRES[mode] + sigma * rng.normal(size=(number, steps, 2))
+    return CENTERS[mode] + sigma * rng.normal(size=(number, steps, 2))
 
 
 def uniform(rng, shape):
@@ -19,7 +19,7 @@ def uniform(rng, shape):
 
 
 def test_the_data_score_full():
-    scores = modes.mode_scores(points(uniform), CENTRES, sigma=0.1)
+    scores = modes.mode_scores(points(uniform), CENTERS, sigma=0.1)
     assert scores["least_modes_covered"] == 9
     # A plane Gaussian has 1 - exp(-9/2) within 3 sigma.
     assert scores["within_3_sigma"] == pytest.approx(1 - np.exp(-4.5), abs=0.003)
@@ -34,26 +34,26 @@ def test_a_lost_mode_is_counted_at_its_step():
         mode[:, 3] %= 8  # mode 8 is missing at step 3
         return mode
 
-    scores = modes.mode_scores(points(choose), CENTRES, sigma=0.1)
+    scores = modes.mode_scores(points(choose), CENTERS, sigma=0.1)
     assert scores["least_modes_covered"] == 8
 
 
 def test_stray_points_cost_their_share():
     x = points(uniform)
     x[: len(x) // 4, 2] = 0.5  # between the modes
-    scores = modes.mode_scores(x, CENTRES, sigma=0.1)
+    scores = modes.mode_scores(x, CENTERS, sigma=0.1)
     assert scores["least_within_3_sigma"] == pytest.approx(0.75 * 0.989, abs=0.01)
 
 
 def test_a_frozen_rollout_has_wrong_transitions():
     frozen = lambda rng, shape: np.repeat(uniform(rng, (shape[0], 1)), 6, 1)  # noqa: E731
-    scores = modes.mode_scores(points(frozen), CENTRES, sigma=0.1)
+    scores = modes.mode_scores(points(frozen), CENTERS, sigma=0.1)
     assert scores["least_modes_covered"] == 9
     assert scores["transition_distance"] == pytest.approx(8 / 9, abs=0.02)
 
 
 def test_a_collapsed_rollout():
-    scores = modes.mode_scores(np.full((50, 4, 2), 0.5), CENTRES, sigma=0.1)
+    scores = modes.mode_scores(np.full((50, 4, 2), 0.5), CENTERS, sigma=0.1)
     assert scores["least_modes_covered"] == scores["within_3_sigma"] == 0
     assert scores["spread"] == 0
     assert scores["kl_to_uniform"] == pytest.approx(np.log(9))

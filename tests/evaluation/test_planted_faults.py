@@ -25,7 +25,7 @@ AHEAD = np.array([0.0, 0.0, 1.0])
 
 
 def body(path, yaw=0.0):
-    """Upright with the toes on the ground where the path has y = 0; metres, radians."""
+    """Upright with the toes on the ground where the path has y = 0; meters, radians."""
     path = np.asarray(path, np.float64) + np.array([0.0, 0.9, 0.0])
     angle = np.broadcast_to(yaw, len(path))
     zero = 0 * angle
@@ -63,7 +63,7 @@ def toes(motion):
 
 
 @pytest.mark.parametrize("slide", [2.0, 5.0, 60.0])
-def test_a_foot_slide_in_centimetres_a_second(slide):
+def test_a_foot_slide_in_centimeters_a_second(slide):
     motion = body(slide / 100 * TIME[:, None] * ALONG, yaw=0.4)
     found = measure(motion)
     assert 100 * found["slide_speed"] == pytest.approx(slide, rel=1e-3)
@@ -110,7 +110,7 @@ def test_an_error_of_heading(degrees):
 
 
 @pytest.mark.parametrize("height", [-0.03, 0.08])
-def test_a_height_in_millimetres(height):
+def test_a_height_in_millimeters(height):
     path = np.zeros((FRAMES, 3))
     path[:30, 1] = height
     positions, _ = toes(body(path))

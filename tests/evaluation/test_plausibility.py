@@ -1,4 +1,4 @@
-"""Planted depths, heights and slides come back in millimetres."""
+"""Planted depths, heights and slides come back in millimeters."""
 
 import jax
 import jax.numpy as jnp
@@ -51,7 +51,7 @@ def test_only_one_of_the_two_at_a_time():
 
 
 def sliding(steps, heights):
-    """One foot that moves by so many metres along (3, 4), at those heights."""
+    """One foot that moves by so many meters along (3, 4), at those heights."""
     along = np.concatenate([[0.0], np.cumsum(steps)])
     foot = np.stack([0.6 * along, np.asarray(heights), 0.8 * along], axis=-1)
     return jnp.asarray(foot[:, None], jnp.float32)

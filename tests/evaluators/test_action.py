@@ -1,4 +1,4 @@
-"""The action recogniser sees the path too, repeats by its key, and learns."""
+"""The action recognizer sees the path too, repeats by its key, and learns."""
 
 import dataclasses
 
@@ -160,7 +160,7 @@ def test_it_learns_to_tell_two_actions(skeleton):
 def test_the_released_input_is_not_turned_and_begins_at_the_root(skeleton):
     motion = tiny.walk(9, turn=1.0, start=0.5)
     positions = np.asarray(joint_positions(skeleton, motion), np.float64)
-    centred = positions - positions[:, :1]
+    centerd = positions - positions[:, :1]
     path = positions[:, :1] - positions[0, 0]
     found = action_evaluator.released_input(skeleton, motion)
-    np.testing.assert_allclose(found, (centred + path).reshape(9, -1), atol=1e-6)
+    np.testing.assert_allclose(found, (centerd + path).reshape(9, -1), atol=1e-6)

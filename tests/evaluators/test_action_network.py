@@ -1,4 +1,4 @@
-"""The recurrent recogniser against its units' equations, and what it depends on."""
+"""The recurrent recognizer against its units' equations, and what it depends on."""
 
 import jax
 import jax.numpy as jnp

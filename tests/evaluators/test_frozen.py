@@ -221,7 +221,7 @@ def actions(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_an_evaluator_of_actions_is_the_recogniser_a_run_trains(actions, tmp_path):
+def test_an_evaluator_of_actions_is_the_recognizer_a_run_trains(actions, tmp_path):
     made = emdm_action_evaluation.train_action(
         actions.train, actions.held_out, field="style", num_steps=3, seed=0
     )
@@ -233,7 +233,7 @@ def test_an_evaluator_of_actions_is_the_recogniser_a_run_trains(actions, tmp_pat
     assert not (actions.folder / "recognizer").exists()
     same(load(actions, **call), made.params)
     assert 0.0 <= made.accuracy <= 1.0 and made.frames == 8
-    # Twice from the file, and once from the run's folder: the same judgement.
+    # Twice from the file, and once from the run's folder: the same judgment.
     frozen = evaluators.load(tmp_path / "e.npz")
     wanted = jnp.repeat(jnp.arange(2), 4)
     positions = emdm_action_evaluation.real_positions(
@@ -290,8 +290,8 @@ def test_the_same_evaluator_gives_the_same_numbers(ball, tmp_path):
 
 
 @pytest.mark.slow
-def test_skills_with_a_ball_are_recognised(ball):
-    assert ball[-1].accuracy > 0.9  # a ball at hand, or thirty metres away
+def test_skills_with_a_ball_are_recognized(ball):
+    assert ball[-1].accuracy > 0.9  # a ball at hand, or thirty meters away
     assert ball[-1].config.num_joints == len(ball[-1].joints) + 1
     wrong = dataclasses.replace(ball[-1], frames=45)
     with pytest.raises(ValueError, match="field 'frames' is 45, expected 12"):

@@ -26,7 +26,7 @@ def evaluator():
 
 @pytest.fixture
 def state(evaluator):
-    """As released: with the optimisers' states and counters beside the weights."""
+    """As released: with the optimizers' states and counters beside the weights."""
     optimizer = torch.optim.Adam(evaluator.text.parameters(), lr=1e-4)
     for array in evaluator.text.parameters():
         array.grad = torch.zeros_like(array)

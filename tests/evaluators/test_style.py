@@ -1,4 +1,4 @@
-"""The recogniser sees limbs and nothing else, and learns to tell styles."""
+"""The recognizer sees limbs and nothing else, and learns to tell styles."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The recogniser's shapes, and that a window's result is its own."""
+"""The recognizer's shapes, and that a window's result is its own."""
 
 import jax
 import numpy as np

@@ -99,7 +99,7 @@ def test_what_is_trained_is_not_trained_again(call, trained, data):
 # --- evaluation --------------------------------------------------------------------
 
 FREE = {"diverged", "div", "fid", "ffr_mann", "ffr_gmd", "speed_m/s"}
-STEERED = {"diverged_uc", "te_promised", "te_realised", "trajectory_error_deg"}
+STEERED = {"diverged_uc", "te_promised", "te_realized", "trajectory_error_deg"}
 
 
 def test_an_evaluation_has_the_data_and_the_trained_rows(evaluated):
@@ -142,7 +142,7 @@ def test_long_rollouts_are_counted(evaluated):
 def test_the_table_has_a_line_for_each_row(evaluated):
     found = json.loads((evaluated / "metrics.json").read_text())["rows"]
     *lines, _, note = (evaluated / "table.md").read_text().splitlines()
-    assert "no recogniser" in note
+    assert "no recognizer" in note
     assert [line.split("|")[1].strip() for line in lines[2:]] == list(found)
     assert len({line.count("|") for line in lines}) == 1
 
@@ -236,9 +236,9 @@ def test_what_is_wrong_is_said_in_one_line(
     ("command", "words"),
     [
         ("", ["train", "evaluate", "rollout", "--data data/lafan1.npz"]),
-        ("train", ["(default: 60.0)", "Windows an update", "Example:"]),
-        ("evaluate", ["seconds", "Metres a second", "epsilon", "Example:"]),
-        ("rollout", ["(default: 20.0)", "Metres a second", "Example:"]),
+        ("train", ["(default: 60.0)", "Windows per update", "Example:"]),
+        ("evaluate", ["seconds", "Meters per second", "epsilon", "Example:"]),
+        ("rollout", ["(default: 20.0)", "Meters per second", "Example:"]),
     ],
 )
 def test_help_has_defaults_units_and_an_example(help_of, command, words):

@@ -77,8 +77,8 @@ def trained(call, data, tmp_path_factory, quick_compile):
     [
         ("", ["train", "evaluate", "rollout", "Examples:", "--data data/bandai2.npz"]),
         ("train", ["(default: 11000)", "in (0, 1)", "Windows a step", "Example:"]),
-        ("evaluate", ["(default: 60.0)", "seconds", "Metres a second", "Example:"]),
-        ("rollout", ["(default: 20.0)", "seconds", "Metres a second", "Example:"]),
+        ("evaluate", ["(default: 60.0)", "seconds", "Meters per second", "Example:"]),
+        ("rollout", ["(default: 20.0)", "seconds", "Meters per second", "Example:"]),
     ],
 )
 def test_help_has_defaults_units_and_an_example(help_of, command, words):

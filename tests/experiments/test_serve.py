@@ -290,7 +290,7 @@ def test_a_client_is_greeted_and_gets_every_frame():
                     "parents": [-1, 0],
                     "offsets": [[0.0, 0.0, 0.0], [0.0, 0.6, 0.0]],
                     "labels": ["calm", "brisk"],
-                    "units": "metres, y up; rotations 6D two columns",
+                    "units": "meters, y up; rotations 6D two columns",
                 }
             }
             frames = [await client.message() for _ in range(20)]

@@ -107,7 +107,7 @@ def test_a_lifted_foot_is_chosen_before_a_nearer_one_that_stands():
     np.testing.assert_allclose(jax.grad(loss)(feet)[0, :, 0], [2.0, 0.0], atol=1e-6)
 
 
-def test_the_threshold_meets_the_penalised_distance():
+def test_the_threshold_meets_the_penalized_distance():
     for grounded, expected in ((0.0, 0.0), (1.0, 0.12)):
         found = loss_of(*one_frame(0.06, grounded=[grounded]))
         np.testing.assert_allclose(found, expected, rtol=1e-6)

@@ -13,7 +13,7 @@ def test_contacts_of_a_foot_that_stands_then_moves():
     np.testing.assert_array_equal(got[:, 0], [1, 1, 0, 0, 1, 1, 1])
 
 
-def test_thresholds_are_per_second_and_in_metres():
+def test_thresholds_are_per_second_and_in_meters():
     x = np.arange(8)[:, None, None] * np.array([0.005, 0.0, 0.0])
     feet = jnp.asarray(x, jnp.float32)
     assert contact.foot_contacts(feet, 30.0).all()  # 0.15 m/s

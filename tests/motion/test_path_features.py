@@ -54,7 +54,7 @@ def test_clip_of_one_frame_stays_where_it_is():
 
 
 def test_left_turn_leads_to_the_left():
-    # Left is +x of the frame, and yaw turns +z towards +x.
+    # Left is +x of the frame, and yaw turns +z toward +x.
     yaw = 1.0 + np.arange(80) / 60.0
     position = np.stack([-np.cos(yaw), np.sin(yaw)], axis=-1)
     found = path_features.path_features(person.path(position, yaw), fps=60.0)[0]

@@ -146,8 +146,8 @@ def test_constant_turn_has_exactly_its_rate(skeleton, rate):
 def test_circle_goes_straight_ahead_in_its_own_axes(skeleton):
     fps, rate, radius = 60.0, 2.0, 0.7
     yaw = 0.3 + rate * np.arange(FRAMES) / fps
-    centre = np.array([1.0, 0.9, 2.0])
-    root = centre + radius * np.stack([-np.cos(yaw), 0 * yaw, np.sin(yaw)], axis=-1)
+    center = np.array([1.0, 0.9, 2.0])
+    root = center + radius * np.stack([-np.cos(yaw), 0 * yaw, np.sin(yaw)], axis=-1)
     vectors = pose_vectors(
         skeleton,
         person.motion(root, person.upright(root, yaw), fps),

@@ -224,7 +224,7 @@ def test_quaternion_gradients_are_finite_at_half_turns_and_the_identity(epsilon)
         assert float(jnp.max(jnp.abs(jacobian))) < 5.0
 
 
-def test_yaw_turns_z_towards_x():
+def test_yaw_turns_z_toward_x():
     yaw = np.linspace(-4.0, 4.0, 33)
     found = rotation.matrix_from_yaw(float32(yaw))
     expected = Rotation.from_rotvec(np.outer(yaw, [0, 1, 0])).as_matrix()

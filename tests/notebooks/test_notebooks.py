@@ -39,7 +39,7 @@ def no_screen(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def little_optimised():
+def little_optimized():
     """For a notebook that compiles for longer than it computes."""
     import jax
 
@@ -61,7 +61,7 @@ def test_is_plain_and_holds_no_output(path):
         assert not re.search(r"^\s*[%!]", source, re.MULTILINE), "magic"
 
 
-def test_one_chain(no_screen, little_optimised, capsys):
+def test_one_chain(no_screen, little_optimized, capsys):
     found = run("01_one_chain.ipynb")
     steps = list(found["STEPS"])
     expected, variance = found["expected"], found["VARIANCE"]
@@ -77,7 +77,7 @@ def test_one_chain(no_screen, little_optimised, capsys):
     assert "recursion" in capsys.readouterr().out
 
 
-def test_steer_a_character(no_screen, little_optimised):
+def test_steer_a_character(no_screen, little_optimized):
     import numpy as np
 
     found = run("02_steer_a_character.ipynb")
@@ -93,7 +93,7 @@ def test_steer_a_character(no_screen, little_optimised):
     assert not list(Path().iterdir())  # nothing is left on disk
 
 
-def test_diversity_by_vmap(no_screen, little_optimised):
+def test_diversity_by_vmap(no_screen, little_optimized):
     import numpy as np
 
     found = run("03_diversity_by_vmap.ipynb")
@@ -114,7 +114,7 @@ def test_diversity_by_vmap(no_screen, little_optimised):
     assert np.isfinite(found["spread"]).all() and (found["spread"] > 0).all()
 
 
-def test_step_counts(no_screen, little_optimised):
+def test_step_counts(no_screen, little_optimized):
     import numpy as np
 
     found = run("04_step_counts.ipynb")
@@ -127,7 +127,7 @@ def test_step_counts(no_screen, little_optimised):
     assert all(len(found["points"][way, steps[-1]]) == 4 for way in found["WAYS"])
 
 
-def test_guidance_gradients(no_screen, little_optimised, capsys):
+def test_guidance_gradients(no_screen, little_optimized, capsys):
     import numpy as np
 
     found = run("05_guidance_gradients.ipynb")

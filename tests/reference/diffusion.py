@@ -49,7 +49,7 @@ def coefficients(betas):
 
 
 def product_of_gaussians(mean_a, variance_a, mean_b, variance_b):
-    """Mean and variance of the normalised product of two densities (Bayes' rule)."""
+    """Mean and variance of the normalized product of two densities (Bayes' rule)."""
     precision = 1 / variance_a + 1 / variance_b
     return (mean_a / variance_a + mean_b / variance_b) / precision, 1 / precision
 

@@ -101,14 +101,14 @@ def selu(x):
 
 
 def group_norm(x, norm, groups, epsilon=1e-5):
-    """Neighbouring channels in equal groups, each to mean 0 and variance 1."""
+    """Neighboring channels in equal groups, each to mean 0 and variance 1."""
     size = len(x) // groups
     out = np.empty(len(x))
     for first in range(0, len(x), size):
         group = x[first : first + size]
-        centred = group - np.mean(group)
-        spread = np.sqrt(np.mean(centred**2) + epsilon)
-        out[first : first + size] = centred / spread
+        centerd = group - np.mean(group)
+        spread = np.sqrt(np.mean(centerd**2) + epsilon)
+        out[first : first + size] = centerd / spread
     return out * np.asarray(norm["scale"]) + np.asarray(norm["bias"])
 
 
@@ -199,9 +199,9 @@ def masked_l2(a, b, mask):
 def foot_loss(found, wanted, feet, mask, speed=0.01):
     """Masked L2 between the steps of the feet and none, where the data's feet stand.
 
-    found, wanted [batch, frames, joints, 3], metres, relative to the root as in the
+    found, wanted [batch, frames, joints, 3], meters, relative to the root as in the
     paper's code; a foot stands from a frame to the next if the data's moves `speed`
-    metres a frame at most. Steps of feet that move count as zeros.
+    meters a frame at most. Steps of feet that move count as zeros.
     """
     steps = np.zeros((len(found), found.shape[1] - 1, len(feet), 3))
     for b, frame, k in np.ndindex(steps.shape[:3]):

@@ -20,23 +20,23 @@ def mean_pair_distance(x):
 
 
 def slide(feet, fps, max_height):
-    """Metres and seconds that feet [F, feet, 3] slide while low."""
-    metres, frames = 0.0, 0
+    """Meters and seconds that feet [F, feet, 3] slide while low."""
+    meters, frames = 0.0, 0
     for f in range(len(feet) - 1):
         for k in range(feet.shape[1]):
             if feet[f, k, 1] < max_height:
                 dx, _, dz = feet[f + 1, k] - feet[f, k]
-                metres += np.hypot(dx, dz)
+                meters += np.hypot(dx, dz)
                 frames += 1
-    return metres / (frames / fps), frames / fps
+    return meters / (frames / fps), frames / fps
 
 
 def camdm_release(names, joints, move=None, look=None):
     """What CAMDM's scripts compute of one recording: floats by name, angles in degrees.
 
-    Written from a description of the scripts. `joints` is [F, J, 3], metres, y up,
+    Written from a description of the scripts. `joints` is [F, J, 3], meters, y up,
     right-handed; move and look (x, z) are what was told in each frame, in these axes.
-    The scripts read BVHs in centimetres, and a preset in Unity's axes, whose x points
+    The scripts read BVHs in centimeters, and a preset in Unity's axes, whose x points
     the other way.
     """
     names, joints = list(names), 100.0 * np.asarray(joints, np.float64)

@@ -1,4 +1,4 @@
-"""Float64 oracles of rotations and skeletons: loops and SciPy, no vectorised tricks."""
+"""Float64 oracles of rotations and skeletons: loops and SciPy, no vectorized tricks."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,7 +9,7 @@ def random_rotations(seed, count):
 
 
 def gram_schmidt(rot6d):
-    """Matrix whose first two columns are the orthonormalised halves of six numbers."""
+    """Matrix whose first two columns are the orthonormalized halves of six numbers."""
     x = rot6d[:3] / np.linalg.norm(rot6d[:3])
     y = rot6d[3:] - np.dot(x, rot6d[3:]) * x
     y = y / np.linalg.norm(y)

@@ -1,7 +1,7 @@
 """Float64 oracles of pose vectors, path features and the simulation bone, with loops.
 
 Written from Holden et al. 2020 and Li et al. 2024: 4x4 matrices along the chains, SciPy
-for rotation vectors and filters. Facings are (x, z), yaw turns +z towards +x.
+for rotation vectors and filters. Facings are (x, z), yaw turns +z toward +x.
 """
 
 import numpy as np
@@ -34,7 +34,7 @@ def local_matrices(offsets, parents, root, rotations, bone_position, bone_facing
     return np.array(rows)
 
 
-def means_of_neighbours(steps):
+def means_of_neighbors(steps):
     """Means of the steps before and after; the ends continue them on a line."""
     means = 0.5 * (steps[1:] + steps[:-1])
     first, last = 2 * means[0] - means[1], 2 * means[-1] - means[-2]
@@ -42,17 +42,17 @@ def means_of_neighbours(steps):
 
 
 def velocity(positions, fps):
-    return means_of_neighbours(np.diff(positions, axis=0) * fps)
+    return means_of_neighbors(np.diff(positions, axis=0) * fps)
 
 
 def angular_velocity(matrices, fps):
     """Of matrices [F, 3, 3], in the axes that they turn into."""
     steps = matrices[1:] @ matrices[:-1].transpose(0, 2, 1)
-    return means_of_neighbours(Rotation.from_matrix(steps).as_rotvec() * fps)
+    return means_of_neighbors(Rotation.from_matrix(steps).as_rotvec() * fps)
 
 
 def contacts(toe, fps, max_speed=0.15, frames=6):
-    """Of one toe [F, 3], at 60 frames a second."""
+    """Of one toe [F, 3], at 60 frames per second."""
     stands = np.linalg.norm(velocity(toe, fps), axis=-1) < max_speed
     return ndimage.median_filter(stands.astype(int), size=frames, mode="nearest")
 
@@ -133,7 +133,7 @@ def path_features(position, facing, offsets):
 
 
 def simulation_bone(chest, across):
-    """Position and facing at 60 frames a second, from chest and right-to-left."""
+    """Position and facing at 60 frames per second, from chest and right-to-left."""
     position = signal.savgol_filter(chest[:, [0, 2]], 31, 3, axis=0, mode="interp")
     facing = np.cross(across, [0.0, 1.0, 0.0])[:, [0, 2]]
     facing = facing / np.linalg.norm(facing, axis=-1, keepdims=True)

@@ -1,6 +1,6 @@
 """Float64 oracles of SMGDiff: the ball's features, its contacts and guidance, in loops.
 
-Written from the paper (eq. 1-2, 10-15). One clip or one sample at a time, metres, y up
+Written from the paper (eq. 1-2, 10-15). One clip or one sample at a time, meters, y up
 (the paper's z), frames first. What the paper leaves open is said where it occurs.
 """
 
@@ -50,7 +50,7 @@ def decode_ball(features, root, start, fps):
 
 
 def accelerations(ball, fps):
-    """Second differences; none (zero) at the two ends, which have no neighbour."""
+    """Second differences; none (zero) at the two ends, which have no neighbor."""
     found = np.zeros(np.shape(ball))
     for i in range(1, len(ball) - 1):
         before, here, after = np.asarray(ball[i - 1 : i + 2], np.float64)
@@ -85,7 +85,7 @@ def contact_loss(
     weight=GROUNDED_WEIGHT,
     delta=0.0,
 ):
-    """Eq. 12, feet [frames, feet, 3]; the threshold meets the penalised distance.
+    """Eq. 12, feet [frames, feet, 3]; the threshold meets the penalized distance.
 
     An indicator over itself plus delta is the indicator, divided by 1 + delta.
     """
@@ -127,7 +127,7 @@ def dsg_deviation(variances, t, last_sigma=None):
 
 
 def dsg_direction(sigma, gradient, noise, rate):
-    """Eq. 13-14: from the drawn noise towards the steepest descent."""
+    """Eq. 13-14: from the drawn noise toward the steepest descent."""
     radius = np.sqrt(np.size(noise)) * sigma
     steepest = -radius * np.asarray(gradient, np.float64) / length(gradient)
     drawn = sigma * np.asarray(noise, np.float64)

@@ -42,7 +42,7 @@ def extend(points, num_frames, reuse):
 
 
 def yaw(facing):
-    """Angle of (x, z) from +z towards +x."""
+    """Angle of (x, z) from +z toward +x."""
     return np.arctan2(facing[..., 0], facing[..., 1])
 
 

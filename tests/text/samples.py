@@ -37,7 +37,7 @@ def _byte_pairs(special_last):
 
 
 def tokenizer(*, special_last=True):
-    """BPE with CLIP's normaliser, bytes, end of word, unknown token and template."""
+    """BPE with CLIP's normalizer, bytes, end of word, unknown token and template."""
     vocabulary, merges = _byte_pairs(special_last)
     made = tokenizers.Tokenizer(
         models.BPE(vocabulary, merges, unk_token=END, end_of_word_suffix="</w>")

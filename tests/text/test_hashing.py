@@ -65,7 +65,7 @@ def test_signs_keep_inner_products_unbiased():
     assert 0.01 < np.std(errors) < 0.2
 
 
-def test_length_one_and_no_dependence_on_case_marks_and_neighbours():
+def test_length_one_and_no_dependence_on_case_marks_and_neighbors():
     found = hashing.encode(TEXTS, dimensions=64)
     assert found.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, rtol=1e-6)

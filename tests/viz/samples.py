@@ -14,7 +14,7 @@ FPS = 30.0
 
 
 def circle(frames=12, radius=1.0):
-    """Positions [F, 4, 3] and the root's path [F, 2], metres."""
+    """Positions [F, 4, 3] and the root's path [F, 2], meters."""
     angle = np.linspace(0, 1.5, frames)
     root = np.stack(
         [

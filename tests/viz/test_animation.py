@@ -155,12 +155,12 @@ def test_the_ground_moves_under_the_character_and_stands_in_the_world(tmp_path):
     assert len(paths["still"]) == 1, "equal pictures are one"
     changed = np.any(np.diff(paths["walk"], axis=0), axis=-1).mean(axis=(1, 2))
     assert changed[5:].min() > 0.005
-    # Tiles have whole metres as corners wherever the camera is.
-    for centre in ([0.3, 0.9, 7.7], [-2.2, 0.9, 0.1]):
-        corners = animation.tiles(np.array(centre), 2.0)
+    # Tiles have whole meters as corners wherever the camera is.
+    for center in ([0.3, 0.9, 7.7], [-2.2, 0.9, 0.1]):
+        corners = animation.tiles(np.array(center), 2.0)
         np.testing.assert_array_equal(corners, np.round(corners))
         assert np.all(corners[:, 0, [0, 2]].sum(axis=-1) % 2 == 0)
-        assert np.all(np.abs(corners.mean(axis=1) - centre)[:, [0, 2]] < 3)
+        assert np.all(np.abs(corners.mean(axis=1) - center)[:, [0, 2]] < 3)
 
 
 def test_eight_seconds_are_small_and_at_most_20_pictures_a_second(tmp_path):
@@ -175,7 +175,7 @@ def test_eight_seconds_are_small_and_at_most_20_pictures_a_second(tmp_path):
         walked=walked,
         commanded=walked + 0.1,
         title="a walk",
-        caption="data (licence)",
+        caption="data (license)",
     )
     assert (tmp_path / "a.gif").stat().st_size < 1_500_000
     with Image.open(tmp_path / "a.gif") as image:
@@ -187,7 +187,7 @@ def test_a_caption_is_below_and_the_title_above(tmp_path):
     positions, skeleton = samples.person(seconds=0.1)
     place = {}
     for name in ("title", "caption"):
-        text = {name: "data and its licence " * 2}
+        text = {name: "data and its license " * 2}
         path = tmp_path / "a.gif"
         animation.save_gif(
             path, positions, skeleton.parents, fps=samples.FPS, size=240, **text

@@ -31,7 +31,7 @@ def person():
 
 
 def heights(made, color):
-    """Lowest and highest point of all shapes of a colour, over the frames."""
+    """Lowest and highest point of all shapes of a color, over the frames."""
     mine = [s for s, c in enumerate(made.colors) if c == color]
     ends, radii = made.points[:, made.ends[mine]], made.radii[mine]
     return (ends[..., 1] - radii).min(), (ends[..., 1] + radii).max()
@@ -68,7 +68,7 @@ def test_toes_point_and_the_nose_looks_ahead(person):
     assert np.all(np.sum(nose * ahead, axis=-1) > 0)
 
 
-def test_a_head_is_found_without_names_and_sides_are_grey(person):
+def test_a_head_is_found_without_names_and_sides_are_gray(person):
     positions, skeleton = person
     made = body.build(positions, skeleton.parents, None)
     named = body.build(positions, skeleton.parents, skeleton.names)

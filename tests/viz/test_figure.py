@@ -10,7 +10,7 @@ from tests.viz import samples
 
 
 def test_the_axes_of_a_view():
-    # Right, up and towards the viewer are orthonormal, and right-handed.
+    # Right, up and toward the viewer are orthonormal, and right-handed.
     for azimuth, elevation in [(0.0, 0.0), (35.0, 20.0), (200.0, 70.0)]:
         axes = figure.view_axes(azimuth=azimuth, elevation=elevation)
         np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)

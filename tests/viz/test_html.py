@@ -49,13 +49,13 @@ def data_of(text):
     return json.loads(line.group(1))
 
 
-def test_the_page_holds_the_positions_to_a_millimetre(tmp_path):
+def test_the_page_holds_the_positions_to_a_millimeter(tmp_path):
     positions, walked = samples.circle()
     data = data_of(save(tmp_path / "a.html", positions))
     np.testing.assert_allclose(data["positions"], positions, atol=5.001e-4)
     np.testing.assert_allclose(data["walked"], walked, atol=5.001e-4)
     np.testing.assert_allclose(data["commanded"], walked + 0.5, atol=5.001e-4)
-    # Three bones: grey, blue and red.
+    # Three bones: gray, blue and red.
     assert [shape[:2] for shape in data["shapes"]] == [[0, 1], [1, 2], [0, 3]]
     assert data["fps"] == samples.FPS
     assert len({shape[4] for shape in data["shapes"]}) == 3

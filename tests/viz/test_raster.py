@@ -19,8 +19,8 @@ def test_a_capsule_covers_the_discs_along_its_axis(depth, radii, length):
     x, y = np.meshgrid(np.arange(80), np.arange(60))
     nearest = np.full(x.shape, np.inf)
     for part in np.linspace(0, 1, 201):
-        centre, r = a + part * (b - a), radii[0] + part * (radii[1] - radii[0])
-        nearest = np.minimum(nearest, np.hypot(x - centre[0], y - centre[1]) - r)
+        center, r = a + part * (b - a), radii[0] + part * (radii[1] - radii[0])
+        nearest = np.minimum(nearest, np.hypot(x - center[0], y - center[1]) - r)
     # No holes, nothing beside it; a cone's side is a little inside its discs' hull.
     assert not np.any(found & (nearest > 0.01))
     assert not np.any(~found & (nearest < -1.2))
@@ -37,7 +37,7 @@ def test_what_is_nearer_hides_what_is_farther():
             assert color(draw(shapes, radii, order)) == front
 
 
-def test_the_side_towards_the_light_is_lighter():
+def test_the_side_toward_the_light_is_lighter():
     seen = draw([[[40.0, 30.0, 0.0]] * 2], [[20.0, 20.0]])
     assert seen[18, 33] > seen[44, 48] > 0
     table = raster.shades((40, 120, 200)).sum(axis=1)

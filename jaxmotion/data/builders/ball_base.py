@@ -1,6 +1,6 @@
 """What builders of clips with a ball add to those of clips.
 
-Beside its motion each clip stores the ball's centre, which joints touch it in every
+Beside its motion each clip stores the ball's center, which joints touch it in every
 frame, the numbers of those joints and the ball's radius.
 """
 
@@ -19,7 +19,7 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 class BallBuilder(base.MotionBuilder, skip_registration=True):
-    """A set of labelled clips with a ball."""
+    """A set of labeled clips with a ball."""
 
     MORE_TENSORS = {
         "ball_position": ((None, 3), np.float32),
@@ -47,10 +47,10 @@ def ball_example(
       skeleton: Its bones.
       motion: Its frames.
       labels: One word for each label field.
-      ball: World position of the ball's centre in every frame, metres, y up.
+      ball: World position of the ball's center in every frame, meters, y up.
       touch: Which of the joints touch the ball in every frame.
       joints: Joints that may touch the ball.
-      radius: Of the ball, metres.
+      radius: Of the ball, meters.
 
     Returns:
       What a builder's generator yields.
@@ -72,7 +72,7 @@ def ball_clips_from_source(
 
     Args:
       builder: A prepared builder.
-      tolerance: Largest difference between the offsets of two skeletons, metres.
+      tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Returns:
       The clips, sorted by name.

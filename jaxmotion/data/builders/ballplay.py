@@ -1,8 +1,8 @@
 """BallPlay-M: a person with a measured basketball, the motions SkillMimic learns from.
 
-The file ballplay_m.npz holds all clips behind each other at 60 frames a second, metres,
+The file ballplay_m.npz holds all clips, concatenated, at 60 frames per second, meters,
 z up: `body_position` of 53 joints, rotation vectors of the root and (parent-local) of
-joints 1 to 52, the ball's centre, and whether a hand touches it. This builder takes
+joints 1 to 52, the ball's center, and whether a hand touches it. This builder takes
 every second frame and turns the axes to y up; a touch in either of two frames is a
 touch. Fingers are dropped. The flag does not say which hand: the wrist that is nearer
 to the ball is taken, so a ball in both hands touches one, and changes hands often (260
@@ -38,7 +38,7 @@ from scipy.spatial.transform import Rotation
 from jaxmotion import files
 from jaxmotion.data import npz
 from jaxmotion.data.builders import ball_base, base, chains
-from jaxmotion.motion.skeleton import MAX_METRES, Skeleton
+from jaxmotion.motion.skeleton import MAX_METERS, Skeleton
 
 RADIUS = 0.112
 OTHER = "other"
@@ -163,11 +163,11 @@ def read_fields(path: str, data: bytes) -> dict[str, np.ndarray]:
             )
         if field not in _FRAMES:
             continue
-        inside = np.abs(fields[field].astype(np.float64)) <= MAX_METRES
+        inside = np.abs(fields[field].astype(np.float64)) <= MAX_METERS
         if not inside.all():
             frame = int(np.argwhere(~inside)[0, 0])
             raise ValueError(
-                f"{path}: field {field!r} of frame {frame} is not within {MAX_METRES:g}"
+                f"{path}: field {field!r} of frame {frame} is not within {MAX_METERS:g}"
             )
     _check_clips(path, fields, num_frames)
     return {

@@ -32,7 +32,7 @@ class BandaiNamcoConfig(tfds.core.BuilderConfig):
 
 
 class BandaiNamco(base.MotionBuilder):
-    """Everyday actions in several styles, 30 frames a second.
+    """Everyday actions in several styles, 30 frames per second.
 
     `joint_Root`, which never moves, is dropped: the hips are joint 0. Offsets come from
     the position channels, which every joint has; OFFSET holds the first frame's.
@@ -52,7 +52,7 @@ class BandaiNamco(base.MotionBuilder):
 
     @property
     def source(self) -> str:
-        """Name of the set and its licence."""
+        """Name of the set and its license."""
         name = self.builder_config.name
         return f"Bandai-Namco Research Motion Dataset {name} (CC BY-NC 4.0)"
 

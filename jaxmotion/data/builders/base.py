@@ -3,7 +3,7 @@
 A builder stores whole clips, one example each, as array_record files, which
 `as_data_source` reads without TensorFlow. `clips_from_source` makes `Clips` of them;
 windows are cut later, on the device. World coordinates stay as published: nothing is
-centred, turned or put on the floor.
+centerd, turned or put on the floor.
 """
 
 import os
@@ -30,13 +30,13 @@ _TENSORS = {
 
 
 class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
-    """A set of labelled clips; a subclass says where they come from.
+    """A set of labeled clips; a subclass says where they come from.
 
     Attributes:
       LABELS: Label fields of each clip.
       LABEL_NAMES: Published order of a field's labels; other fields are sorted.
       MORE_TENSORS: Shape and type of what a clip has beside its motion.
-      SOURCE: Name of the set and its licence.
+      SOURCE: Name of the set and its license.
       HOMEPAGE: Where it is published.
     """
 
@@ -50,7 +50,7 @@ class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
 
     @property
     def source(self) -> str:
-        """Name of the set (and its configuration) and its licence."""
+        """Name of the set (and its configuration) and its license."""
         return self.SOURCE
 
     @property
@@ -102,9 +102,9 @@ def motion_from_matrices(
     """A motion of rotation matrices.
 
     Args:
-      root_position: World position of the root, metres, y up.
+      root_position: World position of the root, meters, y up.
       local: Parent-local rotations; the root's is global.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       The motion.
@@ -284,7 +284,7 @@ def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Cli
 
     Args:
       builder: A prepared builder.
-      tolerance: Largest difference between the offsets of two skeletons, metres.
+      tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Returns:
       The clips, sorted by name.
@@ -303,7 +303,7 @@ def clips_from_records(
     Args:
       builder: The builder.
       records: Features of each clip.
-      tolerance: Largest difference between the offsets of two skeletons, metres.
+      tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Returns:
       The clips, in the order of the records.

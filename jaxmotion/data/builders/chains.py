@@ -57,13 +57,13 @@ def joint_positions(
     """World positions of all joints.
 
     Args:
-      root: World position of the root, metres.
+      root: World position of the root, meters.
       world: World rotations.
-      offsets: Joint position in its parent's frame, metres; the root's is unused.
+      offsets: Joint position in its parent's frame, meters; the root's is unused.
       parents: Parent of each joint, smaller than the joint.
 
     Returns:
-      Positions, metres.
+      Positions, meters.
     """
     found = [root]
     for joint, parent in enumerate(parents[1:], start=1):
@@ -86,7 +86,7 @@ def fit_rotations(
     turns about itself. A joint without children keeps G.
 
     Args:
-      position: World positions of the joints, metres.
+      position: World positions of the joints, meters.
       world: World rotations to start from.
       parents: Parent of each joint, smaller than the joint.
 

@@ -2,15 +2,15 @@
 
 The file is a pickled dictionary of lists, one entry a clip: "poses" (rotation vectors
 of the 24 SMPL joints, [frames, 72]), "joints3D" (their positions, [frames, 24, 3],
-metres) and "y" (the action's number). It is read without running it. There are no bone
+meters) and "y" (the action's number). It is read without running it. There are no bone
 vectors; those stored here are fitted: in the frame of its parent p, joint j lies at
 
     offset[j] = mean over all frames of R_global[p]^T (p_j - p_p),
 
 one skeleton for all clips, although the people recorded differ.
 
-The file states neither a rate nor its axes. 20 frames a second is what HumanML3D takes
-these recordings for, which it includes as they are. The axes stay as published.
+The file states neither a rate nor its axes. 20 frames per second is what HumanML3D
+takes these recordings for, which it includes as they are. The axes stay as published.
 """
 
 from collections.abc import Iterator
@@ -91,7 +91,7 @@ def read_clips(
       data: Its content.
 
     Returns:
-      For each clip rotation vectors [frames, 72], positions [frames, 24, 3] in metres,
+      For each clip rotation vectors [frames, 72], positions [frames, 24, 3] in meters,
       and the name of its action.
 
     Raises:
@@ -145,7 +145,7 @@ def fit_skeleton(
 
     Args:
       poses: Rotation vectors of each clip.
-      joints: Joint positions of each clip, metres.
+      joints: Joint positions of each clip, meters.
 
     Returns:
       The skeleton; its feet are SMPL's foot joints.

@@ -36,9 +36,9 @@ class TextConfig(tfds.core.BuilderConfig):
 
     Attributes:
       num_features: Numbers in a feature vector.
-      fps: Frames a second.
+      fps: Frames per second.
       min_frames: Fewest frames of a clip.
-      source: Name of the set and its licence.
+      source: Name of the set and its license.
     """
 
     num_features: int = 0
@@ -60,7 +60,7 @@ class HumanML3D(tfds.core.GeneratorBasedBuilder, skip_registration=True):
             num_features=263,
             fps=20.0,
             min_frames=40,
-            source="HumanML3D (motions under the licences of AMASS and HumanAct12)",
+            source="HumanML3D (motions under the licenses of AMASS and HumanAct12)",
         ),
         TextConfig(
             name="kit_ml",
@@ -202,7 +202,7 @@ def text_motions_from_source(
 
     Args:
       builder: A prepared `HumanML3D`.
-      cut_fps: Frames a second by which the times of captions become frames. The
+      cut_fps: Frames per second by which the times of captions become frames. The
         released loaders take 20 for both sets; KIT-ML's own rate is 12.5.
 
     Returns:

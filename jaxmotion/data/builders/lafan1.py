@@ -36,7 +36,7 @@ def read_name(name: str) -> dict[str, str]:
 
 
 class Lafan1(base.MotionBuilder):
-    """Five subjects, long takes of fifteen themes, 30 frames a second."""
+    """Five subjects, long takes of fifteen themes, 30 frames per second."""
 
     MANUAL_DOWNLOAD_INSTRUCTIONS = (
         "Put lafan1.zip (and, where there are any, zips of cuts), or the BVH files "

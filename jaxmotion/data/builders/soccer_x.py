@@ -1,17 +1,17 @@
 """Soccer-X: people with a football, the set of SMGDiff. The layout read here is OURS.
 
-The set is described in the paper (30 players, 2398 sequences, 240 frames a second, SMPL
-bodies and a ball), but was never published, and nothing says how its files look. A
+The set is described in the paper (30 players, 2398 sequences, 240 frames per second,
+SMPL bodies and a ball), but was never published, and nothing says how its files look. A
 holder of the data can write the following files, which this builder reads:
 
     skeleton.npz                  "offsets" [24, 3]: joint position of SMPL's rest pose
-                                  relative to its parent, metres; row 0 is the pelvis
+                                  relative to its parent, meters; row 0 is the pelvis
                                   relative to the model's origin. One body for all.
     <skill>_<anything>.npz        one sequence each, in any folder; or <anything>.npz
                                   in a folder <skill>
-      trans       [frames, 3]     SMPL's translation, metres
+      trans       [frames, 3]     SMPL's translation, meters
       poses       [frames, 72]    SMPL's rotation vectors, radians
-      ball_trans  [frames, 3]     the ball's centre, metres
+      ball_trans  [frames, 3]     the ball's center, meters
       ball_rot    [frames, 3]     optional; not read, a ball looks the same all round
       fps                         240 or 30
       up                          "y" or "z"
@@ -20,7 +20,7 @@ with the skills dribble, trick, shoot, stand, celebrate, off_ball. The bones are
 for because SMPL's model may not be passed on.
 
 Every eighth frame of 240 is taken. Which foot touches the ball is not measured. A foot
-joint touches it where, at 30 frames a second,
+joint touches it where, at 30 frames per second,
 
     |joint - ball| < 0.11 m + 0.05 m    and    |ball acceleration| > 12 m/s^2.
 
@@ -42,7 +42,7 @@ from jaxmotion import files
 from jaxmotion.data import npz
 from jaxmotion.data.builders import ball_base, base, chains, smpl
 from jaxmotion.motion.ball import ball_accelerations
-from jaxmotion.motion.skeleton import MAX_METRES, Skeleton
+from jaxmotion.motion.skeleton import MAX_METERS, Skeleton
 
 SKILLS = ("dribble", "trick", "shoot", "stand", "celebrate", "off_ball")
 RADIUS = 0.11
@@ -97,11 +97,11 @@ def _arrays(
                 f"{path}: field {field!r} has shape {found.shape}, expected "
                 f"({expected})"
             )
-        inside = np.abs(found.astype(np.float64)) <= MAX_METRES
+        inside = np.abs(found.astype(np.float64)) <= MAX_METERS
         if not inside.all():
             row = int(np.argwhere(~inside)[0, 0])
             raise ValueError(
-                f"{path}: field {field!r} is not within {MAX_METRES:g} in row {row}"
+                f"{path}: field {field!r} is not within {MAX_METERS:g} in row {row}"
             )
     return fields
 
@@ -154,7 +154,7 @@ def read_skill(path: str) -> str:
 
 
 def read_sequence(path: str, data: bytes, skeleton: Skeleton) -> tuple[str, dict]:
-    """One sequence at 30 frames a second, y up.
+    """One sequence at 30 frames per second, y up.
 
     Args:
       path: The file's path.
@@ -229,8 +229,8 @@ def ball_touch(
     """Which joints touch the ball: near it while its velocity changes.
 
     Args:
-      joints: World positions at 30 frames a second, metres.
-      ball: World position of the ball's centre, metres.
+      joints: World positions at 30 frames per second, meters.
+      ball: World position of the ball's center, meters.
 
     Returns:
       True where a joint touches it; never in the first and the last frame.

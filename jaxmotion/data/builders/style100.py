@@ -6,7 +6,7 @@ name, description, stochastic y/n, symmetric y/n and notes.
 
 Source: the preprocessing of CAMDM's released code (every second frame, cut at start//2
 and stop//2, fingers dropped, symmetric styles mirrored under the same label). Differs:
-clips are not turned, centred or put on the floor; what follows works in any place.
+clips are not turned, centerd or put on the floor; what follows works in any place.
 """
 
 import csv
@@ -42,7 +42,7 @@ class Style100Config(tfds.core.BuilderConfig):
 
 
 class Style100(base.MotionBuilder):
-    """A hundred styles, ten actions each, taken at 30 of 60 frames a second."""
+    """A hundred styles, ten actions each, taken at 30 of 60 frames per second."""
 
     BUILDER_CONFIGS = [
         Style100Config(name="original", description="As recorded."),
@@ -127,11 +127,11 @@ def toes(skeleton: Skeleton, path: str) -> tuple[int, ...]:
 
 
 def cut_clip(content: bvh.Bvh, cut: tuple[int, int]) -> bvh.Bvh:
-    """The cut at 30 frames a second, without fingers and eyes.
+    """The cut at 30 frames per second, without fingers and eyes.
 
     Args:
-      content: A recording at 60 frames a second, or one already taken at 30.
-      cut: First and last (exclusive) frame at 60 frames a second.
+      content: A recording at 60 frames per second, or one already taken at 30.
+      cut: First and last (exclusive) frame at 60 frames per second.
 
     Returns:
       The frames start//2 : stop//2 of every second frame.
@@ -142,7 +142,7 @@ def cut_clip(content: bvh.Bvh, cut: tuple[int, int]) -> bvh.Bvh:
     fps = bvh.frame_rate(content.frame_time)
     if fps not in (60.0, 30.0):
         raise bvh.BvhError(
-            f"{content.name}: {fps:g} frames a second, expected 60 (or 30)"
+            f"{content.name}: {fps:g} frames per second, expected 60 (or 30)"
         )
     start, stop = cut[0] // 2, cut[1] // 2
     values = content.values[:: 2 if fps == 60.0 else 1]

@@ -44,8 +44,8 @@ class CharacterState:
     Attributes:
       frame: Its frame, as the space has it.
       bone: Its simulation bone, world.
-      velocity: Of the bone, metres a second, world.
-      turn_rate: Of the bone, radians a second.
+      velocity: Of the bone, meters per second, world.
+      turn_rate: Of the bone, radians per second.
     """
 
     frame: Float[Array, "*batch channels"]
@@ -60,13 +60,13 @@ class Frame:
     """What a tick shows.
 
     Attributes:
-      root_position: World, metres.
+      root_position: World, meters.
       joint_rotation: Parent-local, two columns each.
       bone: The simulation bone, world.
-      velocity: Of the bone, metres a second, world.
+      velocity: Of the bone, meters per second, world.
       path: Path features that the frame promises.
       wanted: Path features that the user asked for at this tick.
-      desired_velocity: Metres a second, as commanded.
+      desired_velocity: Meters per second, as commanded.
       desired_facing: As commanded.
     """
 
@@ -115,7 +115,7 @@ def wanted_path(
     Args:
       state: The character.
       command: What the user wants now.
-      fps: Frames a second.
+      fps: Frames per second.
       half_life: Of the springs, seconds.
 
     Returns:
@@ -196,7 +196,7 @@ def advance(
       state: The character, with the new frame and the old bone.
       command: What the user wants now.
       num_joints: Joints of the skeleton.
-      fps: Frames a second.
+      fps: Frames per second.
       wanted: Path features that were asked for; None for those that the frame has.
 
     Returns:
@@ -240,7 +240,7 @@ def controller(
       step: Makes the next frame.
       space: The space.
       num_joints: Joints of the skeleton.
-      fps: Frames a second.
+      fps: Frames per second.
       steered: Whether commands matter; if not, none of the steering is compiled in.
       bounded: Whether frames are kept within the bounds of the data; ours.
       half_life: Of the springs that turn a command into a path, seconds.

@@ -25,7 +25,7 @@ class PoseData:
       poses: Pose vectors.
       paths: Path features.
       offsets: First frame of each clip, and the number of frames at the end.
-      fps: Frames a second.
+      fps: Frames per second.
     """
 
     poses: Float[Array, "frames features"]
@@ -44,7 +44,7 @@ def starts(data: PoseData, length: int, *, stride: int = 1) -> Int[Array, " wind
 
     Args:
       data: The frames.
-      length: Frames a window.
+      length: Frames per window.
       stride: Frames between the starts of windows of one clip.
 
     Returns:
@@ -116,7 +116,7 @@ def pose_data(clips: Clips, *, fps: float = 60.0) -> tuple[PoseData, tuple[str, 
 
     Args:
       clips: The clips; those too short for a simulation bone are left out.
-      fps: Frames a second that are wanted.
+      fps: Frames per second that are wanted.
 
     Returns:
       The frames, and the names of the clips that were used.
@@ -141,7 +141,7 @@ def pose_data(clips: Clips, *, fps: float = 60.0) -> tuple[PoseData, tuple[str, 
         rows.append((poses, paths))
         names.append(clips.clip_names[i])
     if not rows:
-        raise ValueError(f"no clip has {least} frames at {fps:g} frames a second")
+        raise ValueError(f"no clip has {least} frames at {fps:g} frames per second")
     poses, paths = (jnp.concatenate(x) for x in zip(*rows, strict=True))
     lengths = [len(row[0]) for row in rows]
     boundaries = jnp.asarray(np.cumsum([0, *lengths]), jnp.int32)

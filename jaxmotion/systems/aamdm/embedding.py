@@ -8,7 +8,7 @@ forward kinematics F, in the character's axes:
     L_val = |y' - y| + |F(y') - F(y)|,  L_vel = the same of frame differences a second,
     L_reg = |z|^2 + |z| + the differences of z.
 
-Source: Li et al. 2024 (AAMDM), section 3.1, eq. 1-4. Norms, weights and normalisation
+Source: Li et al. 2024 (AAMDM), section 3.1, eq. 1-4. Norms, weights and normalization
 are those of Learned Motion Matching (Holden et al. 2020, released code), since the
 paper gives none. So are terms that its equations do not have: differences of local
 positions and rotations beside eq. 2's of F, and the latent's |z| and differences beside
@@ -59,7 +59,7 @@ class Config:
 
     Attributes:
       num_joints: Joints of the skeleton.
-      fps: Frames a second.
+      fps: Frames per second.
       latent: Channels of z (paper: 52, so that xz has 64).
       width: Channels of a hidden layer (ours; the paper gives none).
       weights: Of the loss.
@@ -175,7 +175,7 @@ def encode(
     *,
     config: Config,
 ) -> Float[Array, "*batch embedded"]:
-    """Embeds poses; path features stay in metres, for those who steer.
+    """Embeds poses; path features stay in meters, for those who steer.
 
     Args:
       params: The autoencoder's.
@@ -185,7 +185,7 @@ def encode(
       config: Sizes.
 
     Returns:
-      [path features in metres, latent].
+      [path features in meters, latent].
     """
     given = features.normalize(statistics.group, poses)
     latent = _nets(config)[0].apply({"params": params["encoder"]}, given)
@@ -235,7 +235,7 @@ def loss(
     parents: tuple[int, ...],
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The autoencoder's loss on pairs of neighbouring frames; L1 means throughout.
+    """The autoencoder's loss on pairs of neighboring frames; L1 means throughout.
 
     Args:
       params: The autoencoder's.

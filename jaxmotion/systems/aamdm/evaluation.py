@@ -68,7 +68,7 @@ def commands(
       number: Characters.
       ticks: Length.
       preset: Of `presets.PRESETS`.
-      speed: Metres a second.
+      speed: Meters per second.
 
     Returns:
       Commands [characters, ticks, ...].
@@ -123,7 +123,7 @@ def positions_of(skeleton: Skeleton, frames: Frame) -> jax.Array:
       frames: Displayed frames.
 
     Returns:
-      Positions [characters, ticks, joints, 3], metres.
+      Positions [characters, ticks, joints, 3], meters.
     """
     return forward_kinematics(skeleton, frames.root_position, frames.joint_rotation)
 
@@ -137,7 +137,7 @@ def data_frames(
       run: The run.
       data: Where they come from.
       number: Windows.
-      ticks: Frames a window.
+      ticks: Frames per window.
       seed: Of their choice.
 
     Returns:
@@ -177,7 +177,7 @@ def data_frames(
 def frames_per_second(
     run: Run, space: Space, step: Stepper, *, ticks: int = 300, repeats: int = 5
 ) -> float:
-    """Frames a second of one character, generated one after the other.
+    """Frames per second of one character, generated one after the other.
 
     Args:
       run: The run.
@@ -187,7 +187,7 @@ def frames_per_second(
       repeats: Timed rollouts; the median counts.
 
     Returns:
-      Frames a second, decoding and placing included, compilation not.
+      Frames per second, decoding and placing included, compilation not.
     """
     states = start_states(run, space, 1, seed=0)
     given = commands(run, 1, ticks, preset="forward", speed=1.0)
@@ -202,7 +202,7 @@ def frames_per_second(
 
 
 PAIRS = 2000
-STRIDE = 5  # frames; neighbours are nearly the same
+STRIDE = 5  # frames; neighbors are nearly the same
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -211,9 +211,9 @@ class Reference:
 
     Attributes:
       normalizer: Of joint positions in the character's axes.
-      moments: Of the training frames' positions, normalised.
-      toe_height: Height of the resting toes, metres.
-      root_height: Median height of the root, metres.
+      moments: Of the training frames' positions, normalized.
+      toe_height: Height of the resting toes, meters.
+      root_height: Median height of the root, meters.
     """
 
     normalizer: features.Normalizer
@@ -242,7 +242,7 @@ def make_reference(skeleton: Skeleton, data: PoseData) -> Reference:
     found = jax.jit(lambda x: _pose_positions(skeleton, x))(data.poses[::STRIDE])
     toes = np.asarray(found[:, jnp.array(skeleton.feet), 1])
     flat = found.reshape(len(found), -1)
-    # A centimetre: the chest hardly leaves the bone's axis.
+    # A centimeter: the chest hardly leaves the bone's axis.
     normalizer = features.fit_normalizer(flat, floor=0.01)
     return Reference(
         normalizer=normalizer,
@@ -253,7 +253,7 @@ def make_reference(skeleton: Skeleton, data: PoseData) -> Reference:
 
 
 def _character_features(reference: Reference, frames: Frame, positions: Array) -> Array:
-    """Normalised positions in the character's axes [characters, ticks, 3 J]."""
+    """Normalized positions in the character's axes [characters, ticks, 3 J]."""
     origin = frames.bone.origin[..., None, :]
     facing = jnp.broadcast_to(
         frames.bone.facing[..., None, :], positions.shape[:-1] + (2,)
@@ -280,7 +280,7 @@ def free_row(
       skeleton: The skeleton.
       reference: What to compare with.
       frames: Rollouts [characters, ticks, ...].
-      fps: Frames a second.
+      fps: Frames per second.
       groups: Groups of rollouts for the intervals of DIV and FID; divides their number.
 
     Returns:
@@ -330,7 +330,7 @@ def free_row(
     }
 
 
-def _realised(frames: Frame, fps: float) -> tuple[Array, Array]:
+def _realized(frames: Frame, fps: float) -> tuple[Array, Array]:
     """Path features that came true, and those asked for, at the same ticks."""
     bone = Trajectory(position=frames.bone.origin, facing=frames.bone.facing)
     found = jax.vmap(lambda x: path_features.path_features(x, fps=fps))(bone)
@@ -344,23 +344,23 @@ def control_row(frames: Frame, *, fps: float) -> dict[str, table.Cell]:
 
     Args:
       frames: Steered rollouts.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       te_promised: mean absolute difference of the 12 path features of the frame and
-      those wanted, metres and components of unit vectors together, as the paper's |x|;
-      te_realised: the same of where the character went; trajectory_error_deg: angle
+      those wanted, meters and components of unit vectors together, as the paper's |x|;
+      te_realized: the same of where the character went; trajectory_error_deg: angle
       between the commanded and the actual velocity.
     """
     promised = jnp.abs(frames.path - frames.wanted).mean(axis=(1, 2))
-    found, wanted = _realised(frames, fps)
-    realised = jnp.abs(found - wanted).mean(axis=(1, 2))
+    found, wanted = _realized(frames, fps)
+    realized = jnp.abs(found - wanted).mean(axis=(1, 2))
     angle = alignment.trajectory_error(
         frames.desired_velocity, frames.bone.origin, fps
     ).error
     return {
         "te_promised": table.cell(promised),
-        "te_realised": table.cell(realised),
+        "te_realized": table.cell(realized),
         "trajectory_error_deg": table.cell(angle, scale=180.0 / np.pi),
     }
 
@@ -380,7 +380,7 @@ def long_health(
         frozen whose limbs move at less than 0.05 m/s on average through 30 s. Under
         control, 2 s of that while 0.3 m/s are wanted are enough.
       reference: Heights of the body.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       Counts "diverged" (root below 0.1 m or above 2.5 times its median height, a joint

@@ -1,7 +1,7 @@
 """AAMDM's losses: the diffusion model over windows, and the two players of the GAN.
 
 Source: Li et al. 2024 (AAMDM), eq. 6-12; norms and weights are ours (L1 means).
-Differs: eq. 8 divides differences of neighbouring frames by h times the frame's time,
+Differs: eq. 8 divides differences of neighboring frames by h times the frame's time,
 here they are per frame and `Config.weight_velocity` scales them. The paper trains both
 modules on windows of ten frames and does not say how the GAN's are used; here the GAN
 sees three: one to predict, the one before it, and one more from which the generator may

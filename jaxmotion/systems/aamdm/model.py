@@ -8,9 +8,9 @@ first steps, a diffusion model its last ones; both see the previous frame:
 
 The frame is any vector: the learned 64-dimensional embedding of a pose, or a point of
 the toy problem. What the chain denoises is the frame itself, as in the paper, or its
-change: at 60 frames a second a frame is nearly the one before it, and beside the noise
-of the paper's last steps what is left to choose vanishes; a change, scaled to unit
-variance, does not.
+change: at 60 frames per second a frame is nearly the one before it, and beside the
+noise of the paper's last steps what is left to choose vanishes; a change, scaled to
+unit variance, does not.
 
 Source: Li et al. 2024, "AAMDM: Accelerated Auto-regressive Motion Diffusion Model",
 sections 3.2-3.5. Sizes and the schedule are ours, since the paper gives none.
@@ -50,7 +50,7 @@ class Config:
       width: Channels of a hidden layer.
       depth: Hidden layers.
       window: Frames that the diffusion model predicts in a row in training (paper).
-      weight_velocity: Weight of the differences of neighbouring frames.
+      weight_velocity: Weight of the differences of neighboring frames.
       previous_noise: Largest deviation of the noise that is added in training to the
         previous frames of the data, in units of the target's scale; ours, so that a
         rollout finds back when it has left the data. 0 for none.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 
 class PoseEncoder(nn.Module):
-    """Maps a normalised pose vector to a latent vector.
+    """Maps a normalized pose vector to a latent vector.
 
     Attributes:
       latent: Channels of the result.
@@ -27,7 +27,7 @@ class PoseEncoder(nn.Module):
         """The network.
 
         Args:
-          pose: Normalised pose vectors.
+          pose: Normalized pose vectors.
 
         Returns:
           Latent vectors.
@@ -38,7 +38,7 @@ class PoseEncoder(nn.Module):
 
 
 class PoseDecoder(nn.Module):
-    """Maps an embedded vector to a normalised pose vector.
+    """Maps an embedded vector to a normalized pose vector.
 
     Attributes:
       features: Channels of the result.
@@ -58,7 +58,7 @@ class PoseDecoder(nn.Module):
           embedded: Embedded vectors.
 
         Returns:
-          Normalised pose vectors.
+          Normalized pose vectors.
         """
         for _ in range(self.depth - 1):
             embedded = nn.relu(nn.Dense(self.width)(embedded))

@@ -86,7 +86,7 @@ def _raw(
 def fit_space(
     poses: Float[Array, "frames features"],
     paths: Float[Array, "frames 12"],
-    neighbours: Int[Array, "pairs"],
+    neighbors: Int[Array, "pairs"],
     *,
     autoencoder: Autoencoder | None,
 ) -> Space:
@@ -95,7 +95,7 @@ def fit_space(
     Args:
       poses: Pose vectors of all clips.
       paths: Path features.
-      neighbours: Frames that are followed by another of the same clip.
+      neighbors: Frames that are followed by another of the same clip.
       autoencoder: Of an embedded space; None for full poses.
 
     Returns:
@@ -104,7 +104,7 @@ def fit_space(
     raw = _raw(autoencoder, poses, paths)
     normalizer = features.fit_normalizer(raw, floor=_LEAST)
     frames = features.normalize(normalizer, raw)
-    step = frames[neighbours + 1] - frames[neighbours]
+    step = frames[neighbors + 1] - frames[neighbors]
     change = jnp.maximum(jnp.sqrt(jnp.mean(step**2, axis=0)), 1e-4)
     some = frames[:: max(len(frames) // 20_000, 1)]
     low, high = jnp.quantile(some, jnp.array([_TAIL, 1.0 - _TAIL]), axis=0)
@@ -188,7 +188,7 @@ def to_paths(
       frames: Frames.
 
     Returns:
-      Path features: metres, and directions.
+      Path features: meters, and directions.
     """
     return features.denormalize(path_normalizer(space), frames[..., :PATH])
 

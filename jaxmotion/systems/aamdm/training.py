@@ -18,7 +18,7 @@ from jaxmotion.learning import adversarial, checkpoint, runs, training
 from jaxmotion.learning.runs import Budget as Budget
 from jaxmotion.learning.runs import make_optimizer as make_optimizer
 from jaxmotion.motion import pose
-from jaxmotion.motion.skeleton import MAX_METRES, Skeleton
+from jaxmotion.motion.skeleton import MAX_METERS, Skeleton
 from jaxmotion.systems.aamdm import data as aamdm_data
 from jaxmotion.systems.aamdm import embedding as aamdm_embedding
 from jaxmotion.systems.aamdm import loss as aamdm_loss
@@ -42,8 +42,8 @@ def frame_windows(
     Args:
       frames: One a frame of the data.
       data: The data.
-      length: Frames a window.
-      batch: Windows a batch.
+      length: Frames per window.
+      batch: Windows per batch.
 
     Returns:
       `sample_batch(key, arrays) -> windows`, and its arrays.
@@ -113,7 +113,7 @@ class Run:
       skeleton: The skeleton.
       train: Training frames.
       held_out: Frames that no network saw.
-      source: The data, and its licence.
+      source: The data, and its license.
       config: JSON of how the frames were made.
     """
 
@@ -154,7 +154,7 @@ def prepare(
       data: Clips.
       field: Label field by which clips are chosen.
       labels: Their labels; none: all clips.
-      fps: Frames a second.
+      fps: Frames per second.
       held_out: Part of each clip, at its end, to hold out.
       mirrored: Whether mirrored clips are added.
 
@@ -272,9 +272,9 @@ def _read_frames(path: Path, skeleton: Skeleton, *, fps: float) -> PoseData:
                 f"{path}: field {name!r} has shape {shape}, expected {(number, size)}"
             )
         # Positions, velocities and directions; also keeps them within float32.
-        if not (np.abs(arrays[name].astype(np.float64)) <= MAX_METRES).all():
+        if not (np.abs(arrays[name].astype(np.float64)) <= MAX_METERS).all():
             raise ValueError(
-                f"{path}: field {name!r} has numbers that are not within {MAX_METRES:g}"
+                f"{path}: field {name!r} has numbers that are not within {MAX_METERS:g}"
             )
     return PoseData(
         poses=jnp.asarray(arrays["poses"], jnp.float32),
@@ -457,7 +457,7 @@ def train_generator(
       name: Of the space.
       space: The space.
       config: The method.
-      budget: How long; both players have its optimiser.
+      budget: How long; both players have its optimizer.
 
     Returns:
       The generator's averaged parameters.

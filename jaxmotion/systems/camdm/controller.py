@@ -8,7 +8,7 @@ One tick (1/30 s) of one character:
    c. the blend of both is the condition, with the last 10 *displayed* poses;
    d. sample 45 poses; within the first plans after a change of style with
       classifier-free guidance on the past, which frees the model from its old style;
-   e. an inertialised seam: the plan starts where the displayed motion is, with its
+   e. an inertialized seam: the plan starts where the displayed motion is, with its
       velocity, and takes up the model's motion within 0.2 s.
 2. Display the next pose of the plan, and move the springs on.
 
@@ -52,7 +52,7 @@ class Control:
       bias_position: Exponent of the blend of positions (released scene 0.7, code
         0.4).
       bias_facing: Exponent of the blend of facings (released code 2.2).
-      seam: Duration of the inertialised seam, seconds (released code 0.2); 0 for none.
+      seam: Duration of the inertialized seam, seconds (released code 0.2); 0 for none.
       follow: Half-life, seconds, in which the wanted path returns to the commanded
         one, the integral of the desired velocity; 0 to steer by velocity alone, as
         the paper does. Ours: without it every rollout drifts off its course.
@@ -93,11 +93,11 @@ class CharacterState:
       past: The last displayed poses.
       plan: The poses being played.
       cursor: Next pose of the plan.
-      velocity: Of the desired motion (the spring), metres a second.
-      acceleration: Of the desired motion, metres a second squared.
+      velocity: Of the desired motion (the spring), meters per second.
+      acceleration: Of the desired motion, meters per second squared.
       facing: Desired facing (the spring), unit.
-      turn_rate: Of the desired facing, radians a second.
-      anchor: Where the desired motion is, (x, z) metres: the commanded path's end.
+      turn_rate: Of the desired facing, radians per second.
+      anchor: Where the desired motion is, (x, z) meters: the commanded path's end.
       command: The last command; its label is -1 before the first.
       guided: Plans that are still to be guided.
     """
@@ -120,9 +120,9 @@ class Frame:
     """What one tick displays.
 
     Attributes:
-      root_position: Of the displayed pose, metres, world.
+      root_position: Of the displayed pose, meters, world.
       joint_rotation: Of the displayed pose, two columns.
-      desired_velocity: What the user's springs ask for now, metres a second.
+      desired_velocity: What the user's springs ask for now, meters per second.
       desired_facing: Likewise, unit.
       planned: Whether this tick made a new plan.
     """

@@ -177,7 +177,7 @@ def metric_row(
       skeleton: The skeleton.
       found: Windows.
       hits: From `recognized`; None to leave style accuracy out.
-      height: Below it a foot joint should not move, metres.
+      height: Below it a foot joint should not move, meters.
 
     Returns:
       Columns; angles in degrees.
@@ -208,8 +208,8 @@ def rollout_health(
     Args:
       skeleton: The skeleton.
       frames: Displayed frames [characters, ticks, ...].
-      fps: Frames a second.
-      height: Root height of the standing character, metres; half of it and 1.5
+      fps: Frames per second.
+      height: Root height of the standing character, meters; half of it and 1.5
         times of it are the bounds.
 
     Returns:
@@ -242,12 +242,12 @@ def repeat_diversity(skeleton: Skeleton, found: Windows, *, repeats: int) -> tab
 
     Args:
       skeleton: The skeleton.
-      found: Windows of rollouts in which every `repeats` neighbouring characters
+      found: Windows of rollouts in which every `repeats` neighboring characters
         share style and commands.
       repeats: Characters a style.
 
     Returns:
-      Square metres, with an interval over styles.
+      Square meters, with an interval over styles.
     """
     local = in_batches(
         jax.jit(functools.partial(style_evaluator.recognizer_input, skeleton)),
@@ -267,8 +267,8 @@ def contact_height(skeleton: Skeleton, real: Windows) -> float:
       real: Windows of real clips.
 
     Returns:
-      Where toes rest (their first percentile), and one centimetre more, as the paper's
-      "below, e.g., 1 cm"; metres.
+      Where toes rest (their first percentile), and one centimeter more, as the paper's
+      "below, e.g., 1 cm"; meters.
     """
     feet = jnp.array(skeleton.feet)
     toes = in_batches(
@@ -297,7 +297,7 @@ def evaluation_table(
       made: Windows of the rollouts.
       frames: The rollouts themselves.
       recognizer: From `fit_recognizer`.
-      repeats: Neighbouring characters that share style and commands; with one there
+      repeats: Neighboring characters that share style and commands; with one there
         is no column of diversity.
       seed: Of the subsets for Fréchet distances.
 
@@ -348,7 +348,7 @@ def preset_of_run(
       preset: Of `presets.PRESETS`.
       labels: Style of each character.
       seconds: Length.
-      speed: Metres a second; None for each style's own median speed.
+      speed: Meters per second; None for each style's own median speed.
 
     Returns:
       Speeds [characters], and commands [characters, ticks, ...].
@@ -381,11 +381,11 @@ def steer_one(
       preset: Of `presets.PRESETS`.
       seconds: Length.
       to_style: Its style from half time on; None for the same.
-      speed: Metres a second; None for the first style's own median speed.
+      speed: Meters per second; None for the first style's own median speed.
       seed: Of the start pose and the noise.
 
     Returns:
-      The motion, and the velocity asked for in each frame, metres a second.
+      The motion, and the velocity asked for in each frame, meters per second.
 
     Raises:
       ValueError: if there is no such preset or style; names those there are.
@@ -475,11 +475,11 @@ def evaluate_run(
       preset: Of `presets.PRESETS`.
       rollouts: Characters, spread evenly over the styles; at least one a style.
       seconds: Length of each rollout.
-      speed: Metres a second; None for each style's own median speed.
+      speed: Meters per second; None for each style's own median speed.
       chunk: Characters to run at a time, at most.
-      recognizer_steps: Updates of the style recogniser, if it is trained here.
-      seed: Of poses, noise, recogniser and subsets.
-      evaluator: A frozen style recogniser; None to train one.
+      recognizer_steps: Updates of the style recognizer, if it is trained here.
+      seed: Of poses, noise, recognizer and subsets.
+      evaluator: A frozen style recognizer; None to train one.
 
     Returns:
       The table, and what belongs beside it: speeds, health, counts, versions.
@@ -529,16 +529,16 @@ def evaluate_run(
 def recognizer(
     key: Key, run: Run, evaluator: evaluators.Evaluator | None, *, num_steps: int
 ) -> style_evaluator.Recognized:
-    """The frozen recogniser if there is one, else one trained on the run's clips.
+    """The frozen recognizer if there is one, else one trained on the run's clips.
 
     Args:
       key: Consumed.
       run: The run.
-      evaluator: A frozen style recogniser; None to train one.
+      evaluator: A frozen style recognizer; None to train one.
       num_steps: Updates of a training.
 
     Returns:
-      The recogniser.
+      The recognizer.
 
     Raises:
       ValueError: if the evaluator does not fit the run; names the field.
@@ -564,7 +564,7 @@ def recognizer(
         return style_evaluator.Recognized(
             params=frozen, config=evaluator.config, classes=classes
         )
-    print(f"training the style recogniser for {num_steps} steps", flush=True)
+    print(f"training the style recognizer for {num_steps} steps", flush=True)
     return style_evaluator.fit_recognizer(
         key, run.train, field=run.field, num_steps=num_steps
     )
@@ -589,12 +589,12 @@ def _timed_rollouts(
 def train_style(
     train: Clips, held_out: Clips, *, field: str, num_steps: int, seed: int
 ) -> Evaluator:
-    """CAMDM's recogniser, of windows of 60 frames.
+    """CAMDM's recognizer, of windows of 60 frames.
 
     Args:
       train: Training clips.
       held_out: Clips for its accuracy.
-      field: Label field that it recognises.
+      field: Label field that it recognizes.
       num_steps: Updates.
       seed: Of parameters and batches.
 

@@ -6,7 +6,7 @@ and facings wanted for the 45, and a style. Eight steps of the cosine schedule:
 
     plan = reverse_chain(ancestral_step(schedule, net), key, x_8, start=8)
 
-No feature is normalised: values are metres and entries of rotation matrices.
+No feature is normalized: values are meters and entries of rotation matrices.
 
 Source: Chen et al. 2024, "Taming Diffusion Probabilistic Models for Character Control";
 what the paper leaves open is as in the released code, and said where it is used.
@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.learning import checkpoint, runs
 from jaxmotion.motion import features, rotation, trajectory
-from jaxmotion.motion.skeleton import MAX_METRES, Motion, Skeleton
+from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton
 from jaxmotion.networks import transformer
 from jaxmotion.systems.camdm import network as camdm_network
 from jaxmotion.typing import Key, Params
@@ -41,7 +41,7 @@ class Config:
       num_labels: Styles.
       past: Past poses of the condition, frames.
       future: Poses of a sample, frames.
-      fps: Frames a second.
+      fps: Frames per second.
       num_steps: T of the cosine schedule (paper 8, released weights 4).
       network: "transformer", or the ablation's "mlp" or "single_token".
       width: Channels of a token (released code; the paper does not say).
@@ -63,7 +63,7 @@ class Config:
       rotation_scale: Factor on the 6D rotations of a sample, after their mean is taken
         off; ours, 1 in the paper. Entries vary by about 0.2, the noise of the last
         step alone has that size, and a short training then learns to ignore the
-        noisy sample; 4 gives both about unit variance, as standardising would.
+        noisy sample; 4 gives both about unit variance, as standardizing would.
       rotation_mean: Mean of those features (`camdm_loss.mean_rotations`); ours, empty
         for none in the paper.
       drop_past: Probability that the past is zeroed in training.
@@ -73,7 +73,7 @@ class Config:
       weight_position_velocity: Of the displacements of joint positions (released
         code; not in the paper's eq. 4).
       weight_foot: Of foot sliding.
-      contact_speed: A foot slower than this stands, metres a second.
+      contact_speed: A foot slower than this stands, meters per second.
     """
 
     num_joints: int
@@ -122,7 +122,7 @@ class Condition:
 
     Attributes:
       past: Features of the last displayed poses.
-      trajectory: Ground positions (x, z), metres, and facings wanted for the future.
+      trajectory: Ground positions (x, z), meters, and facings wanted for the future.
       label: Style.
       keep_past: False for the null condition of classifier-free guidance.
     """
@@ -309,7 +309,7 @@ class Model:
       config: The method.
       skeleton: The skeleton that it was trained on.
       labels: Names of the styles.
-      source: The data, and its licence.
+      source: The data, and its license.
       starts: Poses to start from, [labels, number, past, ...], at the origin facing +z;
         None where characters start from clips. A shipped model has its own, which it
         made itself.
@@ -382,9 +382,9 @@ def _starts_from_json(value: Any, config: Config, where: str) -> Motion | None:
             f"{where}: field 'starts' has shapes {root.shape} and {joints.shape}, "
             f"expected {expected[0]} and {expected[1]} of at least one start per label"
         )
-    if not all((np.abs(x) <= MAX_METRES).all() for x in (root, joints)):
+    if not all((np.abs(x) <= MAX_METERS).all() for x in (root, joints)):
         raise ValueError(
-            f"{where}: field 'starts' has numbers that are not within {MAX_METRES:g}"
+            f"{where}: field 'starts' has numbers that are not within {MAX_METERS:g}"
         )
     return Motion(
         root_position=jnp.asarray(root, jnp.float32),

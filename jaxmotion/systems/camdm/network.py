@@ -43,7 +43,7 @@ def flatten_condition(
 
     Args:
       past: Features of the last poses.
-      path: Ground positions of the future, metres.
+      path: Ground positions of the future, meters.
       facing: 6D rotations of the future facings.
       keep_past: False zeroes the past.
 
@@ -90,7 +90,7 @@ class _OneVectorCondition(nn.Module):
 
         Args:
           past: Features of the last poses.
-          path: Ground positions of the future, metres.
+          path: Ground positions of the future, meters.
           facing: 6D rotations of the future facings.
           label: Style.
           keep_past: False zeroes the past.
@@ -125,7 +125,7 @@ class _OneVectorCondition(nn.Module):
           x_t: Noisy features.
           t: Step in 1..T.
           past: Features of the last poses.
-          path: Ground positions of the future, metres.
+          path: Ground positions of the future, meters.
           facing: 6D rotations of the future facings.
           label: Style.
           keep_past: False zeroes the past.

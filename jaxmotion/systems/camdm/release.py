@@ -24,7 +24,7 @@ from jaxmotion.systems.camdm import steering as camdm_steering
 
 Count = int | Int[Array, ""]
 
-LOW = 0.01  # metres above the clip's lowest toe, exclusive
+LOW = 0.01  # meters above the clip's lowest toe, exclusive
 _TOES = ("lefttoebase", "righttoebase", "lefttoe", "righttoe")
 
 
@@ -43,7 +43,7 @@ def _steps(positions: Float[Array, "frames *joints n"]) -> Float[Array, "..."]:
 
 
 def _pace(root: Float[Array, "frames 3"], frames: Count) -> Float[Array, ""]:
-    """Mean horizontal step, metres a frame; the scripts' 1 cm for one at rest."""
+    """Mean horizontal step, meters a frame; the scripts' 1 cm for one at rest."""
     step = _steps(root[:, ::2])
     pace = jnp.mean(step, where=_is_own(frames - 1, len(step)))
     return jnp.where(pace == 0, 0.01, pace)
@@ -119,7 +119,7 @@ def clip_metrics(
 
     Args:
       skeleton: Its shoulders are found by name.
-      motion: [frames, ...], world, metres.
+      motion: [frames, ...], world, meters.
       frames: That are the clip's own; None for all.
       command: Told in each frame, unsmoothed; None for clips that nobody steered.
 

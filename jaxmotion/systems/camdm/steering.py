@@ -32,7 +32,7 @@ def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
 
     Args:
       ticks: Length of the rollouts.
-      fps: Ticks a second.
+      fps: Ticks per second.
       skip: Ticks to leave out at the start.
 
     Raises:
@@ -58,7 +58,7 @@ def rollout_windows(
     Args:
       frames: Displayed frames [characters, ticks, ...].
       labels: Style of each character.
-      fps: Frames a second.
+      fps: Frames per second.
       skip: Ticks to leave out at the start, where the data's own pose still shows.
 
     Returns:
@@ -188,9 +188,9 @@ def preset_batch(
     Args:
       name: Of `presets.PRESETS`.
       labels: Style of each character.
-      speeds: Metres a second of each character.
+      speeds: Meters per second of each character.
       seconds: Length.
-      fps: Ticks a second.
+      fps: Ticks per second.
 
     Returns:
       Commands [characters, ticks, ...].

@@ -1,4 +1,4 @@
-"""How CAMDM is trained: data, objective, optimiser and state of a run, put together."""
+"""How CAMDM is trained: data, objective, optimizer and state of a run, put together."""
 
 import dataclasses
 import functools
@@ -196,7 +196,7 @@ def start(
       model: The model.
       checkpoints: Folder of the run's checkpoints; it need not exist.
       field: Label field that is the style.
-      num_steps: Optimiser steps of the whole run.
+      num_steps: Optimizer steps of the whole run.
       batch: Windows a step.
       optimizer: "muon" for short runs, or the paper's "adamw".
       learning_rate: Peak of its rate; cosine to a tenth.
@@ -323,7 +323,7 @@ def released_skeleton(path: Path, *, scale: float) -> Skeleton:
 
     Args:
       path: The file; fingers and eyes are dropped.
-      scale: Metres per unit of the file.
+      scale: Meters per unit of the file.
 
     Raises:
       OSError: if it cannot be read.

@@ -1,9 +1,9 @@
 """Changes of style: how often they come, how soon, and what the motion is meanwhile.
 
 Every ordered pair of styles is one change. A replication has one rollout of each, with
-noise and start poses of its own; all rows have the same. A recogniser decides in
+noise and start poses of its own; all rows have the same. A recognizer decides in
 windows of two seconds whether the new style is there, and the change is dated to the
-centre of the first window that shows it: up to half of that window may be from before.
+center of the first window that shows it: up to half of that window may be from before.
 
 Source: Chen et al. 2024 (CAMDM), section 4.1, tables 2 and 4, where people judged.
 """
@@ -154,21 +154,21 @@ def find_changes(
       frames: Displayed frames [characters, ticks, ...].
       changes: That they were made for.
       recognizer: Of styles.
-      fps: Ticks a second.
+      fps: Ticks per second.
 
     Returns:
-      Decisions, and the windows' centres in seconds behind the command, from 0 on.
+      Decisions, and the windows' centers in seconds behind the command, from 0 on.
     """
-    centres = np.arange(0, round(changes.limit * fps) + 1, STRIDE)
+    centers = np.arange(0, round(changes.limit * fps) + 1, STRIDE)
     found = []
-    for centre in centres:
-        first = changes.tick + int(centre) - HALF
+    for center in centers:
+        first = changes.tick + int(center) - HALF
         last = first + windows.EVAL_WINDOW
         cut = jax.tree.map(lambda x: x[:, first:last], frames)  # noqa: B023
         label = jnp.asarray(changes.new)
         made = camdm_steering.rollout_windows(cut, label, fps=fps, skip=0)
         found.append(style_evaluator.recognized(skeleton, made, recognizer)[1] > 0.5)
-    return np.stack(found, axis=1), centres / fps
+    return np.stack(found, axis=1), centers / fps
 
 
 def transition_row(
@@ -186,7 +186,7 @@ def transition_row(
       frames: Of all characters.
       changes: That they were made for.
       recognizer: Of styles.
-      height: Below it a foot joint should not move, metres.
+      height: Below it a foot joint should not move, meters.
 
     Returns:
       Success in per cent; duration in seconds and frames, failures counted as the
@@ -194,9 +194,9 @@ def transition_row(
       the whole rollout slide and coherence of CAMDM's release.
     """
     skeleton, fps = run.model.skeleton, run.model.config.fps
-    found, centres = find_changes(skeleton, frames, changes, recognizer, fps=fps)
+    found, centers = find_changes(skeleton, frames, changes, recognizer, fps=fps)
     done = transition(
-        jnp.asarray(found), jnp.asarray(centres, jnp.float32), limit=changes.limit
+        jnp.asarray(found), jnp.asarray(centers, jnp.float32), limit=changes.limit
     )
 
     def cell(values: Array, **options) -> table.Cell:
@@ -273,7 +273,7 @@ def evaluate_transitions(
 
 
 def clip_accuracy(run: Run, recognizer: Recognized) -> table.Cell:
-    """How often the recogniser is right on held-out clips: a bound on success.
+    """How often the recognizer is right on held-out clips: a bound on success.
 
     Args:
       run: The run.

@@ -1,7 +1,7 @@
 """What EMDM's motions from actions, or from nothing, are scored with.
 
 Every set that is scored, real or generated, has the same number of motions with actions
-drawn uniformly, and goes through one recogniser that was trained on real motions only.
+drawn uniformly, and goes through one recognizer that was trained on real motions only.
 
 Source: Zhou et al. 2024 (EMDM), section 4.3; the evaluation of Guo et al. 2020
 (Action2Motion) with uniform actions.
@@ -24,12 +24,12 @@ from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm.data import ActionArrays, ActionRun
 from jaxmotion.typing import Key, Params
 
-# Motions that the recogniser is trained on: most windows of the clips.
+# Motions that the recognizer is trained on: most windows of the clips.
 _RECOGNIZED = 12288
 
 
 def recognizer_config(run: ActionRun) -> action_evaluator.ActionRecognizerConfig:
-    """Size of a run's recogniser.
+    """Size of a run's recognizer.
 
     Args:
       run: The run.
@@ -45,7 +45,7 @@ def recognizer_config(run: ActionRun) -> action_evaluator.ActionRecognizerConfig
 def fit_recognizer(
     train: ActionArrays, *, num_steps: int, seed: int
 ) -> tuple[action_evaluator.ActionRecognizerConfig, Params]:
-    """Trains a recogniser on motions with actions drawn uniformly.
+    """Trains a recognizer on motions with actions drawn uniformly.
 
     Args:
       train: Training clips.
@@ -74,13 +74,13 @@ def load_recognizer(
     seed: int,
     evaluator: evaluators.Evaluator | None = None,
 ) -> Params:
-    """The run's recogniser, trained on its training clips if it is not there yet.
+    """The run's recognizer, trained on its training clips if it is not there yet.
 
     Args:
       run: The run.
       num_steps: Updates.
       seed: Of parameters and batches.
-      evaluator: A frozen recogniser to use in its place; None for none.
+      evaluator: A frozen recognizer to use in its place; None for none.
 
     Returns:
       Its parameters.
@@ -120,7 +120,7 @@ def load_recognizer(
 
 
 def _flat(positions: Array) -> Array:
-    """What the recogniser sees of motions that start at the origin facing +z."""
+    """What the recognizer sees of motions that start at the origin facing +z."""
     return positions.reshape(*positions.shape[:-2], -1)
 
 
@@ -136,17 +136,17 @@ def real_positions(
       part: Training or held-out clips.
 
     Returns:
-      Positions, metres.
+      Positions, meters.
     """
     motions = emdm_data.sample_motions(key, part, actions)
     return joint_positions(part.clips.skeleton, motions)
 
 
 def moments(params: Params, run: ActionRun) -> Callable[[Key, Array], frechet.Moments]:
-    """Moments of the recogniser's features of a set of motions.
+    """Moments of the recognizer's features of a set of motions.
 
     Args:
-      params: The recogniser's.
+      params: The recognizer's.
       run: The run.
 
     Returns:
@@ -170,10 +170,10 @@ def scorer(
     """Scores of a set of motions, as one compiled program.
 
     Args:
-      params: The recogniser's.
+      params: The recognizer's.
       run: The run.
       reference: Moments of the real features.
-      ground: Height of the lowest joint of a person who stands, metres.
+      ground: Height of the lowest joint of a person who stands, meters.
 
     Returns:
       `score(key, positions, actions) -> scores`. The actions are in ascending order,
@@ -215,7 +215,7 @@ def scorer(
 
 
 def ground_height(run: ActionRun) -> float:
-    """Height of the lowest joint of a person who stands in the run's clips, metres.
+    """Height of the lowest joint of a person who stands in the run's clips, meters.
 
     The median over frames of the height of the lowest joint.
 
@@ -246,7 +246,7 @@ def train_action(
     num_steps: int,
     seed: int,
 ) -> Evaluator:
-    """EMDM's recogniser, of motions with actions drawn uniformly.
+    """EMDM's recognizer, of motions with actions drawn uniformly.
 
     Args:
       train: Training clips.

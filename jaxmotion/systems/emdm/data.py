@@ -61,7 +61,7 @@ def prepare_clips(
       field: Label field that is the action.
       merge: Labels that are the same action as others, and those others.
       least: Fewest clips of an action.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       The clips, and the labels that were left out.
@@ -282,7 +282,7 @@ def clip_features(
 
     Returns:
       One array a clip, of one frame less than the clip; and the largest error of joints
-      to features to joints, metres.
+      to features to joints, meters.
 
     Raises:
       ValueError: if the skeleton is unknown.
@@ -341,11 +341,11 @@ def from_labels(
       unseen: Pairs "content/style".
       held_out: Part of the other clips in "test".
       least: Shortest clip, frames at the new rate.
-      fps: Frames a second of the features.
+      fps: Frames per second of the features.
       seed: Of captions and of the split.
 
     Returns:
-      The text motions, and the largest error of joints to features to joints, metres.
+      The text motions, and the largest error of joints to features to joints, meters.
 
     Raises:
       ValueError: if a label or the skeleton is unknown, or no clip has an unseen pair.

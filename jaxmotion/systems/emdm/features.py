@@ -3,7 +3,7 @@
 A frame is one 6D rotation (two rows) a joint and a pseudo-joint for the root, as in the
 action-to-motion data of the released code. Ours: a motion starts at the ground's origin
 facing +z; the pseudo-joint is (step in x, y, step in z, 0, 0, 0), since an error of a
-step bends the path where one of a place would shake it; and features are standardised,
+step bends the path where one of a place would shake it; and features are standardized,
 with one deviation for all rotations.
 """
 
@@ -26,7 +26,7 @@ class Representation:
     Attributes:
       skeleton: The skeleton.
       normalizer: Mean and deviation of the features.
-      fps: Frames a second.
+      fps: Frames per second.
     """
 
     skeleton: Skeleton
@@ -40,7 +40,7 @@ class Representation:
 
 
 def _raw(motion: Motion) -> Array:
-    """Features before they are standardised; the first step is from the origin."""
+    """Features before they are standardized; the first step is from the origin."""
     raw = features.motion_features(motion)
     place = raw[..., -6:-3]
     before = jnp.pad(place[..., :-1, :], [(0, 0)] * (place.ndim - 2) + [(1, 0), (0, 0)])
@@ -55,7 +55,7 @@ def fit(skeleton: Skeleton, motions: Motion, *, floor: float = 0.01) -> Represen
       skeleton: The skeleton.
       motions: Motions of the training data, batch first, from
         `features.to_first_pose`.
-      floor: Least deviation, metres or entries of rotation matrices.
+      floor: Least deviation, meters or entries of rotation matrices.
 
     Returns:
       The representation.
@@ -98,7 +98,7 @@ def to_motion(
       representation: Of the skeleton.
 
     Returns:
-      The motions, in metres.
+      The motions, in meters.
     """
     raw = features.denormalize(representation.normalizer, x)
     step = raw[..., -6:-3]

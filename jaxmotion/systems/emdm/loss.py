@@ -51,13 +51,13 @@ class Geometry:
     """How features become joints; only for the geometric losses.
 
     Attributes:
-      positions: Features (network's units) to joint positions, metres, relative to the
+      positions: Features (network's units) to joint positions, meters, relative to the
         root or in the world.
       feet: Joints that may stand.
       channels: Channels of whose frame differences the velocity loss is made.
-      fps: Frames a second.
-      contact_speed: A foot slower than this stands, metres per second (released: 0.01
-        metres per frame at any rate, which is 0.2 at HumanML3D's 20 frames per second).
+      fps: Frames per second.
+      contact_speed: A foot slower than this stands, meters per second (released: 0.01
+        meters per frame at any rate, which is 0.2 at HumanML3D's 20 frames per second).
     """
 
     positions: Callable[[Array], Array]

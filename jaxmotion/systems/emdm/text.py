@@ -216,7 +216,7 @@ def joints(
       x: Z-scored features.
 
     Returns:
-      Positions, metres (as published: KIT-ML's unit is its own).
+      Positions, meters (as published: KIT-ML's unit is its own).
     """
     like = lambda v: jnp.asarray(v).reshape((1,) * (x.ndim - 1) + (-1,))  # noqa: E731
     raw = x * like(run.motions.std) + like(run.motions.mean)

@@ -300,7 +300,7 @@ def embed(
     *,
     padding: text_motion_evaluator.Padding = "zeros",
 ) -> Float[Array, "batch embedding"]:
-    """Embeds motions, normalised anew as the evaluator expects.
+    """Embeds motions, normalized anew as the evaluator expects.
 
     Args:
       run: The run.

@@ -176,8 +176,8 @@ def train_row(
       folder: The run folder.
       task: Data and configuration.
       row: Its name.
-      generator: How long, and the generator's optimiser.
-      discriminator: The discriminator's optimiser; its steps are the generator's.
+      generator: How long, and the generator's optimizer.
+      discriminator: The discriminator's optimizer; its steps are the generator's.
 
     Raises:
       ValueError: if the row has a checkpoint of other sizes or data.

@@ -7,7 +7,7 @@ One tick (1/30 s) of one player:
    b. the rest of the plan's own path, extended by HFTE, is blended into it;
    c. the motion model makes 45 frames of body, ball and contacts for that path, with
       contact guidance in some of its steps;
-   d. an inertialised seam: body and ball start where they are displayed.
+   d. an inertialized seam: body and ball start where they are displayed.
 2. Display the next frame of the plan.
 
 The paper blends when the control changes; here at every plan, as CAMDM does, since a
@@ -46,7 +46,7 @@ class Control:
       reuse: K of HFTE, points reflected at a time.
       bias_position: Exponent of the blend of positions (CAMDM's).
       bias_facing: Exponent of the blend of facings (CAMDM's).
-      seam: Duration of the inertialised seam, seconds; 0 for none.
+      seam: Duration of the inertialized seam, seconds; 0 for none.
     """
 
     apply: int = 15
@@ -80,11 +80,11 @@ class Frame:
     """What one tick displays.
 
     Attributes:
-      root_position: Of the displayed pose, metres, world.
+      root_position: Of the displayed pose, meters, world.
       joint_rotation: Of the displayed pose, two columns.
-      ball: Centre of the displayed ball, metres, world.
+      ball: Center of the displayed ball, meters, world.
       touch: How sure the model is that each joint touches the ball, 0..1.
-      desired_velocity: What the user asks for now, metres a second.
+      desired_velocity: What the user asks for now, meters per second.
       desired_facing: Likewise, unit.
       planned: Whether this tick made a new plan.
     """

@@ -162,6 +162,6 @@ def skill_speeds(data: BallClips) -> Float[np.ndarray, " skills"]:
       data: The clips.
 
     Returns:
-      Metres a second; 0 for a skill without clips.
+      Meters per second; 0 for a skill without clips.
     """
     return np.asarray(style_speeds(data.clips, field=FIELD))

@@ -42,11 +42,11 @@ class Thresholds:
     """Where a touch begins; the same for all rows of a table.
 
     Attributes:
-      acceleration: A ball that accelerates more is being pushed, metres a second
+      acceleration: A ball that accelerates more is being pushed, meters per second
         squared. Half of the weakest push of the synthetic dribble.
-      distance: From a joint to the ball's centre up to which it pushes, metres: the
+      distance: From a joint to the ball's center up to which it pushes, meters: the
         ball's radius, half a foot, and 2 cm.
-      foot_height: Below it a foot joint should not move, metres.
+      foot_height: Below it a foot joint should not move, meters.
     """
 
     acceleration: float
@@ -57,13 +57,13 @@ class Thresholds:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Judge:
-    """A trained recogniser, and what real windows look like to it.
+    """A trained recognizer, and what real windows look like to it.
 
     Attributes:
-      params: Of the recogniser.
+      params: Of the recognizer.
       reference: Moments of its features over windows of training clips.
       representation: Says what the skeleton and the ball are.
-      config: Size of the recogniser.
+      config: Size of the recognizer.
     """
 
     params: Params
@@ -82,7 +82,7 @@ def recognizer_input(
       representation: Of their skeleton.
 
     Returns:
-      Metres; three channels a joint, and three of the ball, no longer than the reach.
+      Meters; three channels a joint, and three of the ball, no longer than the reach.
     """
     skeleton = representation.skeleton
     joints = style_evaluator.recognizer_input(skeleton, scene.motion)
@@ -104,7 +104,7 @@ def make_judge(
     num_steps: int,
     frozen: Params | None = None,
 ) -> Judge:
-    """Trains the recogniser of skills on real windows.
+    """Trains the recognizer of skills on real windows.
 
     Args:
       key: Consumed.
@@ -113,7 +113,7 @@ def make_judge(
       representation: Of their skeleton.
       num_labels: Skills.
       num_steps: Updates.
-      frozen: Parameters of a recogniser that was trained before; None to train one.
+      frozen: Parameters of a recognizer that was trained before; None to train one.
 
     Returns:
       The judge; the same windows are its reference.
@@ -345,9 +345,9 @@ def limits(data: BallClips, model: Model) -> Thresholds:
       model: The model.
 
     Returns:
-      Feet: where toes rest (their first percentile) and one centimetre more. Touches:
+      Feet: where toes rest (their first percentile) and one centimeter more. Touches:
       the ball's radius and 7 cm (half a foot, and 2 cm); and an acceleration of 12
-      metres a second squared, a change of 0.4 m/s within a frame of 1/30 s.
+      meters per second squared, a change of 0.4 m/s within a frame of 1/30 s.
     """
     feet = jnp.array(model.representation.skeleton.feet)
     motion = Motion(
@@ -369,7 +369,7 @@ class Setting:
     """What all rows of a table share.
 
     Attributes:
-      judge: The recogniser.
+      judge: The recognizer.
       score: From `smgdiff_scores.scorer`.
       known: Held-out moments.
       replications: Sets of windows and noise.
@@ -412,9 +412,9 @@ def make_setting(
       model: The model.
       number: Windows of either part, at most.
       replications: Sets of half of the held-out windows.
-      recognizer_steps: Updates of the recogniser.
+      recognizer_steps: Updates of the recognizer.
       seed: Of everything random.
-      evaluator: A frozen recogniser; None to train one.
+      evaluator: A frozen recognizer; None to train one.
 
     Returns:
       The setting.
@@ -518,7 +518,7 @@ def train_ball(
     num_steps: int,
     seed: int,
 ) -> Evaluator:
-    """SMGDiff's recogniser of skills, of joints and ball.
+    """SMGDiff's recognizer of skills, of joints and ball.
 
     Args:
       train: Training clips.

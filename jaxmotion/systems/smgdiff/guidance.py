@@ -34,10 +34,10 @@ class Guidance:
       rate: w_r of DSG, in 0..1.
       last_sigma: Length of the last step per channel, in deviations of the features;
         None for the released code's (`guidance.dsg_step`).
-      min_acceleration: tau_a: a ball that accelerates more is being touched, metres a
+      min_acceleration: tau_a: a ball that accelerates more is being touched, meters a
         second squared.
-      max_distance: tau_d: from here on a joint is too far from the ball's centre,
-        metres.
+      max_distance: tau_d: from here on a joint is too far from the ball's center,
+        meters.
       grounded_weight: w_d: distances of feet that stand count so much.
     """
 
@@ -53,7 +53,7 @@ class Guidance:
 UNGUIDED = Guidance(end=0)
 # For models of a short training, chosen on windows of training clips. Their ball still
 # trembles: the paper's threshold takes every frame for a touch. Joints, unlike skin,
-# keep more than 11 cm from its centre. The last step changes the result itself, without
+# keep more than 11 cm from its center. The last step changes the result itself, without
 # a network behind it to smooth that, and is kept short.
 TUNED = Guidance(rate=0.9, last_sigma=0.0005, min_acceleration=12.0, max_distance=0.18)
 # Table 4 of the paper, beside no guidance at all.
@@ -97,12 +97,12 @@ def contact_objective(
     """How far feet are from the ball where the ball is pushed.
 
     Args:
-      start: Where the ball was displayed last, in the frame of the plan, metres.
+      start: Where the ball was displayed last, in the frame of the plan, meters.
       representation: What features mean.
       guided: Thresholds and weights.
 
     Returns:
-      Objective of a prediction's features, metres.
+      Objective of a prediction's features, meters.
 
     Source: SMGDiff, eq. 10-12.
     """

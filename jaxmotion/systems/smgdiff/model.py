@@ -39,7 +39,7 @@ class Config:
       num_labels: Skills.
       past: Past frames of the condition.
       future: Frames of a sample.
-      fps: Frames a second.
+      fps: Frames per second.
       num_steps: T of the cosine schedule.
       width: Channels of a token (CAMDM's).
       depth: Layers.
@@ -100,7 +100,7 @@ class Condition:
       past: Features of the last displayed frames.
       trajectory: Ground path and facings wanted for the future.
       label: Skill.
-      ball: Where the ball was displayed last, metres.
+      ball: Where the ball was displayed last, meters.
     """
 
     past: Float[Array, "*batch past features"]
@@ -172,8 +172,8 @@ class Model:
       paths: Of the trajectory generator.
       representation: What features mean.
       labels: Names of the skills.
-      speeds: Median speed of the root in each skill, metres a second.
-      source: The data, and its licence.
+      speeds: Median speed of the root in each skill, meters per second.
+      source: The data, and its license.
     """
 
     config: Config

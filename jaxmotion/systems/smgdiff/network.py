@@ -74,7 +74,7 @@ class TrajectoryGenerator(nn.Module):
           x_t: Noisy future path.
           t: Step in 1..T.
           past: Displayed path.
-          target: Where the user points to: wanted velocity times one second, metres.
+          target: Where the user points to: wanted velocity times one second, meters.
           label: Skill.
 
         Returns:

@@ -76,7 +76,7 @@ def player(
 
     Returns:
       `play(key, known) -> scenes` [players, ticks, ...]; those of one start are
-      neighbours.
+      neighbors.
     """
     driver = smgdiff_controller.controller(
         generate,

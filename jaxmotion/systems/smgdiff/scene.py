@@ -2,7 +2,7 @@
 
 A frame is the body (root 3, one 6D rotation a joint), the ball (place relative to the
 root 3, velocity 3, control weight 1) and the contacts (feet on the ground, joints at
-the ball), seen from the last displayed pose. Features are standardised, each kind with
+the ball), seen from the last displayed pose. Features are standardized, each kind with
 one deviation: the paper does not say, and places, rotations and a ball's velocity
 differ by a factor of twenty.
 
@@ -35,10 +35,10 @@ class Representation:
       skeleton: The skeleton; its feet are what stands on the ground.
       normalizer: Mean and deviation of the features.
       joints: Joints that may touch the ball.
-      fps: Frames a second.
-      radius: Of the ball, metres.
-      reach: Distance at which the ball fades out of the features, metres (paper 2).
-      contact_speed: A foot slower than this stands, metres a second.
+      fps: Frames per second.
+      radius: Of the ball, meters.
+      reach: Distance at which the ball fades out of the features, meters (paper 2).
+      contact_speed: A foot slower than this stands, meters per second.
     """
 
     skeleton: Skeleton
@@ -74,7 +74,7 @@ def feature_layout(
 
 
 def _raw(scene: Scene, representation: Representation) -> Array:
-    """Features before they are standardised."""
+    """Features before they are standardized."""
     skeleton, motion = representation.skeleton, scene.motion
     feet = joint_positions(skeleton, motion)[..., jnp.array(skeleton.feet), :]
     stands = contact.foot_contacts(
@@ -109,7 +109,7 @@ def fit(
       skeleton: The skeleton.
       scenes: Windows of the training data, batch first, seen from `plan_frame`.
       joints: Joints that may touch the ball.
-      radius: Of the ball, metres.
+      radius: Of the ball, meters.
       floor: Least deviation, in the features' units.
 
     Returns:
@@ -240,7 +240,7 @@ def to_scene(
 
     Args:
       x: Features, perhaps from a network.
-      start: Where the ball was in the frame before the first, metres.
+      start: Where the ball was in the frame before the first, meters.
       representation: Of the skeleton.
 
     Returns:

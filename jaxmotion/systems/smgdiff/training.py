@@ -50,7 +50,7 @@ def make_model(
       paths: Of `smgdiff_trajectory.Config`, likewise.
 
     Returns:
-      The model, its features standardised on the clips.
+      The model, its features standardized on the clips.
 
     Raises:
       ValueError: if no clip is as long as a window.

@@ -4,7 +4,7 @@ A diffusion model with T = 1: its only step starts from noise that knows next to
 of the path, so its loss is a regression and the best answer does not depend on the
 noise. T >= 2 is the same chain, and can draw different paths.
 
-Paths are seen from the last displayed pose and divided by `Config.metres`; so noise of
+Paths are seen from the last displayed pose and divided by `Config.meters`; so noise of
 unit deviation is as large as a path.
 
 Source: SMGDiff, section 3.1, eq. 3.
@@ -44,7 +44,7 @@ class Config:
       token_margin: Frames beyond its own, on either side, that an output token predicts
         and shares with its neighbors; ours, 0 in the paper.
       token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
-      metres: Unit of the network's positions.
+      meters: Unit of the network's positions.
       weight_velocity: Of the displacements, beside the data's 1.
     """
 
@@ -59,7 +59,7 @@ class Config:
     frames_per_token: int = 5
     token_margin: int = 0
     token_window: Literal["hann", "trapezoid"] = "hann"
-    metres: float = 1.0
+    meters: float = 1.0
     weight_velocity: float = 1.0
 
 
@@ -70,8 +70,8 @@ class Wish:
 
     Attributes:
       past: Displayed path.
-      velocity: Wanted velocity (x, z), metres a second; the target point is one second
-        of it away.
+      velocity: Wanted velocity (x, z), meters per second; the target point is one
+        second of it away.
       label: Skill.
     """
 
@@ -114,7 +114,7 @@ def init(key: Key, config: Config) -> Params:
 
 
 def _pack(path: trajectory.Trajectory, config: Config) -> Array:
-    return jnp.concatenate([path.position / config.metres, path.facing], axis=-1)
+    return jnp.concatenate([path.position / config.meters, path.facing], axis=-1)
 
 
 def _apply(params: Params, x_t: Array, t: Array, wish: Wish, config: Config) -> Array:
@@ -123,7 +123,7 @@ def _apply(params: Params, x_t: Array, t: Array, wish: Wish, config: Config) -> 
         x_t,
         t,
         _pack(wish.past, config),
-        wish.velocity / config.metres,
+        wish.velocity / config.meters,
         wish.label,
     )
 
@@ -223,7 +223,7 @@ def generator(params: Params, *, config: Config) -> Generate:
         shape = (config.future, CHANNELS)
         x = chain.sample(step, key, shape, num_steps=config.num_steps)
         return trajectory.Trajectory(
-            position=x[:, :2] * config.metres, facing=ground.unit(x[:, 2:])
+            position=x[:, :2] * config.meters, facing=ground.unit(x[:, 2:])
         )
 
     return generate
@@ -236,7 +236,7 @@ def straight(key: Key, wish: Wish, *, future: int, fps: float) -> trajectory.Tra
       key: Unused; there so that it can stand for a generator.
       wish: What the user wants.
       future: Frames.
-      fps: Frames a second.
+      fps: Frames per second.
 
     Returns:
       The path. Where the user wants to stand, the facing stays.

@@ -122,7 +122,7 @@ def test_constant_channels_stay_finite():
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
-def test_embedded_vectors_begin_with_the_path_in_metres(shape):
+def test_embedded_vectors_begin_with_the_path_in_meters(shape):
     params, statistics = fitted()
     poses, paths = drawn(*shape, SIZE, seed=5), drawn(*shape, 12, seed=6)
     embedded = aamdm_embedding.encode(params, statistics, poses, paths, config=CONFIG)

@@ -221,7 +221,7 @@ def test_promised_error_is_that_of_the_frames_features():
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.2])
-def test_realised_error_is_that_of_where_it_went(offset):
+def test_realized_error_is_that_of_where_it_went(offset):
     frames, came_true = speeding()
     # What is asked for at a tick is asked of the bone after the tick before; the start
     # and the last second have nothing to compare with.
@@ -231,7 +231,7 @@ def test_realised_error_is_that_of_where_it_went(offset):
     row = aamdm_evaluation.control_row(
         dataclasses.replace(frames, wanted=wanted), fps=FPS
     )
-    np.testing.assert_allclose(row["te_realised"].value, offset, atol=1e-5)
+    np.testing.assert_allclose(row["te_realized"].value, offset, atol=1e-5)
 
 
 def test_trajectory_error_is_the_angle_to_the_command():
@@ -248,7 +248,7 @@ def test_trajectory_error_is_the_angle_to_the_command():
 
 
 def health(limbs, seconds, *, speed=None, diverge=False):
-    """Counts of one rollout at 10 frames a second whose limbs move that fast."""
+    """Counts of one rollout at 10 frames per second whose limbs move that fast."""
     ticks = round(10 * seconds) + 1
     positions = np.zeros((1, ticks, 6, 3))
     positions[..., 1] = 0.9

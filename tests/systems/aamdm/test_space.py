@@ -31,7 +31,7 @@ def walks():
     return both[:, :SIZE], both[:, SIZE:]
 
 
-def neighbours():
+def neighbors():
     """All frames but the last of each clip."""
     first, second = LENGTHS
     found = [*range(first - 1), *range(first, first + second - 1)]
@@ -48,7 +48,7 @@ def space_of(kind):
             statistics=aamdm_embedding.fit_statistics(poses, paths, config=CONFIG),
             config=CONFIG,
         )
-    return aamdm_space.fit_space(poses, paths, neighbours(), autoencoder=own)
+    return aamdm_space.fit_space(poses, paths, neighbors(), autoencoder=own)
 
 
 def frames_of(kind):
@@ -94,7 +94,7 @@ def test_poses_of_embedded_frames_are_the_decoders():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_change_is_the_deviation_of_neighbours_within_clips(kind):
+def test_change_is_the_deviation_of_neighbors_within_clips(kind):
     found = frames_of(kind)
     clips = np.split(found, [LENGTHS[0]])
     steps = np.concatenate([np.diff(clip, axis=0) for clip in clips])
@@ -123,7 +123,7 @@ def test_channels_that_hardly_vary_are_not_blown_up():
     poses, paths = walks()
     tiny_change = 1e-6 * jnp.arange(sum(LENGTHS))
     poses = poses.at[:, 5].set(0.4 + tiny_change).at[:, 6].set(2.0)
-    space = aamdm_space.fit_space(poses, paths, neighbours(), autoencoder=None)
+    space = aamdm_space.fit_space(poses, paths, neighbors(), autoencoder=None)
     frames = aamdm_space.to_frames(space, poses, paths)
     assert np.abs(frames[:, 12 + 5]).max() < 0.2
     np.testing.assert_allclose(frames[:, 12 + 6], 0.0, atol=1e-3)

@@ -66,7 +66,7 @@ def test_the_rows_and_columns_are_there():
     assert report["contact_height_m"] == pytest.approx(0.04, abs=1e-3)
 
 
-def test_styles_are_recognised_far_above_chance():
+def test_styles_are_recognized_far_above_chance():
     rows, _ = evaluated("walking")
     assert rows[TRUTH]["style_accuracy_%"].value > 75.0
     assert rows["rollouts"]["style_accuracy_%"].value > 75.0
@@ -125,7 +125,7 @@ def test_diversity_is_zero_for_characters_that_do_the_same():
     assert evaluated("walking")[0]["rollouts"]["diversity_m2"].value > 1e-4
 
 
-def test_a_row_without_recogniser_lacks_style_accuracy_only():
+def test_a_row_without_recognizer_lacks_style_accuracy_only():
     run, _, real, _ = parts()
     row = camdm_evaluation.metric_row(run.model.skeleton, real, None, height=0.04)
     expected = dict(evaluated("walking")[0][TRUTH])

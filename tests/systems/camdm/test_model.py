@@ -267,11 +267,11 @@ def camdm_turned(skeleton, window, frame, layout):
 
 
 @pytest.mark.parametrize("layout", ["rows", "columns"])
-@pytest.mark.parametrize("centred", [True, False])
-def test_features_and_back(walker, skeleton, layout, centred):
+@pytest.mark.parametrize("centerd", [True, False])
+def test_features_and_back(walker, skeleton, layout, centerd):
     config = tiny.config(rotation_layout=layout, rotation_scale=3.0, heading="facing")
     window, mean = window_of(walker, config), np.zeros(30)
-    if centred:
+    if centerd:
         found = camdm_loss.mean_rotations(skeleton, window, config=config)
         config = dataclasses.replace(config, rotation_mean=found)
         mean = np.mean(

@@ -130,7 +130,7 @@ def straight(toward, noise=0.0524, frames=300):
 
 
 def test_directions_are_cut_at_plus_x():
-    """The scripts mirror x: a walk towards -x is good, one towards +x half a turn off.
+    """The scripts mirror x: a walk toward -x is good, one toward +x half a turn off.
 
     As measured with the released scripts: 0.1 and 185.9 degrees.
     """
@@ -183,7 +183,7 @@ def test_a_lifted_clip_slides_as_before():
     assert slide[1] == pytest.approx(wanted, rel=1e-5)
 
 
-def test_a_root_that_stands_still_divides_by_a_centimetre():
+def test_a_root_that_stands_still_divides_by_a_centimeter():
     motion = clip(4)
     still = jnp.broadcast_to(motion.root_position[:1], motion.root_position.shape)
     motion = dataclasses.replace(motion, root_position=still)

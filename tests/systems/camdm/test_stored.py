@@ -20,7 +20,7 @@ def model(skeleton, config):
         config=config,
         skeleton=skeleton,
         labels=tiny.STYLES,
-        source="tests (no licence)",
+        source="tests (no license)",
     )
 
 

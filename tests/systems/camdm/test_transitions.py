@@ -39,7 +39,7 @@ def test_every_pair_is_commanded_in_every_replication(changes):
     np.testing.assert_array_equal(label[:, :30], changes.old[:, None].repeat(30, 1))
     after = label.shape[1] - 30
     np.testing.assert_array_equal(label[:, 30:], changes.new[:, None].repeat(after, 1))
-    # The last window is whole, centred 2 s behind; 4 s are measured.
+    # The last window is whole, centerd 2 s behind; 4 s are measured.
     assert after == max(60 + 30, 120)
     speed = np.linalg.norm(np.asarray(changes.commands.velocity), axis=-1)
     assert abs(speed[0, 5] - speed[1, 5]) > 0.01
@@ -57,7 +57,7 @@ def test_those_who_keep_their_style_are_told_nothing(changes):
 
 
 def planted(changes, delays):
-    """The walker, a metre higher from so many frames behind the command on."""
+    """The walker, a meter higher from so many frames behind the command on."""
     frames = samples.walking(changes.old, seconds=5.0)
     frames = jax.tree.map(lambda x: x[:, : changes.commands.label.shape[1]], frames)
     ticks = np.arange(frames.root_position.shape[1])
@@ -68,7 +68,7 @@ def planted(changes, delays):
 
 @pytest.fixture
 def sees_height(monkeypatch):
-    """A recogniser that finds the new style in windows that are high throughout."""
+    """A recognizer that finds the new style in windows that are high throughout."""
 
     def recognized(skeleton, found, recognizer):
         del skeleton, recognizer
@@ -80,7 +80,7 @@ def sees_height(monkeypatch):
 
 @pytest.mark.usefixtures("sees_height")
 def test_planted_changes_are_found_at_their_time(changes):
-    # All of a window must be high: its centre is a second behind the change.
+    # All of a window must be high: its center is a second behind the change.
     frames = planted(changes, [-30, 0, 2, np.inf])
     row = camdm_transitions.transition_row(
         samples.run(), frames, changes, JUDGE, height=0.05
@@ -115,11 +115,11 @@ def test_planted_changes_are_found_at_their_time(changes):
 def test_windows_are_where_they_say(changes):
     run = samples.run()
     frames = planted(changes, [12, 12, 12, 12])
-    found, centres = camdm_transitions.find_changes(
+    found, centers = camdm_transitions.find_changes(
         run.model.skeleton, frames, changes, JUDGE, fps=FPS
     )
-    np.testing.assert_allclose(centres, np.arange(0, 61, 3) / 30)
-    np.testing.assert_array_equal(found, (centres >= 1.4)[None].repeat(4, 0))
+    np.testing.assert_allclose(centers, np.arange(0, 61, 3) / 30)
+    np.testing.assert_array_equal(found, (centers >= 1.4)[None].repeat(4, 0))
 
 
 @pytest.mark.parametrize(

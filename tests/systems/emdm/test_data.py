@@ -141,7 +141,7 @@ def drawn(arrays):
     return motions, np.asarray(action), clip, frame
 
 
-def test_motions_are_of_their_action_and_of_neighbouring_frames(arrays, drawn):
+def test_motions_are_of_their_action_and_of_neighboring_frames(arrays, drawn):
     motions, action, clip, frame = drawn
     names = np.array(arrays.clips.names("content"))
     np.testing.assert_array_equal(names[action], np.array(ACTIONS)[clip])

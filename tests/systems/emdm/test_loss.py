@@ -428,7 +428,7 @@ def test_every_frame_of_unequal_lengths_counts_the_same():
 
 
 def test_standing_feet_must_not_move_and_others_may():
-    """One foot stands, one walks; both are predicted to walk a centimetre a frame."""
+    """One foot stands, one walks; both are predicted to walk a centimeter a frame."""
     x_0, walk = np.zeros((1, 6, 15)), 0.01 * np.arange(6)
     x_0[0, :, 3 * 3] = 0.03 * np.arange(6)
     for foot, expected in ((1, 0.01**2 / 6), (3, 0.0)):

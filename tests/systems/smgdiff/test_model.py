@@ -134,7 +134,7 @@ def test_a_scene_goes_into_a_frame_and_back():
     np.testing.assert_allclose(gap(there), gap(scene), atol=2e-6)
 
 
-def test_features_are_standardised_by_kind(scenes, representation):
+def test_features_are_standardized_by_kind(scenes, representation):
     x = np.float64(smgdiff_scene.to_features(scenes, representation))
     rotations = x[..., 3:33].reshape(-1, 30)
     np.testing.assert_allclose(np.mean(x.reshape(-1, x.shape[-1]), 0), 0, atol=1e-5)
@@ -234,7 +234,7 @@ def test_the_truth_costs_nothing_but_its_own_slide(scenes, representation):
 
 
 def test_a_ball_that_trembles_costs_its_second_differences(scenes, representation):
-    """Every other frame a centimetre higher: differences of 2 cm in each triple."""
+    """Every other frame a centimeter higher: differences of 2 cm in each triple."""
     near = dataclasses.replace(
         scenes, ball=scenes.motion.root_position + jnp.array([[[0.3, -0.7, 0.4]]])
     )
@@ -258,7 +258,7 @@ def test_a_ball_that_is_far_away_costs_nothing_of_its_own(scenes, representation
 
 
 def test_a_shifted_person_costs_its_shift(scenes, representation):
-    """Ten centimetres along x: a third of 0.01 square metres in every joint."""
+    """Ten centimeters along x: a third of 0.01 square meters in every joint."""
     x = smgdiff_scene.to_features(scenes, representation)
     std = representation.normalizer.std[0]
     shifted = x.at[..., 0].add(0.1 / std)
