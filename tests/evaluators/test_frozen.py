@@ -20,8 +20,7 @@ from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import training as smgdiff_training
-from tests import ball_walker, tiny
-from tests.protocols import samples
+from tests import ball_walker, samples, tiny
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 

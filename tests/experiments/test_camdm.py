@@ -23,7 +23,7 @@ from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import published as camdm_published
 from jaxmotion.systems.camdm import release as camdm_release
 from jaxmotion.systems.camdm import training as camdm_training
-from tests.protocols import samples
+from tests import samples
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "experiments" / "camdm.py"

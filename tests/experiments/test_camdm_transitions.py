@@ -7,7 +7,7 @@ import pytest
 
 from jaxmotion.data import clips_io
 from jaxmotion.evaluators import frozen
-from tests.protocols import samples
+from tests import samples
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 

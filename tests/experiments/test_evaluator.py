@@ -16,8 +16,7 @@ from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
-from tests import ball_walker, tiny
-from tests.protocols import samples
+from tests import ball_walker, samples, tiny
 
 ROOT = Path(__file__).parents[2]
 FIELDS = ("fingerprint", "kind", "labels", "joints", "fps", "frames", "accuracy")

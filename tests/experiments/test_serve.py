@@ -28,8 +28,7 @@ from jaxmotion.learning import checkpoint
 from jaxmotion.motion import skeleton
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import training as camdm_training
-from tests import tiny
-from tests.protocols import samples
+from tests import samples, tiny
 
 ROOT = Path(__file__).parents[2]
 FPS = 100.0

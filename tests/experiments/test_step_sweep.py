@@ -14,8 +14,7 @@ from jaxmotion.data import bvh_text, clips_io, procedural
 from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.evaluation import table
 from jaxmotion.evaluators import frozen
-from tests import ball_walker
-from tests.protocols import samples
+from tests import ball_walker, samples
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "experiments" / "step_sweep.py"

@@ -17,10 +17,9 @@ from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import model as smgdiff_model
 from jaxmotion.systems.smgdiff import training as smgdiff_training
-from tests import ball_walker, person, tiny
+from tests import ball_walker, person, samples, tiny
 from tests.fuzz import harness, mutations
 from tests.fuzz.test_npz import fields_of
-from tests.protocols import samples
 from tests.systems.smgdiff.test_training import PATHS, SIZES
 
 # Orbax abandons its other reads when one fails.

@@ -14,7 +14,7 @@ from jaxmotion.evaluation import table
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import steering as camdm_steering
-from tests.protocols import samples
+from tests import samples
 
 LABELS = np.repeat([0, 1], 2)
 TRUTH, FLOOR = "held-out (ground truth)", "training half vs half (noise floor)"

@@ -15,7 +15,7 @@ from jaxmotion.evaluators.style import RecognizerConfig
 from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import release as camdm_release
 from jaxmotion.systems.camdm import steering as camdm_steering
-from tests.protocols import samples
+from tests import samples
 from tests.reference import metrics as oracle
 
 LABELS = np.array([0, 1, 1])

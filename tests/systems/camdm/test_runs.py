@@ -11,8 +11,7 @@ from jaxmotion.learning import checkpoint
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import training as camdm_training
-from tests import tiny
-from tests.protocols import samples
+from tests import samples, tiny
 
 EXPERIMENT = {
     "contents": [],

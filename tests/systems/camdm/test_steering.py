@@ -13,7 +13,7 @@ from jaxmotion.data import selection, windows
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import steering as camdm_steering
-from tests.protocols import samples
+from tests import samples
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 LABELS = np.array([0, 1, 1, 0])

@@ -11,7 +11,7 @@ from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import transitions as camdm_transitions
 from jaxmotion.systems.camdm.controller import Control
-from tests.protocols import samples
+from tests import samples
 from tests.reference import metrics as oracle
 
 pytestmark = pytest.mark.usefixtures("quick_compile")

@@ -13,9 +13,9 @@ from jaxmotion.learning import adversarial, training
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
 from tests import tiny
-from tests.networks import test_sequence_discriminator
 from tests.reference import diffusion
 from tests.reference import emdm as reference
+from tests.systems.emdm import test_discriminator
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
@@ -150,7 +150,7 @@ def test_discriminator_loss_is_the_formula(watch):
         return *found, [(call[0], call[2]) for call in seen[:2]]
 
     loss, info, calls = run(jnp.bool_(True))
-    own = test_sequence_discriminator.oracle(params["discriminator"])
+    own = test_discriminator.oracle(params["discriminator"])
     real, fake = logits(own, calls)
     for call, expected in zip(calls, (real, fake), strict=True):
         np.testing.assert_allclose(call[1], expected, rtol=1e-3, atol=1e-4)
@@ -200,7 +200,7 @@ def test_generator_loss_is_the_formula(watch):
 
     given = params["generator"], params["discriminator"], jax.random.key(0), data
     value, info, prediction, calls = run(*given)
-    (fake,) = logits(test_sequence_discriminator.oracle(params["discriminator"]), calls)
+    (fake,) = logits(test_discriminator.oracle(params["discriminator"]), calls)
     expected = reference.generator_loss(fake)
     np.testing.assert_allclose(info["adversarial"], expected, rtol=1e-4)
     terms = oracle_terms(prediction, data)
