@@ -170,8 +170,8 @@ def eval_windows(clips: Clips, *, stride: int, field: str) -> EvalWindows:
     Returns:
       The windows; wanted paths are filtered with sigma 10 frames, as in training.
     """
-    index = windows.window_index(clips, EVAL_WINDOW, stride=stride, short="skip")
-    motion = jax.vmap(lambda s: windows.cut(clips, s, EVAL_WINDOW))(index.starts)
+    index = window_index(clips, EVAL_WINDOW, stride=stride, short="skip")
+    motion = jax.vmap(lambda s: cut(clips, s, EVAL_WINDOW))(index.starts)
     path = trajectory.root_trajectory(clips.skeleton, motion)
     matrix = trajectory.smoothing_matrices(EVAL_WINDOW, (10.0,))[0]
     position = trajectory.smooth(path.position, matrix)

@@ -15,9 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.clips import Clips
-from jaxmotion.data.windows import EVAL_WINDOW as WINDOW
-from jaxmotion.data.windows import EvalWindows as Windows
-from jaxmotion.data.windows import eval_windows as data_windows
+from jaxmotion.data.windows import EVAL_WINDOW, EvalWindows, eval_windows
 from jaxmotion.evaluators.network import Recognizer, StyleClassifier
 from jaxmotion.learning import training
 from jaxmotion.motion import rotation, trajectory
@@ -363,11 +361,11 @@ def fit_recognizer(
     Returns:
       The recognizer.
     """
-    found = data_windows(clips, stride=10, field=field)
+    found = eval_windows(clips, stride=10, field=field)
     config = RecognizerConfig(
         num_classes=len(clips.names(field)),
         num_joints=clips.skeleton.num_joints,
-        frames=WINDOW,
+        frames=EVAL_WINDOW,
     )
     to_input = jax.jit(functools.partial(recognizer_input, clips.skeleton))
     x = jnp.asarray(in_batches(to_input, found.motion))
@@ -378,7 +376,7 @@ def fit_recognizer(
 
 
 def recognized(
-    skeleton: Skeleton, found: Windows, recognizer: Recognized
+    skeleton: Skeleton, found: EvalWindows, recognizer: Recognized
 ) -> tuple[np.ndarray, np.ndarray]:
     """Features of windows, and whether each one's style is recognized.
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.data import clips_io
-from jaxmotion.data.windows import eval_windows as data_windows
+from jaxmotion.data.windows import eval_windows
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.learning import checkpoint
@@ -198,7 +198,7 @@ def test_an_evaluator_of_styles_judges_from_its_file_as_when_it_was_trained(tmp_
     assert made.accuracy in (0.0, 0.25, 0.5, 0.75, 1.0)  # of four windows
     assert made.clips == evaluators.clips_fingerprint(clips, "style")
     evaluators.save(tmp_path / "e.npz", made)
-    windows = data_windows(clips, stride=60, field="style")
+    windows = eval_windows(clips, stride=60, field="style")
     found = []
     for one in (made, *(evaluators.load(tmp_path / "e.npz") for _ in range(2))):
         judge = style_evaluator.Recognized(params=one.params, config=one.config)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxmotion.data import selection, windows
 from jaxmotion.data.clips import Clips
-from jaxmotion.data.windows import EvalWindows as Windows
+from jaxmotion.data.windows import EvalWindows
 from jaxmotion.evaluation import (
     diversity,
     frechet,
@@ -158,7 +158,7 @@ _COLUMNS = {
 
 
 @jax.jit
-def _metrics(skeleton: Skeleton, height: Array, x: Windows) -> dict[str, Array]:
+def _metrics(skeleton: Skeleton, height: Array, x: EvalWindows) -> dict[str, Array]:
     return locomotion.locomotion_metrics(
         skeleton, x.motion, x.velocity, x.facing, contact_height=height
     )
@@ -166,7 +166,7 @@ def _metrics(skeleton: Skeleton, height: Array, x: Windows) -> dict[str, Array]:
 
 def metric_row(
     skeleton: Skeleton,
-    found: Windows,
+    found: EvalWindows,
     hits: np.ndarray | None,
     *,
     height: float,
@@ -235,7 +235,9 @@ def rollout_health(
     }
 
 
-def repeat_diversity(skeleton: Skeleton, found: Windows, *, repeats: int) -> table.Cell:
+def repeat_diversity(
+    skeleton: Skeleton, found: EvalWindows, *, repeats: int
+) -> table.Cell:
     """Intra-style variance over characters of one style under one control.
 
     Windows of the same time are compared in the frame of the root.
@@ -259,7 +261,7 @@ def repeat_diversity(skeleton: Skeleton, found: Windows, *, repeats: int) -> tab
     return table.cell(jax.vmap(diversity.intra_style_variance)(local))
 
 
-def contact_height(skeleton: Skeleton, real: Windows) -> float:
+def contact_height(skeleton: Skeleton, real: EvalWindows) -> float:
     """Height below which toes should not move.
 
     Args:
@@ -279,9 +281,9 @@ def contact_height(skeleton: Skeleton, real: Windows) -> float:
 
 def evaluation_table(
     skeleton: Skeleton,
-    real: Windows,
-    dense: Windows,
-    made: Windows,
+    real: EvalWindows,
+    dense: EvalWindows,
+    made: EvalWindows,
     frames: camdm_controller.Frame,
     recognizer: Recognized,
     *,

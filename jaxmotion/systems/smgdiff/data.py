@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.data import windows
 from jaxmotion.data.ball_clips import BallClips, cut_scene, take_ball_clips
-from jaxmotion.data.selection import label_speeds as style_speeds
+from jaxmotion.data.selection import label_speeds
 from jaxmotion.motion.ball import Scene
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.typing import Key
@@ -164,4 +164,4 @@ def skill_speeds(data: BallClips) -> Float[np.ndarray, " skills"]:
     Returns:
       Meters per second; 0 for a skill without clips.
     """
-    return np.asarray(style_speeds(data.clips, field=FIELD))
+    return np.asarray(label_speeds(data.clips, field=FIELD))
