@@ -148,7 +148,7 @@ def train(args: Train) -> None:
     model, params = model_of(args, clips), None
     if args.init:
         model, params = camdm_training.continued(model, args.init)
-    made_by = camdm_training.arguments_json(args) | {
+    made_by = reporting.arguments_json(args) | {
         "clips": frozen.clips_fingerprint(clips, args.label)
     }
     config = camdm_model.to_json(model) | {"experiment": made_by}
@@ -312,7 +312,7 @@ def evaluate(args: Evaluate) -> None:
         seed=args.seed,
         evaluator=evaluator,
     )
-    report = {"arguments": camdm_training.arguments_json(args)} | report
+    report = {"arguments": reporting.arguments_json(args)} | report
     report |= reporting.provenance()
     notes = (frozen.note(report["evaluator"]),)
     reporting.write_table(out, rows, report, notes)
@@ -334,7 +334,7 @@ def speeds(args: Speeds) -> None:
         control=camdm_controller.Control(follow=args.follow),
         seed=args.seed,
     )
-    report = {"arguments": camdm_training.arguments_json(args)} | report
+    report = {"arguments": reporting.arguments_json(args)} | report
     report |= reporting.provenance()
     reporting.write_table(out, rows, report, (by_frame.to_markdown(plans),))
 
@@ -424,7 +424,7 @@ def import_weights(args: Import) -> None:
     labels = args.labels and camdm_published.read_styles(args.labels)
     model, params = camdm_published.load(args.weights, skeleton=bones, labels=labels)
     # Which clips to use, as `train` would note it.
-    clips = camdm_training.arguments_json(Train(data=args.data, contents=()))
+    clips = reporting.arguments_json(Train(data=args.data, contents=()))
     config = camdm_model.to_json(model) | {"experiment": clips}
     checkpoint.export_params(args.out, params, config, dtype=np.float32)
     print(

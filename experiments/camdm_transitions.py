@@ -96,7 +96,7 @@ def measure(args: Config) -> None:
         run, changes, CONTROLS, judge, chunk=args.chunk, seed=args.seed
     )
     report = {
-        "arguments": camdm_training.arguments_json(args),
+        "arguments": reporting.arguments_json(args),
         "source": run.model.source,
         "rollouts": int(changes.old.size),
         "recognized_in_clips_%": camdm_transitions.clip_accuracy(run, judge).value,

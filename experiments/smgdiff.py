@@ -21,7 +21,7 @@ from jaxmotion import cli, files
 from jaxmotion.data.ball_clips import load_ball_clips
 from jaxmotion.evaluators import frozen
 from jaxmotion.learning import loop, runs
-from jaxmotion.systems.camdm.training import arguments_json
+from jaxmotion.reporting import arguments_json
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import training as smgdiff_training
@@ -56,7 +56,7 @@ class Train:
 
     data: Path = Path("data/dribble.npz")
     out: Path = Path("runs/smgdiff")
-    runs: tuple[str, ...] = ("paths_1", "motion_8")
+    stages: tuple[str, ...] = ("paths_1", "motion_8")
     preset: Literal["small", "paper"] = "small"
     width: int | None = None
     depth: int | None = None

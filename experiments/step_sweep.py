@@ -22,7 +22,7 @@ from sweeps.system import Job
 
 from jaxmotion import cli
 from jaxmotion.evaluators import frozen
-from jaxmotion.systems.camdm.training import arguments_json
+from jaxmotion.reporting import arguments_json
 
 SYSTEMS = {
     "camdm": camdm.SYSTEM,

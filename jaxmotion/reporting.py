@@ -182,3 +182,18 @@ def provenance() -> dict[str, Any]:
         "command": " ".join(["python", *sys.argv]),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
+
+
+def arguments_json(arguments: Any) -> dict[str, Any]:
+    """Arguments of an experiment as JSON.
+
+    Args:
+      arguments: A dataclass of plain values and paths.
+
+    Returns:
+      A JSON object.
+    """
+    return {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in dataclasses.asdict(arguments).items()
+    }

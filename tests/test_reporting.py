@@ -1,9 +1,11 @@
 """What a table was made with."""
 
+import dataclasses
 import importlib.metadata
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -34,3 +36,15 @@ def test_a_commit_says_whether_files_differ(monkeypatch, changed):
 
     monkeypatch.setattr(subprocess, "run", git)
     assert reporting.git_commit() == "0123abc" + ("+" if changed else "")
+
+
+def test_arguments_are_json():
+    @dataclasses.dataclass
+    class Arguments:
+        out: Path = Path("runs/a")
+        steps: int = 3
+        speed: float | None = None
+        contents: tuple[str, ...] = ("walk",)
+
+    found = json.loads(json.dumps(reporting.arguments_json(Arguments())))
+    assert found == dict(out="runs/a", steps=3, speed=None, contents=["walk"])

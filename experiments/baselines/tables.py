@@ -14,7 +14,6 @@ from jaxmotion.learning import checkpoint
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
 from jaxmotion.systems.aamdm.controller import Frame
-from jaxmotion.systems.camdm import training as camdm_training
 
 Row = dict[str, table.Cell]
 
@@ -161,7 +160,7 @@ def evaluate(
         found[name] = measure(name, run, space, step, reference, args)
         files.write_text(out / "rows.json", json.dumps(table.to_json(found), indent=1))
     report = {
-        "arguments": camdm_training.arguments_json(args),
+        "arguments": reporting.arguments_json(args),
         "source": run.source,
         **reporting.provenance(),
     }

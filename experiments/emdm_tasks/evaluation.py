@@ -13,7 +13,7 @@ from jaxmotion import reporting
 from jaxmotion.evaluation import by_frame, columns
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.evaluators import frozen
-from jaxmotion.systems.camdm.training import arguments_json
+from jaxmotion.reporting import arguments_json
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
 

@@ -13,7 +13,7 @@ from jaxmotion.evaluation import by_frame, columns
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.evaluators import frozen
 from jaxmotion.motion import skeleton
-from jaxmotion.systems.camdm.training import arguments_json
+from jaxmotion.reporting import arguments_json
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import players as smgdiff_players

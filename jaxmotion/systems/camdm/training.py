@@ -265,21 +265,6 @@ class Run:
     field: str
 
 
-def arguments_json(arguments: Any) -> dict[str, Any]:
-    """Arguments of an experiment as JSON.
-
-    Args:
-      arguments: A dataclass of plain values and paths.
-
-    Returns:
-      A JSON object.
-    """
-    return {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in dataclasses.asdict(arguments).items()
-    }
-
-
 def split_data(
     data: Path,
     contents: tuple[str, ...],

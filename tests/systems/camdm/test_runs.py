@@ -1,6 +1,4 @@
 import dataclasses
-import json
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -118,18 +116,6 @@ def test_contents_narrow_the_clips_where_they_have_such_a_field(tmp_path):
         camdm_training.split_data(path, ("fly",), "style", 0.4)
     with pytest.raises(ValueError, match="unknown label field 'mood'"):
         camdm_training.split_data(path, (), "mood", 0.4)
-
-
-def test_arguments_are_json():
-    @dataclasses.dataclass
-    class Arguments:
-        out: Path = Path("runs/a")
-        steps: int = 3
-        speed: float | None = None
-        contents: tuple[str, ...] = ("walk",)
-
-    found = json.loads(json.dumps(camdm_training.arguments_json(Arguments())))
-    assert found == dict(out="runs/a", steps=3, speed=None, contents=["walk"])
 
 
 def test_speeds_of_a_preset_are_the_styles_or_the_one_asked_for():
