@@ -144,7 +144,7 @@ def training_program(
     Returns:
       The jitted function and its arguments.
     """
-    optimizer = training.adamw_cosine(num_steps=1000)
+    optimizer = training.make_optimizer("adamw", learning_rate=1e-4, num_steps=1000)
     loss = functools.partial(
         camdm_loss.loss, skeleton=model.skeleton, config=model.config
     )

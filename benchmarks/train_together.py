@@ -100,7 +100,7 @@ def camdm_program(width: int, batch: int) -> Program:
     clips = workload.make_clips()
     sizes = camdm_training.PRESETS["small"] | {"width": width, "hidden": 4 * width}
     model = camdm_training.make_model(clips, field="style", **sizes)
-    optimizer = training.muon_cosine(num_steps=1000)
+    optimizer = training.make_optimizer("muon", learning_rate=1e-3, num_steps=1000)
     loss = functools.partial(
         camdm_loss.loss, skeleton=model.skeleton, config=model.config
     )
@@ -125,7 +125,7 @@ def aamdm_program(width: int, batch: int) -> Program:
       The program.
     """
     config = aamdm_model.Config(features=64, width=width)
-    optimizer = training.radam()
+    optimizer = training.make_optimizer("radam", learning_rate=1e-4)
     shape = (4096, config.window + 1, config.features)
     frames = np.random.default_rng(0).normal(size=shape)
 

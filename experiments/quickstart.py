@@ -173,7 +173,8 @@ def steps_of(args: Config) -> int:
 def train(args: Config, clips, model, params, key):
     """Trains on the clips; returns the averaged parameters and the losses."""
     steps = steps_of(args)
-    optimizer = training.muon_cosine(
+    optimizer = training.make_optimizer(
+        "muon",
         learning_rate=1e-3 if args.from_scratch else 3e-4,
         num_steps=steps,
         warmup_steps=min(steps // 4, 500),

@@ -82,7 +82,7 @@ def train_aamdm(args: Config, key):
     key_init, key_p, key_g = jax.random.split(key, 3)
     params = aamdm_model.init(key_init, config)
     polisher_loss = functools.partial(aamdm_loss.polisher_loss, config=config)
-    optimizer = training.radam(learning_rate=1e-3)
+    optimizer = training.make_optimizer("radam", learning_rate=1e-3)
     state = fit(
         training.make_update(polisher_loss, optimizer),
         training.init_train_state(params["polisher"], optimizer),
@@ -91,7 +91,9 @@ def train_aamdm(args: Config, key):
         batch=args.batch // 4,
         window=config.window + 1,
     )
-    players = [training.radam(learning_rate=rate) for rate in (5e-4, 5e-4)]
+    players = [
+        training.make_optimizer("radam", learning_rate=rate) for rate in (5e-4, 5e-4)
+    ]
     update = adversarial.make_gan_update(
         functools.partial(aamdm_loss.discriminator_loss, config=config),
         functools.partial(aamdm_loss.generator_loss, config=config),
@@ -117,7 +119,9 @@ def train_aamdm(args: Config, key):
 def train_baseline(args: Config, key, module, config, *, window: int):
     """A baseline; returns its stepper."""
     key_init, key_train = jax.random.split(key)
-    optimizer = training.adamw_cosine(learning_rate=1e-3, num_steps=args.steps)
+    optimizer = training.make_optimizer(
+        "adamw", learning_rate=1e-3, num_steps=args.steps
+    )
     state = fit(
         training.make_update(functools.partial(module.loss, config=config), optimizer),
         training.init_train_state(module.init(key_init, config), optimizer),

@@ -139,8 +139,8 @@ def training_parts(
     """A run of training on the walker: `run_chunk`, first state, key and data."""
     walker = clips()
     index = windows.window_index(walker, config.window)
-    optimizer = training.adamw_cosine(
-        learning_rate=learning_rate, num_steps=40, warmup_steps=2, max_norm=1.0
+    optimizer = training.make_optimizer(
+        "adamw", learning_rate=learning_rate, num_steps=40, warmup_steps=2, max_norm=1.0
     )
 
     def sample_batch(key, data):

@@ -293,7 +293,8 @@ def train_classifier(
       The moving average of the parameters, and losses and accuracies by step.
     """
     key_init, key_train = jax.random.split(key)
-    optimizer = training.adamw_cosine(
+    optimizer = training.make_optimizer(
+        "adamw",
         learning_rate=learning_rate,
         num_steps=num_steps,
         weight_decay=weight_decay,

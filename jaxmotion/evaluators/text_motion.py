@@ -251,8 +251,12 @@ def train_matcher(
     """
     key_init, key_train = jax.random.split(key)
     if optimizer is None:
-        optimizer = training.adamw_cosine(
-            learning_rate=1e-4, num_steps=num_steps, final_fraction=1.0, max_norm=0.5
+        optimizer = training.make_optimizer(
+            "adamw",
+            learning_rate=1e-4,
+            num_steps=num_steps,
+            final_fraction=1.0,
+            max_norm=0.5,
         )
     loss = functools.partial(matcher_loss, config=config)
     update = training.make_update(loss, optimizer, ema_decay=0.99)

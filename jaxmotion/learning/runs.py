@@ -175,11 +175,12 @@ def make_optimizer(budget: Budget) -> training.Optimizer:
     Returns:
       The optimizer.
     """
-    constant = {"radam": training.radam, "adam": training.gan_adam}
-    if budget.optimizer in constant:
-        return constant[budget.optimizer](learning_rate=budget.learning_rate)
-    make = {"muon": training.muon_cosine, "adamw": training.adamw_cosine}
-    return make[budget.optimizer](
+    if budget.optimizer in ("radam", "adam"):
+        return training.make_optimizer(
+            budget.optimizer, learning_rate=budget.learning_rate
+        )
+    return training.make_optimizer(
+        budget.optimizer,
         learning_rate=budget.learning_rate,
         num_steps=budget.steps,
         warmup_steps=min(100, budget.steps // 10),

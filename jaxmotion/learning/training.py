@@ -5,9 +5,10 @@ state. So a run that stops and resumes draws what an uninterrupted one would hav
 """
 
 import dataclasses
+import functools
 import typing
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -62,109 +63,67 @@ class Update(Protocol):
         ...
 
 
-def adamw_cosine(
+def _adam(rate: optax.ScalarOrSchedule) -> Optimizer:
+    return optax.adam(rate, b1=0.5, b2=0.9)
+
+
+def _muon(rate: optax.ScalarOrSchedule) -> Optimizer:
+    return optax.contrib.muon(rate, consistent_rms=0.2)
+
+
+OptimizerName = Literal["muon", "adamw", "radam", "adam"]
+# muon: matrices' updates orthogonal and scaled to the size of Adam's usual update, so
+#   that one rate serves them and the rest, which Nadam updates. In none of the papers:
+#   ours, for short runs (Jordan et al. 2024, "Muon"; the scale of 0.2 from Liu et al.
+#   2025, "Muon is Scalable for LLM Training").
+# adamw: CAMDM (its code: 1e-4, no weight decay, cosine to a tenth).
+# radam: AAMDM (Liu et al. 2020; Li et al. 2024, section 4).
+# adam: both networks of EMDM (its code: generator 2e-5, discriminator 1.25e-4).
+OPTIMIZERS: dict[OptimizerName, Callable[[optax.ScalarOrSchedule], Optimizer]] = {
+    "muon": _muon,
+    "adamw": functools.partial(optax.adamw, weight_decay=0.0),
+    "radam": optax.radam,
+    "adam": _adam,
+}
+
+
+def make_optimizer(
+    name: OptimizerName,
     *,
-    learning_rate: float = 1e-4,
-    num_steps: int,
+    learning_rate: float,
+    num_steps: int | None = None,
     warmup_steps: int = 0,
     final_fraction: float = 0.1,
-    weight_decay: float = 0.0,
     max_norm: float | None = None,
-) -> optax.GradientTransformation:
-    """AdamW with linear warm-up and cosine decay.
+) -> Optimizer:
+    """An optimizer with linear warm-up and cosine decay, or at a constant rate.
 
     Args:
+      name: One of `OPTIMIZERS`.
       learning_rate: Peak rate.
       num_steps: Steps of the whole run; the rate stays at its end value after them.
-      warmup_steps: Steps of linear rise from 0.
-      final_fraction: Rate at the end as a fraction of the peak.
-      weight_decay: Decoupled weight decay.
+        None for a constant rate.
+      warmup_steps: Steps of linear rise from 0, where the rate is not constant.
+      final_fraction: Rate at the end of the decay as a fraction of the peak.
       max_norm: Clip the gradient to this global norm; None to leave it.
 
     Returns:
       The optimizer.
-
-    Source: released code of CAMDM: 1e-4, no decay, cosine to a tenth.
     """
-    rate = _warmup_cosine(learning_rate, num_steps, warmup_steps, final_fraction)
+    rate: optax.ScalarOrSchedule = learning_rate
+    if num_steps is not None:
+        rate = optax.warmup_cosine_decay_schedule(
+            init_value=0.0 if warmup_steps else learning_rate,
+            peak_value=learning_rate,
+            warmup_steps=warmup_steps,
+            decay_steps=max(num_steps, warmup_steps + 1),
+            end_value=learning_rate * final_fraction,
+        )
     clip = [] if max_norm is None else [optax.clip_by_global_norm(max_norm)]
-    return optax.chain(*clip, optax.adamw(rate, weight_decay=weight_decay))
+    return optax.chain(*clip, OPTIMIZERS[name](rate))
 
 
-def muon_cosine(
-    *,
-    learning_rate: float = 1e-3,
-    num_steps: int,
-    warmup_steps: int = 0,
-    final_fraction: float = 0.1,
-    max_norm: float | None = None,
-) -> optax.GradientTransformation:
-    """Muon for matrices, Nadam for the rest, with the rates of `adamw_cosine`.
-
-    Muon makes each matrix's update orthogonal. It is scaled to the size of Adam's
-    usual update, so one rate serves both kinds of parameters.
-
-    Args:
-      learning_rate: Peak rate.
-      num_steps: Steps of the whole run; the rate stays at its end value after them.
-      warmup_steps: Steps of linear rise from 0.
-      final_fraction: Rate at the end as a fraction of the peak.
-      max_norm: Clip the gradient to this global norm; None to leave it.
-
-    Returns:
-      The optimizer.
-
-    Source: Jordan et al. 2024, "Muon"; the scale of 0.2 from Liu et al. 2025, "Muon is
-    Scalable for LLM Training". Not in the paper of CAMDM: ours, for short runs.
-    """
-    rate = _warmup_cosine(learning_rate, num_steps, warmup_steps, final_fraction)
-    clip = [] if max_norm is None else [optax.clip_by_global_norm(max_norm)]
-    return optax.chain(*clip, optax.contrib.muon(rate, consistent_rms=0.2))
-
-
-def radam(*, learning_rate: float = 1e-4) -> optax.GradientTransformation:
-    """Rectified Adam at a constant rate, AAMDM's optimizer.
-
-    Args:
-      learning_rate: The rate.
-
-    Returns:
-      The optimizer.
-
-    Source: Liu et al. 2020; Li et al. 2024 (AAMDM), section 4.
-    """
-    return optax.radam(learning_rate)
-
-
-def gan_adam(*, learning_rate: float = 1e-4) -> optax.GradientTransformation:
-    """Adam with beta (0.5, 0.9) at a constant rate, of both of EMDM's networks.
-
-    Args:
-      learning_rate: The rate.
-
-    Returns:
-      The optimizer.
-
-    Source: released code of EMDM (generator 2e-5, discriminator 1.25e-4).
-    """
-    return optax.adam(learning_rate, b1=0.5, b2=0.9)
-
-
-def _warmup_cosine(
-    learning_rate: float, num_steps: int, warmup_steps: int, final_fraction: float
-) -> optax.Schedule:
-    return optax.warmup_cosine_decay_schedule(
-        init_value=0.0 if warmup_steps else learning_rate,
-        peak_value=learning_rate,
-        warmup_steps=warmup_steps,
-        decay_steps=max(num_steps, warmup_steps + 1),
-        end_value=learning_rate * final_fraction,
-    )
-
-
-def init_train_state(
-    params: Params, optimizer: optax.GradientTransformation
-) -> TrainState:
+def init_train_state(params: Params, optimizer: Optimizer) -> TrainState:
     """State before the first step.
 
     Args:
@@ -183,7 +142,7 @@ def init_train_state(
 
 
 def make_update(
-    loss: Loss, optimizer: optax.GradientTransformation, *, ema_decay: float = 0.995
+    loss: Loss, optimizer: Optimizer, *, ema_decay: float = 0.995
 ) -> Update:
     """Update of parameters and their moving average by one batch.
 

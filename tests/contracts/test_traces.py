@@ -154,7 +154,7 @@ def test_a_chunk_of_two_players_is_traced_once(monkeypatch):
     for name in ("generator_loss", "discriminator_loss"):
         counted = chex.assert_max_traces(getattr(emdm_loss, name), n=1)
         monkeypatch.setattr(emdm_loss, name, counted)
-    optimizers = (training.gan_adam(),) * 2
+    optimizers = (training.make_optimizer("adam", learning_rate=1e-4),) * 2
     update = emdm_training.gan_update(optimizers, config=EMDM, geometry=None, ema=0.5)
     params = tiny.random_params(emdm_model.init, EMDM)
     state = adversarial.GanState(

@@ -138,7 +138,7 @@ def test_it_learns_to_match_new_motions():
         make_pairs(0, NUM_PAIRS),
         config=CONFIG,
         num_steps=steps,
-        optimizer=training.adamw_cosine(learning_rate=3e-3, num_steps=steps),
+        optimizer=training.make_optimizer("adamw", learning_rate=3e-3, num_steps=steps),
     )
     assert info["loss"].shape == (steps,)
     text, motion = embed(params, make_pairs(1, 128))

@@ -51,7 +51,6 @@ PRESETS["planted"] = PRESETS["small"] | dict(
     weight_position_velocity=20.0,
     weight_foot=20.0,
 )
-OPTIMIZERS = {"muon": training.muon_cosine, "adamw": training.adamw_cosine}
 # How the presets are trained, for `start`.
 FITTING: dict[str, dict[str, Any]] = {
     # The paper: as MDM, that is AdamW at 1e-4. The released code: the same, batch 512,
@@ -216,7 +215,8 @@ def start(
         model.
     """
     index = windows.window_index(clips, model.config.window, short="skip")
-    transformation = OPTIMIZERS[optimizer](
+    transformation = training.make_optimizer(
+        optimizer,
         learning_rate=learning_rate,
         num_steps=num_steps,
         warmup_steps=warmup,

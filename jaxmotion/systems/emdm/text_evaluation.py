@@ -140,8 +140,8 @@ def train_evaluator(
             data,
             config=config,
             num_steps=num_steps,
-            optimizer=training.adamw_cosine(
-                learning_rate=1e-3, num_steps=num_steps, max_norm=0.5
+            optimizer=training.make_optimizer(
+                "adamw", learning_rate=1e-3, num_steps=num_steps, max_norm=0.5
             ),
         )
         checkpoint.save(folder, num_steps, {"params": params}, value)

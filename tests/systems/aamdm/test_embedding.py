@@ -290,7 +290,7 @@ def test_training_on_a_few_poses_lowers_the_loss():
         parents=person.PARENTS,
         config=CONFIG,
     )
-    optimizer = training.adamw_cosine(learning_rate=1e-2, num_steps=150)
+    optimizer = training.make_optimizer("adamw", learning_rate=1e-2, num_steps=150)
     run = training.train_chunk(
         training.make_update(loss, optimizer),
         lambda key, data: data,

@@ -525,7 +525,9 @@ def toy_chunk():
         )
         make = functools.partial(emdm_loss.generator_loss, config=TOY, geometry=None)
         optimizers = tuple(
-            optax.chain(training.gan_adam(learning_rate=1.0), optax.scale(rate))
+            optax.chain(
+                training.make_optimizer("adam", learning_rate=1.0), optax.scale(rate)
+            )
             for rate in rates
         )
         update = adversarial.make_gan_update(judge, make, optimizers, ema_decay=0.9)
@@ -542,7 +544,9 @@ def toy_chunk():
 def toy_state():
     params, optimizer = (
         parameters(TOY),
-        optax.chain(training.gan_adam(), optax.scale(1)),
+        optax.chain(
+            training.make_optimizer("adam", learning_rate=1e-4), optax.scale(1)
+        ),
     )
     return adversarial.GanState(
         **{name: training.init_train_state(params[name], optimizer) for name in params}
