@@ -1,0 +1,437 @@
+"""Feet that stand where they were put down.
+
+A network's frames slide: while a foot carries the body its toe drifts by some
+centimeters per second. The lock holds the toe at the point where the contact began and
+bends the leg to reach it.
+
+1. **Contact.** A toe is in contact from the frame in which it is slow and low until it
+   is fast or high; the thresholds of the end lie above those of the beginning, so that
+   a contact does not flicker.
+2. **Lock.** A contact that begins locks the toe at the point of the ground where it is
+   displayed. The lock ends with the contact, or when the animated toe is farther than
+   `radius` from the point. Into and out of the lock, the offset between what was
+   displayed and what is wanted now decays as a critically damped spring: no jump. Only
+   the two horizontal coordinates are locked: the height stays the model's, since a
+   toe that is held down while it lifts would be dragged over the ground.
+3. **Leg.** The ankle moves by as much as the toe has to, by two-bone inverse
+   kinematics: the interior angles follow from the law of cosines,
+
+       cos(hip)  = (a^2 + d^2 - b^2) / (2 a d)                                     (1)
+       cos(knee) = (a^2 + b^2 - d^2) / (2 a b)                                     (2)
+
+   with the lengths a and b of thigh and shank and the distance d from hip to ankle,
+   both before and after; the knee turns by the difference about the axis it is bent
+   about already, so it never flips. As d approaches a + b, it does so exponentially
+   (`softness`): a leg that is pulled too far does not snap straight. The foot keeps its
+   orientation, but for what the leg cannot reach and a heel that would sink.
+
+A frame that needs no correction comes back as it was. The lock works on what is
+displayed; the planner's own past stays untouched, so plans are those without it.
+
+Source: the offset spring and the order of lock and release after D. Holden's notes on
+motion matching; two-bone inverse kinematics is textbook geometry.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxmotion.control.rollout import Controller
+from jaxmotion.motion.rotation import rot6d_from_matrix, safe_normalize
+from jaxmotion.motion.rotation_vector import to_matrix
+from jaxmotion.motion.skeleton import Motion, Skeleton, global_transforms
+from jaxmotion.motion.spring import spring
+
+_UP = (0.0, 1.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FootLock:
+    """Settings of the lock.
+
+    Attributes:
+      toe_height: Height below which no displayed toe goes, meters.
+      ankle_height: Height below which no displayed ankle goes, meters.
+      begin_speed: A contact begins below this speed, meters per second,
+      begin_height: and below this height of the toe, meters.
+      end_speed: It ends above this speed,
+      end_height: or above this height.
+      radius: Distance of the animated toe from the locked point that ends a lock,
+        meters.
+      half_life: Half-life of the offset into and out of a lock, seconds.
+      softness: Distance from full stretch at which a leg begins to resist, meters.
+    """
+
+    toe_height: float = 0.02
+    ankle_height: float = 0.04
+    begin_speed: float = 0.5
+    begin_height: float = 0.05
+    end_speed: float = 0.6
+    end_height: float = 0.10
+    radius: float = 0.2
+    half_life: float = 0.05
+    softness: float = 0.015
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class LockState:
+    """Both feet of a character between two frames; world, meters and seconds.
+
+    Attributes:
+      animated: Toes of the last frame as the model had them.
+      shown: The same as they were displayed.
+      contact: Whether each toe is in contact.
+      locked: Whether each toe is locked.
+      point: Where it is locked, if so.
+      offset: Of what is displayed from what is wanted.
+      offset_velocity: The rate of that.
+      started: Whether there was a frame before.
+    """
+
+    animated: Float[Array, "feet 3"]
+    shown: Float[Array, "feet 3"]
+    contact: Bool[Array, " feet"]
+    locked: Bool[Array, " feet"]
+    point: Float[Array, "feet 3"]
+    offset: Float[Array, "feet 3"]
+    offset_velocity: Float[Array, "feet 3"]
+    started: Bool[Array, ""]
+
+
+def legs(skeleton: Skeleton) -> tuple[tuple[int, int, int, int], ...]:
+    """Hip, knee, ankle and toe of each foot: the joints above it.
+
+    Raises:
+      ValueError: if the skeleton names no feet, or a foot has no leg above it.
+    """
+    if not skeleton.feet:
+        raise ValueError("the skeleton names no feet: there is nothing to lock")
+    found = []
+    for toe in skeleton.feet:
+        chain = [toe]
+        while len(chain) < 4 and skeleton.parents[chain[0]] > 0:
+            chain.insert(0, skeleton.parents[chain[0]])
+        if len(chain) < 4:
+            raise ValueError(
+                f"foot {skeleton.names[toe]!r} has {len(chain) - 1} joints between it "
+                "and the root, expected hip, knee and ankle"
+            )
+        found.append(tuple(chain))
+    return tuple(found)
+
+
+def init_lock(skeleton: Skeleton) -> LockState:
+    """State before the first frame; nothing is locked."""
+    count = len(legs(skeleton))
+    zeros, none = jnp.zeros((count, 3)), jnp.zeros(count, bool)
+    return LockState(
+        animated=zeros,
+        shown=zeros,
+        contact=none,
+        locked=none,
+        point=zeros,
+        offset=zeros,
+        offset_velocity=zeros,
+        started=jnp.zeros((), bool),
+    )
+
+
+def contacts(
+    was: Bool[Array, " feet"],
+    speed: Float[Array, " feet"],
+    height: Float[Array, " feet"],
+    *,
+    lock: FootLock,
+) -> Bool[Array, " feet"]:
+    """Which toes are in contact now, given which were: thresholds with hysteresis."""
+    begins = (speed < lock.begin_speed) & (height < lock.begin_height)
+    goes_on = (speed < lock.end_speed) & (height < lock.end_height)
+    return jnp.where(was, goes_on, begins)
+
+
+def step_lock(
+    state: LockState, toes: Float[Array, "feet 3"], *, fps: float, lock: FootLock
+) -> LockState:
+    """Where the toes are to be displayed: parts 1 and 2 of the module's text.
+
+    Args:
+      state: After the last frame.
+      toes: Animated toes of this frame, world.
+      fps: Frames per second.
+      lock: Settings.
+
+    Returns:
+      The state of this frame; `shown` is where its toes belong.
+    """
+    dt = 1.0 / fps
+    velocity = jnp.where(state.started, (toes - state.animated) * fps, 0.0)
+    speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1) + 1e-12)
+    contact = contacts(state.contact, speed, toes[:, 1], lock=lock)
+    contact = contact & state.started
+
+    # What was displayed: the wanted place of the last frame and the offset from it.
+    target = jnp.where(state.locked[:, None], state.point, toes)
+    still = spring(
+        state.offset,
+        state.offset_velocity,
+        jnp.zeros_like(state.offset),
+        half_life=lock.half_life,
+        dt=dt,
+    )
+    offset, offset_velocity = still
+    here = target + offset
+    moving = jnp.where(state.locked[:, None], 0.0, velocity)
+
+    begins = contact & ~state.contact
+    level = jnp.array([[1.0, 0.0, 1.0]])
+    point = jnp.where(begins[:, None], here, state.point)
+    away = jnp.sqrt(jnp.sum((point - toes) ** 2 * level, axis=-1) + 1e-12)
+    locked = (state.locked | begins) & contact & (away < lock.radius)
+    wanted = jnp.where(locked[:, None], point, toes)
+    wanted_velocity = jnp.where(locked[:, None], 0.0, velocity)
+
+    # A change of what is wanted goes into the offset, so that nothing jumps.
+    changed = (locked != state.locked)[:, None] | begins[:, None]
+    offset = jnp.where(changed, here - wanted, offset)
+    offset_velocity = jnp.where(
+        changed, moving + offset_velocity - wanted_velocity, offset_velocity
+    )
+    return LockState(
+        animated=toes,
+        shown=jnp.where(level > 0, wanted + offset, toes),
+        contact=contact,
+        locked=locked,
+        point=point,
+        offset=offset,
+        offset_velocity=offset_velocity,
+        started=jnp.ones((), bool),
+    )
+
+
+def _length(x: Array) -> Array:
+    return jnp.sqrt(jnp.sum(x * x, axis=-1) + 1e-12)
+
+
+def _angle(cosine: Array) -> Array:
+    """Inverse of the cosine with a gradient that is finite everywhere."""
+    return jnp.arccos(jnp.clip(cosine, -1.0 + 1e-6, 1.0 - 1e-6))
+
+
+def _turn(axis: Array, angle: Array) -> Array:
+    return to_matrix(axis * angle[..., None])
+
+
+def _swing(start: Array, end: Array) -> Array:
+    """Least rotation from one direction to another; not for opposite ones."""
+    start, end = (safe_normalize(x, jnp.array(_UP)) for x in (start, end))
+    cross, cosine = jnp.cross(start, end), jnp.sum(start * end, axis=-1)
+    x, y, z = cross
+    zero = jnp.zeros_like(x)
+    skew = jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    return jnp.eye(3) + skew + skew @ skew / jnp.maximum(1.0 + cosine, 1e-3)
+
+
+def solve_leg(
+    positions: Float[Array, "4 3"],
+    rotations: Float[Array, "4 3 3"],
+    toe: Float[Array, "3"],
+    *,
+    bend: Float[Array, "3"],
+    lock: FootLock,
+) -> Float[Array, "3 3 3"]:
+    """World rotations of hip, knee and ankle that bring the toe to a place.
+
+    Args:
+      positions: Hip, knee, ankle and toe as animated, world.
+      rotations: Their world rotations.
+      toe: Where the toe belongs, world.
+      bend: Axis that a straight leg bends about: the knee moves along the cross product
+        of it and the leg's direction.
+      lock: Settings.
+
+    Returns:
+      The rotations; those given where the toe is in its place.
+    """
+    hip, knee, ankle, animated = positions
+    goal = ankle + toe - animated
+    goal = goal.at[1].set(jnp.maximum(goal[1], jnp.minimum(ankle[1], 0.0)))
+    goal = goal.at[1].set(jnp.maximum(goal[1], lock.ankle_height))
+    thigh, shank = _length(knee - hip), _length(ankle - knee)
+    before, asked = _length(ankle - hip), _length(goal - hip)
+    # The last centimeters of stretch are approached, never reached; a leg that is
+    # animated straighter than that may stay so.
+    start = jnp.maximum(thigh + shank - lock.softness, before)
+    rest = jnp.maximum(thigh + shank - start, 1e-4)
+    over = jnp.maximum(asked - start, 0.0)
+    after = jnp.where(over > 0.0, start + rest * (1.0 - jnp.exp(-over / rest)), asked)
+    after = jnp.maximum(after, jnp.abs(thigh - shank) + 1e-3)
+
+    def interior(distance: Array) -> tuple[Array, Array]:
+        at_hip = (thigh**2 + distance**2 - shank**2) / (2 * thigh * distance)
+        at_knee = (thigh**2 + shank**2 - distance**2) / (2 * thigh * shank)
+        return _angle(at_hip), _angle(at_knee)
+
+    (hip_0, knee_0), (hip_1, knee_1) = interior(before), interior(after)
+    own = jnp.cross(ankle - hip, knee - hip) / (thigh * shank)
+    along = (ankle - hip) / before
+    spare = bend - jnp.sum(bend * along) * along
+    sine = _length(own)
+    axis = safe_normalize(
+        jnp.where(sine > 0.02, own, own + (1.0 - sine / 0.02) * spare), bend
+    )
+    opened = _turn(axis, hip_1 - hip_0)
+    lower = _turn(axis, hip_1 - hip_0 + knee_1 - knee_0)
+    swing = _swing(ankle - hip, goal - hip)
+    # The foot keeps its orientation, then looks at the toe's place.
+    reached = hip + after * safe_normalize(goal - hip, jnp.array(_UP))
+    look = _swing(animated - ankle, toe - reached)
+    return jnp.stack(
+        [
+            swing @ opened @ rotations[0],
+            swing @ lower @ rotations[1],
+            look @ rotations[2],
+        ]
+    )
+
+
+def place_toes(
+    skeleton: Skeleton,
+    root_position: Float[Array, "3"],
+    joint_rotation: Float[Array, "joints 6"],
+    toes: Float[Array, "feet 3"],
+    *,
+    lock: FootLock,
+) -> Float[Array, "joints 6"]:
+    """Rotations of a pose whose toes are moved to other places: part 3.
+
+    Args:
+      skeleton: The skeleton; its feet are the toes.
+      root_position: World, meters; stays.
+      joint_rotation: The pose as animated.
+      toes: Where they belong, world; no lower than a standing toe is taken.
+      lock: Settings.
+
+    Returns:
+      Rotations; only hips, knees and ankles differ.
+    """
+    positions, rotations = global_transforms(skeleton, root_position, joint_rotation)
+    chains = legs(skeleton)
+    # Knees bend about the line between the hips, so that the shank goes back.
+    hips = [chain[0] for chain in chains]
+    side = positions[hips[0]] - positions[hips[-1]] if len(hips) > 1 else None
+    new = rotations
+    for i, chain in enumerate(chains):
+        joints = jnp.array(chain)
+        bend = rotations[0][:, 0] if side is None else side
+        solved = solve_leg(
+            positions[joints],
+            rotations[joints],
+            jnp.maximum(toes[i], jnp.array([-jnp.inf, lock.toe_height, -jnp.inf])),
+            bend=-safe_normalize(bend, jnp.array([1.0, 0.0, 0.0])),
+            lock=lock,
+        )
+        new = new.at[joints[:3]].set(solved)
+    changed = sorted({joint for chain in chains for joint in chain[:3]})
+    index = jnp.array(changed)
+    parents = jnp.array([skeleton.parents[joint] for joint in changed])
+    local = jnp.swapaxes(new[parents], -1, -2) @ new[index]
+    return joint_rotation.at[index].set(rot6d_from_matrix(local))
+
+
+def lock_frame(
+    skeleton: Skeleton,
+    state: LockState,
+    root_position: Float[Array, "3"],
+    joint_rotation: Float[Array, "joints 6"],
+    *,
+    fps: float,
+    lock: FootLock,
+) -> tuple[LockState, Float[Array, "joints 6"]]:
+    """The next frame with its feet locked.
+
+    Args:
+      skeleton: The skeleton; its feet are the toes.
+      state: From `init_lock` or the frame before.
+      root_position: World, meters.
+      joint_rotation: The pose as animated.
+      fps: Frames per second.
+      lock: Settings.
+
+    Returns:
+      The state, and the rotations to display.
+    """
+    positions, _ = global_transforms(skeleton, root_position, joint_rotation)
+    toes = positions[jnp.array(skeleton.feet)]
+    state = step_lock(state, toes, fps=fps, lock=lock)
+    shown = place_toes(skeleton, root_position, joint_rotation, state.shown, lock=lock)
+    return state, shown
+
+
+@functools.partial(jax.jit, static_argnames=("lock",))
+def lock_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motion:
+    """A motion of one character with its feet locked, frame after frame.
+
+    For many characters, `jax.vmap` over the motion.
+    """
+
+    def step(state: LockState, frame: tuple[Array, Array]) -> tuple[LockState, Array]:
+        return lock_frame(skeleton, state, *frame, fps=motion.fps, lock=lock)
+
+    frames = (motion.root_position, motion.joint_rotation)
+    _, rotations = jax.lax.scan(step, init_lock(skeleton), frames)
+    return dataclasses.replace(motion, joint_rotation=rotations)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class LockedState:
+    """State of a controller and of its character's feet.
+
+    Attributes:
+      inner: The controller's own.
+      feet: Of `init_lock` at the start.
+    """
+
+    inner: Any
+    feet: LockState
+
+
+def locked(
+    controller: Controller, skeleton: Skeleton, *, fps: float, lock: FootLock
+) -> Controller:
+    """A controller that displays its frames with locked feet.
+
+    Its state is a `LockedState`. What the controller itself remembers are the frames
+    without the lock.
+    """
+
+    def planner(plan: Any) -> Any:
+        def run(key: Any, state: LockedState, command: Any) -> LockedState:
+            return dataclasses.replace(state, inner=plan(key, state.inner, command))
+
+        return run
+
+    def advance(state: LockedState, command: Any) -> tuple[LockedState, Any]:
+        inner, frame = controller.advance(state.inner, command)
+        feet, rotations = lock_frame(
+            skeleton,
+            state.feet,
+            frame.root_position,
+            frame.joint_rotation,
+            fps=fps,
+            lock=lock,
+        )
+        frame = dataclasses.replace(frame, joint_rotation=rotations)
+        return LockedState(inner=inner, feet=feet), frame
+
+    return dataclasses.replace(
+        controller,
+        urgency=lambda state, command: controller.urgency(state.inner, command),
+        plans=tuple(planner(plan) for plan in controller.plans),
+        advance=advance,
+    )

@@ -1,0 +1,272 @@
+"""Foot lock: planted feet stand, legs reach, nothing jumps or flips."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.control import foot_lock, rollout
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+
+FPS = 30.0
+LOCK = foot_lock.FootLock()
+NAMES = ("Hips", "LHip", "LKnee", "LFoot", "LToe", "RHip", "RKnee", "RFoot", "RToe")
+SKELETON = Skeleton(
+    offsets=jnp.array(
+        [[0, 0, 0]]
+        + [[0.1, 0, 0], [0, -0.45, 0], [0, -0.42, 0], [0, -0.06, 0.14]]
+        + [[-0.1, 0, 0], [0, -0.45, 0], [0, -0.42, 0], [0, -0.06, 0.14]],
+        jnp.float32,
+    ),
+    parents=(-1, 0, 1, 2, 3, 0, 5, 6, 7),
+    names=NAMES,
+    feet=(4, 8),
+)
+ROOT = np.array([0.0, 0.93, 0.0])
+
+
+def pitch(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([1, 0, 0, 0, c, s], np.float32)
+
+
+def pose(bend=0.3):
+    """Both knees bent so that the ankles stay under the hips, roughly."""
+    joints = np.tile(pitch(0.0), (9, 1))
+    for hip in (1, 5):
+        joints[hip], joints[hip + 1] = pitch(-bend), pitch(2 * bend)
+        joints[hip + 2] = pitch(-bend)
+    return jnp.asarray(joints)
+
+
+def stood(bend=0.3):
+    """Height of the root at which the toes are 2.5 cm high."""
+    toes = toes_of(np.zeros(3, np.float32), pose(bend))
+    return np.array([0.0, 0.025 - toes[0, 1], 0.0], np.float32)
+
+
+def toes_of(root, joints, skeleton=SKELETON):
+    motion = Motion(
+        root_position=jnp.asarray(root)[None],
+        joint_rotation=jnp.asarray(joints)[None],
+        fps=FPS,
+    )
+    return np.asarray(joint_positions(skeleton, motion))[0, list(skeleton.feet)]
+
+
+def drift(speed, seconds=2.0):
+    """A pose that slides over the ground without moving a joint."""
+    frames = round(seconds * FPS)
+    path = np.zeros((frames, 3), np.float32)
+    path[:, 2] = speed / FPS * np.arange(frames)
+    return Motion(
+        root_position=jnp.asarray(stood() + path),
+        joint_rotation=jnp.tile(pose(), (frames, 1, 1)),
+        fps=FPS,
+    )
+
+
+solve = jax.jit(functools.partial(foot_lock.place_toes, SKELETON, lock=LOCK))
+
+
+def place(root, joints, toes):
+    return solve(*(jnp.asarray(x, jnp.float32) for x in (root, joints, toes)))
+
+
+def positions_of(root, joints):
+    motion = Motion(
+        root_position=jnp.asarray(root)[None],
+        joint_rotation=jnp.asarray(joints)[None],
+        fps=FPS,
+    )
+    return np.asarray(joint_positions(SKELETON, motion)[0], np.float64)
+
+
+def test_a_pose_whose_toes_are_right_stays():
+    for bend in (0.05, 0.3, 0.9):
+        root, joints = stood(bend), pose(bend)
+        found = place(root, joints, toes_of(root, joints))
+        np.testing.assert_allclose(found, joints, atol=2e-4)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_leg_reaches_within_its_length(seed):
+    """By kinematics: toes are there, bones keep their length, feet do not turn."""
+    generator = np.random.default_rng(seed)
+    root, joints = stood(0.5), pose(0.5)
+    toes = toes_of(root, joints)
+    wanted = toes + generator.uniform(-0.08, 0.08, toes.shape).astype(np.float32)
+    wanted[:, 1] = np.maximum(wanted[:, 1], 0.06)
+    found = place(root, joints, wanted)
+    after, before = positions_of(root, found), positions_of(root, joints)
+    np.testing.assert_allclose(after[[4, 8]], wanted, atol=2e-4)
+    for joint, parent in enumerate(SKELETON.parents[1:], start=1):
+        length = lambda x, j=joint, p=parent: np.linalg.norm(x[j] - x[p])  # noqa: E731
+        assert length(after) == pytest.approx(length(before), abs=1e-5)
+    # The foot moved with the ankle and did not turn.
+    np.testing.assert_allclose(
+        after[[4, 8]] - after[[3, 7]], before[[4, 8]] - before[[3, 7]], atol=2e-4
+    )
+
+
+def test_angles_are_those_of_the_law_of_cosines():
+    root, joints = stood(0.5), pose(0.5)
+    wanted = toes_of(root, joints) + np.array([0.0, 0.1, 0.05])
+    hip, knee, ankle = positions_of(root, place(root, joints, wanted))[1:4]
+    d = np.linalg.norm(ankle - hip)
+    want = np.arccos((0.45**2 + 0.42**2 - d**2) / (2 * 0.45 * 0.42))
+    cosine = np.dot(hip - knee, ankle - knee) / (0.45 * 0.42)
+    assert np.arccos(cosine) == pytest.approx(want, abs=1e-4)
+
+
+def test_knees_stay_in_front():
+    """From far back to far ahead, also through a straight leg."""
+    root = stood(0.05)
+    for bend in (0.0, 0.02, 0.3):
+        joints = pose(bend)
+        for ahead in np.linspace(-0.5, 0.5, 11):
+            wanted = toes_of(root, joints) + np.array([0.0, 0.1, ahead])
+            hip, knee, ankle = positions_of(root, place(root, joints, wanted))[1:4]
+            # In front of the line from hip to ankle, seen by a body that faces +z.
+            line = (ankle - hip) / np.linalg.norm(ankle - hip)
+            out = (knee - hip) - np.dot(knee - hip, line) * line
+            front = np.array([0.0, 0.0, 1.0]) - line[2] * line
+            assert np.dot(out, front) > -1e-3, (bend, ahead)
+
+
+def test_a_leg_that_is_pulled_too_far_never_snaps():
+    root, joints = stood(0.3), pose(0.3)
+    toes, lengths = toes_of(root, joints), []
+    for away in np.linspace(0.0, 1.0, 41):
+        joints_now = place(root, joints, toes + np.array([0.0, 0.0, away]))
+        hip, _, ankle = positions_of(root, joints_now)[1:4]
+        lengths.append(np.linalg.norm(ankle - hip))
+    assert max(lengths) < 0.45 + 0.42
+    assert np.all(np.diff(lengths) > -1e-4)
+    assert np.abs(np.diff(lengths)).max() < 0.03
+
+
+def test_no_toe_and_no_ankle_goes_below_the_ground():
+    root, joints = stood(), pose()
+    found = positions_of(root, place(root, joints, toes_of(root, joints) - 0.2))
+    assert found[[4, 8], 1].min() > LOCK.toe_height - 2e-3
+    assert found[[3, 7], 1].min() > LOCK.ankle_height - 2e-3
+
+
+def test_feet_that_slide_stand():
+    motion = drift(0.05)
+    found = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
+    toes = joint_positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
+    # The first frame has no speed, and the second begins the contact.
+    moved = np.linalg.norm(np.asarray(toes)[15:] - np.asarray(toes)[15], axis=-1)
+    assert moved.max() < 1e-3
+    np.testing.assert_array_equal(found.root_position, motion.root_position)
+
+
+def test_a_lock_ends_at_its_radius():
+    """At 0.3 m/s the toe lies 0.2 m behind after two thirds of a second."""
+    states, state = [], foot_lock.init_lock(SKELETON)
+    motion = drift(0.3, seconds=1.5)
+    step = jax.jit(functools.partial(foot_lock.step_lock, fps=FPS, lock=LOCK))
+    toes = joint_positions(SKELETON, motion)[:, jnp.array(SKELETON.feet)]
+    for now in toes:
+        state = step(state, now)
+        states.append(np.asarray(state.locked))
+    locked = np.array(states)
+    last = np.flatnonzero(locked[:, 0])[-1]
+    assert abs(last / FPS - (0.2 / 0.3 + 1 / FPS)) < 0.1
+    assert not locked[last + 1 :].any()
+
+
+def test_nothing_jumps():
+    """Toes go from a stand to a swing and back: steps stay near the model's own."""
+    frames = 120
+    time = np.arange(frames) / FPS
+    swing = np.clip(np.sin(2 * np.pi * time / 2), 0, None)
+    joints = np.stack([np.asarray(pose(0.3 + 0.6 * float(x))) for x in swing])
+    path = np.zeros((frames, 3), np.float32)
+    path[:, 2] = 0.1 * time
+    motion = Motion(
+        root_position=jnp.asarray(stood() + path),
+        joint_rotation=jnp.asarray(joints),
+        fps=FPS,
+    )
+    found = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
+    step = lambda x: np.abs(np.diff(joint_positions(SKELETON, x), axis=0)).max()  # noqa: E731
+    assert step(found) < step(motion) + 0.02
+
+
+def test_contacts_have_hysteresis():
+    ask = functools.partial(foot_lock.contacts, lock=LOCK)
+    between = jnp.array([(LOCK.begin_speed + LOCK.end_speed) / 2])
+    low, no, yes = jnp.array([0.0]), jnp.array([False]), jnp.array([True])
+    assert not ask(no, between, low)[0] and ask(yes, between, low)[0]
+    high = jnp.array([(LOCK.begin_height + LOCK.end_height) / 2])
+    assert not ask(no, low, high)[0] and ask(yes, low, high)[0]
+    assert not ask(yes, jnp.array([LOCK.end_speed]), low)[0]
+
+
+def test_gradients_are_finite_everywhere():
+    def loss(angles):
+        joints = pose(0.3).at[:, 4:].add(angles)
+        motion = drift(0.05, seconds=0.3)
+        motion = dataclasses.replace(
+            motion, joint_rotation=jnp.broadcast_to(joints, (9, 9, 6))
+        )
+        found = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
+        return jnp.sum(found.joint_rotation**2)
+
+    gradient = jax.grad(loss)(jnp.zeros((9, 2)))
+    assert np.isfinite(np.asarray(gradient)).all()
+    straight = jax.grad(lambda x: jnp.sum(place(stood(), pose(0.0), x)))
+    assert np.isfinite(np.asarray(straight(toes_of(stood(), pose(0.0))))).all()
+
+
+def test_many_are_each_alone():
+    motions = [drift(0.05), drift(0.3)]
+    both = jax.tree.map(lambda *x: jnp.stack(x), *motions)
+    run = functools.partial(foot_lock.lock_motion, SKELETON, lock=LOCK)
+    found = jax.vmap(run)(both)
+    for i, motion in enumerate(motions):
+        np.testing.assert_allclose(
+            found.joint_rotation[i], run(motion).joint_rotation, atol=1e-5
+        )
+
+
+def test_a_controller_displays_locked_feet():
+    """A controller that plays a clip: the same as the clip locked on its own."""
+    motion = drift(0.05)
+
+    @dataclasses.dataclass(frozen=True)
+    class Shown:
+        root_position: jax.Array
+        joint_rotation: jax.Array
+
+    jax.tree_util.register_dataclass(Shown, ["root_position", "joint_rotation"], [])
+
+    def advance(tick, command):
+        shown = Shown(motion.root_position[tick], motion.joint_rotation[tick])
+        return tick + 1, shown
+
+    plays = rollout.Controller(
+        urgency=lambda state, command: jnp.zeros((), jnp.int32),
+        plans=(),
+        advance=advance,
+    )
+    made = foot_lock.locked(plays, SKELETON, fps=FPS, lock=LOCK)
+    start = foot_lock.LockedState(
+        inner=jnp.zeros((), jnp.int32), feet=foot_lock.init_lock(SKELETON)
+    )
+    _, frames = jax.lax.scan(made.advance, start, jnp.zeros(60))
+    want = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
+    np.testing.assert_allclose(frames.joint_rotation, want.joint_rotation, atol=1e-6)
+
+
+def test_a_skeleton_without_legs_is_refused(skeleton):
+    with pytest.raises(ValueError, match="expected hip, knee and ankle"):
+        foot_lock.legs(skeleton)
+    with pytest.raises(ValueError, match="names no feet"):
+        foot_lock.legs(dataclasses.replace(SKELETON, feet=()))
