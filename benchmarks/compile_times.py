@@ -178,7 +178,7 @@ def programs(args: Config) -> Iterator[tuple[str, Callable, tuple]]:
     )
 
     def scanned(params: Params, key: Key, condition: camdm_model.Condition) -> Array:
-        return camdm_model.planner(params, config=config)(key, condition)
+        return camdm_model.sampler(params, config=config)(key, condition)
 
     condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
     given = (params, jax.random.key(1), condition)

@@ -95,8 +95,8 @@ def our_calls(
     Returns:
       Calls without arguments.
     """
-    free = jax.jit(lambda p, k, c: camdm_model.planner(p, config=config)(k, c))
-    bound = jax.jit(lambda k, c: camdm_model.planner(params, config=config)(k, c))
+    free = jax.jit(lambda p, k, c: camdm_model.sampler(p, config=config)(k, c))
+    bound = jax.jit(lambda k, c: camdm_model.sampler(params, config=config)(k, c))
     free, _ = timing.compile_program(free, params, *given)
     bound, _ = timing.compile_program(bound, *given)
     return {

@@ -100,7 +100,7 @@ def sampler(
     """
 
     def plans(params: Params, keys: Array, conditions: camdm_model.Condition) -> Array:
-        plan = camdm_model.planner(params, config=config)
+        plan = camdm_model.sampler(params, config=config)
         if batch == 1:
             return plan(keys[0], jax.tree.map(lambda x: x[0], conditions))
         if not chunk or batch < 16:

@@ -71,7 +71,7 @@ def make_load(run: Path | None, *, width: int, seconds: float) -> workload.Load:
     config, params, space, data, joints = _trained(run) if run else _random(width)
 
     def controller(params: Params) -> Any:
-        step = aamdm_model.transition(params["networks"], config=config)
+        step = aamdm_model.sampler(params["networks"], config=config)
         return aamdm_controller.controller(
             aamdm_controller.guided(step, scale=0.0),
             params["space"],

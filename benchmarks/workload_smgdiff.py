@@ -85,7 +85,7 @@ def program(
     def plans(
         params: Params, keys: Array, conditions: smgdiff_model.Condition
     ) -> Array:
-        plan = smgdiff_guidance.planner(
+        plan = smgdiff_guidance.sampler(
             params, config=config, representation=representation, guided=guidance
         )
         if batch == 1:

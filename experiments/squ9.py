@@ -113,7 +113,7 @@ def train_aamdm(args: Config, key):
         window=3,
     )
     trained = {"polisher": state.ema_params, "generator": gan.generator.ema_params}
-    return aamdm_model.transition(trained, config=config)
+    return aamdm_model.sampler(trained, config=config)
 
 
 def train_baseline(args: Config, key, module, config, *, window: int):

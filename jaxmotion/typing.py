@@ -49,11 +49,12 @@ class ConditionalDenoiser(Protocol):
 
 @runtime_checkable
 class Step(Protocol):
-    """One step of the reverse chain: x_t -> x_{t-1}."""
+    """One step of the reverse chain: x_t -> x_{t-1}.
 
-    def __call__(
-        self, key: Key, x_t: Float[Array, "*shape"], t: Int[Array, ""], /
-    ) -> Float[Array, "*shape"]:
+    x is a sample, or for a step that looks back a pytree of the sample and its history.
+    """
+
+    def __call__(self, key: Key, x_t: Any, t: Int[Array, ""], /) -> Any:
         """Maps x_t at step t (1..T) to x_{t-1}."""
         ...
 

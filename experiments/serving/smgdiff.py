@@ -35,8 +35,8 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
     past = jax.tree.map(lambda x: x[0], known.past)
     skeleton = model.representation.skeleton
     driver = smgdiff_controller.controller(
-        smgdiff_trajectory.generator(path_params, config=paths.paths),
-        smgdiff_guidance.planner(
+        smgdiff_trajectory.sampler(path_params, config=paths.paths),
+        smgdiff_guidance.sampler(
             params,
             config=model.config,
             representation=model.representation,

@@ -19,7 +19,7 @@ from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.model import Model
 from jaxmotion.systems.smgdiff.training import Run
-from jaxmotion.systems.smgdiff.trajectory import Generate
+from jaxmotion.systems.smgdiff.trajectory import SamplePath
 from smgdiff_tasks.tables import guidance_of
 
 # The direction of the command turns by so much, every so often.
@@ -56,7 +56,7 @@ def commands(model: Model, skills: tuple[str, ...], *, seconds: float) -> Comman
     )
 
 
-def generator_of(run: Run, stage: str) -> Generate:
+def generator_of(run: Run, stage: str) -> SamplePath:
     """Paths of a stage, or straight ones.
 
     Args:
@@ -69,7 +69,7 @@ def generator_of(run: Run, stage: str) -> Generate:
     if stage == "straight":
         return smgdiff_players.straight(run.model)
     model, params = smgdiff_training.load_stage(run, stage)
-    return smgdiff_trajectory.generator(params, config=model.paths)
+    return smgdiff_trajectory.sampler(params, config=model.paths)
 
 
 def play(args: Any, run: Run, out: Path) -> None:
@@ -85,7 +85,7 @@ def play(args: Any, run: Run, out: Path) -> None:
     steered = commands(model, args.skills or model.labels, seconds=args.seconds)
     driver = smgdiff_controller.controller(
         generator_of(run, args.paths),
-        smgdiff_guidance.planner(
+        smgdiff_guidance.sampler(
             params,
             config=model.config,
             representation=features,

@@ -20,7 +20,7 @@ from jaxmotion.systems.smgdiff import players as smgdiff_players
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.evaluation import Setting
-from jaxmotion.systems.smgdiff.guidance import SCHEDULES, UNGUIDED, Guidance, Plan
+from jaxmotion.systems.smgdiff.guidance import SCHEDULES, UNGUIDED, Guidance, SamplePlan
 from jaxmotion.systems.smgdiff.model import Model
 from jaxmotion.systems.smgdiff.training import Run
 
@@ -75,7 +75,7 @@ def guidance_of(args: Any, schedule: str) -> Guidance:
     )
 
 
-def _milliseconds(plan: Plan, setting: Setting) -> Cell:
+def _milliseconds(plan: SamplePlan, setting: Setting) -> Cell:
     """Time of one plan at batch 1; its parameters are constants of the program."""
     condition = jax.tree.map(lambda x: x[0], setting.known.condition)
     return columns.milliseconds(jax.jit(lambda key: plan(key, condition)))
@@ -85,7 +85,7 @@ def _plan_row(
     run: Run, setting: Setting, steps: int, guided: Guidance, chunk: int
 ) -> tuple[dict[str, Cell], by_frame.ByFrame]:
     model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
-    plan = smgdiff_guidance.planner(
+    plan = smgdiff_guidance.sampler(
         params, config=model.config, representation=model.representation, guided=guided
     )
     many = smgdiff_evaluation.plan_many(plan, model, chunk=chunk)
@@ -178,7 +178,7 @@ def _generators(run: Run) -> dict[str, tuple[Model, Any]]:
     found = {}
     for folder in sorted(run.folder.glob("paths_*")):
         model, params = smgdiff_training.load_stage(run, folder.name)
-        found[f"generator, T = {model.paths.num_steps}"] = smgdiff_trajectory.generator(
+        found[f"generator, T = {model.paths.num_steps}"] = smgdiff_trajectory.sampler(
             params, config=model.paths
         )
     return found
@@ -210,7 +210,7 @@ def paths(args: Any, run: Run, setting: Setting) -> tuple[Rows, dict[str, Any]]:
     every = {"straight paths": smgdiff_players.straight(model)} | generators
     for name, generate in every.items():
         for schedule in ("none", "end 2"):
-            plan = smgdiff_guidance.planner(
+            plan = smgdiff_guidance.sampler(
                 params,
                 config=model.config,
                 representation=model.representation,

@@ -251,7 +251,7 @@ def bench(job: Job) -> Bench:
     def sampler(point: Point) -> Callable[[Array], Array]:
         own = _run_of(job, run, point)
         condition = condition_of(own, seed=job.seed)
-        plan = camdm_model.planner(own.params, config=own.model.config)
+        plan = camdm_model.sampler(own.params, config=own.model.config)
         return jax.jit(lambda key: plan(key, condition))
 
     def rollout(point: Point, folder: Path) -> None:

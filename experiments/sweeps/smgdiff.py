@@ -13,7 +13,7 @@ from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import training as smgdiff_training
-from jaxmotion.systems.smgdiff.guidance import UNGUIDED, Plan
+from jaxmotion.systems.smgdiff.guidance import UNGUIDED, SamplePlan
 from sweeps import points
 from sweeps.budgets import Amount
 from sweeps.points import Point
@@ -94,9 +94,9 @@ def bench(job: Job) -> Bench:
     ground_truth, noise_floor = script.tables.real_rows(run, setting).values()
     condition = jax.tree.map(lambda x: x[0], setting.known.condition)
 
-    def planner(point: Point) -> Plan:
+    def plans_of(point: Point) -> SamplePlan:
         model, params = smgdiff_training.load_stage(run, _stage(point))
-        return smgdiff_guidance.planner(
+        return smgdiff_guidance.sampler(
             params,
             config=model.config,
             representation=model.representation,
@@ -105,13 +105,13 @@ def bench(job: Job) -> Bench:
 
     def score(point: Point) -> Row:
         many = smgdiff_evaluation.plan_many(
-            planner(point), run.model, chunk=budget["chunk"]
+            plans_of(point), run.model, chunk=budget["chunk"]
         )
         found = columns.row(smgdiff_evaluation.score_plans(setting, many))
         return {column: found[column] for column in ground_truth}
 
     def sampler(point: Point) -> Callable[[Array], Array]:
-        plan = planner(point)
+        plan = plans_of(point)
         return jax.jit(lambda key: plan(key, condition))
 
     def rollout(point: Point, folder: Path) -> None:

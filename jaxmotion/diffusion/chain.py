@@ -5,28 +5,59 @@ a step x_t -> x_{t-1}. The step's key is `fold_in(key, t)`, so the noise of step
 not depend on where the chain was entered: a chain cut in two equals the whole chain,
 and "guide only the last two steps" is two calls with one key.
 
+What the chain walks is any pytree. For most steps it is the sample; a step that looks
+back (`Multistep`) walks the sample together with its history, and `sample_from` and
+`sample` hide that: they take a sample and return one, whatever the step carries.
+
+Samplers take a step factory, `(schedule, denoise) -> step`: `ancestral_step`,
+`ddim_step`, `dpm_solver_step`, or a `functools.partial` of one.
+
 Functions here take callables and are not jitted; jit the whole program around them.
 """
 
+import dataclasses
 import operator
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.diffusion import schedule as _schedule
 from jaxmotion.diffusion.schedule import Schedule
 from jaxmotion.typing import Denoiser, Key, Step
 
+StepFactory = Callable[[Schedule, Denoiser], Step]
+
+
+@dataclasses.dataclass(frozen=True)
+class Multistep:
+    """A step that looks back: what the chain walks is the sample and its history.
+
+    Attributes:
+      step: Maps (key, state at t, t) to the state at t - 1.
+      init: Maps a sample to a state without history.
+      finish: Maps a state to its sample.
+    """
+
+    step: Step
+    init: Callable[[Array], Any]
+    finish: Callable[[Any], Array]
+
+    def __call__(self, key: Key, state: Any, t: Int[Array, ""], /) -> Any:
+        """Maps the state at t to that at t - 1."""
+        return self.step(key, state, t)
+
 
 def reverse_chain(
     step: Step,
     key: Key,
-    x: Float[Array, "*shape"],
+    x: Any,
     *,
     start: int,
     stop: int = 0,
-) -> Float[Array, "*shape"]:
+) -> Any:
     """Takes x from step `start` down to step `stop`.
 
     With start = stop it returns x. Cutting the chain anywhere, with the same key for
@@ -35,13 +66,13 @@ def reverse_chain(
     Args:
       step: Maps (key, x_t, t) to x_{t-1}.
       key: Consumed; step t gets `fold_in(key, t)`.
-      x: Sample at step `start`.
+      x: What the step walks at step `start`: a sample, or any pytree of arrays.
       start: First t, at most the T of the step's schedule (the chain cannot see the
         schedule: a larger start clamps); static.
       stop: Step at which the result lies, 0 = clean; static.
 
     Returns:
-      Sample at step `stop`.
+      The same at step `stop`.
 
     Raises:
       ValueError: unless start >= stop >= 0, both integers.
@@ -49,44 +80,56 @@ def reverse_chain(
     Source: Ho et al. 2020, alg. 2.
     """
 
-    def body(x_t: Array, t: Array) -> tuple[Array, None]:
+    def body(x_t: Any, t: Array) -> tuple[Any, None]:
         return step(jax.random.fold_in(key, t), x_t, t), None
 
-    return jax.lax.scan(body, jnp.asarray(x), _countdown(start, stop))[0]
+    x = jax.tree.map(jnp.asarray, x)
+    return jax.lax.scan(body, x, _countdown(start, stop))[0]
 
 
 def reverse_chain_trace(
+    step: Step,
+    key: Key,
+    x: Any,
+    *,
+    start: int,
+    stop: int = 0,
+) -> tuple[Any, Any]:
+    """Like `reverse_chain`, and keeps every state on the way.
+
+    Returns:
+      x at step `stop`, and x at steps start - 1, start - 2, ..., stop on a new leading
+      axis: the last of them is the first result.
+
+    Raises:
+      ValueError: unless start >= stop >= 0, both integers.
+    """
+
+    def body(x_t: Any, t: Array) -> tuple[Any, Any]:
+        x_prev = step(jax.random.fold_in(key, t), x_t, t)
+        return x_prev, x_prev
+
+    x = jax.tree.map(jnp.asarray, x)
+    return jax.lax.scan(body, x, _countdown(start, stop))
+
+
+def sample_from(
     step: Step,
     key: Key,
     x: Float[Array, "*shape"],
     *,
     start: int,
     stop: int = 0,
-) -> tuple[Float[Array, "*shape"], Float[Array, "steps *shape"]]:
-    """Like `reverse_chain`, and keeps every state on the way.
+) -> Float[Array, "*shape"]:
+    """`reverse_chain` from a sample to a sample: a `Multistep` begins without history.
 
-    Args:
-      step: Maps (key, x_t, t) to x_{t-1}.
-      key: Consumed; step t gets `fold_in(key, t)`.
-      x: Sample at step `start`.
-      start: First t; static.
-      stop: Step at which the result lies, 0 = clean; static.
-
-    Returns:
-      Sample at step `stop`, and the samples at steps start - 1, start - 2, ..., stop:
-      the last of them is the first result.
-
-    Raises:
-      ValueError: unless start >= stop >= 0, both integers.
-
-    Source: Ho et al. 2020, alg. 2.
+    To cut the chain of a `Multistep` in two and keep its history, walk its state by
+    `reverse_chain`.
     """
-
-    def body(x_t: Array, t: Array) -> tuple[Array, Array]:
-        x_prev = step(jax.random.fold_in(key, t), x_t, t)
-        return x_prev, x_prev
-
-    return jax.lax.scan(body, jnp.asarray(x), _countdown(start, stop))
+    if not isinstance(step, Multistep):
+        return reverse_chain(step, key, x, start=start, stop=stop)
+    state = reverse_chain(step, key, step.init(x), start=start, stop=stop)
+    return step.finish(state)
 
 
 def ancestral_step(schedule: Schedule, denoise: Denoiser) -> Step:
@@ -160,6 +203,69 @@ def ddim_step(
     return step
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class SolverState:
+    """What DPM-Solver++ 2M walks.
+
+    Attributes:
+      x: Sample at step t.
+      x_0: Prediction of the step before, from t + 1.
+      known: Whether there was a step before.
+    """
+
+    x: Float[Array, "*shape"]
+    x_0: Float[Array, "*shape"]
+    known: Bool[Array, ""]
+
+
+def dpm_solver_step(schedule: Schedule, denoise: Denoiser) -> Multistep:
+    """Step of DPM-Solver++ 2M: DDIM without noise, of second order in the step size.
+
+    With a = sqrt(alpha_bar), s = sqrt(1 - alpha_bar) and l = log(a / s), the ODE whose
+    solutions have the marginals of the diffusion is, for a denoiser D(x, l) = x_0,
+
+        d(x / s) / dl = e^l D      so that, over h = l_{t-1} - l_t,
+
+        x_{t-1} = (s_{t-1} / s_t) x_t + s_{t-1} int_{l_t}^{l_{t-1}} e^l D(l) dl.
+
+    A constant D gives the factor a_{t-1} (1 - e^{-h}) of D(x_t), which is DDIM. Here D
+    is a line through the predictions of this step and of the one before, a distance h'
+    away; the line's value in the middle of the step makes the integral exact to
+    O(h^3):
+
+        D = D_t + h / (2 h') (D_t - D_{t+1})
+        x_{t-1} = (s_{t-1} / s_t) x_t + a_{t-1} (1 - e^{-h}) D
+
+    The first step, which has no predecessor, and the last, whose h is infinite, take
+    D_t alone; at t = 1 the result is the prediction itself. It draws no noise;
+    `respace` the schedule to skip steps.
+
+    Source: Lu et al. 2022, "DPM-Solver++", alg. 2, with its first-order last step.
+    """
+    log_ratio = 0.5 * (schedule.log_alpha_bar - jnp.log(schedule.one_minus_alpha_bar))
+
+    def step(key: Key, state: SolverState, t: Int[Array, ""], /) -> SolverState:
+        x_t, dtype = state.x, state.x.dtype
+        key_denoise, _ = jax.random.split(key)
+        x_0 = denoise(key_denoise, x_t, t).astype(dtype)
+        h, h_before = log_ratio[t - 1] - log_ratio[t], log_ratio[t] - log_ratio[t + 1]
+        second = state.known & (t > 1)
+        share = jnp.where(second, h / (2.0 * jnp.where(second, h_before, 1.0)), 0.0)
+        line = x_0 + share.astype(dtype) * (x_0 - state.x_0)
+        alpha_bar, rest = schedule.alpha_bar[t - 1], schedule.one_minus_alpha_bar
+        keep = jnp.sqrt(rest[t - 1] / rest[t]).astype(dtype)
+        take = (-jnp.sqrt(alpha_bar) * jnp.expm1(-h)).astype(dtype)
+        x = keep * x_t + take * line
+        return SolverState(x=x, x_0=x_0, known=jnp.ones_like(state.known))
+
+    def init(x: Float[Array, "*shape"]) -> SolverState:
+        x = jnp.asarray(x)
+        return SolverState(x=x, x_0=jnp.zeros_like(x), known=jnp.zeros((), bool))
+
+    return Multistep(step, init, lambda state: state.x)
+
+
 def sample(
     step: Step, key: Key, shape: tuple[int, ...], *, num_steps: int
 ) -> Float[Array, "..."]:
@@ -181,7 +287,7 @@ def sample(
     """
     key_start, key_chain = jax.random.split(key)
     x = jax.random.normal(key_start, shape)
-    return reverse_chain(step, key_chain, x, start=num_steps)
+    return sample_from(step, key_chain, x, start=num_steps)
 
 
 def _countdown(start: int, stop: int) -> Int[Array, " steps"]:

@@ -119,7 +119,7 @@ def test_unrolled_sampler_is_the_scanned_one(load):
     config = tiny.config(num_steps=2)
     params = tiny.random_params(camdm_model.init, config)
     condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
-    scan = jax.jit(camdm_model.planner(params, config=config))
+    scan = jax.jit(camdm_model.sampler(params, config=config))
     loop = jax.jit(lambda k, c: compile_times.unrolled(config, params, k, c))
     found, expected = (f(jax.random.key(0), condition) for f in (loop, scan))
     np.testing.assert_allclose(found, expected, atol=1e-5)

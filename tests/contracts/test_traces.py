@@ -51,7 +51,7 @@ def test_a_planner_is_traced_once():
     @jax.jit
     @chex.assert_max_traces(n=1)
     def plan(params, key, condition, scale):
-        return camdm_model.planner(params, config=CONFIG)(key, condition, scale=scale)
+        return camdm_model.sampler(params, config=CONFIG)(key, condition, scale=scale)
 
     results = [
         plan(

@@ -283,3 +283,94 @@ def test_bad_range_of_steps(run, start, stop):
 def test_bad_eta(eta):
     with pytest.raises(ValueError, match="eta is"):
         chain.ddim_step(schedule.cosine_schedule(T), tanh_denoiser, eta=eta)
+
+
+def even_schedule(num_steps, highest=1.9, lowest=-1.9):
+    """Steps of equal size in log(signal / noise), from `lowest` up to `highest`."""
+    ratio = np.linspace(highest, lowest, num_steps)
+    log_alpha_bar = np.append(0.0, -np.log1p(np.exp(-2 * ratio)))
+    beta = np.append(0.0, -np.expm1(np.diff(log_alpha_bar)))
+    return schedule.Schedule(
+        beta=jnp.asarray(beta, jnp.float32),
+        log_alpha_bar=jnp.asarray(log_alpha_bar, jnp.float32),
+    )
+
+
+def gaussian_denoiser(table):
+    """Posterior mean of x_0 ~ N(MEAN, VARIANCE)."""
+
+    def denoise(key, x_t, t):
+        del key
+        alpha_bar, noise = table.alpha_bar[t], table.one_minus_alpha_bar[t]
+        gain = jnp.sqrt(alpha_bar) * VARIANCE / (alpha_bar * VARIANCE + noise)
+        return MEAN + gain * (x_t - jnp.sqrt(alpha_bar) * MEAN)
+
+    return denoise
+
+
+def flow(table, x, start, stop):
+    """The flow's solution: the normalized deviation from the mean does not change."""
+    alpha_bar = np.exp(np.float64(table.log_alpha_bar))
+    deviation = lambda t: np.sqrt(alpha_bar[t] * VARIANCE + 1 - alpha_bar[t])  # noqa: E731
+    mean = lambda t: np.sqrt(alpha_bar[t]) * MEAN  # noqa: E731
+    return mean(stop) + deviation(stop) / deviation(start) * (x - mean(start))
+
+
+@pytest.mark.parametrize(
+    ("factory", "order"), [(chain.ddim_step, 1), (chain.dpm_solver_step, 2)]
+)
+def test_order_of_convergence_against_the_closed_form(factory, order):
+    x, errors = np.array([-1.7, -0.4, 0.9, 2.2]), []
+    for num_steps in (33, 65, 129):
+        table = even_schedule(num_steps)
+        step = factory(table, gaussian_denoiser(table))
+        found = chain.sample_from(
+            step, jax.random.key(0), jnp.float32(x), start=num_steps, stop=1
+        )
+        errors.append(np.abs(found - flow(table, x, num_steps, 1)).max())
+    rates = np.log2(np.array(errors[:-1]) / errors[1:])
+    np.testing.assert_allclose(rates, order, atol=0.15)
+    if order == 2:
+        assert errors[-1] < 1e-4
+
+
+def test_dpm_solver_begins_as_ddim_and_ends_with_the_prediction():
+    table = schedule.cosine_schedule(T)
+    solver = chain.dpm_solver_step(table, tanh_denoiser)
+    ddim = chain.ddim_step(table, tanh_denoiser)
+    one = dict(start=T, stop=T - 1)
+    np.testing.assert_allclose(
+        chain.sample_from(solver, jax.random.key(0), random(0), **one),
+        chain.sample_from(ddim, jax.random.key(0), random(0), **one),
+        atol=1e-6,
+    )
+    state = chain.reverse_chain(
+        solver, jax.random.key(0), solver.init(random(0)), start=T, stop=1
+    )
+    last = solver(jax.random.key(1), state, jnp.array(1))
+    np.testing.assert_allclose(
+        solver.finish(last), tanh_denoiser(None, state.x, jnp.array(1)), atol=1e-6
+    )
+
+
+def test_a_cut_chain_keeps_the_history_that_it_walks():
+    table = schedule.cosine_schedule(T)
+    solver = chain.dpm_solver_step(table, tanh_denoiser)
+    run = lambda x, **cut: chain.reverse_chain(solver, jax.random.key(0), x, **cut)  # noqa: E731
+    start = solver.init(random(0))
+    whole = run(start, start=T)
+    parts = run(run(start, start=T, stop=3), start=3)
+    np.testing.assert_allclose(parts.x, whole.x, atol=1e-6)
+    # Without its history the second part begins with a step of first order.
+    forgotten = solver.init(run(start, start=T, stop=3).x)
+    assert np.abs(run(forgotten, start=3).x - whole.x).max() > 1e-4
+
+
+def test_a_multistep_samples_like_any_step():
+    table = schedule.cosine_schedule(T)
+    solver = chain.dpm_solver_step(table, noisy_denoiser)
+    draw = lambda k: chain.sample(solver, k, (3,), num_steps=T)  # noqa: E731
+    alone = draw(jax.random.split(jax.random.key(0), 4)[2])
+    together = jax.jit(jax.vmap(draw))(jax.random.split(jax.random.key(0), 4))
+    assert together.shape == (4, 3) and np.isfinite(together).all()
+    np.testing.assert_allclose(together[2], alone, atol=1e-5)

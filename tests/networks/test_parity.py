@@ -94,7 +94,7 @@ def test_sampler():
     with jax.debug_key_reuse(False):
         keys = jax.random.split(jax.random.key(2), BATCH)
         noise = jax.jit(jax.vmap(noises, out_axes=1))(keys)
-        plan = camdm_model.planner(parameters(), config=CONFIG)
+        plan = camdm_model.sampler(parameters(), config=CONFIG)
         ours = jax.jit(jax.vmap(plan))(keys, condition)
     beta = schedule.cosine_schedule(CONFIG.num_steps).beta
     table = torch_camdm.posterior_table(np.asarray(beta))

@@ -28,7 +28,7 @@ from jaxmotion.motion.features import unpack
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
 from jaxmotion.systems.aamdm import space as aamdm_space
 from jaxmotion.systems.aamdm.embedding import PATH
-from jaxmotion.systems.aamdm.model import Transition
+from jaxmotion.systems.aamdm.model import Sample
 from jaxmotion.systems.aamdm.space import Space
 from jaxmotion.typing import Key, Objective
 
@@ -160,11 +160,11 @@ def path_objective(goal: Float[Array, " 12"]) -> Objective:
     return objective
 
 
-def guided(transition: Transition, *, scale: float | Float[Array, ""]) -> Stepper:
+def guided(sample: Sample, *, scale: float | Float[Array, ""]) -> Stepper:
     """AAMDM as a stepper: steered by the gradient of the objective.
 
     Args:
-      transition: From `aamdm.transition`.
+      sample: From `aamdm_model.sampler`.
       scale: Strength of the guidance, epsilon of eq. 13.
 
     Returns:
@@ -173,9 +173,9 @@ def guided(transition: Transition, *, scale: float | Float[Array, ""]) -> Steppe
 
     def step(key: Key, previous: Array, goal: Array | None) -> Array:
         if goal is None:
-            return transition(key, previous)
+            return sample(key, previous)
         objective = path_objective(goal)
-        return transition(key, previous, objective=objective, scale=scale)
+        return sample(key, previous, objective=objective, scale=scale)
 
     return step
 

@@ -238,12 +238,16 @@ def polish(
     return denoise
 
 
-Transition = Callable[..., Float[Array, "*batch features"]]
+Sample = Callable[..., Float[Array, "*batch features"]]
 
 
-def transition(
-    params: Params, *, config: Config, change: Float[Array, " features"] | None = None
-) -> Transition:
+def sampler(
+    params: Params,
+    *,
+    config: Config,
+    change: Float[Array, " features"] | None = None,
+    step: chain.StepFactory = chain.ancestral_step,
+) -> Sample:
     """The sampler of the next frame.
 
     Args:
@@ -251,9 +255,11 @@ def transition(
         one that takes no steps may be missing.
       config: The method.
       change: Deviation of each channel's changes; for `target` "change" only.
+      step: Makes the chain's step from the schedule and a denoiser; the default is the
+        paper's. One that looks back forgets where the polisher takes over.
 
     Returns:
-      `step(key, previous, *, objective=None, scale=0.0) -> next`. With an objective
+      `sample(key, previous, *, objective=None, scale=0.0) -> next`. With an objective
       of the predicted frame every step is guided down its gradient (eq. 13).
 
     Raises:
@@ -262,7 +268,7 @@ def transition(
     check_change(config, change)
     table = config.table()
 
-    def step(
+    def sample(
         key: Key,
         previous: Float[Array, "*batch features"],
         *,
@@ -277,8 +283,8 @@ def transition(
                     lambda x_0: objective(from_target(x_0, previous, change)),
                     scale=scale,
                 )
-            step = chain.ancestral_step(table, denoise)
-            return chain.reverse_chain(step, key_chain, x, start=start, stop=stop)
+            move = step(table, denoise)
+            return chain.sample_from(move, key_chain, x, start=start, stop=stop)
 
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, previous.shape, previous.dtype)
@@ -290,4 +296,4 @@ def transition(
             x = part(polisher, x, config.polishes, 0)
         return from_target(x, previous, change)
 
-    return step
+    return sample

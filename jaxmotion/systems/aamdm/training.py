@@ -25,7 +25,7 @@ from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
 from jaxmotion.systems.aamdm.data import PoseData, starts
-from jaxmotion.systems.aamdm.model import Transition
+from jaxmotion.systems.aamdm.model import Sample
 from jaxmotion.systems.aamdm.space import Autoencoder, Space
 from jaxmotion.typing import Key, Params
 
@@ -563,8 +563,8 @@ def load_networks(
     return params, config
 
 
-def load_chain(run: Run, name: SpaceName, space: Space, **chain: Any) -> Transition:
-    """The transition of a trained chain.
+def load_chain(run: Run, name: SpaceName, space: Space, **chain: Any) -> Sample:
+    """The sampler of a trained chain.
 
     Args:
       run: The run.
@@ -573,11 +573,11 @@ def load_chain(run: Run, name: SpaceName, space: Space, **chain: Any) -> Transit
       **chain: As of `load_networks`.
 
     Returns:
-      The transition.
+      The sampler.
 
     Raises:
       CheckpointError, ValueError: as `load_networks`.
     """
     params, config = load_networks(run, name, space, **chain)
     change = space.change if config.target == "change" else None
-    return aamdm_model.transition(params, config=config, change=change)
+    return aamdm_model.sampler(params, config=config, change=change)

@@ -312,7 +312,7 @@ def wanted_trajectory(
 
 
 def replan(
-    sample: camdm_model.Plan,
+    sample: camdm_model.Sample,
     key: Key,
     skeleton: Skeleton,
     state: CharacterState,
@@ -325,7 +325,7 @@ def replan(
     """Step 1: a new plan.
 
     Args:
-      sample: From `camdm.planner`.
+      sample: From `camdm.sampler`.
       key: Consumed.
       skeleton: The skeleton.
       state: The character's state.
@@ -444,7 +444,7 @@ def controller(
     control = Control() if control is None else control
     if not 1 <= control.apply <= config.future:
         raise ValueError(f"apply is {control.apply}, expected 1..{config.future}")
-    sample = camdm_model.planner(params, config=config, table=table)
+    sample = camdm_model.sampler(params, config=config, table=table)
 
     def plan(guided: bool) -> Callable:
         return lambda key, state, command: replan(

@@ -244,17 +244,17 @@ def to_motion(
     )
 
 
-Plan = Callable[..., Float[Array, "future features"]]
+Sample = Callable[..., Float[Array, "future features"]]
 
 
-def planner(
+def sampler(
     params: Params,
     *,
     config: Config,
     table: schedule.Schedule | None = None,
-    step: Literal["ancestral", "ddim"] = "ancestral",
-) -> Plan:
-    """The sampler, with everything that the steps share computed once.
+    step: chain.StepFactory = chain.ancestral_step,
+) -> Sample:
+    """The sampler of plans, with everything that the steps share computed once.
 
     Inside a jitted function that closes over concrete parameters they are constants,
     which the compiler lays out once: fastest at batch 1, one program a model.
@@ -263,15 +263,15 @@ def planner(
       params: The network's parameters.
       config: The method.
       table: Schedule; None for the cosine one of `config.num_steps`.
-      step: "ancestral" (the paper's), or "ddim" for comparisons.
+      step: Makes the chain's step from the schedule and the denoiser; the default is
+        the paper's.
 
     Returns:
-      `plan(key, condition, *, scale=None) -> [future, features]`. With a scale, the
+      `sample(key, condition, *, scale=None) -> [future, features]`. With a scale, the
       prediction is null + scale (full - null), where null has no past (eq. 5);
       without, the network is called once a step.
     """
     net = network(config)
-    make_step = {"ancestral": chain.ancestral_step, "ddim": chain.ddim_step}[step]
 
     def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
         del key  # deterministic
@@ -281,7 +281,7 @@ def planner(
         arguments = condition.arguments(config)
         return net.apply({"params": params}, *arguments, method="encode")
 
-    def plan(key: Key, condition: Condition, *, scale=None) -> Array:
+    def sample(key: Key, condition: Condition, *, scale=None) -> Array:
         noise_table = schedule.cosine_schedule(config.num_steps)
         noise_table = noise_table if table is None else table
         context = encode(condition)
@@ -292,13 +292,13 @@ def planner(
             null = encode(dataclasses.replace(condition, keep_past=off))
             denoiser = guidance.classifier_free(denoise, context, null, scale)
         return chain.sample(
-            make_step(noise_table, denoiser),
+            step(noise_table, denoiser),
             key,
             (config.future, config.num_features),
             num_steps=noise_table.num_steps,
         )
 
-    return plan
+    return sample
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

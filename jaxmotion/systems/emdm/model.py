@@ -10,7 +10,7 @@ its latent from its key:
 What it is compared with are other settings of the same composition:
 
     MDM (DDPM)     latent=0, schedule="cosine", num_steps 50 or 1000
-    DDIM-10        the same weights, step="ddim", ten of the steps
+    DDIM-10        the same weights, step=chain.ddim_step, ten of the steps
     naive DDGAN    discriminator_condition=False, all weights of geometry 0
 
 Source: Zhou et al. 2024, "EMDM: Efficient Motion Diffusion Model for Fast and
@@ -269,7 +269,7 @@ def sampler(
     params: Params,
     *,
     config: Config,
-    step: Literal["ancestral", "ddim"] = "ancestral",
+    step: chain.StepFactory = chain.ancestral_step,
     steps: tuple[int, ...] | None = None,
 ) -> Sample:
     """The sampler of one motion, with what the steps share computed once.
@@ -280,7 +280,8 @@ def sampler(
     Args:
       params: The generator's.
       config: The method.
-      step: "ancestral" (EMDM, DDPM), or "ddim" without noise.
+      step: Makes the chain's step from the schedule and the denoiser; the default is
+        that of EMDM and DDPM.
       steps: Steps of the schedule to visit, increasing; None for all.
 
     Returns:
@@ -289,7 +290,6 @@ def sampler(
       network is called once a step.
     """
     net = generator(config)
-    make_step = {"ancestral": chain.ancestral_step, "ddim": chain.ddim_step}[step]
 
     def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
         told = t if steps is None else jnp.asarray(steps, jnp.int32)[t - 1]
@@ -313,7 +313,7 @@ def sampler(
             denoiser = guidance.classifier_free(denoise, context, null, scale)
         shape = (config.frames, config.features)
         return chain.sample(
-            make_step(table, denoiser), key, shape, num_steps=table.num_steps
+            step(table, denoiser), key, shape, num_steps=table.num_steps
         )
 
     return sample

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxmotion import files
+from jaxmotion.diffusion import chain
 from jaxmotion.learning import adversarial, checkpoint, runs, training
 from jaxmotion.learning.runs import Budget
 from jaxmotion.systems.emdm import loss as emdm_loss
@@ -311,7 +312,7 @@ def row_sampler(params: Params, config: Config, row: str) -> emdm_model.Sample:
     if row not in SAMPLERS:
         return emdm_model.sampler(params, config=config)
     steps = ddim_steps(config.num_steps, SAMPLERS[row][1])
-    return emdm_model.sampler(params, config=config, step="ddim", steps=steps)
+    return emdm_model.sampler(params, config=config, step=chain.ddim_step, steps=steps)
 
 
 def guidance_scale(scale: float | None, *, default: float) -> Array | None:

@@ -30,10 +30,10 @@ from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
-from jaxmotion.systems.smgdiff.guidance import Plan
+from jaxmotion.systems.smgdiff.guidance import SamplePlan
 from jaxmotion.systems.smgdiff.model import Condition, Config
 from jaxmotion.systems.smgdiff.scene import Representation
-from jaxmotion.systems.smgdiff.trajectory import Generate, Wish
+from jaxmotion.systems.smgdiff.trajectory import SamplePath, Wish
 from jaxmotion.typing import Key
 
 
@@ -168,7 +168,7 @@ __all__ = [
 
 
 def wanted_trajectory(
-    generate: Generate,
+    generate: SamplePath,
     key: Key,
     skeleton: Skeleton,
     state: PlayerState,
@@ -216,8 +216,8 @@ def wanted_trajectory(
 
 
 def replan(
-    generate: Generate,
-    sample: Plan,
+    generate: SamplePath,
+    sample: SamplePlan,
     key: Key,
     state: PlayerState,
     command: trajectory.Command,
@@ -230,7 +230,7 @@ def replan(
 
     Args:
       generate: From `smgdiff_trajectory`.
-      sample: From `smgdiff_guidance.planner`.
+      sample: From `smgdiff_guidance.sampler`.
       key: Consumed.
       state: The player's state.
       command: What the user wants now.
@@ -308,8 +308,8 @@ def advance(
 
 
 def controller(
-    generate: Generate,
-    sample: Plan,
+    generate: SamplePath,
+    sample: SamplePlan,
     *,
     representation: Representation,
     config: Config,
@@ -318,8 +318,8 @@ def controller(
     """The run-time of one player, for `rollout.tick` and `rollout.rollout`.
 
     Args:
-      generate: Paths: `smgdiff_trajectory.generator`, or `straight`.
-      sample: Plans: `smgdiff_guidance.planner`.
+      generate: Paths: `smgdiff_trajectory.sampler`, or `straight`.
+      sample: Plans: `smgdiff_guidance.sampler`.
       representation: What features mean.
       config: The method.
       control: Constants; None for the defaults.

@@ -29,7 +29,7 @@ from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff import training as smgdiff_training
-from jaxmotion.systems.smgdiff.guidance import Plan
+from jaxmotion.systems.smgdiff.guidance import SamplePlan
 from jaxmotion.systems.smgdiff.model import Condition, Model
 from jaxmotion.systems.smgdiff.scene import Representation
 from jaxmotion.typing import Key, Params
@@ -308,12 +308,12 @@ def _situations(scenes: Scene, labels: Array, representation, config) -> Situati
 
 
 def plan_many(
-    plan: Plan, model: Model, *, chunk: int
+    plan: SamplePlan, model: Model, *, chunk: int
 ) -> Callable[[Key, Condition], Scene]:
     """Plans for many conditions, as one compiled program.
 
     Args:
-      plan: From `smgdiff_guidance.planner`.
+      plan: From `smgdiff_guidance.sampler`.
       model: Says what features mean.
       chunk: Plans at a time.
 

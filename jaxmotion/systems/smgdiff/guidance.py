@@ -21,7 +21,7 @@ from jaxmotion.systems.smgdiff.model import Condition, Config, network
 from jaxmotion.systems.smgdiff.scene import Representation, to_scene
 from jaxmotion.typing import Key, Objective, Params
 
-Plan = Callable[[Key, Condition], Float[Array, "future features"]]
+SamplePlan = Callable[[Key, Condition], Float[Array, "future features"]]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,23 +128,26 @@ def contact_objective(
     return objective
 
 
-def planner(
+def sampler(
     params: Params,
     *,
     config: Config,
     representation: Representation,
     guided: Guidance = Guidance(),
-) -> Plan:
-    """The sampler; gradients are compiled into the guided segments only.
+    step: chain.StepFactory = chain.ancestral_step,
+) -> SamplePlan:
+    """The sampler of plans; gradients are compiled into the guided segments only.
 
     Args:
       params: The network's parameters.
       config: The method.
       representation: What features mean.
       guided: Where and how contact guidance acts.
+      step: Makes the step of the unguided segments from the schedule and the denoiser;
+        the default is the paper's.
 
     Returns:
-      `plan(key, condition) -> [future, features]`.
+      `sample(key, condition) -> [future, features]`.
 
     Raises:
       ValueError: if more steps are guided than there are.
@@ -152,7 +155,7 @@ def planner(
     net, parts = network(config), segments(guided, config.num_steps)
     shape = (config.future, config.num_features)
 
-    def plan(key: Key, condition: Condition) -> Array:
+    def sample(key: Key, condition: Condition) -> Array:
         table = schedule.cosine_schedule(config.num_steps)
         context = net.apply({"params": params}, *condition.arguments(), method="encode")
 
@@ -164,7 +167,7 @@ def planner(
             condition.ball, representation=representation, guided=guided
         )
         steps = {
-            False: chain.ancestral_step(table, denoise),
+            False: step(table, denoise),
             True: guidance.dsg_step(
                 table,
                 denoise,
@@ -176,9 +179,8 @@ def planner(
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, shape)
         for is_guided, start, stop in parts:
-            x = chain.reverse_chain(
-                steps[is_guided], key_chain, x, start=start, stop=stop
-            )
+            move = steps[is_guided]
+            x = chain.sample_from(move, key_chain, x, start=start, stop=stop)
         return x
 
-    return plan
+    return sample

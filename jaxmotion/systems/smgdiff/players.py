@@ -22,9 +22,9 @@ from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.evaluation import Setting, Situations
-from jaxmotion.systems.smgdiff.guidance import Plan
+from jaxmotion.systems.smgdiff.guidance import SamplePlan
 from jaxmotion.systems.smgdiff.model import Model
-from jaxmotion.systems.smgdiff.trajectory import Generate, Wish
+from jaxmotion.systems.smgdiff.trajectory import SamplePath, Wish
 from jaxmotion.typing import Key
 
 Play = Callable[[Key, Situations], Scene]
@@ -54,8 +54,8 @@ def wishes(known: Situations, model: Model) -> Wish:
 
 
 def player(
-    generate: Generate,
-    plan: Plan,
+    generate: SamplePath,
+    plan: SamplePlan,
     model: Model,
     *,
     ticks: int,
@@ -181,7 +181,7 @@ def _diversity(scene: Scene, model: Model, repeats: int) -> Array:
 
 
 def noise_share(
-    key: Key, generate: Generate, known: Situations, model: Model, *, repeats: int
+    key: Key, generate: SamplePath, known: Situations, model: Model, *, repeats: int
 ) -> dict[str, Float[Array, ""]]:
     """How much generated paths depend on their noise.
 
@@ -220,14 +220,14 @@ def noise_share(
     }
 
 
-def straight(model: Model) -> Generate:
+def straight(model: Model) -> SamplePath:
     """The straight path of a model's lengths.
 
     Args:
       model: The model.
 
     Returns:
-      As `smgdiff_trajectory.generator`.
+      As `smgdiff_trajectory.sampler`.
     """
     config = model.config
     return functools.partial(

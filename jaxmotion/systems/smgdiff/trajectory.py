@@ -80,7 +80,7 @@ class Wish:
     label: Int[Array, "*batch"]
 
 
-Generate = Callable[[Key, Wish], trajectory.Trajectory]
+SamplePath = Callable[[Key, Wish], trajectory.Trajectory]
 
 
 def network(config: Config) -> TrajectoryGenerator:
@@ -202,31 +202,28 @@ def loss(
     return terms["data"] + config.weight_velocity * terms["velocity"], terms
 
 
-def generator(params: Params, *, config: Config) -> Generate:
+def sampler(
+    params: Params, *, config: Config, step: chain.StepFactory = chain.ancestral_step
+) -> SamplePath:
     """The sampler of paths.
 
-    Args:
-      params: The network's parameters.
-      config: The method.
-
     Returns:
-      `generate(key, wish) -> path` in the frame of the last displayed pose.
+      `sample(key, wish) -> path` in the frame of the last displayed pose.
     """
 
-    def generate(key: Key, wish: Wish) -> trajectory.Trajectory:
+    def sample(key: Key, wish: Wish) -> trajectory.Trajectory:
         def denoise(key: Key, x_t: Array, t: Array) -> Array:
             del key  # deterministic
             return _apply(params, x_t, t, wish, config)
 
         table = schedule.cosine_schedule(config.num_steps)
-        step = chain.ancestral_step(table, denoise)
         shape = (config.future, CHANNELS)
-        x = chain.sample(step, key, shape, num_steps=config.num_steps)
+        x = chain.sample(step(table, denoise), key, shape, num_steps=config.num_steps)
         return trajectory.Trajectory(
             position=x[:, :2] * config.meters, facing=ground.unit(x[:, 2:])
         )
 
-    return generate
+    return sample
 
 
 def straight(key: Key, wish: Wish, *, future: int, fps: float) -> trajectory.Trajectory:

@@ -143,7 +143,7 @@ def test_objective_is_half_the_squared_distance_of_the_path():
 
 
 def test_without_a_goal_the_step_is_the_transition():
-    transition = aamdm_model.transition(
+    transition = aamdm_model.sampler(
         tiny.random_params(aamdm_model.init, CONFIG), config=CONFIG
     )
     step = aamdm_controller.guided(transition, scale=0.5)
@@ -249,7 +249,7 @@ def test_frames_stay_within_the_bounds_of_the_data():
 
 def test_an_unsteered_character_ignores_its_commands():
     step = aamdm_controller.guided(
-        aamdm_model.transition(
+        aamdm_model.sampler(
             tiny.random_params(aamdm_model.init, CONFIG), config=CONFIG
         ),
         scale=1.0,
@@ -262,7 +262,7 @@ def test_an_unsteered_character_ignores_its_commands():
 
 def test_characters_together_are_what_each_is_alone():
     params = tiny.random_params(aamdm_model.init, CONFIG)
-    transition = aamdm_model.transition(params, config=CONFIG)
+    transition = aamdm_model.sampler(params, config=CONFIG)
     made = driver(aamdm_controller.guided(transition, scale=0.1))
     key, characters, ticks = jax.random.key(5), 3, 3
     states = [character([0.1 * c, 1.0], 0.5 * c) for c in range(characters)]

@@ -37,7 +37,7 @@ def test_drafts_come_before_polishes(drafts, polishes):
     config = dataclasses.replace(CONFIG, drafts=drafts, polishes=polishes)
     params = tiny.random_params(aamdm_model.init, config)
     key, previous = jax.random.key(1), normal(3)
-    found = jax.jit(aamdm_model.transition(params, config=config))(key, previous)
+    found = jax.jit(aamdm_model.sampler(params, config=config))(key, previous)
 
     key_start, key_chain = jax.random.split(jax.random.clone(key))
     x = jax.random.normal(key_start, (3,))
@@ -51,7 +51,7 @@ def test_drafts_come_before_polishes(drafts, polishes):
 
 
 def test_characters_batch_by_vmap_and_compile_once():
-    step = aamdm_model.transition(parameters(), config=CONFIG)
+    step = aamdm_model.sampler(parameters(), config=CONFIG)
     traced = chex.assert_max_traces(lambda *a: jax.vmap(step)(*a), n=1)
     run = jax.jit(traced)
     keys, previous = jax.random.split(jax.random.key(0), 4), normal(4, 3)
@@ -62,7 +62,7 @@ def test_characters_batch_by_vmap_and_compile_once():
 
 
 def test_guidance_lowers_its_objective():
-    step = aamdm_model.transition(parameters(), config=CONFIG)
+    step = aamdm_model.sampler(parameters(), config=CONFIG)
     goal = jnp.array([0.5, -0.5, 1.0])
     objective = lambda x: 0.5 * jnp.sum(jnp.square(x - goal))  # noqa: E731
 
@@ -149,7 +149,7 @@ def test_the_scale_of_changes_must_fit_the_target(config, change, message):
     players = params["generator"], params["discriminator"]
     for make in (
         lambda: aamdm_model.check_change(config, change),
-        lambda: aamdm_model.transition(params, **given),
+        lambda: aamdm_model.sampler(params, **given),
         lambda: aamdm_loss.polisher_loss(params["polisher"], key, windows, **given),
         lambda: aamdm_loss.generator_loss(*players, key, windows, **given),
         lambda: aamdm_loss.discriminator_loss(*players[::-1], key, windows, **given),
@@ -162,7 +162,7 @@ def test_the_scale_of_changes_must_fit_the_target(config, change, message):
 
 def test_the_chain_of_changes_is_added_to_the_previous_frame():
     params, key, previous = parameters(), jax.random.key(1), normal(3)
-    step = aamdm_model.transition(params, config=CHANGING, change=CHANGE)
+    step = aamdm_model.sampler(params, config=CHANGING, change=CHANGE)
     found = jax.jit(step)(key, previous)
 
     key_start, key_chain = jax.random.split(jax.random.clone(key))
@@ -179,7 +179,7 @@ def test_the_chain_of_changes_is_added_to_the_previous_frame():
 
 def test_guidance_sees_frames_and_not_changes():
     """An objective that is flat where frames lie, and steep at their changes."""
-    step = aamdm_model.transition(parameters(), config=CHANGING, change=CHANGE)
+    step = aamdm_model.sampler(parameters(), config=CHANGING, change=CHANGE)
 
     @jax.jit
     def guided(previous):

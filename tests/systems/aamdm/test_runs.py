@@ -196,7 +196,7 @@ def test_a_stored_chain_makes_frames(run, space, chain):
     step = aamdm_training.load_chain(run, "full_pose", space, drafts=3, polishes=2)
     previous = aamdm_space.to_frames(space, run.train.poses[0], run.train.paths[0])
     found = jax.jit(step)(jax.random.key(0), previous)
-    made = aamdm_model.transition(chain, config=CONFIG)
+    made = aamdm_model.sampler(chain, config=CONFIG)
     expected = jax.jit(made)(jax.random.key(0), previous)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 

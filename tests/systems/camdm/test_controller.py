@@ -26,9 +26,9 @@ CONTROL = camdm_controller.Control(apply=5, reuse=6, seam=0.0)
 
 
 def obedient(height):
-    """A stand-in of `camdm.planner`: walks the wanted path at a height of its own."""
+    """A stand-in of `camdm.sampler`: walks the wanted path at a height of its own."""
 
-    def planner(params, *, config, table=None):
+    def sampler(params, *, config, table=None):
         def plan(key, condition, *, scale=None):
             facing = rotation.matrix_from_facing(condition.trajectory.facing)
             joints = jnp.broadcast_to(
@@ -47,13 +47,13 @@ def obedient(height):
 
         return plan
 
-    return planner
+    return sampler
 
 
 @pytest.fixture
 def use(monkeypatch):
     def replace(height):
-        monkeypatch.setattr(camdm_model, "planner", obedient(height))
+        monkeypatch.setattr(camdm_model, "sampler", obedient(height))
 
     return replace
 
@@ -318,7 +318,7 @@ def test_seams_are_continuous_in_position_and_velocity(skeleton, monkeypatch):
     for fps in (120.0, 240.0):
         config = tiny.config(heading="facing", fps=fps, future=60)
 
-        def planner(params, *, config, table=None):
+        def sampler(params, *, config, table=None):
             def plan(key, condition, *, scale=None):
                 time = jnp.arange(1, config.future + 1) / config.fps
                 root = jnp.stack([0.1 + 0 * time, 0.9 + 0 * time, 0.1 + 1.5 * time], -1)
@@ -333,7 +333,7 @@ def test_seams_are_continuous_in_position_and_velocity(skeleton, monkeypatch):
 
             return plan
 
-        monkeypatch.setattr(camdm_model, "planner", planner)
+        monkeypatch.setattr(camdm_model, "sampler", sampler)
         commands = commands_of(*steady(1, 10))
         for seam in (0.0, 0.2) if fps == 120.0 else (0.2,):
             control = dataclasses.replace(CONTROL, apply=30, seam=seam)

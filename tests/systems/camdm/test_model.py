@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from jaxmotion.diffusion import schedule
+from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import losses
 from jaxmotion.motion import features, trajectory
 from jaxmotion.motion.skeleton import Motion, joint_positions
@@ -407,9 +407,9 @@ def condition_of(walker, skeleton, config, key=0):
 
 
 @functools.cache
-def plan_of(config, step="ancestral", guided=False):
+def plan_of(config, step=chain.ancestral_step, guided=False):
     def run(params, key, condition, scale):
-        plan = camdm_model.planner(params, config=config, step=step)
+        plan = camdm_model.sampler(params, config=config, step=step)
         return plan(key, condition, scale=scale if guided else None)
 
     return jax.jit(run)
@@ -473,7 +473,7 @@ def test_a_batch_of_plans_is_its_plans(params, situation):
     batch = jax.tree.map(lambda *x: jnp.stack(x), situation, other, situation)
 
     def run(params, keys, batch):
-        return jax.vmap(camdm_model.planner(params, config=FACING))(keys, batch)
+        return jax.vmap(camdm_model.sampler(params, config=FACING))(keys, batch)
 
     plans = jax.jit(run)(params, keys, batch)
     for i, condition in enumerate((situation, other)):
@@ -483,7 +483,9 @@ def test_a_batch_of_plans_is_its_plans(params, situation):
 
 
 def test_ddim_draws_no_noise_after_the_start(params, situation):
-    found = plan_of(FACING, step="ddim")(params, jax.random.key(1), situation, 0.0)
+    found = plan_of(FACING, step=chain.ddim_step)(
+        params, jax.random.key(1), situation, 0.0
+    )
     other = plan_of(FACING)(params, jax.random.key(1), situation, 0.0)
     assert np.isfinite(found).all()
     assert np.abs(found - other).max() > 1e-3
@@ -494,7 +496,7 @@ def test_a_table_sets_the_number_of_steps(params, situation):
 
     def run(params, key, condition):
         table = schedule.cosine_schedule(2)
-        plan = camdm_model.planner(params, config=FACING, table=table)
+        plan = camdm_model.sampler(params, config=FACING, table=table)
         calls.append(jax.make_jaxpr(plan)(key, condition))
         return plan(key, condition)
 
@@ -511,7 +513,7 @@ def test_parameters_as_constants_give_the_same_plan(params, situation):
     expected = plan_of(FACING)(params, jax.random.key(1), situation, 0.0)
     # The checker of keys cannot follow constants into nested calls (jax 0.10).
     with jax.debug_key_reuse(False):
-        constant = jax.jit(camdm_model.planner(params, config=FACING))
+        constant = jax.jit(camdm_model.sampler(params, config=FACING))
         np.testing.assert_allclose(
             constant(jax.random.key(1), situation), expected, atol=1e-5
         )

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.diffusion import chain
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
 from tests import tiny
@@ -175,7 +176,9 @@ def test_ddim_follows_x_T_and_tells_the_network_the_old_step():
     """Nothing but x_T comes from the key: the oracle draws no noise."""
     steps = emdm_training.ddim_steps(20, 5)
     condition = one_condition(length=4)
-    found = jitted(DDPM, step="ddim", steps=steps)(jax.random.key(1), condition)
+    found = jitted(DDPM, step=chain.ddim_step, steps=steps)(
+        jax.random.key(1), condition
+    )
     x, _, _ = draws(jax.random.key(1), 5, 0)
     alpha_bar = np.cumprod(1 - diffusion.cosine_betas(20))[np.array(steps) - 1]
     betas = 1 - alpha_bar / np.append(1.0, alpha_bar[:-1])

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.diffusion import chain
 from jaxmotion.learning import checkpoint, runs, training
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
@@ -202,7 +203,7 @@ def test_a_sampler_is_another_way_to_use_a_row(trained, monkeypatch):
     for row in ("ddim_10", "ddpm_1000", "emdm"):
         emdm_training.row_sampler(params, config, row)
     steps = tuple(range(1, 1000, 100))
-    assert seen[0] == dict(config=config, step="ddim", steps=steps)
+    assert seen[0] == dict(config=config, step=chain.ddim_step, steps=steps)
     for kind in seen[1:]:
         assert kind == dict(config=config)
 

@@ -62,13 +62,13 @@ def parts_of(representation, config):
         hidden=32,
         frames_per_token=2,
     )
-    sample = smgdiff_guidance.planner(
+    sample = smgdiff_guidance.sampler(
         tiny.random_params(smgdiff_model.init, config, seed=3),
         config=config,
         representation=representation,
         guided=smgdiff_guidance.Guidance(end=1, last_sigma=0.01),
     )
-    generate = smgdiff_trajectory.generator(
+    generate = smgdiff_trajectory.sampler(
         tiny.random_params(smgdiff_trajectory.init, paths, seed=1), config=paths
     )
     return generate, sample

@@ -167,7 +167,7 @@ def test_more_guided_steps_than_steps_are_refused(start, end):
 
 
 def plans(params, config, representation, condition, guided):
-    plan = smgdiff_guidance.planner(
+    plan = smgdiff_guidance.sampler(
         params, config=config, representation=representation, guided=guided
     )
     keys = jax.random.split(jax.random.key(5), 6)
@@ -210,7 +210,7 @@ def test_guided_plans_are_finite_and_the_same_alone(
 
 
 def test_a_guided_plan_can_be_differentiated(params, config, representation, condition):
-    plan = smgdiff_guidance.planner(
+    plan = smgdiff_guidance.sampler(
         params, config=config, representation=representation, guided=Guidance(end=1)
     )
 

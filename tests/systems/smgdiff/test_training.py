@@ -185,7 +185,7 @@ def test_planted_errors_are_measured(setting):
 @pytest.mark.slow
 def test_plans_are_scored_alike_whatever_the_chunk(run, setting):
     model, params = smgdiff_training.load_stage(run, "motion_2")
-    plan = smgdiff_guidance.planner(
+    plan = smgdiff_guidance.sampler(
         params,
         config=model.config,
         representation=model.representation,
@@ -205,7 +205,7 @@ def test_plans_are_scored_alike_whatever_the_chunk(run, setting):
 @pytest.mark.slow
 def test_players_are_scored_with_their_spread(run, setting):
     model, params = smgdiff_training.load_stage(run, "motion_2")
-    plan = smgdiff_guidance.planner(
+    plan = smgdiff_guidance.sampler(
         params,
         config=model.config,
         representation=model.representation,

@@ -56,7 +56,7 @@ def test_the_wish_is_the_mean_velocity_of_what_happened():
 
 @pytest.mark.parametrize("label", [-1, 2])
 def test_an_unknown_skill_is_refused_or_when_compiled_the_nearest(params, label):
-    generate = smgdiff_trajectory.generator(params, config=CONFIG)
+    generate = smgdiff_trajectory.sampler(params, config=CONFIG)
     ask = lambda skill: dataclasses.replace(wish(), label=jnp.int32(skill))  # noqa: E731
     run = jax.jit(lambda wanted: generate(jax.random.key(0), wanted).position)
     found = run(ask(label))
@@ -85,7 +85,7 @@ def test_who_stands_goes_on_facing_as_before():
 def test_generated_paths_have_unit_facings(params, steps):
     config = smgdiff_trajectory.Config(**{**vars(CONFIG), "num_steps": steps})
     params = tiny.random_params(smgdiff_trajectory.init, config, seed=1)
-    path = jax.jit(smgdiff_trajectory.generator(params, config=config))(
+    path = jax.jit(smgdiff_trajectory.sampler(params, config=config))(
         jax.random.key(0), wish()
     )
     assert path.position.shape == (12, 2)
