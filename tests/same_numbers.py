@@ -23,7 +23,16 @@ from tests.experiments import test_kills, test_step_sweep
 ROOT = Path(__file__).parents[1]
 RECORD = Path(__file__).with_suffix(".json")
 # Cells that are times, and what says when, where and by what it was made.
-TIMES = ("p50 ms", "p95 ms", "ms", "first_ms", "seconds", "latency_ms", "fps")
+TIMES = (
+    "steps_per_second",
+    "p50 ms",
+    "p95 ms",
+    "ms",
+    "first_ms",
+    "seconds",
+    "latency_ms",
+    "fps",
+)
 TRAIN = {
     "camdm": "--held-out 0.5 --contents --width 16 --depth 1 --batch 2 --warmup 1 "
     "--diffusion-steps 2 --chunk 10 --save-every 10 --steps 20",
@@ -79,12 +88,14 @@ def _digest(path: Path) -> str:
 
 def _losses(folder: Path) -> dict:
     """Last row of each stage's losses."""
-    return {
-        path.parent.relative_to(folder).as_posix(): json.loads(
-            path.read_text().splitlines()[-1]
-        )
-        for path in sorted(folder.rglob("losses.jsonl"))
-    }
+    return _cells(
+        {
+            path.parent.relative_to(folder).as_posix(): json.loads(
+                path.read_text().splitlines()[-1]
+            )
+            for path in sorted(folder.rglob("losses.jsonl"))
+        }
+    )
 
 
 def compute(program: str, folder: Path) -> dict:

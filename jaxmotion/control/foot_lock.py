@@ -43,7 +43,12 @@ from jaxtyping import Array, Bool, Float
 from jaxmotion.control.rollout import Controller
 from jaxmotion.motion.rotation import rot6d_from_matrix, safe_normalize
 from jaxmotion.motion.rotation_vector import to_matrix
-from jaxmotion.motion.skeleton import Motion, Skeleton, global_transforms
+from jaxmotion.motion.skeleton import (
+    Motion,
+    Skeleton,
+    global_transforms,
+    joint_positions,
+)
 from jaxmotion.motion.spring import spring
 
 _UP = (0.0, 1.0, 0.0)
@@ -384,6 +389,78 @@ def lock_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motion
 
     frames = (motion.root_position, motion.joint_rotation)
     _, rotations = jax.lax.scan(step, init_lock(skeleton), frames)
+    return dataclasses.replace(motion, joint_rotation=rotations)
+
+
+def _planted(
+    toes: Float[Array, "frames feet 3"], *, fps: float, lock: FootLock
+) -> Bool[Array, "frames-1 feet"]:
+    """Whether each toe is in contact in a frame and in the next one."""
+    velocity = jnp.diff(toes, axis=0) * fps
+    speed = jnp.sqrt(jnp.sum(velocity**2, axis=-1) + 1e-12)
+
+    def step(was: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        is_now = contacts(was, *now, lock=lock)
+        return is_now, is_now
+
+    none = jnp.zeros(toes.shape[1], bool)
+    return jax.lax.scan(step, none, (speed, toes[:-1, :, 1]))[1]
+
+
+def toe_offsets(
+    toes: Float[Array, "frames feet 3"],
+    planted: Bool[Array, "frames-1 feet"],
+    *,
+    stand: float = 1e4,
+    smooth: float = 10.0,
+) -> Float[Array, "frames feet 2"]:
+    """Least changes of the toes' paths after which planted toes stand.
+
+    With toes p and offsets o it minimizes, over all frames at once,
+
+        sum |o_f|^2  +  stand sum_planted |o_{f+1} - o_f + p_{f+1} - p_f|^2
+                     +  smooth sum |o_{f+1} - 2 o_f + o_{f-1}|^2                   (3)
+
+    by conjugate gradients: the terms are least squares, so the optimum is a linear
+    system.
+
+    Args:
+      toes: World, meters.
+      planted: Whether a toe should not move from a frame to the next.
+      stand: Weight of standing still.
+      smooth: Weight of the acceleration that is added.
+
+    Returns:
+      What to add to (x, z) of each toe, meters.
+    """
+    path = toes[..., ::2]
+    weight = stand * planted[..., None].astype(path.dtype)
+
+    def normal(o: Array) -> Array:
+        return jax.grad(lambda x: cost(x, jnp.zeros_like(path)))(o)
+
+    def cost(o: Array, path: Array) -> Array:
+        moved = jnp.diff(o + path, axis=0)
+        bent = jnp.diff(o, n=2, axis=0)
+        terms = (jnp.sum(o**2), jnp.sum(weight * moved**2), smooth * jnp.sum(bent**2))
+        return sum(terms) / 2
+
+    right = -jax.grad(cost)(jnp.zeros_like(path), path)
+    return jax.scipy.sparse.linalg.cg(normal, right, tol=1e-6, maxiter=2000)[0]
+
+
+@functools.partial(jax.jit, static_argnames=("lock",))
+def clean_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motion:
+    """A recorded or generated motion of one character whose planted feet stand.
+
+    Unlike `lock_motion` it looks ahead: toes begin to move to their places before the
+    contact begins, see `toe_offsets`.
+    """
+    toes = joint_positions(skeleton, motion)[:, jnp.array(skeleton.feet)]
+    planted = _planted(toes, fps=motion.fps, lock=lock)
+    wanted = toes.at[..., ::2].add(toe_offsets(toes, planted))
+    place = functools.partial(place_toes, skeleton, lock=lock)
+    rotations = jax.vmap(place)(motion.root_position, motion.joint_rotation, wanted)
     return dataclasses.replace(motion, joint_rotation=rotations)
 
 

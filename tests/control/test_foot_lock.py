@@ -265,6 +265,36 @@ def test_a_controller_displays_locked_feet():
     np.testing.assert_allclose(frames.joint_rotation, want.joint_rotation, atol=1e-6)
 
 
+def test_offsets_are_those_of_the_normal_equations():
+    """A dense solve in float64, from the three terms as rows."""
+    generator, frames = np.random.default_rng(3), 40
+    path = np.cumsum(generator.normal(0, 0.01, (frames, 2)), axis=0)
+    planted = generator.uniform(size=frames - 1) < 0.6
+    first = np.diff(np.eye(frames), axis=0)
+    stand, smooth = 1e3, 10.0
+    rows = [
+        np.eye(frames),
+        np.sqrt(stand) * planted[:, None] * first,
+        np.sqrt(smooth) * np.diff(np.eye(frames), n=2, axis=0),
+    ]
+    right = [np.zeros((frames, 2)), -rows[1] @ path, np.zeros((frames - 2, 2))]
+    want = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+    toes = np.zeros((frames, 1, 3), np.float32)
+    toes[:, 0, ::2] = path
+    found = foot_lock.toe_offsets(
+        jnp.asarray(toes), jnp.asarray(planted[:, None]), stand=stand, smooth=smooth
+    )
+    np.testing.assert_allclose(found[:, 0], want, atol=2e-5)
+
+
+def test_a_clip_is_cleaned():
+    motion = drift(0.05)
+    found = foot_lock.clean_motion(SKELETON, motion, lock=LOCK)
+    toes = joint_positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
+    speed = np.linalg.norm(np.diff(toes, axis=0), axis=-1) * FPS
+    assert speed.max() < 0.005
+
+
 def test_a_skeleton_without_legs_is_refused(skeleton):
     with pytest.raises(ValueError, match="expected hip, knee and ankle"):
         foot_lock.legs(skeleton)
