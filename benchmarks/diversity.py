@@ -23,7 +23,7 @@ import tyro
 import workload_diversity as workload
 
 from jaxmotion import cli, files, reporting
-from jaxmotion.control import presets
+from jaxmotion.control import courses
 from jaxmotion.evaluation import table
 
 WALKER = Path(__file__).parents[1] / "jaxmotion" / "assets" / "walker.npz"
@@ -51,7 +51,7 @@ class Config:
       guidance: Scales of classifier-free guidance on the past poses, in all plans; 1
         changes nothing. Less than 1 frees the motion from its past.
       style: Style; None for the model's first.
-      preset: Commands: forward, strafe or stop_and_go.
+      course: Commands.
       speed: Meters per second; None for the style's median.
       seconds: Length of a rollout.
       every: Keep every so many frames, from the last one backwards.
@@ -72,7 +72,7 @@ class Config:
     steps: tuple[int, ...] = (2, 4, 8, 16, 32)
     guidance: tuple[float, ...] = (0.0, 0.5, 0.7, 1.0)
     style: str | None = None
-    preset: str = "forward"
+    course: str = "forward"
     speed: float | None = None
     seconds: float = 4.0
     every: int = 6
@@ -107,9 +107,9 @@ def check(args: Config) -> None:
     for name, (found, expected) in least.items():
         if found < expected:
             raise ValueError(f"{name} {found}: expected {expected} or more")
-    if args.preset not in presets.PRESETS:
-        known = ", ".join(presets.PRESETS)
-        raise ValueError(f"--preset {args.preset}: there are {known}")
+    if args.course not in courses.COURSES:
+        known = ", ".join(courses.COURSES)
+        raise ValueError(f"--course {args.course}: there are {known}")
     if not args.memory_gib > 0:
         raise ValueError(f"--memory-gib {args.memory_gib}: expected more than 0")
 
@@ -200,7 +200,7 @@ def main() -> None:
     suite.prepare(args)
     options = dict(
         style=args.style,
-        preset=args.preset,
+        course=args.course,
         speed=args.speed,
         seconds=args.seconds,
         seed=args.seed,

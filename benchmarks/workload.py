@@ -9,13 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion.control import courses
 from jaxmotion.control.rollout import Controller
 from jaxmotion.data import procedural
 from jaxmotion.data.clips import Clips
 from jaxmotion.motion import trajectory
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.typing import Params
 
 
@@ -135,24 +135,24 @@ def steered(
     seconds: float,
     staggered: bool = False,
 ) -> tuple[camdm_controller.CharacterState, trajectory.Command]:
-    """Start states, and commands of the preset "forward" at 1 m/s.
+    """Start states, and commands of the course "forward" at 1 m/s.
 
     Args:
       model: Of the walker.
       clips: Where the start poses come from.
       characters: Their number; they take the styles in turn.
       seconds: Length of the rollout.
-      staggered: Start the preset at another place for each character, so that
+      staggered: Start the course at another place for each character, so that
         commands change at other ticks; without it they change at the same.
 
     Returns:
       States [characters], commands [characters, ticks].
     """
     labels = np.arange(characters) % len(model.labels)
-    states = camdm_steering.start_states(clips, model, labels, field="style", seed=0)
+    states = camdm_controller.start_states(clips, model, labels, field="style", seed=0)
     fps = model.config.fps
     ticks, extra = round(seconds * fps), 30.0 if staggered else 0.0
-    commands = camdm_steering.preset_batch(
+    commands = courses.course_batch(
         "forward", labels, np.ones(characters), seconds=seconds + extra, fps=fps
     )
     places = np.random.default_rng(0).integers(0, round(extra * fps) + 1, characters)

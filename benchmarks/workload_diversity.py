@@ -13,7 +13,7 @@ import numpy as np
 import workload
 from jaxtyping import Array, Float
 
-from jaxmotion.control import rollout
+from jaxmotion.control import courses, rollout
 from jaxmotion.data import selection
 from jaxmotion.evaluation import diversity
 from jaxmotion.evaluators import style as style_evaluator
@@ -21,7 +21,6 @@ from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.typing import Key, Params
 
@@ -76,7 +75,7 @@ def make_load(
     run: Path,
     *,
     style: str | None,
-    preset: str,
+    course: str,
     speed: float | None,
     seconds: float,
     seed: int,
@@ -86,7 +85,7 @@ def make_load(
     Args:
       run: Exported file of the procedural walker, or a run folder.
       style: Its style; None for the first.
-      preset: Of `presets.PRESETS`.
+      course: Of `courses.COURSES`.
       speed: Meters per second; None for the style's median.
       seconds: Length of the rollouts.
       seed: Of the start pose.
@@ -96,7 +95,7 @@ def make_load(
 
     Raises:
       OSError: if the run or its clips cannot be read.
-      ValueError: if the run is none, or has no such style or preset.
+      ValueError: if the run is none, or has no such style or course.
     """
     if not run.exists():
         raise ValueError(f"{run}: no such file or folder")
@@ -114,10 +113,10 @@ def make_load(
     label = np.array([0 if style is None else model.label(style)])
     speeds = np.asarray(selection.label_speeds(clips, field=field))[label]
     speeds = speeds if speed is None else np.array([speed])
-    commands = camdm_steering.preset_batch(
-        preset, label, speeds, seconds=seconds, fps=model.config.fps
+    commands = courses.course_batch(
+        course, label, speeds, seconds=seconds, fps=model.config.fps
     )
-    states = camdm_steering.start_states(clips, model, label, field=field, seed=seed)
+    states = camdm_controller.start_states(clips, model, label, field=field, seed=seed)
     state, command = jax.tree.map(lambda x: x[0], (states, commands))
     return Load(
         name=run.name, model=model, params=params, state=state, commands=command

@@ -19,12 +19,10 @@ from reports import aamdm as paper
 from reports import results, verdicts
 
 from jaxmotion import cli, reporting
+from jaxmotion.control.courses import Course
 from jaxmotion.learning import loop
-from jaxmotion.motion import skeleton
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
-
-Steering = Literal["forward", "strafe", "stop_and_go"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +92,7 @@ class Evaluate:
       out: Folder for metrics.json and table.md; None for <run>/evaluation.
       rollouts: Characters; a multiple of 4.
       seconds: Length of each rollout, seconds (the paper: 1000 frames).
-      preset: Commands of the steered rollouts.
+      course: Commands of the steered rollouts.
       speed: Meters per second that are commanded.
       scale: Strength of AAMDM's guidance, epsilon of eq. 13.
       amdm_scale: Likewise, of AMDM's.
@@ -108,7 +106,7 @@ class Evaluate:
     out: Path | None = None
     rollouts: int = 16
     seconds: float = 1000 / 60
-    preset: Steering = "forward"
+    course: Course = "forward"
     speed: float = 1.2
     scale: float = 10.0
     amdm_scale: float = 1.0
@@ -128,7 +126,7 @@ class Rollout:
       row: Which method.
       steered: Whether it is steered.
       seconds: Length.
-      preset: Commands.
+      course: Commands.
       speed: Meters per second that are commanded.
       scale: Strength of the guidance, epsilon of eq. 13.
       out: Folder; None for <run>/rollout.
@@ -139,7 +137,7 @@ class Rollout:
     row: str = "aamdm"
     steered: bool = True
     seconds: float = 20.0
-    preset: Steering = "forward"
+    course: Course = "forward"
     speed: float = 1.2
     scale: float = 10.0
     out: Path | None = None
@@ -232,20 +230,15 @@ def rollout(args: Rollout) -> None:
     states = aamdm_evaluation.start_states(run, space, 1, seed=args.seed)
     ticks = round(args.seconds * run.train.fps)
     given = aamdm_evaluation.commands(
-        run, 1, ticks, preset=args.preset, speed=args.speed
+        run, 1, ticks, course=args.course, speed=args.speed
     )
     cli.announce("compiling the rollout", 40)
     roll = aamdm_evaluation.roller(run, space, step, steered=args.steered)
     _, frames = roll(jax.random.key(args.seed), states, given)
-    motion = skeleton.Motion(
-        root_position=frames.root_position[0],
-        joint_rotation=frames.joint_rotation[0],
-        fps=run.train.fps,
-    )
     reporting.write_rollout(
         out,
         run.skeleton,
-        motion,
+        frames[0].motion,
         frames.desired_velocity[0],
         title=f"{args.row}{'' if args.steered else ', not steered'}",
         caption=run.source,

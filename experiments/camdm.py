@@ -18,6 +18,7 @@ import numpy as np
 import tyro
 
 from jaxmotion import cli, files, reporting
+from jaxmotion.control.courses import Course
 from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import by_frame
@@ -29,8 +30,6 @@ from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import published as camdm_published
 from jaxmotion.systems.camdm import speeds as camdm_speeds
 from jaxmotion.systems.camdm import training as camdm_training
-
-Steering = Literal["forward", "strafe", "stop_and_go"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,7 +199,7 @@ def train(args: Train) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """Steer characters along a preset in every style, and measure them.
+    """Steer characters along a course in every style, and measure them.
 
     Example: python experiments/camdm.py evaluate --run runs/camdm --rollouts 105
 
@@ -211,7 +210,7 @@ class Evaluate:
         (beside an exported file).
       rollouts: Characters; spread evenly over the styles.
       seconds: Length of each rollout, seconds; 4 at least.
-      preset: Commands.
+      course: Commands.
       speed: Meters per second; None for each style's own median walking speed.
       contents: Contents of the clips to compare with; none: all of the run's.
       chunk: Characters to run at a time, at most.
@@ -226,7 +225,7 @@ class Evaluate:
     out: Path | None = None
     rollouts: int = 105
     seconds: float = 60.0
-    preset: Steering = "forward"
+    course: Course = "forward"
     speed: float | None = None
     contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right")
     chunk: int = 5
@@ -277,7 +276,7 @@ class Rollout:
       style: Its style.
       to_style: Change to this style at half time; None to keep it.
       seconds: Length, seconds.
-      preset: Commands.
+      course: Commands.
       speed: Meters per second; None for the style's own median speed.
       out: Folder; None for <run>/rollout (beside an exported file).
       seed: Of the start pose and the noise.
@@ -288,7 +287,7 @@ class Rollout:
     style: str = "elderly"
     to_style: str | None = None
     seconds: float = 20.0
-    preset: Steering = "forward"
+    course: Course = "forward"
     speed: float | None = None
     out: Path | None = None
     seed: int = 0
@@ -303,7 +302,7 @@ def evaluate(args: Evaluate) -> None:
     cli.announce("compiling the rollouts", 40)
     rows, report = camdm_evaluation.evaluate_run(
         run,
-        preset=args.preset,
+        course=args.course,
         rollouts=args.rollouts,
         seconds=args.seconds,
         speed=args.speed,
@@ -349,7 +348,7 @@ def rollout(args: Rollout) -> None:
         run,
         args.style,
         to_style=args.to_style,
-        preset=args.preset,
+        course=args.course,
         seconds=args.seconds,
         speed=args.speed,
         seed=args.seed,

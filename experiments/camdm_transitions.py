@@ -17,6 +17,7 @@ import jax
 import tyro
 
 from jaxmotion import cli, reporting
+from jaxmotion.control.courses import Course
 from jaxmotion.evaluators import frozen
 from jaxmotion.learning import loop
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
@@ -45,7 +46,7 @@ class Config:
         poses and noise of their own; intervals run over these.
       before: Seconds in the first style, 1 at least.
       limit: Seconds behind the command in which the change must have come.
-      preset: Commands: forward, strafe or stop_and_go; each style goes at its own
+      course: Commands; each style goes at its own
         median speed.
       contents: Contents of the clips to start from; none: all of the run's.
       chunk: Characters to run at a time, at most.
@@ -61,7 +62,7 @@ class Config:
     replications: int = 20
     before: float = 2.0
     limit: float = 4.0
-    preset: str = "forward"
+    course: Course = "forward"
     contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right")
     chunk: int = 14
     recognizer_steps: int = 1500
@@ -82,7 +83,7 @@ def measure(args: Config) -> None:
     cli.announce("compiling the rollouts of each row", 40)
     changes = camdm_transitions.make_changes(
         run,
-        preset=args.preset,
+        course=args.course,
         before=args.before,
         limit=args.limit,
         replications=args.replications,

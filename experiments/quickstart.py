@@ -26,7 +26,7 @@ import numpy as np
 import tyro
 
 from jaxmotion import cli, reporting
-from jaxmotion.control import presets
+from jaxmotion.control import courses, steering
 from jaxmotion.data import procedural, selection, windows
 from jaxmotion.data.gaits import GAITS, Gait
 from jaxmotion.learning import loop, training
@@ -35,7 +35,6 @@ from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm import training as camdm_training
 
 # Seconds, direction of travel and facing (degrees from +z toward +x), m/s, style.
@@ -111,7 +110,7 @@ def steer_shipped(args: Config):
     model, params, _ = camdm_model.load("locomotion")
     fps = model.config.fps
     print(f"locomotion: {model.source}; compiling, about 15 s", flush=True)
-    course = presets.segment_commands(
+    course = courses.segment_commands(
         [(*part[:4], model.label(part[4])) for part in COURSE],
         seconds=sum(part[0] for part in COURSE),
         fps=fps,
@@ -119,16 +118,16 @@ def steer_shipped(args: Config):
     many = args.characters
     commands = jax.tree.map(lambda x: jnp.repeat(x[None], many, axis=0), course)
     labels = np.zeros(many, int)
-    frames = camdm_steering.steered_rollouts(
-        params,
+    frames = steering.steered_rollouts(
+        camdm_controller.character(
+            params, model, control=camdm_controller.Control(follow=1.0)
+        ),
         jax.random.key(args.seed),
-        camdm_steering.own_states(model, labels, seed=args.seed),
+        camdm_controller.own_states(model, labels, seed=args.seed),
         commands,
-        model=model,
-        control=camdm_controller.Control(follow=1.0),
         chunk=4,
     )
-    made = camdm_steering.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=0)
+    made = windows.rollout_windows(frames, jnp.asarray(labels), skip=0)
     standing = jax.tree.map(lambda x: x[0], model.starts)
     toes = skeleton.joint_positions(model.skeleton, standing)[
         ..., model.skeleton.feet, 1
@@ -221,7 +220,7 @@ def steer(args: Config, clips, model, params, key):
     styles = [model.label(name) for name in args.styles]
     labels = np.resize(styles, args.characters)
     speeds = np.asarray(selection.label_speeds(clips, field="style"))[labels]
-    commands = camdm_steering.preset_batch(
+    commands = courses.course_batch(
         "forward", labels, speeds, seconds=args.seconds, fps=model.config.fps
     )
     # The first character goes through all the styles, one after the other.
@@ -229,12 +228,16 @@ def steer(args: Config, clips, model, params, key):
     order = jnp.asarray(styles)[jnp.arange(ticks) * len(styles) // ticks]
     label = commands.label.at[0].set(order)
     commands = dataclasses.replace(commands, label=label)
-    states = camdm_steering.start_states(
+    states = camdm_controller.start_states(
         clips, model, labels, field="style", seed=args.seed
     )
     control = camdm_controller.Control(follow=1.0)
-    frames = camdm_steering.steered_rollouts(
-        params, key, states, commands, model=model, control=control, chunk=4
+    frames = steering.steered_rollouts(
+        camdm_controller.character(params, model, control=control),
+        key,
+        states,
+        commands,
+        chunk=4,
     )
     return jax.block_until_ready(frames), labels
 
@@ -255,7 +258,7 @@ def train_walker(args: Config):
     frames, labels = steer(args, clips, model, params, key_roll)
 
     fps = model.config.fps
-    made = camdm_steering.rollout_windows(frames, jnp.asarray(labels), fps=fps, skip=30)
+    made = windows.rollout_windows(frames, jnp.asarray(labels), skip=30)
     real = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field="style")
     height = procedural.TOE_HEIGHT + 0.01
     rows = {

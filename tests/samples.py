@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion.control import courses
+from jaxmotion.control.frame import Frame
 from jaxmotion.data import gaits, procedural, selection
 from jaxmotion.evaluators import action as action_evaluator
 from jaxmotion.evaluators import frozen
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm import training as camdm_training
 from tests import tiny
 
@@ -57,7 +57,7 @@ def run():
 
 def walking(labels, seconds=8.0):
     """Frames of characters that do as they are told: the procedural walker itself."""
-    commands = camdm_steering.preset_batch(
+    commands = courses.course_batch(
         "forward", labels, np.full(len(labels), 0.8), seconds=seconds, fps=30.0
     )
     made = []
@@ -69,12 +69,13 @@ def walking(labels, seconds=8.0):
             own, jnp.float32(30.0), jnp.float32(0.27)
         )
         made.append(
-            camdm_controller.Frame(
+            Frame(
                 root_position=motion.root_position,
                 joint_rotation=motion.joint_rotation,
                 desired_velocity=jnp.gradient(path, axis=0) * 30.0,
                 desired_facing=facing,
                 planned=jnp.zeros(path.shape[0], bool),
+                fps=30.0,
             )
         )
     return jax.tree.map(lambda *x: jnp.stack(x), *made)

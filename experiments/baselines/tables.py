@@ -9,11 +9,11 @@ import numpy as np
 
 from baselines import rows
 from jaxmotion import files, reporting
+from jaxmotion.control.frame import Frame
 from jaxmotion.evaluation import table
 from jaxmotion.learning import checkpoint
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
-from jaxmotion.systems.aamdm.controller import Frame
 
 Row = dict[str, table.Cell]
 
@@ -52,7 +52,7 @@ def _unbounded(
     ticks = round(args.seconds * run.train.fps)
     states = aamdm_evaluation.start_states(run, space, args.rollouts, seed=args.seed)
     given = aamdm_evaluation.commands(
-        run, args.rollouts, ticks, preset=args.preset, speed=args.speed
+        run, args.rollouts, ticks, course=args.course, speed=args.speed
     )
     roll = aamdm_evaluation.roller(run, space, step, steered=False, bounded=False)
     frames = roll(jax.random.key(args.seed), states, given)[1]
@@ -73,7 +73,7 @@ def measure(
     fps, ticks = run.train.fps, round(args.seconds * run.train.fps)
     skip = round(fps)
     given = aamdm_evaluation.commands(
-        run, args.rollouts, ticks + skip, preset=args.preset, speed=args.speed
+        run, args.rollouts, ticks + skip, course=args.course, speed=args.speed
     )
     row: Row = {"diverged_unbounded": _unbounded(run, space, step, reference, args)}
     for i, steered in enumerate((False, True)):
@@ -132,7 +132,7 @@ def long_rollouts(
     ticks = round(args.long_minutes * 60 * run.train.fps)
     number, found = args.long_rollouts, {"ticks": ticks}
     given = aamdm_evaluation.commands(
-        run, number, ticks, preset=args.preset, speed=args.speed
+        run, number, ticks, course=args.course, speed=args.speed
     )
     states = aamdm_evaluation.start_states(run, space, number, seed=args.seed)
     for steered in (False, True):

@@ -10,7 +10,6 @@ import numpy as np
 from jaxmotion.motion import skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm import training as camdm_training
 from serving.controlled import ControlledSimulation
 
@@ -56,7 +55,7 @@ def first_state(
             model.skeleton, mean_pose(model), config=config
         )
     loaded = camdm_training.load_run(run, data)
-    states = camdm_steering.start_states(
+    states = camdm_controller.start_states(
         loaded.train, model, np.zeros(1, int), field=loaded.field, seed=0
     )
     return jax.tree.map(lambda x: x[0], states)

@@ -52,7 +52,7 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
         lambda frame: {
             "root": frame.root_position,
             "rotations": frame.joint_rotation,
-            "ball": frame.ball,
+            "ball": frame.extra["ball"],
         },
         labels=model.labels,
         fps=model.config.fps,

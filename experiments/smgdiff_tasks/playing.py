@@ -101,7 +101,7 @@ def play(args: Any, run: Run, out: Path) -> None:
     one = lambda tree: jax.tree.map(lambda x: x[None], tree)  # noqa: E731
     run_all = jax.jit(lambda *given: rollout.rollout(driver, *given)[1])
     frames = run_all(jax.random.key(args.seed), one(state), one(steered))
-    scene = smgdiff_players.to_scene(jax.tree.map(lambda x: x[0], frames), model)
+    scene = smgdiff_players.to_scene(frames[0])
     touch = np.asarray(scene.touch) > 0.5
     reporting.write_rollout(
         out,

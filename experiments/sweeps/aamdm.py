@@ -10,10 +10,11 @@ import aamdm as script
 import jax
 from jaxtyping import Array
 
+from jaxmotion.control.frame import Frame
 from jaxmotion.data import clips_io
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
-from jaxmotion.systems.aamdm.controller import Frame, Stepper
+from jaxmotion.systems.aamdm.controller import Stepper
 from jaxmotion.systems.aamdm.data import PoseData
 from jaxmotion.systems.aamdm.space import Space
 from sweeps import points
@@ -56,7 +57,7 @@ AMOUNTS = {
     ),
 }
 FIELD, LABELS = script.Train.field, script.Train.labels
-PRESET, SPEED = script.Evaluate.preset, script.Evaluate.speed
+COURSE, SPEED = script.Evaluate.course, script.Evaluate.speed
 
 
 def _selected(data: Path) -> dict[str, Any]:
@@ -147,7 +148,7 @@ def score(setting: Setting, point: Point) -> Row:
     run, number, seed = setting.run, setting.rollouts, setting.job.seed
     skip = round(run.train.fps)  # where the data's own pose still shows
     given = aamdm_evaluation.commands(
-        run, number, skip + setting.ticks, preset=PRESET, speed=SPEED
+        run, number, skip + setting.ticks, course=COURSE, speed=SPEED
     )
     step, row = _stepper(setting, point), {}
     for i, steered in enumerate((False, True)):
@@ -169,7 +170,7 @@ def sampler(setting: Setting, point: Point) -> Callable[[Array], Any]:
     run, space = setting.run, setting.space
     roll = aamdm_evaluation.roller(run, space, _stepper(setting, point), steered=False)
     states = aamdm_evaluation.start_states(run, space, 1, seed=setting.job.seed)
-    given = aamdm_evaluation.commands(run, 1, 1, preset=PRESET, speed=SPEED)
+    given = aamdm_evaluation.commands(run, 1, 1, course=COURSE, speed=SPEED)
     return lambda key: roll(key, states, given)
 
 
@@ -206,7 +207,7 @@ def bench(job: Job) -> Bench:
         describe={
             "source": run.source,
             "samples": f"{budget['characters']} rollouts of {budget['seconds']:g} s, "
-            f"free and steered (preset {PRESET!r}, {SPEED:g} m/s); Fréchet distances "
+            f"free and steered (course {COURSE!r}, {SPEED:g} m/s); Fréchet distances "
             f"of every fifth frame to those of {run.train.num_frames} training "
             "frames, no recognizer; other intervals over rollouts",
             "rollouts": setting.rollouts,

@@ -12,17 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxmotion.control import steering
 from jaxmotion.data import windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.evaluators import frozen
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import release as camdm_release
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm import training as camdm_training
 from sweeps import points
 from sweeps.budgets import Amount
@@ -57,7 +58,7 @@ AMOUNTS = {
         training=False,
     ),
 }
-PRESET = "forward"
+COURSE = "forward"
 CONTENTS = script.Evaluate.contents
 
 
@@ -137,9 +138,7 @@ def _judge(job: Job, run: camdm_training.Run) -> tuple[Judge, dict[str, Row]]:
     skeleton, field = run.model.skeleton, run.field
     styles, budget = len(run.model.labels), job.budget
     ticks = round(budget["seconds"] * run.model.config.fps)
-    camdm_steering.check_ticks(
-        ticks, fps=run.model.config.fps, skip=camdm_evaluation.SKIP
-    )
+    windows.check_ticks(ticks, fps=run.model.config.fps, skip=camdm_evaluation.SKIP)
     key_fit, _ = jax.random.split(jax.random.key(job.seed))
     recognizer = camdm_evaluation.recognizer(
         key_fit, run, job.evaluator, num_steps=budget["recognizer_updates"]
@@ -209,18 +208,22 @@ def _fid(job: Job, judge: Judge, features: np.ndarray, owner: np.ndarray) -> Cel
 def score(job: Job, judge: Judge, run: camdm_training.Run) -> Row:
     """Steers one character a style in each replication, and measures them."""
     model, skeleton, fps = run.model, run.model.skeleton, run.model.config.fps
-    _, commands = camdm_evaluation.preset_of_run(
-        run, PRESET, judge.labels, seconds=job.budget["seconds"], speed=None
+    _, commands = camdm_evaluation.course_of_run(
+        run, COURSE, judge.labels, seconds=job.budget["seconds"], speed=None
     )
-    states = camdm_steering.start_states(
+    states = camdm_controller.start_states(
         run.held_out, model, judge.labels, field=run.field, seed=job.seed
     )
     _, key = jax.random.split(jax.random.key(job.seed))
-    frames = camdm_steering.steered_rollouts(
-        run.params, key, states, commands, model=model, chunk=job.budget["chunk"]
+    frames = steering.steered_rollouts(
+        camdm_controller.character(run.params, model),
+        key,
+        states,
+        commands,
+        chunk=job.budget["chunk"],
     )
-    made = camdm_steering.rollout_windows(
-        frames, jnp.asarray(judge.labels), fps=fps, skip=camdm_evaluation.SKIP
+    made = windows.rollout_windows(
+        frames, jnp.asarray(judge.labels), skip=camdm_evaluation.SKIP
     )
     features, hits = style_evaluator.recognized(skeleton, made, judge.recognizer)
     owner = np.asarray(made.group) % job.replications
@@ -273,7 +276,7 @@ def bench(job: Job) -> Bench:
         describe={
             "source": run.model.source,
             "samples": f"one rollout of {job.budget['seconds']:g} s for each of "
-            f"{len(run.model.labels)} styles, preset {PRESET!r}; Fréchet distances of "
+            f"{len(run.model.labels)} styles, course {COURSE!r}; Fréchet distances of "
             f"{judge.count} windows to {len(judge.reference)}; the clips' distances "
             "are of as many random subsets, their other intervals over clips; "
             "fid_unbiased is extrapolated to infinitely many windows from a row's "

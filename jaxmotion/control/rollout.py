@@ -2,17 +2,17 @@
 
 A controller is three functions for one character:
 
-* `urgency(state, command)` says which plan the tick needs: 0 none, 1 .. n one of the n
-  planners, dearer ones behind.
+* `plan_level(state, command)` says which plan the tick needs: 0 none, 1 .. n one of the
+  n planners, from the cheapest to the most expensive.
 * `plans[i - 1](key, state, command)` makes a new plan (runs a network).
 * `advance(state, command)` displays the next frame.
 
 `tick` composes them for one character: live use. `rollout` scans them over time for a
 batch. There a plain `vmap(tick)` would run every planner in every tick, because under
 vmap a conditional computes all of its branches; so the batch asks once a tick for the
-dearest plan that any of its characters needs, and runs only that one. Characters that
-need none keep theirs, and those that need a cheaper one get the dearer one, which must
-give them the same (as classifier-free guidance with scale 1 does).
+most expensive plan that any of its characters needs, and runs only that one. Characters
+that need none keep theirs, and those that need a cheaper one get the more expensive
+one, which must give them the same (as classifier-free guidance with scale 1 does).
 
 Keys: character c draws from `fold_in(key, c)`, tick i of it from `fold_in(that, i)`. So
 neither the number of characters nor their division into chunks changes a result.
@@ -39,12 +39,12 @@ class Controller:
     """The three functions of the module's docstring; not a pytree.
 
     Attributes:
-      urgency: `(state, command) -> int32`.
+      plan_level: `(state, command) -> int32`.
       plans: Planners in the order of their cost, `(key, state, command) -> state`.
       advance: `(state, command) -> (state, frame)`.
     """
 
-    urgency: Callable[[State, Commands], Int[Array, ""]]
+    plan_level: Callable[[State, Commands], Int[Array, ""]]
     plans: tuple[Callable[[Key, State, Commands], State], ...]
     advance: Callable[[State, Commands], tuple[State, Frame]]
 
@@ -64,7 +64,7 @@ def tick(
       The next state and the displayed frame.
     """
     branches = [lambda k, s, c: s, *controller.plans]
-    need = controller.urgency(state, command)
+    need = controller.plan_level(state, command)
     state = jax.lax.switch(need, branches, key, state, command)
     return controller.advance(state, command)
 
@@ -79,7 +79,7 @@ def _select(keep: Array, old: State, new: State) -> State:
 def _batch_tick(
     controller: Controller, keys: Array, states: State, commands: Commands
 ) -> tuple[State, Frame]:
-    need = jax.vmap(controller.urgency)(states, commands)
+    need = jax.vmap(controller.plan_level)(states, commands)
 
     def run(plan) -> Callable:
         def planned(keys: Array, states: State, commands: Commands) -> State:

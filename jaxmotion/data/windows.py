@@ -5,7 +5,7 @@ is a gather that jit-compiles, so that data stays on the device for a whole trai
 """
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -182,4 +182,57 @@ def eval_windows(clips: Clips, *, stride: int, field: str) -> EvalWindows:
         facing=rotation.safe_normalize(facing, jnp.array([0.0, 1.0])),
         label=clips.labels[field][index.clips],
         group=index.clips,
+    )
+
+
+def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
+    """Raises unless rollouts are long enough to be measured; for use before the work.
+
+    Args:
+      ticks: Length of the rollouts.
+      fps: Ticks per second.
+      skip: Ticks to leave out at the start.
+
+    Raises:
+      ValueError: names the length that is needed.
+    """
+    if ticks < skip + EVAL_WINDOW:
+        raise ValueError(
+            f"rollouts of {ticks / fps:g} s are too short to measure: expected at "
+            f"least {(skip + EVAL_WINDOW) / fps:g} s ({skip} frames left out, "
+            f"then windows of {EVAL_WINDOW})"
+        )
+
+
+def rollout_windows(
+    frames: Any, labels: Int[Array, " characters"], *, skip: int
+) -> EvalWindows:
+    """Consecutive windows of rollouts.
+
+    Args:
+      frames: A `control.frame.Frame` [characters, ticks, ...].
+      labels: Style of each character.
+      skip: Ticks to leave out at the start, where the data's own pose still shows.
+
+    Returns:
+      The windows; their group is the character.
+
+    Raises:
+      ValueError: if the rollouts are shorter than what is left out and one window.
+    """
+    motion = frames.motion
+    characters, ticks = motion.root_position.shape[:2]
+    check_ticks(ticks, fps=motion.fps, skip=skip)
+    number = (ticks - skip) // EVAL_WINDOW
+
+    def cut(x: Array) -> Array:
+        x = x[:, skip : skip + number * EVAL_WINDOW]
+        return x.reshape(characters * number, EVAL_WINDOW, *x.shape[2:])
+
+    return EvalWindows(
+        motion=jax.tree.map(cut, motion),
+        velocity=cut(frames.desired_velocity),
+        facing=cut(frames.desired_facing),
+        label=jnp.repeat(labels, number),
+        group=jnp.repeat(jnp.arange(characters), number),
     )

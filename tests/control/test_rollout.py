@@ -38,7 +38,7 @@ def toy(ran=None):
         return (count + 1, value, plans), frame
 
     return Controller(
-        urgency=lambda state, command: command,
+        plan_level=lambda state, command: command,
         plans=(plan(1), plan(2)),
         advance=advance,
     )
@@ -134,7 +134,7 @@ def test_commands_may_be_any_tree(commands):
 
     plain = toy()
     nested = Controller(
-        urgency=lambda s, c: plain.urgency(s, c.number),
+        plan_level=lambda s, c: plain.plan_level(s, c.number),
         plans=tuple(
             lambda k, s, c, plan=plan: plan(k, s, c.number) for plan in plain.plans
         ),

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.control import presets
+from jaxmotion.control import courses
 from jaxmotion.data import gaits, procedural
 from jaxmotion.motion.skeleton import Motion, joint_positions
 
@@ -42,18 +42,19 @@ def still(frames, **changes):
 
 
 @functools.cache
-def steered(gait, preset, part=1.0):
-    """A gait steered along a preset at a part of its top speed."""
+def steered(gait, course, part=1.0):
+    """A gait steered along a course at a part of its top speed."""
     made = gaits.GAITS[gait]
     speed = part * made.max_speed
-    commands = presets.preset_commands(
-        preset, seconds=SECONDS, fps=FPS, speed=speed, label=0
+    commands = courses.course_commands(
+        course, seconds=SECONDS, fps=FPS, speed=speed, label=0
     )
     found = procedural.walk(commands, made, fps=FPS, seed=5)
     return commands, found, fk(found.motion)
 
 
-CASES = [(gait, preset) for gait in gaits.GAITS for preset in presets.PRESETS]
+COURSES = ("forward", "strafe", "stop_and_go")
+CASES = [(gait, course) for gait in gaits.GAITS for course in COURSES]
 
 
 def check_contacts(walk, position):
@@ -187,10 +188,10 @@ def test_path_and_facing_are_the_springs_of_a_first_order_reference():
 
 
 @pytest.mark.parametrize("speed", [2.0, 3.0, 5.0, 9.0])
-@pytest.mark.parametrize("preset", presets.PRESETS)
-def test_too_fast_is_an_error_or_still_exact(preset, speed):
-    commands = presets.preset_commands(
-        preset, seconds=12.0, fps=FPS, speed=speed, label=0
+@pytest.mark.parametrize("course", COURSES)
+def test_too_fast_is_an_error_or_still_exact(course, speed):
+    commands = courses.course_commands(
+        course, seconds=12.0, fps=FPS, speed=speed, label=0
     )
     for name in ("neutral", "sneaky"):
         try:
@@ -207,7 +208,7 @@ def test_too_fast_is_an_error_or_still_exact(preset, speed):
 def test_other_rates_walk_the_same_path_with_exact_contacts(fps):
     made = []
     for rate in (30.0, fps):
-        commands = presets.preset_commands(
+        commands = courses.course_commands(
             "forward", seconds=8.0, fps=rate, speed=1.2, label=0
         )
         made.append(procedural.walk(commands, gaits.GAITS["neutral"], fps=rate, seed=1))

@@ -141,7 +141,7 @@ def test_without_an_evaluator_there_are_no_parameters():
 
 
 def test_camdm_refuses_one_that_does_not_fit_before_any_training(capsys):
-    call = dict(preset="forward", rollouts=2, seconds=4.0)
+    call = dict(course="forward", rollouts=2, seconds=4.0)
     wrong = samples.evaluator("style", labels=samples.STYLES, frames=60)
     with pytest.raises(ValueError, match="does not fit the run: field 'joints'"):
         camdm_evaluation.evaluate_run(samples.run(), evaluator=wrong, **call)

@@ -161,7 +161,7 @@ def check_evaluation(folder, rollouts):
         assert found["rows"]["rollouts"][name]["samples"] == rollouts
     assert found["health"]["rollouts"] == rollouts
     assert set(found["speeds"]) == set(samples.STYLES)
-    assert found["arguments"]["preset"] == "forward"
+    assert found["arguments"]["course"] == "forward"
     assert "procedural" in found["source"]
     assert "(trained here)" in (folder / "table.md").read_text().splitlines()[-1]
 
@@ -386,9 +386,9 @@ def test_what_is_wrong_is_named_before_any_work(
     assert (contents(trained), contents(tmp_path)) == before
 
 
-def test_an_unknown_preset_lists_the_known_ones(call, trained, capsys):
+def test_an_unknown_course_lists_the_known_ones(call, trained, capsys):
     with pytest.raises(SystemExit) as stop:
-        call(f"rollout --run {trained} --style zombie --preset waltz")
+        call(f"rollout --run {trained} --style zombie --course waltz")
     assert stop.value.code == 2
     text = capsys.readouterr()
     for word in ("waltz", "forward", "strafe", "stop_and_go"):

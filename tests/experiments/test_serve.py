@@ -728,7 +728,7 @@ def counting_controller():
         return state | {"root": root}, state | {"facing": command.facing}
 
     return rollout.Controller(
-        urgency=lambda state, command: jnp.int32(state["label"] != command.label),
+        plan_level=lambda state, command: jnp.int32(state["label"] != command.label),
         plans=(plan,),
         advance=advance,
     )

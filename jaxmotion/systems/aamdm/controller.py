@@ -13,6 +13,10 @@ which are steered in other ways, run in it too; `guided` makes one of AAMDM.
 
 Source: Li et al. 2024 (AAMDM), sections 3.5 and 3.6. J is ours: half the squared
 distance of the 12 features in units of their deviation over the data.
+
+What frames hold as `extra`: the simulation bone in the world ("bone_origin",
+"bone_facing", "bone_velocity" in m/s), the path features that the frame promises
+("path") and those that were asked for at this tick ("wanted_path").
 """
 
 import dataclasses
@@ -22,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
 from jaxmotion.motion import features, ground, path_features, pose, spring
 from jaxmotion.motion.features import unpack
@@ -52,32 +57,6 @@ class CharacterState:
     bone: PlanarFrame
     velocity: Float[Array, "*batch 2"]
     turn_rate: Float[Array, "*batch"]
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
-    """What a tick shows.
-
-    Attributes:
-      root_position: World, meters.
-      joint_rotation: Parent-local, two columns each.
-      bone: The simulation bone, world.
-      velocity: Of the bone, meters per second, world.
-      path: Path features that the frame promises.
-      wanted: Path features that the user asked for at this tick.
-      desired_velocity: Meters per second, as commanded.
-      desired_facing: As commanded.
-    """
-
-    root_position: Float[Array, "*batch 3"]
-    joint_rotation: Float[Array, "*batch joints 6"]
-    bone: PlanarFrame
-    velocity: Float[Array, "*batch 2"]
-    path: Float[Array, "*batch 12"]
-    wanted: Float[Array, "*batch 12"]
-    desired_velocity: Float[Array, "*batch 2"]
-    desired_facing: Float[Array, "*batch 2"]
 
 
 def init_state(
@@ -215,12 +194,17 @@ def advance(
     return state, Frame(
         root_position=root,
         joint_rotation=rot6d,
-        bone=bone,
-        velocity=velocity,
-        path=path,
-        wanted=path if wanted is None else wanted,
         desired_velocity=command.velocity,
         desired_facing=command.facing,
+        planned=jnp.ones((), bool),
+        extra={
+            "bone_origin": bone.origin,
+            "bone_facing": bone.facing,
+            "bone_velocity": velocity,
+            "path": path,
+            "wanted_path": path if wanted is None else wanted,
+        },
+        fps=fps,
     )
 
 
@@ -273,7 +257,7 @@ def controller(
         )
 
     return Controller(
-        urgency=lambda state, command: jnp.ones((), jnp.int32),
+        plan_level=lambda state, command: jnp.ones((), jnp.int32),
         plans=(plan,),
         advance=show,
     )

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmotion.control import presets, rollout
+from jaxmotion.control import courses, rollout
+from jaxmotion.control.frame import Frame
 from jaxmotion.evaluation import (
     alignment,
     contact,
@@ -31,7 +32,7 @@ from jaxmotion.motion.features import unpack
 from jaxmotion.motion.skeleton import Skeleton, forward_kinematics
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
 from jaxmotion.systems.aamdm import controller as aamdm_controller
-from jaxmotion.systems.aamdm.controller import CharacterState, Frame, Stepper
+from jaxmotion.systems.aamdm.controller import CharacterState, Stepper
 from jaxmotion.systems.aamdm.data import PoseData, starts
 from jaxmotion.systems.aamdm.space import Space
 from jaxmotion.systems.aamdm.training import Run
@@ -59,7 +60,7 @@ def start_states(run: Run, space: Space, number: int, *, seed: int) -> Character
 
 
 def commands(
-    run: Run, number: int, ticks: int, *, preset: str, speed: float
+    run: Run, number: int, ticks: int, *, course: str, speed: float
 ) -> Command:
     """The same commands for every character.
 
@@ -67,18 +68,18 @@ def commands(
       run: The run.
       number: Characters.
       ticks: Length.
-      preset: Of `presets.PRESETS`.
+      course: Of `courses.COURSES`.
       speed: Meters per second.
 
     Returns:
       Commands [characters, ticks, ...].
 
     Raises:
-      ValueError: if there is no such preset.
+      ValueError: if there is no such course.
     """
     fps = run.train.fps
-    one = presets.preset_commands(
-        preset, seconds=ticks / fps, fps=fps, speed=speed, label=0
+    one = courses.course_commands(
+        course, seconds=ticks / fps, fps=fps, speed=speed, label=0
     )
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (number, *x.shape)), one)
 
@@ -163,12 +164,17 @@ def data_frames(
         return Frame(
             root_position=root,
             joint_rotation=rot6d,
-            bone=bone,
-            velocity=velocity,
-            path=paths,
-            wanted=paths,
             desired_velocity=velocity,
             desired_facing=bone.facing,
+            planned=jnp.ones(ticks, bool),
+            extra={
+                "bone_origin": bone.origin,
+                "bone_facing": bone.facing,
+                "bone_velocity": velocity,
+                "path": paths,
+                "wanted_path": paths,
+            },
+            fps=fps,
         )
 
     return jax.lax.map(window, first[chosen])
@@ -190,7 +196,7 @@ def frames_per_second(
       Frames per second, decoding and placing included, compilation not.
     """
     states = start_states(run, space, 1, seed=0)
-    given = commands(run, 1, ticks, preset="forward", speed=1.0)
+    given = commands(run, 1, ticks, course="forward", speed=1.0)
     roll = roller(run, space, step, steered=False)
     jax.block_until_ready(roll(jax.random.key(0), states, given))
     times = []
@@ -254,9 +260,9 @@ def make_reference(skeleton: Skeleton, data: PoseData) -> Reference:
 
 def _character_features(reference: Reference, frames: Frame, positions: Array) -> Array:
     """Normalized positions in the character's axes [characters, ticks, 3 J]."""
-    origin = frames.bone.origin[..., None, :]
+    origin = frames.extra["bone_origin"][..., None, :]
     facing = jnp.broadcast_to(
-        frames.bone.facing[..., None, :], positions.shape[:-1] + (2,)
+        frames.extra["bone_facing"][..., None, :], positions.shape[:-1] + (2,)
     )
     planar = ground.into_frame(positions[..., ::2] - origin, facing)
     local = jnp.stack([planar[..., 0], positions[..., 1], planar[..., 1]], axis=-1)
@@ -316,7 +322,7 @@ def free_row(
     ]
     feet = positions[..., jnp.array(skeleton.feet), :]
     feet = feet.at[..., 1].add(-reference.toe_height)
-    speed = jnp.linalg.norm(frames.velocity, axis=-1).mean(axis=1)
+    speed = jnp.linalg.norm(frames.extra["bone_velocity"], axis=-1).mean(axis=1)
     return row | {
         "div": table.cell(jnp.stack(spread)),
         "fid": table.cell(jnp.stack(distance)),
@@ -332,11 +338,13 @@ def free_row(
 
 def _realized(frames: Frame, fps: float) -> tuple[Array, Array]:
     """Path features that came true, and those asked for, at the same ticks."""
-    bone = Trajectory(position=frames.bone.origin, facing=frames.bone.facing)
+    bone = Trajectory(
+        position=frames.extra["bone_origin"], facing=frames.extra["bone_facing"]
+    )
     found = jax.vmap(lambda x: path_features.path_features(x, fps=fps))(bone)
     last = max(path_features.path_offsets(fps))
     # What was asked for at tick i + 1 was asked of the bone after tick i.
-    return found[:, : -last - 1], frames.wanted[:, 1:-last]
+    return found[:, : -last - 1], frames.extra["wanted_path"][:, 1:-last]
 
 
 def control_row(frames: Frame, *, fps: float) -> dict[str, table.Cell]:
@@ -352,11 +360,13 @@ def control_row(frames: Frame, *, fps: float) -> dict[str, table.Cell]:
       te_realized: the same of where the character went; trajectory_error_deg: angle
       between the commanded and the actual velocity.
     """
-    promised = jnp.abs(frames.path - frames.wanted).mean(axis=(1, 2))
+    promised = jnp.abs(frames.extra["path"] - frames.extra["wanted_path"]).mean(
+        axis=(1, 2)
+    )
     found, wanted = _realized(frames, fps)
     realized = jnp.abs(found - wanted).mean(axis=(1, 2))
     angle = alignment.trajectory_error(
-        frames.desired_velocity, frames.bone.origin, fps
+        frames.desired_velocity, frames.extra["bone_origin"], fps
     ).error
     return {
         "te_promised": table.cell(promised),

@@ -22,10 +22,15 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.control import inertia
+from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
+from jaxmotion.control.steering import Character, check_labels
+from jaxmotion.data import windows
+from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import schedule
 from jaxmotion.motion import features, spring, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton
@@ -114,26 +119,6 @@ class CharacterState:
     guided: Int[Array, "*batch"]
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
-    """What one tick displays.
-
-    Attributes:
-      root_position: Of the displayed pose, meters, world.
-      joint_rotation: Of the displayed pose, two columns.
-      desired_velocity: What the user's springs ask for now, meters per second.
-      desired_facing: Likewise, unit.
-      planned: Whether this tick made a new plan.
-    """
-
-    root_position: Float[Array, "*batch 3"]
-    joint_rotation: Float[Array, "*batch joints 6"]
-    desired_velocity: Float[Array, "*batch 2"]
-    desired_facing: Float[Array, "*batch 2"]
-    planned: Bool[Array, "*batch"]
-
-
 def init_state(
     skeleton: Skeleton, past: Motion, *, config: camdm_model.Config
 ) -> CharacterState:
@@ -198,7 +183,7 @@ def is_new_style(
     return (state.command.label != command.label) & started
 
 
-def urgency(
+def plan_level(
     state: CharacterState, command: trajectory.Command, *, control: Control
 ) -> Int[Array, ""]:
     """Which plan a tick needs.
@@ -219,21 +204,6 @@ def urgency(
     )
     guided = need & (new_style | (state.guided > 0))
     return need.astype(jnp.int32) + guided.astype(jnp.int32)
-
-
-__all__ = [
-    "RELEASED",
-    "CharacterState",
-    "Control",
-    "Frame",
-    "advance",
-    "controller",
-    "init_state",
-    "plan_frame",
-    "replan",
-    "urgency",
-    "wanted_trajectory",
-]
 
 
 def plan_frame(
@@ -401,6 +371,7 @@ def advance(
         desired_velocity=velocity,
         desired_facing=facing,
         planned=state.cursor == 0,
+        fps=config.fps,
     )
     # A style that changes while the old plan still plays arms the next plans.
     armed = is_new_style(state, command, control=control) & (state.cursor > 0)
@@ -459,7 +430,122 @@ def controller(
         )
 
     return Controller(
-        urgency=functools.partial(urgency, control=control),
+        plan_level=functools.partial(plan_level, control=control),
         plans=(plan(False), plan(True)),
         advance=functools.partial(advance, config=config, control=control),
     )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Method:
+    """What makes a controller of `(network's parameters, skeleton)`; hashable."""
+
+    config: camdm_model.Config
+    control: Control | None = None
+
+    def __call__(self, params: tuple[Params, Skeleton]) -> Controller:
+        """The controller."""
+        return controller(*params, config=self.config, control=self.control)
+
+
+def character(
+    params: Params, model: camdm_model.Model, *, control: Control | None = None
+) -> Character:
+    """A model as a character to be steered.
+
+    Args:
+      params: The network's parameters.
+      model: The model. Without poses of its own (`starts`) it starts from clips alone.
+      control: Constants of the run-time; None for the defaults.
+    """
+    return Character(
+        skeleton=model.skeleton,
+        labels=model.labels,
+        fps=model.config.fps,
+        source=model.source,
+        params=(params, model.skeleton),
+        method=Method(config=model.config, control=control),
+        starts=lambda labels, seed: own_states(model, labels, seed=seed),
+        clip_starts=lambda clips, labels, seed: start_states(
+            clips, model, labels, field=camdm_model.style_field(model, clips), seed=seed
+        ),
+    )
+
+
+def start_states(
+    clips: Clips, model: camdm_model.Model, labels: np.ndarray, *, field: str, seed: int
+) -> CharacterState:
+    """States of characters that start with real poses of their style.
+
+    Each is moved so that it stands at the origin and faces +z.
+
+    Args:
+      clips: Where the poses come from.
+      model: The model.
+      labels: Style of each character.
+      field: Label field that is the style.
+      seed: Of the choice of poses.
+
+    Returns:
+      States, batch axis first.
+
+    Raises:
+      ValueError: if a label is none of the model's, or a style has no clip that is long
+        enough; names it.
+    """
+    past = model.config.past
+    index = windows.window_index(clips, past, short="skip")
+    owner = np.asarray(clips.labels[field])[np.asarray(index.clips)]
+    generator = np.random.default_rng(seed)
+    starts = []
+    check_labels(labels, model.labels)
+    for label in labels:
+        known = np.flatnonzero(owner == label)
+        if known.size == 0:
+            raise ValueError(f"no clip of style {model.labels[label]!r} to start from")
+        starts.append(int(index.starts[generator.choice(known)]))
+    cut = jax.vmap(lambda start: windows.cut(clips, start, past))
+    return _states_of(model.skeleton, cut(jnp.asarray(starts)), config=model.config)
+
+
+def own_states(
+    model: camdm_model.Model, labels: np.ndarray, *, seed: int = 0
+) -> CharacterState:
+    """States of characters that start with the model's own poses of their style.
+
+    Args:
+      model: A model with `starts`.
+      labels: Style of each character.
+      seed: Of the choice of poses.
+
+    Returns:
+      States, batch axis first.
+
+    Raises:
+      ValueError: if the model has no poses of its own, or no such style.
+    """
+    if model.starts is None:
+        raise ValueError("the model has no poses to start from: give clips")
+    check_labels(labels, model.labels)
+    labels = np.asarray(labels)
+    number = model.starts.root_position.shape[1]
+    which = np.random.default_rng(seed).integers(number, size=labels.shape)
+    chosen = jax.tree.map(lambda x: x[labels, which], model.starts)
+    return _states_of(model.skeleton, chosen, config=model.config)
+
+
+def at_origin(skeleton: Skeleton, motion: Motion) -> Motion:
+    """A motion moved so that its last pose stands at the origin and faces +z."""
+    path = trajectory.root_trajectory(skeleton, motion)
+    frame = trajectory.PlanarFrame(origin=path.position[-1], facing=path.facing[-1])
+    return features.to_frame(motion, frame)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _states_of(
+    skeleton: Skeleton, motions: Motion, *, config: camdm_model.Config
+) -> CharacterState:
+    def state(motion: Motion) -> CharacterState:
+        return init_state(skeleton, at_origin(skeleton, motion), config=config)
+
+    return jax.vmap(state)(motions)

@@ -1,4 +1,4 @@
-"""Characters of a run, steered along a preset; and how they measure up."""
+"""Characters of a run, steered along a course; and how they measure up."""
 
 import dataclasses
 import functools
@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmotion.control import courses, steering
+from jaxmotion.control.frame import Frame
 from jaxmotion.data import selection, windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.data.windows import EvalWindows
@@ -29,7 +31,6 @@ from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import release as camdm_release
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm.training import Run
 from jaxmotion.typing import Key
 
@@ -175,7 +176,7 @@ def metric_row(
 
     Args:
       skeleton: The skeleton.
-      found: Windows.
+      found: EvalWindows.
       hits: From `recognized`; None to leave style accuracy out.
       height: Below it a foot joint should not move, meters.
 
@@ -198,7 +199,7 @@ def metric_row(
 
 def rollout_health(
     skeleton: Skeleton,
-    frames: camdm_controller.Frame,
+    frames: Frame,
     *,
     fps: float,
     height: float,
@@ -217,11 +218,8 @@ def rollout_health(
     """
 
     @jax.jit
-    def run(x: camdm_controller.Frame) -> tuple[Array, Array]:
-        motion = Motion(
-            root_position=x.root_position, joint_rotation=x.joint_rotation, fps=fps
-        )
-        positions = joint_positions(skeleton, motion)
+    def run(x: Frame) -> tuple[Array, Array]:
+        positions = joint_positions(skeleton, x.motion)
         diverged = health.has_diverged(
             positions, fps=fps, min_root=0.5 * height, max_root=1.5 * height
         )
@@ -244,7 +242,7 @@ def repeat_diversity(
 
     Args:
       skeleton: The skeleton.
-      found: Windows of rollouts in which every `repeats` neighboring characters
+      found: EvalWindows of rollouts in which every `repeats` neighboring characters
         share style and commands.
       repeats: Characters a style.
 
@@ -284,7 +282,7 @@ def evaluation_table(
     real: EvalWindows,
     dense: EvalWindows,
     made: EvalWindows,
-    frames: camdm_controller.Frame,
+    frames: Frame,
     recognizer: Recognized,
     *,
     repeats: int,
@@ -340,14 +338,14 @@ def evaluation_table(
 SKIP = 60
 
 
-def preset_of_run(
-    run: Run, preset: str, labels: np.ndarray, *, seconds: float, speed: float | None
+def course_of_run(
+    run: Run, course: str, labels: np.ndarray, *, seconds: float, speed: float | None
 ) -> tuple[np.ndarray, trajectory.Command]:
     """Speed and commands of each character.
 
     Args:
       run: The run.
-      preset: Of `presets.PRESETS`.
+      course: Of `courses.COURSES`.
       labels: Style of each character.
       seconds: Length.
       speed: Meters per second; None for each style's own median speed.
@@ -356,12 +354,12 @@ def preset_of_run(
       Speeds [characters], and commands [characters, ticks, ...].
 
     Raises:
-      ValueError: if there is no such preset.
+      ValueError: if there is no such course.
     """
     speeds = np.asarray(selection.label_speeds(run.train, field=run.field))[labels]
     speeds = speeds if speed is None else np.full(labels.shape, speed)
-    return speeds, camdm_steering.preset_batch(
-        preset, labels, speeds, seconds=seconds, fps=run.model.config.fps
+    return speeds, courses.course_batch(
+        course, labels, speeds, seconds=seconds, fps=run.model.config.fps
     )
 
 
@@ -369,7 +367,7 @@ def steer_one(
     run: Run,
     style: str,
     *,
-    preset: str,
+    course: str,
     seconds: float,
     to_style: str | None = None,
     speed: float | None = None,
@@ -380,7 +378,7 @@ def steer_one(
     Args:
       run: The run.
       style: Its style.
-      preset: Of `presets.PRESETS`.
+      course: Of `courses.COURSES`.
       seconds: Length.
       to_style: Its style from half time on; None for the same.
       speed: Meters per second; None for the first style's own median speed.
@@ -390,27 +388,25 @@ def steer_one(
       The motion, and the velocity asked for in each frame, meters per second.
 
     Raises:
-      ValueError: if there is no such preset or style; names those there are.
+      ValueError: if there is no such course or style; names those there are.
     """
     model = run.model
     label = np.array([model.label(style)])
     end = label[0] if to_style is None else model.label(to_style)
-    _, commands = preset_of_run(run, preset, label, seconds=seconds, speed=speed)
+    _, commands = course_of_run(run, course, label, seconds=seconds, speed=speed)
     half = commands.label.shape[1] // 2
     changed = commands.label.at[:, half:].set(int(end))
     commands = dataclasses.replace(commands, label=changed)
-    states = camdm_steering.start_states(
+    states = camdm_controller.start_states(
         run.train, model, label, field=run.field, seed=seed
     )
-    frames = camdm_steering.steered_rollouts(
-        run.params, jax.random.key(seed), states, commands, model=model
+    frames = steering.steered_rollouts(
+        camdm_controller.character(run.params, model),
+        jax.random.key(seed),
+        states,
+        commands,
     )
-    motion = Motion(
-        root_position=frames.root_position[0],
-        joint_rotation=frames.joint_rotation[0],
-        fps=model.config.fps,
-    )
-    return motion, frames.desired_velocity[0]
+    return frames[0].motion, frames.desired_velocity[0]
 
 
 def own_starts(run: Run, *, number: int, seed: int = 0) -> Motion:
@@ -436,32 +432,38 @@ def own_starts(run: Run, *, number: int, seed: int = 0) -> Motion:
     found = []
     for label in range(len(model.labels)):
         labels = np.full(many, label)
-        commands = camdm_steering.straight_batch(
-            0.0, labels, seconds=12.0, fps=model.config.fps
-        )
-        states = camdm_steering.start_states(
-            run.train, model, labels, field=run.field, seed=seed
-        )
-        frames = camdm_steering.steered_rollouts(
-            run.params, jax.random.key(seed), states, commands, model=model, chunk=4
-        )
-        past = Motion(
-            root_position=frames.root_position[:, -model.config.past :],
-            joint_rotation=frames.joint_rotation[:, -model.config.past :],
+        commands = courses.course_batch(
+            "straight",
+            labels,
+            np.full(len(labels), 0.0),
+            seconds=12.0,
             fps=model.config.fps,
         )
+        states = camdm_controller.start_states(
+            run.train, model, labels, field=run.field, seed=seed
+        )
+        frames = steering.steered_rollouts(
+            camdm_controller.character(run.params, model),
+            jax.random.key(seed),
+            states,
+            commands,
+            chunk=4,
+        )
+        past = frames[:, -model.config.past :].motion
         positions = joint_positions(model.skeleton, past)
         unrest = jnp.mean(jnp.abs(jnp.diff(positions, axis=1)), axis=(1, 2, 3))
         calmest = jnp.argsort(unrest)[:number]
         motions = jax.tree.map(lambda x, i=calmest: x[i], past)
-        found.append(jax.vmap(lambda m: camdm_steering.at_origin(model, m))(motions))
+        found.append(
+            jax.vmap(lambda m: camdm_controller.at_origin(model.skeleton, m))(motions)
+        )
     return jax.tree.map(lambda *x: jnp.stack(x), *found)
 
 
 def evaluate_run(
     run: Run,
     *,
-    preset: str,
+    course: str,
     rollouts: int,
     seconds: float,
     speed: float | None = None,
@@ -474,7 +476,7 @@ def evaluate_run(
 
     Args:
       run: The run.
-      preset: Of `presets.PRESETS`.
+      course: Of `courses.COURSES`.
       rollouts: Characters, spread evenly over the styles; at least one a style.
       seconds: Length of each rollout.
       speed: Meters per second; None for each style's own median speed.
@@ -487,15 +489,15 @@ def evaluate_run(
       The table, and what belongs beside it: speeds, health, counts, versions.
 
     Raises:
-      ValueError: before any training, if there is no such preset, rollouts are too
+      ValueError: before any training, if there is no such course, rollouts are too
         short, a style has no held-out clip, or the evaluator does not fit the run.
     """
     model, field, fps = run.model, run.field, run.model.config.fps
     repeats = max(rollouts // len(model.labels), 1)
     labels = np.repeat(np.arange(len(model.labels)), repeats)
-    speeds, commands = preset_of_run(run, preset, labels, seconds=seconds, speed=speed)
-    camdm_steering.check_ticks(commands.label.shape[1], fps=fps, skip=SKIP)
-    states = camdm_steering.start_states(
+    speeds, commands = course_of_run(run, course, labels, seconds=seconds, speed=speed)
+    windows.check_ticks(commands.label.shape[1], fps=fps, skip=SKIP)
+    states = camdm_controller.start_states(
         run.held_out, model, labels, field=field, seed=seed
     )
     key_fit, key_roll = jax.random.split(jax.random.key(seed))
@@ -503,16 +505,14 @@ def evaluate_run(
     frames = _timed_rollouts(run, key_roll, states, commands, chunk)
     real = windows.eval_windows(run.held_out, stride=windows.EVAL_WINDOW, field=field)
     dense = windows.eval_windows(run.train, stride=10, field=field)
-    made = camdm_steering.rollout_windows(
-        frames, jnp.asarray(labels), fps=fps, skip=SKIP
-    )
+    made = windows.rollout_windows(frames, jnp.asarray(labels), skip=SKIP)
     rows, report = evaluation_table(
         model.skeleton, real, dense, made, frames, judge, repeats=repeats
     )
     styles = camdm_release.style_features(model.skeleton, run.train, judge, field=field)
     for name, whole in (
         (TRUTH, camdm_release.of_clips(run.held_out, field=field)),
-        (ROLLOUTS, camdm_release.of_rollouts(frames, commands, fps=fps)),
+        (ROLLOUTS, camdm_release.of_rollouts(frames, commands)),
     ):
         values = camdm_release.metrics(model.skeleton, whole)
         fid = camdm_release.distances(model.skeleton, whole, judge, styles)
@@ -579,8 +579,12 @@ def _timed_rollouts(
     number, ticks = commands.label.shape
     print(f"{number} rollouts of {ticks} ticks, in one program", flush=True)
     begun = time.perf_counter()
-    frames = camdm_steering.steered_rollouts(
-        run.params, key, states, commands, model=run.model, chunk=chunk
+    frames = steering.steered_rollouts(
+        camdm_controller.character(run.params, run.model),
+        key,
+        states,
+        commands,
+        chunk=chunk,
     )
     jax.block_until_ready(frames)
     taken = time.perf_counter() - begun

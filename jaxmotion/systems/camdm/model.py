@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.learning import checkpoint, runs
 from jaxmotion.motion import features, rotation, trajectory
@@ -444,6 +445,47 @@ def _shapes(model: Model, where: Path) -> Params:
     except Exception as error:  # whatever a network makes of sizes that do not fit
         line = (str(error).splitlines() or [type(error).__name__])[0]
         raise ValueError(f"{where}: field 'config' is of no network: {line}") from error
+
+
+def check_clips(model: Model, clips: Clips, field: str) -> None:
+    """Raises unless clips are of the model's skeleton, styles and rate.
+
+    Args:
+      model: The model.
+      clips: The clips.
+      field: Label field that is the style.
+
+    Raises:
+      ValueError: names what differs.
+    """
+    pairs = {
+        "joints": (model.skeleton.names, clips.skeleton.names),
+        "parents": (model.skeleton.parents, clips.skeleton.parents),
+        f"names of {field!r}": (model.labels, clips.names(field)),
+        "fps": (model.config.fps, clips.fps),
+    }
+    for what, (expected, found) in pairs.items():
+        if expected != found:
+            raise ValueError(
+                f"the clips do not fit the model: {what} {found}, expected {expected}"
+            )
+
+
+def style_field(model: Model, clips: Clips) -> str:
+    """The label field of clips that has the model's styles.
+
+    Raises:
+      ValueError: if there is none, or the clips are of another skeleton or rate.
+    """
+    fields = dict(clips.label_names)
+    for field, names in fields.items():
+        if names == model.labels:
+            check_clips(model, clips, field)
+            return field
+    raise ValueError(
+        f"the clips do not fit the model: no label field (of {', '.join(fields)}) has "
+        f"the styles {', '.join(model.labels)}"
+    )
 
 
 # Models that come with the package, by name; each has a card beside it.

@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmotion.control.frame import Frame
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import frechet, table
 from jaxmotion.evaluators.style import Recognized, in_batches, recognized
 from jaxmotion.motion import facing, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
-from jaxmotion.systems.camdm import controller as camdm_controller
-from jaxmotion.systems.camdm import steering as camdm_steering
 
 Count = int | Int[Array, ""]
 
@@ -237,9 +236,7 @@ def of_clips(clips: Clips, *, field: str) -> Recordings:
     )
 
 
-def of_rollouts(
-    frames: camdm_controller.Frame, commands: trajectory.Command, *, fps: float
-) -> Recordings:
+def of_rollouts(frames: Frame, commands: trajectory.Command) -> Recordings:
     """Rollouts from their first frame on, with the commands that steered them.
 
     Each one's style is that of its first command.
@@ -247,15 +244,11 @@ def of_rollouts(
     characters, ticks = commands.label.shape
     label = commands.label[:, 0]
     return Recordings(
-        motion=Motion(
-            root_position=frames.root_position,
-            joint_rotation=frames.joint_rotation,
-            fps=fps,
-        ),
+        motion=frames.motion,
         frames=jnp.full(characters, ticks),
         label=label,
         command=commands,
-        windows=camdm_steering.rollout_windows(frames, label, fps=fps, skip=0),
+        windows=windows.rollout_windows(frames, label, skip=0),
     )
 
 

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion.control import courses, steering
 from jaxmotion.data import windows
 from jaxmotion.evaluation import by_frame, locomotion, table
 from jaxmotion.evaluators.style import in_batches
 from jaxmotion.motion import skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm.training import Run
 
 # Ticks to leave out at the start: characters begin with other speeds.
@@ -101,7 +101,7 @@ def speed_table(
       ValueError: if rollouts are too short to measure, or there is no such style.
     """
     model, fps = run.model, run.model.config.fps
-    camdm_steering.check_ticks(round(seconds * fps), fps=fps, skip=SKIP)
+    windows.check_ticks(round(seconds * fps), fps=fps, skip=SKIP)
     label = model.label(style)
     labels = np.full(rollouts, label)
     real = {
@@ -116,27 +116,23 @@ def speed_table(
         name: (*_row(run, found, height=height, rest=rest), np.asarray(found.label))
         for name, found in real.items()
     }
-    states = camdm_steering.start_states(
+    states = camdm_controller.start_states(
         run.held_out, model, labels, field=run.field, seed=seed
     )
     rows: dict[str, dict[str, table.Cell]] = {}
     plans: dict[str, by_frame.ByFrame] = {}
     for speed in speeds:
-        commands = camdm_steering.straight_batch(
-            speed, labels, seconds=seconds, fps=fps
+        commands = courses.course_batch(
+            "straight", labels, np.full(len(labels), speed), seconds=seconds, fps=fps
         )
-        frames = camdm_steering.steered_rollouts(
-            run.params,
+        frames = steering.steered_rollouts(
+            camdm_controller.character(run.params, model, control=control),
             jax.random.key(seed),
             states,
             commands,
-            model=model,
-            control=control,
             chunk=4,
         )
-        made = camdm_steering.rollout_windows(
-            frames, jnp.asarray(labels), fps=fps, skip=SKIP
-        )
+        made = windows.rollout_windows(frames, jnp.asarray(labels), skip=SKIP)
         row = _cells(*_row(run, made, height=height, rest=rest))
         if speed == 0:
             root = np.asarray(frames.root_position)[:, SKIP:, ::2]
@@ -149,11 +145,7 @@ def speed_table(
             near &= style_of == label
             part = {k: v[near] for k, v in values.items()}
             rows[f"{name}, about {speed:g} m/s"] = _cells(part, groups[near])
-        motion = skeleton.Motion(
-            root_position=frames.root_position[:, SKIP:],
-            joint_rotation=frames.joint_rotation[:, SKIP:],
-            fps=fps,
-        )
+        motion = frames[:, SKIP:].motion
         plans[f"told {speed:g} m/s"] = by_frame.by_frame(
             skeleton.joint_positions(model.skeleton, motion),
             model.skeleton.feet,

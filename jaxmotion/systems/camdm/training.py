@@ -321,30 +321,6 @@ def released_skeleton(path: Path, *, scale: float) -> Skeleton:
     return dataclasses.replace(skeleton, feet=style100.toes(skeleton, str(path)))
 
 
-def check_clips(model: camdm_model.Model, clips: Clips, field: str) -> None:
-    """Raises unless clips are of the model's skeleton, styles and rate.
-
-    Args:
-      model: The model.
-      clips: The clips.
-      field: Label field that is the style.
-
-    Raises:
-      ValueError: names what differs.
-    """
-    pairs = {
-        "joints": (model.skeleton.names, clips.skeleton.names),
-        "parents": (model.skeleton.parents, clips.skeleton.parents),
-        f"names of {field!r}": (model.labels, clips.names(field)),
-        "fps": (model.config.fps, clips.fps),
-    }
-    for what, (expected, found) in pairs.items():
-        if expected != found:
-            raise ValueError(
-                f"the clips do not fit the model: {what} {found}, expected {expected}"
-            )
-
-
 def load_run(
     run: Path, data: Path | None = None, contents: tuple[str, ...] = ()
 ) -> Run:
@@ -384,7 +360,7 @@ def load_run(
     )
     if contents and "content" in dict(parts[0].label_names):
         parts = tuple(selection.select(part, "content", contents) for part in parts)
-    check_clips(model, parts[0], field)
+    camdm_model.check_clips(model, parts[0], field)
     return Run(
         model=model, params=params, train=parts[0], held_out=parts[1], field=field
     )

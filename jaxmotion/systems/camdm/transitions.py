@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from jaxmotion.control import steering
+from jaxmotion.control.frame import Frame
 from jaxmotion.data import windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.transitions import transition
@@ -27,7 +29,6 @@ from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import release as camdm_release
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm.training import Run
 
 # Frames between the windows in which the new style is looked for.
@@ -64,7 +65,7 @@ class Changes:
 def make_changes(
     run: Run,
     *,
-    preset: str,
+    course: str,
     before: float,
     limit: float = 4.0,
     replications: int,
@@ -74,7 +75,7 @@ def make_changes(
 
     Args:
       run: The run.
-      preset: Of `presets.PRESETS`.
+      course: Of `courses.COURSES`.
       before: Seconds in the first style, at least half a window.
       limit: Seconds behind the command in which the change must have come.
       replications: Of all pairs, with start poses of their own.
@@ -84,7 +85,7 @@ def make_changes(
       The changes; their rollouts last so long that the last window is whole.
 
     Raises:
-      ValueError: if there are fewer than two styles or replications, no such preset,
+      ValueError: if there are fewer than two styles or replications, no such course,
         or no time.
     """
     number, fps = len(run.model.labels), run.model.config.fps
@@ -104,7 +105,7 @@ def make_changes(
     tick = round(before * fps)
     ticks = tick + max(round(limit * fps) + HALF, round(MEASURED * fps))
     of_style = functools.partial(
-        camdm_evaluation.preset_of_run, run, preset, seconds=ticks / fps, speed=None
+        camdm_evaluation.course_of_run, run, course, seconds=ticks / fps, speed=None
     )
     commands = jax.tree.map(
         lambda a, b: jnp.concatenate([a[:, :tick], b[:, tick:]], axis=1),
@@ -112,7 +113,7 @@ def make_changes(
         of_style(new)[1],
     )
     return Changes(
-        states=camdm_steering.start_states(
+        states=camdm_controller.start_states(
             run.held_out, run.model, old, field=run.field, seed=seed
         ),
         commands=commands,
@@ -141,7 +142,7 @@ def without(changes: Changes) -> Changes:
 
 def find_changes(
     skeleton: Skeleton,
-    frames: camdm_controller.Frame,
+    frames: Frame,
     changes: Changes,
     recognizer: Recognized,
     *,
@@ -166,14 +167,14 @@ def find_changes(
         last = first + windows.EVAL_WINDOW
         cut = jax.tree.map(lambda x: x[:, first:last], frames)  # noqa: B023
         label = jnp.asarray(changes.new)
-        made = camdm_steering.rollout_windows(cut, label, fps=fps, skip=0)
+        made = windows.rollout_windows(cut, label, skip=0)
         found.append(style_evaluator.recognized(skeleton, made, recognizer)[1] > 0.5)
     return np.stack(found, axis=1), centers / fps
 
 
 def transition_row(
     run: Run,
-    frames: camdm_controller.Frame,
+    frames: Frame,
     changes: Changes,
     recognizer: Recognized,
     *,
@@ -209,15 +210,13 @@ def transition_row(
     }
     behind = slice(changes.tick, changes.tick + round(MEASURED * fps))
     cut = jax.tree.map(lambda x: x[:, behind], frames)
-    made = camdm_steering.rollout_windows(
-        cut, jnp.asarray(changes.new), fps=fps, skip=0
-    )
+    made = windows.rollout_windows(cut, jnp.asarray(changes.new), skip=0)
     owner = changes.replication[np.asarray(made.group)]
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
     motion = camdm_evaluation.metric_row(skeleton, grouped, None, height=height)
     row |= {name: motion[name] for name in MOTION}
     # Of its changes of style the release measures neither direction nor facing.
-    whole = camdm_release.of_rollouts(frames, changes.commands, fps=fps)
+    whole = camdm_release.of_rollouts(frames, changes.commands)
     values = camdm_release.metrics(skeleton, dataclasses.replace(whole, command=None))
     return row | camdm_release.row(values, changes.replication)
 
@@ -253,13 +252,11 @@ def evaluate_transitions(
     height = camdm_evaluation.contact_height(run.model.skeleton, real)
 
     def row(own: Changes, control: camdm_controller.Control) -> dict[str, table.Cell]:
-        frames = camdm_steering.steered_rollouts(
-            run.params,
+        frames = steering.steered_rollouts(
+            camdm_controller.character(run.params, run.model, control=control),
             jax.random.key(seed),
             own.states,
             own.commands,
-            model=run.model,
-            control=control,
             chunk=chunk,
         )
         return transition_row(run, frames, own, recognizer, height=height)

@@ -13,6 +13,9 @@ One tick (1/30 s) of one player:
 The paper blends when the control changes; here at every plan, as CAMDM does, since a
 path that jumps at a regular plan would be no better.
 
+What frames hold as `extra`: the center of the displayed ball ("ball", meters, world),
+and how sure the model is that each joint touches it ("touch", 0..1).
+
 Source: SMGDiff, section 3; Chen et al. 2024 (CAMDM) for HFTE and the seam.
 """
 
@@ -22,9 +25,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Int
 
 from jaxmotion.control import inertia
+from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
@@ -74,30 +78,6 @@ class PlayerState:
     command: trajectory.Command
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Frame:
-    """What one tick displays.
-
-    Attributes:
-      root_position: Of the displayed pose, meters, world.
-      joint_rotation: Of the displayed pose, two columns.
-      ball: Center of the displayed ball, meters, world.
-      touch: How sure the model is that each joint touches the ball, 0..1.
-      desired_velocity: What the user asks for now, meters per second.
-      desired_facing: Likewise, unit.
-      planned: Whether this tick made a new plan.
-    """
-
-    root_position: Float[Array, "*batch 3"]
-    joint_rotation: Float[Array, "*batch joints 6"]
-    ball: Float[Array, "*batch 3"]
-    touch: Float[Array, "*batch touching"]
-    desired_velocity: Float[Array, "*batch 2"]
-    desired_facing: Float[Array, "*batch 2"]
-    planned: Bool[Array, "*batch"]
-
-
 def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerState:
     """State of a player that has shown `past` and has no plan yet.
 
@@ -135,7 +115,7 @@ def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerStat
     )
 
 
-def urgency(
+def plan_level(
     state: PlayerState, command: trajectory.Command, *, control: Control
 ) -> Int[Array, ""]:
     """Whether a tick needs a plan.
@@ -152,19 +132,6 @@ def urgency(
     changed = jnp.any(jnp.abs(old.velocity - command.velocity) > 1e-3)
     changed = changed | (old.label != command.label)
     return (changed | (state.cursor >= control.apply)).astype(jnp.int32)
-
-
-__all__ = [
-    "Control",
-    "Frame",
-    "PlayerState",
-    "advance",
-    "controller",
-    "init_state",
-    "replan",
-    "urgency",
-    "wanted_trajectory",
-]
 
 
 def wanted_trajectory(
@@ -296,11 +263,11 @@ def advance(
     frame = Frame(
         root_position=shown.motion.root_position[0],
         joint_rotation=shown.motion.joint_rotation[0],
-        ball=shown.ball[0],
-        touch=shown.touch[0],
         desired_velocity=command.velocity,
         desired_facing=command.facing,
         planned=state.cursor == 0,
+        extra={"ball": shown.ball[0], "touch": shown.touch[0]},
+        fps=shown.motion.fps,
     )
     return dataclasses.replace(
         state, past=past, cursor=state.cursor + 1, command=command
@@ -344,7 +311,7 @@ def controller(
         control=control,
     )
     return Controller(
-        urgency=functools.partial(urgency, control=control),
+        plan_level=functools.partial(plan_level, control=control),
         plans=(plan,),
         advance=advance,
     )

@@ -15,10 +15,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmotion.control import rollout
+from jaxmotion.control.frame import Frame
 from jaxmotion.evaluation import diversity
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
-from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.evaluation import Setting, Situations
@@ -105,27 +106,14 @@ def player(
         number = known.label.shape[0]
         size = max(n for n in range(1, chunk + 1) if number % n == 0)
         frames = rollout.rollout(driver, key, states, commands, chunk=size)[1]
-        return to_scene(frames, model)
+        return to_scene(frames)
 
     return play
 
 
-def to_scene(frames: smgdiff_controller.Frame, model: Model) -> Scene:
-    """Displayed frames as a scene.
-
-    Args:
-      frames: Of players.
-      model: The model.
-
-    Returns:
-      The scene.
-    """
-    motion = Motion(
-        root_position=frames.root_position,
-        joint_rotation=frames.joint_rotation,
-        fps=model.config.fps,
-    )
-    return Scene(motion=motion, ball=frames.ball, touch=frames.touch)
+def to_scene(frames: Frame) -> Scene:
+    """Displayed frames as a scene."""
+    return Scene(motion=frames.motion, **frames.extra)
 
 
 @functools.partial(jax.jit, static_argnames=("future", "fps"))

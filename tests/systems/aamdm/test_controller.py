@@ -194,16 +194,23 @@ def test_a_fixed_frame_moves_the_bone_by_its_velocity(steered):
     roll = jax.jit(functools.partial(rollout.rollout, made))
     states, frames = roll(jax.random.key(0), states, given)
 
+    shown = frames.extra
     position, facing = np.array([1.0, 2.0]), person.directions(0.7)
     for i in range(ticks):
         position, facing = reference.advance(position, facing, MOVE, SPIN, FPS)
-        np.testing.assert_allclose(frames.bone.origin[0, i], position, atol=1e-4)
-        np.testing.assert_allclose(frames.bone.facing[0, i], facing, atol=1e-4)
+        np.testing.assert_allclose(
+            frames.extra["bone_origin"][0, i], position, atol=1e-4
+        )
+        np.testing.assert_allclose(shown["bone_facing"][0, i], facing, atol=1e-4)
         world = (reference.turn(facing) @ MOVE)[[0, 2]]
-        np.testing.assert_allclose(frames.velocity[0, i], world, atol=1e-4)
+        np.testing.assert_allclose(
+            frames.extra["bone_velocity"][0, i], world, atol=1e-4
+        )
     np.testing.assert_allclose(states.bone.origin[0], position, atol=1e-4)
     np.testing.assert_allclose(states.turn_rate, SPIN[1], atol=1e-4)
-    np.testing.assert_allclose(frames.path[0, -1], normal(12, seed=9), atol=1e-4)
+    np.testing.assert_allclose(
+        frames.extra["path"][0, -1], normal(12, seed=9), atol=1e-4
+    )
     np.testing.assert_array_equal(frames.desired_velocity, given.velocity)
     np.testing.assert_array_equal(frames.desired_facing, given.facing)
     # Joint 0 stands over the bone, in its direction.

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.control.frame import Frame
 from jaxmotion.evaluation import table
-from jaxmotion.motion.trajectory import PlanarFrame
 from jaxmotion.systems.aamdm import data as aamdm_data
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
-from jaxmotion.systems.aamdm.controller import Frame
 from tests import person
 from tests.reference import pose as reference
 
@@ -89,10 +88,10 @@ def test_the_reference_is_that_of_the_poses():
 def test_windows_of_the_data_are_its_frames():
     frames = real(3, 100)
     assert frames.root_position.shape == (3, 100, 3)
-    np.testing.assert_array_equal(frames.bone.origin[:, 0], 0.0)
-    np.testing.assert_array_equal(frames.path, frames.wanted)
+    np.testing.assert_array_equal(frames.extra["bone_origin"][:, 0], 0.0)
+    np.testing.assert_array_equal(frames.extra["path"], frames.extra["wanted_path"])
     paths = np.asarray(run().train.paths)
-    for window in np.asarray(frames.path):
+    for window in np.asarray(frames.extra["path"]):
         start = np.flatnonzero(np.all(paths == window[0], axis=-1))[0]
         np.testing.assert_array_equal(window, paths[start : start + 100])
         height = run().train.poses[start : start + 100, 1]
@@ -131,11 +130,12 @@ def test_place_and_direction_in_the_world_do_not_count():
         root_position=frames.root_position @ matrix.T
         + person.float32(shift).reshape(1, 1, 3),
         joint_rotation=six,
-        bone=PlanarFrame(
-            origin=frames.bone.origin @ ground.T
+        extra=frames.extra
+        | {
+            "bone_origin": frames.extra["bone_origin"] @ ground.T
             + person.float32(shift[::2]).reshape(1, 1, 2),
-            facing=frames.bone.facing @ ground.T,
-        ),
+            "bone_facing": frames.extra["bone_facing"] @ ground.T,
+        },
     )
     assert abs(row_of(moved)["fid"].value) < 0.02
 
@@ -174,12 +174,17 @@ def stiff(speed, ticks=60, number=2):
     return Frame(
         root_position=many(motion.root_position),
         joint_rotation=many(motion.joint_rotation),
-        bone=PlanarFrame(origin=many(root[:, ::2]), facing=many(ahead)),
-        velocity=many(speed * ahead),
-        path=many(np.zeros((ticks, 12))),
-        wanted=many(np.zeros((ticks, 12))),
         desired_velocity=many(ahead),
         desired_facing=many(ahead),
+        planned=jnp.ones((number, ticks), bool),
+        extra={
+            "bone_origin": many(root[:, ::2]),
+            "bone_facing": many(ahead),
+            "bone_velocity": many(speed * ahead),
+            "path": many(np.zeros((ticks, 12))),
+            "wanted_path": many(np.zeros((ticks, 12))),
+        },
+        fps=FPS,
     )
 
 
@@ -198,6 +203,10 @@ def test_a_glider_skates_at_every_frame(speed, skates):
 # --- control -----------------------------------------------------------------------
 
 
+def with_extra(frames, **changes):
+    return dataclasses.replace(frames, extra=frames.extra | changes)
+
+
 def speeding(ticks=100, number=2):
     """Rollouts along +z that get faster, with features that came true."""
     frames = stiff(1.0, ticks, number)
@@ -206,16 +215,13 @@ def speeding(ticks=100, number=2):
     facing = np.tile([0.0, 1.0], (ticks, 1))
     found = reference.path_features(origin, facing, (20, 40, 60))
     origin = jnp.broadcast_to(person.float32(origin), (number, ticks, 2))
-    bone = PlanarFrame(origin=origin, facing=frames.bone.facing)
-    return dataclasses.replace(frames, bone=bone), found
+    return with_extra(frames, bone_origin=origin), found
 
 
 def test_promised_error_is_that_of_the_frames_features():
     frames, _ = speeding()
-    wanted = frames.path.at[0].add(0.3).at[1, :, :6].add(-0.1)
-    row = aamdm_evaluation.control_row(
-        dataclasses.replace(frames, wanted=wanted), fps=FPS
-    )
+    wanted = frames.extra["path"].at[0].add(0.3).at[1, :, :6].add(-0.1)
+    row = aamdm_evaluation.control_row(with_extra(frames, wanted_path=wanted), fps=FPS)
     np.testing.assert_allclose(row["te_promised"].value, (0.3 + 0.05) / 2, rtol=1e-5)
     assert row["te_promised"].samples == 2
 
@@ -228,16 +234,14 @@ def test_realized_error_is_that_of_where_it_went(offset):
     wanted = np.full((100, 12), 9.0)
     wanted[1:40] = came_true[:39] + offset
     wanted = jnp.broadcast_to(person.float32(wanted), (2, 100, 12))
-    row = aamdm_evaluation.control_row(
-        dataclasses.replace(frames, wanted=wanted), fps=FPS
-    )
+    row = aamdm_evaluation.control_row(with_extra(frames, wanted_path=wanted), fps=FPS)
     np.testing.assert_allclose(row["te_realized"].value, offset, atol=1e-5)
 
 
 def test_trajectory_error_is_the_angle_to_the_command():
     frames = stiff(1.0, ticks=100)
     aside = person.float32(1.3 * person.directions(np.deg2rad(25.0)))
-    desired = jnp.broadcast_to(aside, frames.velocity.shape)
+    desired = jnp.broadcast_to(aside, frames.extra["bone_velocity"].shape)
     found = aamdm_evaluation.control_row(
         dataclasses.replace(frames, desired_velocity=desired), fps=FPS
     )

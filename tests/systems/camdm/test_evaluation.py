@@ -1,5 +1,6 @@
 """The table of tiny clips, with rollouts that are known to be good or frozen."""
 
+import dataclasses
 import functools
 import json
 
@@ -13,7 +14,6 @@ from jaxmotion.data import selection, windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
-from jaxmotion.systems.camdm import steering as camdm_steering
 from tests import samples
 
 LABELS = np.repeat([0, 1], 2)
@@ -42,9 +42,7 @@ def evaluated(kind):
     frames = samples.walking(LABELS, seconds=14.0)
     frames = samples.standing(frames) if kind == "standing" else frames
     repeats = 1 if kind == "standing" else 2
-    made = camdm_steering.rollout_windows(
-        frames, jnp.asarray(LABELS), fps=30.0, skip=60
-    )
+    made = windows.rollout_windows(frames, jnp.asarray(LABELS), skip=60)
     return camdm_evaluation.evaluation_table(
         run.model.skeleton, real, dense, made, frames, recognizer, repeats=repeats
     )
@@ -90,9 +88,7 @@ def test_health_counts_who_stands_although_told_to_walk():
     run = parts()[0]
     frames = samples.walking(LABELS[:1])
     broken = frames.root_position.at[0, 50, 1].set(5.0)
-    frames = camdm_evaluation.camdm_control.Frame(
-        **{**vars(frames), "root_position": broken}
-    )
+    frames = dataclasses.replace(frames, root_position=broken)
     found = camdm_evaluation.rollout_health(
         run.model.skeleton, frames, fps=30.0, height=0.95
     )
@@ -117,10 +113,8 @@ def test_diversity_is_zero_for_characters_that_do_the_same():
     same = jax.tree.map(
         lambda x: jnp.repeat(x, 2, axis=0), samples.walking(np.array([0, 1]))
     )
-    windows = camdm_steering.rollout_windows(
-        same, jnp.asarray(LABELS), fps=30.0, skip=60
-    )
-    found = camdm_evaluation.repeat_diversity(run.model.skeleton, windows, repeats=2)
+    found = windows.rollout_windows(same, jnp.asarray(LABELS), skip=60)
+    found = camdm_evaluation.repeat_diversity(run.model.skeleton, found, repeats=2)
     assert found.value == pytest.approx(0.0, abs=1e-9) and found.samples == 2
     assert evaluated("walking")[0]["rollouts"]["diversity_m2"].value > 1e-4
 

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.control import courses
 from jaxmotion.data import windows
 from jaxmotion.data.clips import clip_motion
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.style import RecognizerConfig
 from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import release as camdm_release
-from jaxmotion.systems.camdm import steering as camdm_steering
 from tests import samples
 from tests.reference import metrics as oracle
 
@@ -25,7 +25,7 @@ SECONDS = 5.0
 @functools.cache
 def rollouts():
     """Frames of three characters, and what they were told."""
-    commands = camdm_steering.preset_batch(
+    commands = courses.course_batch(
         "forward", LABELS, np.full(3, 0.8), seconds=SECONDS, fps=30.0
     )
     return samples.walking(LABELS, seconds=SECONDS), commands
@@ -41,7 +41,7 @@ def scored():
 
 def recordings():
     frames, commands = rollouts()
-    return camdm_release.of_rollouts(frames, commands, fps=30.0)
+    return camdm_release.of_rollouts(frames, commands)
 
 
 def joints(motion):
@@ -119,9 +119,7 @@ def test_distances_are_of_each_recording_to_its_style(monkeypatch):
     frames, commands = rollouts()
     for i, label in enumerate(LABELS):
         own = jax.tree.map(lambda x, i=i: x[i : i + 1], frames)
-        made = camdm_steering.rollout_windows(
-            own, jnp.asarray([label]), fps=30.0, skip=0
-        )
+        made = windows.rollout_windows(own, jnp.asarray([label]), skip=0)
         rows, _ = recognized(skeleton, made, None)
         assert len(rows) == 2  # 150 frames
         data = reference[np.asarray(dense.label) == label]

@@ -118,13 +118,13 @@ def test_contents_narrow_the_clips_where_they_have_such_a_field(tmp_path):
         camdm_training.split_data(path, (), "mood", 0.4)
 
 
-def test_speeds_of_a_preset_are_the_styles_or_the_one_asked_for():
+def test_speeds_of_a_course_are_the_styles_or_the_one_asked_for():
     run, labels = samples.run(), np.array([1, 0, 1])
-    own, commands = camdm_evaluation.preset_of_run(
+    own, commands = camdm_evaluation.course_of_run(
         run, "forward", labels, seconds=2.0, speed=None
     )
     assert own[0] == own[2] != own[1]
-    given, commands = camdm_evaluation.preset_of_run(
+    given, commands = camdm_evaluation.course_of_run(
         run, "forward", labels, seconds=2.0, speed=0.7
     )
     np.testing.assert_array_equal(given, 0.7)
@@ -135,16 +135,16 @@ def test_speeds_of_a_preset_are_the_styles_or_the_one_asked_for():
 
 def test_what_is_wrong_is_found_before_any_training():
     run = samples.run()
-    options = dict(preset="forward", rollouts=2, seconds=6.0)
+    options = dict(course="forward", rollouts=2, seconds=6.0)
     for change, message in (
         (dict(seconds=3.0), "too short to measure"),
-        (dict(preset="waltz"), "unknown preset 'waltz'"),
+        (dict(course="waltz"), "unknown course 'waltz'"),
     ):
         with pytest.raises(ValueError, match=message):
             camdm_evaluation.evaluate_run(run, **(options | change))
     with pytest.raises(ValueError, match="unknown style 'sad': the model has neutral"):
-        camdm_evaluation.steer_one(run, "sad", preset="forward", seconds=1.0)
+        camdm_evaluation.steer_one(run, "sad", course="forward", seconds=1.0)
     with pytest.raises(ValueError, match="unknown style 'glad'"):
         camdm_evaluation.steer_one(
-            run, "zombie", to_style="glad", preset="forward", seconds=1.0
+            run, "zombie", to_style="glad", course="forward", seconds=1.0
         )

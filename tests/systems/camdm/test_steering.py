@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.control import presets
+from jaxmotion.control import courses, steering
 from jaxmotion.data import selection, windows
 from jaxmotion.motion import skeleton, trajectory
+from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import steering as camdm_steering
 from tests import samples
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -58,9 +58,7 @@ def test_what_is_wanted_of_a_clip_is_its_own_path_smoothed(run):
 
 def test_rollout_windows_leave_out_the_start_and_keep_their_owner():
     frames = samples.walking(LABELS, seconds=7.0)
-    found = camdm_steering.rollout_windows(
-        frames, jnp.asarray(LABELS), fps=30.0, skip=60
-    )
+    found = windows.rollout_windows(frames, jnp.asarray(LABELS), skip=60)
     assert found.motion.root_position.shape == (8, 60, 3)  # 150 frames hold two
     for window in range(8):
         owner, part = divmod(window, 2)
@@ -78,8 +76,8 @@ def test_rollout_windows_leave_out_the_start_and_keep_their_owner():
 def test_rollouts_too_short_to_measure_are_named():
     frames = samples.walking(LABELS[:1], seconds=3.9)
     with pytest.raises(ValueError, match=r"3\.9 s are too short.*at least 4 s"):
-        camdm_steering.rollout_windows(frames, jnp.asarray([0]), fps=30.0, skip=60)
-    camdm_steering.check_ticks(120, fps=30.0, skip=60)
+        windows.rollout_windows(frames, jnp.asarray([0]), skip=60)
+    windows.check_ticks(120, fps=30.0, skip=60)
 
 
 def test_style_speeds_are_medians_within_clips(run):
@@ -100,11 +98,11 @@ def test_a_style_without_clips_has_no_speed_and_no_start(run):
     )
     assert selection.label_speeds(lonely, field="style")[1] == 0.0
     with pytest.raises(ValueError, match="no clip of style 'zombie' to start from"):
-        camdm_steering.start_states(lonely, run.model, LABELS, field="style", seed=0)
+        camdm_controller.start_states(lonely, run.model, LABELS, field="style", seed=0)
 
 
 def test_characters_start_at_the_origin_facing_ahead_in_poses_of_the_data(run):
-    states = camdm_steering.start_states(
+    states = camdm_controller.start_states(
         run.held_out, run.model, LABELS, field="style", seed=2
     )
     past = states.past
@@ -133,7 +131,7 @@ def test_characters_start_in_poses_of_the_models_own(run):
     )
     value = camdm_model.to_json(dataclasses.replace(run.model, starts=starts))
     model = camdm_model.from_json(json.loads(json.dumps(value)), where="here")
-    states = camdm_steering.own_states(model, LABELS, seed=1)
+    states = camdm_controller.own_states(model, LABELS, seed=1)
     path = trajectory.root_trajectory(model.skeleton, states.past)
     np.testing.assert_allclose(path.position[:, -1], 0.0, atol=1e-5)
     np.testing.assert_allclose(path.facing[:, -1, 1], 1.0, atol=1e-5)
@@ -142,9 +140,9 @@ def test_characters_start_in_poses_of_the_models_own(run):
     for label, pose in zip(LABELS, states.past.joint_rotation[:, :, 1:], strict=True):
         assert min(np.abs(pose - known).max() for known in own[label]) < 1e-4
     with pytest.raises(ValueError, match="labels are in 0..2, expected 0..1"):
-        camdm_steering.own_states(model, np.array([0, 2]))
+        camdm_controller.own_states(model, np.array([0, 2]))
     with pytest.raises(ValueError, match="no poses to start from: give clips"):
-        camdm_steering.own_states(run.model, LABELS)
+        camdm_controller.own_states(run.model, LABELS)
     for change, message in (
         (lambda v: v["starts"]["root_position"].pop(), "'starts' has shapes"),
         (lambda v: v["starts"].pop("joint_rotation"), "'starts' is wrong"),
@@ -161,30 +159,34 @@ def test_characters_start_in_poses_of_the_models_own(run):
 
 def test_presets_are_stacked_at_each_ones_speed():
     speeds = np.array([0.5, 1.0, 1.5, 0.0])
-    found = camdm_steering.preset_batch("strafe", LABELS, speeds, seconds=4.0, fps=30.0)
+    found = courses.course_batch("strafe", LABELS, speeds, seconds=4.0, fps=30.0)
     for i, (label, speed) in enumerate(zip(LABELS, speeds, strict=True)):
-        one = presets.preset_commands(
+        one = courses.course_commands(
             "strafe", seconds=4.0, fps=30.0, speed=float(speed), label=int(label)
         )
         for got, expected in zip(
             jax.tree.leaves(found), jax.tree.leaves(one), strict=True
         ):
             np.testing.assert_array_equal(got[i], expected)
-    with pytest.raises(ValueError, match="unknown preset 'waltz'"):
-        camdm_steering.preset_batch("waltz", LABELS, speeds, seconds=4.0, fps=30.0)
+    with pytest.raises(ValueError, match="unknown course 'waltz'"):
+        courses.course_batch("waltz", LABELS, speeds, seconds=4.0, fps=30.0)
 
 
 @functools.cache
 def steered(chunk):
     run = samples.run()
-    states = camdm_steering.start_states(
+    states = camdm_controller.start_states(
         run.held_out, run.model, LABELS, field="style", seed=2
     )
-    commands = camdm_steering.preset_batch(
+    commands = courses.course_batch(
         "forward", LABELS, np.full(4, 1.0), seconds=1.2, fps=30.0
     )
-    frames = camdm_steering.steered_rollouts(
-        run.params, jax.random.key(5), states, commands, model=run.model, chunk=chunk
+    frames = steering.steered_rollouts(
+        camdm_controller.character(run.params, run.model),
+        jax.random.key(5),
+        states,
+        commands,
+        chunk=chunk,
     )
     return states, frames
 
@@ -204,17 +206,20 @@ def test_rollouts_show_a_frame_a_tick_from_where_they_start(run):
 def test_a_second_call_compiles_nothing(run):
     """Other commands, start poses and keys of the same shapes."""
     steered(None)
-    counted = camdm_steering._rollouts._cache_size()
-    states = camdm_steering.start_states(
+    counted = steering._rollouts._cache_size()
+    states = camdm_controller.start_states(
         run.held_out, run.model, LABELS, field="style", seed=9
     )
-    commands = camdm_steering.preset_batch(
+    commands = courses.course_batch(
         "strafe", LABELS, np.full(4, 0.5), seconds=1.2, fps=30.0
     )
-    camdm_steering.steered_rollouts(
-        run.params, jax.random.key(7), states, commands, model=run.model
+    steering.steered_rollouts(
+        camdm_controller.character(run.params, run.model),
+        jax.random.key(7),
+        states,
+        commands,
     )
-    assert camdm_steering._rollouts._cache_size() == counted
+    assert steering._rollouts._cache_size() == counted
 
 
 def test_a_chunk_that_does_not_divide_is_made_smaller(run):
@@ -230,16 +235,21 @@ def test_a_style_that_the_model_has_not_is_refused(run, label):
     message = rf"labels are in {min(label, 0)}..{max(label, 1)}, expected 0..1 \("
     labels = np.array([0, 1, label])
     with pytest.raises(ValueError, match=message):
-        camdm_steering.start_states(run.train, run.model, labels, field="style", seed=0)
+        camdm_controller.start_states(
+            run.train, run.model, labels, field="style", seed=0
+        )
     both, speeds = labels[:2], np.ones(2)
-    good = camdm_steering.preset_batch("forward", both, speeds, seconds=1.0, fps=30.0)
+    good = courses.course_batch("forward", both, speeds, seconds=1.0, fps=30.0)
     bad = dataclasses.replace(good, label=good.label.at[0, 3].set(label))
-    states = camdm_steering.start_states(
+    states = camdm_controller.start_states(
         run.train, run.model, both, field="style", seed=0
     )
     with pytest.raises(ValueError, match=message):
-        camdm_steering.steered_rollouts(
-            run.params, jax.random.key(0), states, bad, model=run.model
+        steering.steered_rollouts(
+            camdm_controller.character(run.params, run.model),
+            jax.random.key(0),
+            states,
+            bad,
         )
 
 

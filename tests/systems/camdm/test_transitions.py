@@ -21,7 +21,7 @@ JUDGE = style_evaluator.Recognized(
     params={},
     config=style_evaluator.RecognizerConfig(num_classes=2, num_joints=22, frames=60),
 )
-SETTINGS = dict(preset="forward", before=1.0, replications=2, seed=0)
+SETTINGS = dict(course="forward", before=1.0, replications=2, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_windows_are_where_they_say(changes):
         ({"replications": 1}, "replications: 1, expected at least 2"),
         ({"before": 0.5}, "before: 0.5 s, expected at least 1"),
         ({"limit": -1.0}, "limit: -1.0 s"),
-        ({"preset": "zigzag"}, "zigzag"),
+        ({"course": "zigzag"}, "zigzag"),
     ],
 )
 def test_what_is_wrong_is_named(wrong, message):

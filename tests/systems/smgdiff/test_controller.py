@@ -146,16 +146,19 @@ def test_a_plan_begins_where_body_and_ball_are_displayed(parts):
 
 @pytest.mark.slow
 def test_players_draw_their_own_noise_and_one_alone_is_the_same(parts, frames):
-    assert float(jnp.abs(frames.ball[0, 1] - frames.ball[1, 1]).max()) > 1e-4
+    assert (
+        float(jnp.abs(frames.extra["ball"][0, 1] - frames.extra["ball"][1, 1]).max())
+        > 1e-4
+    )
     alone = played(parts, commands(13, change=7))
-    np.testing.assert_allclose(alone.ball[0, :5], frames.ball[0, :5], atol=1e-3)
+    np.testing.assert_allclose(alone.extra["ball"][0, :5], balls[0, :5], atol=1e-3)
 
 
 def test_urgency_is_a_matter_of_command_and_cursor(parts):
     _, config, _ = parts
     state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
     wanted = jax.tree.map(lambda x: x[0], commands(1))
-    need = lambda s, c: int(smgdiff_controller.urgency(s, c, control=CONTROL))  # noqa: E731
+    need = lambda s, c: int(smgdiff_controller.plan_level(s, c, control=CONTROL))  # noqa: E731
     assert need(state, wanted) == 1  # the first command
     state = dataclasses.replace(state, command=wanted)
     assert need(state, wanted) == 0

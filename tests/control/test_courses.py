@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.control import presets
+from jaxmotion.control import courses
 from jaxmotion.motion import trajectory
 
 FPS = 30.0
@@ -10,7 +10,7 @@ FPS = 30.0
 
 def commands(name, seconds=60.0, **changes):
     options = dict(seconds=seconds, fps=FPS, speed=1.5, label=3) | changes
-    found = presets.preset_commands(name, **options)
+    found = courses.course_commands(name, **options)
     return np.asarray(found.velocity), np.asarray(found.facing), np.asarray(found.label)
 
 
@@ -19,7 +19,7 @@ def degrees(direction):
     return np.rad2deg(np.arctan2(direction[..., 0], direction[..., 1]))
 
 
-@pytest.mark.parametrize("name", presets.PRESETS)
+@pytest.mark.parametrize("name", courses.COURSES)
 def test_one_command_a_tick_with_unit_facing_and_the_speed_asked_for(name):
     velocity, facing, label = commands(name)
     assert velocity.shape == facing.shape == (1800, 2)
@@ -34,9 +34,9 @@ def test_one_command_a_tick_with_unit_facing_and_the_speed_asked_for(name):
     assert np.diff(np.flatnonzero(changes)).min() >= 15
 
 
-@pytest.mark.parametrize("name", presets.PRESETS)
+@pytest.mark.parametrize("name", courses.COURSES)
 def test_a_preset_that_ends_begins_again(name):
-    length = sum(segment[0] for segment in presets.PRESETS[name]())
+    length = sum(segment[0] for segment in courses.COURSES[name]())
     velocity, facing, _ = commands(name, seconds=2 * length)
     ticks = round(length * FPS)
     np.testing.assert_array_equal(velocity[:ticks], velocity[ticks:])

@@ -1,0 +1,206 @@
+"""Steering many characters at once, whatever system moves them.
+
+A system hands over a `Character`: how it starts, and a hashable method that makes a
+`rollout.Controller` of parameters. `steered_rollouts` is one compiled program per
+method and shape over all calls: parameters, states, commands and keys are arguments.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array
+
+from jaxmotion.control import rollout
+from jaxmotion.control.frame import Frame
+from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.trajectory import Command
+from jaxmotion.typing import Key, Params
+
+# Makes the controller of a character from arrays. Hashable, and equal to another of
+# equal settings: it is a static argument of the compiled program.
+Method = Callable[[Params], rollout.Controller]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Character:
+    """What a system hands over to be steered.
+
+    Attributes:
+      skeleton: The skeleton.
+      labels: Names of the styles or skills; none where commands have no label.
+      fps: Ticks per second.
+      source: The data that it was trained on, and their license.
+      params: All arrays that `method` needs, not only a network's.
+      method: Makes the controller.
+      starts: `(labels, seed) -> states`, batch axis first, of characters at the origin
+        that face +z; raises `ValueError` where it cannot.
+      clip_starts: `(clips, labels, seed) -> states` in poses of recorded clips; None
+        where a system has no such start.
+    """
+
+    skeleton: Skeleton
+    labels: tuple[str, ...]
+    fps: float
+    source: str
+    params: Params
+    method: Method
+    starts: Callable[[np.ndarray, int], Any]
+    clip_starts: Callable[[Any, np.ndarray, int], Any] | None = None
+
+    def label(self, name: str) -> int:
+        """Index of a label; raises `ValueError` that names those there are."""
+        return int(label_indices(self.labels, name)[0])
+
+    def start(
+        self,
+        number: int | None = None,
+        *,
+        labels: Any = None,
+        clips: Any = None,
+        seed: int = 0,
+    ) -> Any:
+        """States of characters at the origin that face +z.
+
+        Args:
+          number: Characters; None for one per label that is given, or one.
+          labels: Name or index for all characters, or a sequence with one for each;
+            None for the first label.
+          clips: Start in poses of these clips instead of the model's own.
+          seed: Of the choice of poses.
+
+        Returns:
+          States, batch axis first.
+
+        Raises:
+          ValueError: if a label is unknown, the numbers do not agree, or the system
+            cannot start so.
+        """
+        found = label_indices(self.labels, labels, number)
+        if clips is None:
+            return self.starts(found, seed)
+        if self.clip_starts is None:
+            raise ValueError("this model does not start from clips: leave them out")
+        return self.clip_starts(clips, found, seed)
+
+
+def label_indices(
+    names: tuple[str, ...], labels: Any = None, number: int | None = None
+) -> np.ndarray:
+    """Index of each character's label.
+
+    Args:
+      names: Those that the model has; none where commands have no label.
+      labels: Name or index for all, or a sequence with one for each; None for the
+        first.
+      number: Characters; None for as many as there are labels.
+
+    Returns:
+      Indices [number]; zeros where the model has no labels.
+
+    Raises:
+      ValueError: if a label is unknown or the numbers do not agree.
+    """
+    if number is not None and not (isinstance(number, int | np.integer) and number > 0):
+        raise ValueError(f"number of characters is {number!r}, expected 1 or more")
+    single = labels is None or isinstance(labels, str) or np.ndim(labels) == 0
+    given = [0 if labels is None else labels] if single else list(labels)
+    given = [x.item() if isinstance(x, np.ndarray | Array) else x for x in given]
+    if single:
+        given = given * (1 if number is None else number)
+    elif number is not None and len(given) != number:
+        raise ValueError(f"{len(given)} labels for {number} characters")
+    found = []
+    for label in given:
+        if isinstance(label, str):
+            if label not in names:
+                known = ", ".join(names) or "none"
+                raise ValueError(f"unknown label {label!r}: the model has {known}")
+            label = names.index(label)
+        if isinstance(label, bool) or not isinstance(label, int | np.integer):
+            raise ValueError(f"label is {label!r}, expected a name or an index")
+        found.append(int(label))
+    check_labels(np.array(found, int), names)
+    return np.array(found, int)
+
+
+def check_labels(labels: np.ndarray | Array, names: tuple[str, ...]) -> None:
+    """Raises unless labels are indices of names; compiled code cannot.
+
+    Where a model has no labels, nothing reads them and all pass.
+
+    Raises:
+      ValueError: names the range and the labels found.
+    """
+    found, last = np.asarray(labels), len(names) - 1
+    if names and found.size and (found.min() < 0 or found.max() > last):
+        raise ValueError(
+            f"labels are in {found.min()}..{found.max()}, expected 0..{last} "
+            f"({', '.join(names)})"
+        )
+
+
+def steered_rollouts(
+    character: Character,
+    key: Key,
+    states: Any,
+    commands: Command,
+    *,
+    chunk: int | None = None,
+    mesh: Mesh | None = None,
+) -> Frame:
+    """Frames of steered characters, as one compiled program.
+
+    Args:
+      character: What moves them.
+      key: Consumed.
+      states: From `character.start`.
+      commands: Commands [characters, ticks, ...], as from `courses.course_batch`.
+      chunk: Characters to run at a time, at most (the largest number that divides
+        theirs); see `rollout.rollout`.
+      mesh: Devices to split the characters over; see `rollout.rollout`.
+
+    Returns:
+      Frames [characters, ticks, ...].
+
+    Raises:
+      ValueError: if states and commands are of different numbers of characters, the
+        chunk is not positive, or a label is none of the model's.
+    """
+    check_labels(commands.label, character.labels)
+    number = commands.label.shape[0]
+    found = jax.tree.leaves(states)[0].shape[0]
+    if found != number:
+        raise ValueError(f"{found} states and commands for {number} characters")
+    if chunk is not None:
+        if chunk < 1:
+            raise ValueError(f"chunks of {chunk} characters, expected 1 or more")
+        chunk = max(size for size in range(1, chunk + 1) if number % size == 0)
+    return _rollouts(
+        character.params,
+        key,
+        states,
+        commands,
+        method=character.method,
+        chunk=chunk,
+        mesh=mesh,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("method", "chunk", "mesh"))
+def _rollouts(
+    params: Params,
+    key: Key,
+    states: Any,
+    commands: Command,
+    *,
+    method: Method,
+    chunk: int | None,
+    mesh: Mesh | None,
+) -> Frame:
+    run = rollout.rollout
+    return run(method(params), key, states, commands, chunk=chunk, mesh=mesh)[1]
