@@ -97,7 +97,7 @@ def make_load(run: Path | None, *, width: int, seconds: float) -> workload.Load:
         params={"networks": params, "space": space},
         controller=controller,
         start=start,
-        plans=lambda frames: float(frames.path[..., 0].size),
+        plans=lambda frames: float(frames.extra["path"][..., 0].size),
         fps=FPS,
         config=config,
         joints=joints,

@@ -30,12 +30,12 @@ def test_one_command_a_tick_with_unit_facing_and_the_speed_asked_for(name):
     np.testing.assert_allclose(facing[0], [0.0, 1.0], atol=1e-6)
     # Directions are turned in steps: most ticks repeat the command before.
     changes = np.any(np.diff(np.concatenate([velocity, facing], -1), axis=0) != 0, -1)
-    assert 0 < changes.mean() < 0.1
-    assert np.diff(np.flatnonzero(changes)).min() >= 15
+    assert changes.any() == (name not in ("straight", "stand"))
+    assert np.diff(np.flatnonzero(changes)).min(initial=60) >= 15
 
 
 @pytest.mark.parametrize("name", courses.COURSES)
-def test_a_preset_that_ends_begins_again(name):
+def test_a_course_that_ends_begins_again(name):
     length = sum(segment[0] for segment in courses.COURSES[name]())
     velocity, facing, _ = commands(name, seconds=2 * length)
     ticks = round(length * FPS)
@@ -70,10 +70,55 @@ def test_stop_and_go_stands_two_seconds_of_five():
     assert not stands[: 3 * 30].any() and stands[3 * 30 : 5 * 30].all()
 
 
+def test_straight_and_stand_are_one_command():
+    velocity, facing, _ = commands("straight")
+    np.testing.assert_array_equal(velocity, np.broadcast_to([0, 1.5], (1800, 2)))
+    np.testing.assert_array_equal(facing, np.broadcast_to([0, 1.0], (1800, 2)))
+    assert not commands("stand")[0].any()
+
+
+def test_figure_eight_is_a_circle_to_either_side():
+    velocity, facing, _ = commands("figure_eight", seconds=15.0)
+    np.testing.assert_allclose(velocity, 1.5 * facing, atol=1e-6)
+    path = np.cumsum(velocity, axis=0) / FPS
+    half = len(path) // 2
+    # Both circles close where they began; one lies to either side.
+    assert np.linalg.norm(path[[half - 1, -1]], axis=-1).max() < 0.1
+    assert path[:half, 0].min() > -0.1 and path[:half, 0].max() > 3.0
+    assert path[half:, 0].max() < 0.8 and path[half:, 0].min() < -2.0
+
+
+def test_turn_around_goes_back_the_way_it_came():
+    velocity, facing, _ = commands("turn_around", seconds=8.0)
+    np.testing.assert_allclose(velocity, 1.5 * facing, atol=1e-6)
+    assert set(np.abs(degrees(facing)).round().astype(int)) == {0, 180}
+    np.testing.assert_allclose(velocity.sum(axis=0), 0.0, atol=1e-3)
+
+
+def test_turn_on_the_spot_turns_a_full_circle_to_either_side():
+    velocity, facing, _ = commands("turn_on_the_spot", seconds=16.0)
+    assert not velocity.any()
+    turned = np.unwrap(degrees(facing), period=360)
+    assert turned.max() == pytest.approx(360) and turned.min() == pytest.approx(0)
+
+
+def test_a_batch_has_each_ones_label_and_speed():
+    labels, speeds = [0, 1, 1, 0], [0.5, 1.0, 1.5, 0.0]
+    options = dict(seconds=4.0, fps=FPS)
+    found = courses.course_batch("strafe", labels, speeds, **options)
+    for i, (label, speed) in enumerate(zip(labels, speeds, strict=True)):
+        one = courses.course_commands("strafe", speed=speed, label=label, **options)
+        np.testing.assert_array_equal(found.velocity[i], one.velocity)
+        np.testing.assert_array_equal(found.facing[i], one.facing)
+        np.testing.assert_array_equal(found.label[i], one.label)
+    with pytest.raises(ValueError, match="unknown course 'waltz'"):
+        courses.course_batch("waltz", labels, speeds, **options)
+
+
 @pytest.mark.parametrize(
     "bad, message",
     [
-        (dict(name="waltz"), "'waltz': there are forward, strafe, stop_and_go"),
+        (dict(name="waltz"), "'waltz': there are straight, stand, forward"),
         (dict(seconds=0.0), "0.0 s"),
         (dict(seconds=float("nan")), "nan s"),
         (dict(fps=-30.0), "-30.0 ticks"),

@@ -234,10 +234,10 @@ def test_only_steered_characters_have_a_goal(steered):
     found, shown = rollout.tick(made, jax.random.key(0), state, given)
     if not steered:
         assert goals and all(goal is None for goal in goals)
-        np.testing.assert_array_equal(shown.wanted, shown.path)
+        np.testing.assert_array_equal(shown.extra["wanted_path"], shown.extra["path"])
         return
     wanted = wanted_path(state, given, half_life=0.4)
-    np.testing.assert_allclose(shown.wanted, wanted, atol=1e-5)
+    np.testing.assert_allclose(shown.extra["wanted_path"], wanted, atol=1e-5)
     planned = made.plans[0](jax.random.key(0), state, given)
     own = space().normalizer
     expected = (wanted - own.mean[:12]) / own.std[:12]

@@ -77,8 +77,8 @@ def test_what_differs_is_named(change, message):
     run = samples.run()
     other = dataclasses.replace(run.train, **change)
     with pytest.raises(ValueError, match=message):
-        camdm_training.check_clips(run.model, other, "style")
-    camdm_training.check_clips(run.model, run.train, "style")
+        camdm_model.check_clips(run.model, other, "style")
+    camdm_model.check_clips(run.model, run.train, "style")
 
 
 def test_missing_data_are_named(folder, tmp_path):

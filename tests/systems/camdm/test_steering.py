@@ -157,21 +157,6 @@ def test_characters_start_in_poses_of_the_models_own(run):
             camdm_model.from_json(bad, where="here")
 
 
-def test_presets_are_stacked_at_each_ones_speed():
-    speeds = np.array([0.5, 1.0, 1.5, 0.0])
-    found = courses.course_batch("strafe", LABELS, speeds, seconds=4.0, fps=30.0)
-    for i, (label, speed) in enumerate(zip(LABELS, speeds, strict=True)):
-        one = courses.course_commands(
-            "strafe", seconds=4.0, fps=30.0, speed=float(speed), label=int(label)
-        )
-        for got, expected in zip(
-            jax.tree.leaves(found), jax.tree.leaves(one), strict=True
-        ):
-            np.testing.assert_array_equal(got[i], expected)
-    with pytest.raises(ValueError, match="unknown course 'waltz'"):
-        courses.course_batch("waltz", LABELS, speeds, seconds=4.0, fps=30.0)
-
-
 @functools.cache
 def steered(chunk):
     run = samples.run()

@@ -146,10 +146,8 @@ def test_a_plan_begins_where_body_and_ball_are_displayed(parts):
 
 @pytest.mark.slow
 def test_players_draw_their_own_noise_and_one_alone_is_the_same(parts, frames):
-    assert (
-        float(jnp.abs(frames.extra["ball"][0, 1] - frames.extra["ball"][1, 1]).max())
-        > 1e-4
-    )
+    balls = frames.extra["ball"]
+    assert float(jnp.abs(balls[0, 1] - balls[1, 1]).max()) > 1e-4
     alone = played(parts, commands(13, change=7))
     np.testing.assert_allclose(alone.extra["ball"][0, :5], balls[0, :5], atol=1e-3)
 
