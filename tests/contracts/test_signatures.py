@@ -20,6 +20,8 @@ BEFORE_KEY = {
     "schedule",
     "step",
     "controller",
+    "character",  # with its parameters
+    "model",  # a character, in the face
     "run_chunk",
     "sample",
     "generate",
