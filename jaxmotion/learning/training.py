@@ -79,7 +79,7 @@ OptimizerName = Literal["muon", "adamw", "radam", "adam"]
 # adamw: CAMDM (its code: 1e-4, no weight decay, cosine to a tenth).
 # radam: AAMDM (Liu et al. 2020; Li et al. 2024, section 4).
 # adam: both networks of EMDM (its code: generator 2e-5, discriminator 1.25e-4).
-OPTIMIZERS: dict[OptimizerName, Callable[[optax.ScalarOrSchedule], Optimizer]] = {
+OPTIMIZERS: dict[OptimizerName, Callable[..., Optimizer]] = {
     "muon": _muon,
     "adamw": functools.partial(optax.adamw, weight_decay=0.0),
     "radam": optax.radam,
@@ -95,6 +95,7 @@ def make_optimizer(
     warmup_steps: int = 0,
     final_fraction: float = 0.1,
     max_norm: float | None = None,
+    **own: float,
 ) -> Optimizer:
     """An optimizer with linear warm-up and cosine decay, or at a constant rate.
 
@@ -106,6 +107,7 @@ def make_optimizer(
       warmup_steps: Steps of linear rise from 0, where the rate is not constant.
       final_fraction: Rate at the end of the decay as a fraction of the peak.
       max_norm: Clip the gradient to this global norm; None to leave it.
+      **own: What that optimizer alone has, such as adamw's weight_decay.
 
     Returns:
       The optimizer.
@@ -120,7 +122,7 @@ def make_optimizer(
             end_value=learning_rate * final_fraction,
         )
     clip = [] if max_norm is None else [optax.clip_by_global_norm(max_norm)]
-    return optax.chain(*clip, OPTIMIZERS[name](rate))
+    return optax.chain(*clip, OPTIMIZERS[name](rate, **own))
 
 
 def init_train_state(params: Params, optimizer: Optimizer) -> TrainState:

@@ -92,7 +92,7 @@ def test_learning_rate_rises_and_falls():
     np.testing.assert_allclose(moves, expected, atol=1e-5)
 
 
-def test_gradient_is_clipped():
+def test_gradient_is_clipped_and_weights_decay():
     clipped = training.make_optimizer(
         "adamw", learning_rate=0.1, num_steps=10, max_norm=1.0
     )
@@ -101,6 +101,13 @@ def test_gradient_is_clipped():
     _, state = clipped.update(large, state, large)
     first_moment = optax.tree_utils.tree_get(state, "mu")["a"]
     np.testing.assert_allclose(first_moment, [0.1 * 0.6, 0.1 * 0.8], rtol=1e-5)
+
+    decaying = training.make_optimizer(
+        "adamw", learning_rate=0.1, num_steps=10, weight_decay=0.5
+    )
+    params = {"a": jnp.array([2.0, -2.0])}
+    change, _ = decaying.update({"a": jnp.zeros(2)}, decaying.init(params), params)
+    np.testing.assert_allclose(change["a"], [-0.1, 0.1], rtol=1e-6)
 
 
 def test_muon_moves_matrices_orthogonally_and_vectors_as_nadam_does():
