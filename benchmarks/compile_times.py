@@ -1,34 +1,27 @@
-"""Seconds to trace, lower and compile the programs of this library.
+"""Seconds to trace, lower and compile the programs of a system.
 
 Example:
   python benchmarks/compile_times.py
   python benchmarks/compile_times.py --steps 32
+  python benchmarks/compile_times.py --system aamdm
 """
 
 import dataclasses
-import functools
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import suite
-import tyro
 import workload
 from jaxtyping import Array
 
 from jaxmotion import cli
 from jaxmotion.control import rollout
-from jaxmotion.data import windows
-from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import training
-from jaxmotion.systems.camdm import controller as camdm_controller
-from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.typing import Key, Params
 
 COLUMNS = {
@@ -40,45 +33,34 @@ COLUMNS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Config:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(suite.Settings):
     """Schedule, sampler (one scan, and unrolled), training chunk, rollout.
 
     Seconds of each phase of one program; JAX's caches are emptied before each. The
     parameters are arguments.
 
     Attributes:
+      system: What to compile: camdm or aamdm (the sampler unrolled is CAMDM's).
       steps: Diffusion steps of the sampler.
       updates: Optimizer steps of the training chunk.
       batch: Windows of an update.
       characters: Of the rollout.
       seconds: Length of the rollout.
       width: Channels of a token.
-      out: Folder for compile_times.json.
-      gate: Report to compare with; exit status 1 if something is worse.
     """
 
+    system: str = "camdm"
     steps: int = 8
     updates: int = 50
     batch: int = 32
     characters: int = 16
     seconds: float = 2.0
     width: int = 256
-    out: Path = Path("runs/benchmarks")
-    gate: Path | None = None
 
 
 def phases(name: str, function: Callable, given: tuple) -> dict[str, Any]:
-    """Seconds of the three phases of one program.
-
-    Args:
-      name: Of the program.
-      function: From `jax.jit`.
-      given: Its arguments.
-
-    Returns:
-      One row of the report.
-    """
+    """Seconds of the three phases of one jitted function: a row of the report."""
     jax.clear_caches()
     clock = [time.perf_counter()]
     traced = function.trace(*given)
@@ -102,17 +84,7 @@ def unrolled(
     key: Key,
     condition: camdm_model.Condition,
 ) -> Array:
-    """The sampler with a Python loop over the steps, for comparison.
-
-    Args:
-      config: The network.
-      params: Its parameters.
-      key: Consumed.
-      condition: Of one character.
-
-    Returns:
-      Clean features.
-    """
+    """CAMDM's sampler with a Python loop over the steps, for comparison."""
     table = schedule.cosine_schedule(config.num_steps)
     net = camdm_model.network(config)
     arguments = condition.arguments(config)
@@ -130,77 +102,43 @@ def unrolled(
     return x
 
 
-def training_program(
-    args: Config, model: camdm_model.Model, params: Params, clips: Clips
-) -> tuple[Callable, tuple]:
-    """A chunk of training.
-
-    Args:
-      args: The settings.
-      model: The model.
-      params: Its first parameters.
-      clips: The data.
-
-    Returns:
-      The jitted function and its arguments.
-    """
-    optimizer = training.make_optimizer("adamw", learning_rate=1e-4, num_steps=1000)
-    loss = functools.partial(
-        camdm_loss.loss, skeleton=model.skeleton, config=model.config
-    )
-
-    sample_batch = camdm_training.window_sampler(field="style", batch=args.batch)
-    update = training.make_update(loss, optimizer)
-    run = training.train_chunk(update, sample_batch, num_steps=args.updates)
-    state = training.init_train_state(params, optimizer)
-    index = windows.window_index(clips, model.config.window)
-    return run, (state, jax.random.key(0), (clips, index))
-
-
 def programs(args: Config) -> Iterator[tuple[str, Callable, tuple]]:
-    """The programs to measure.
+    """The programs to measure: name, jitted function and arguments."""
+    parts = ("samples", "rollouts", "training")
+    samples, rollouts, train = (workload.of(args.system, part) for part in parts)
+    sizes = workload.Sizes(steps=args.steps, width=args.width)
+    yield "schedule, 1000 steps", jax.jit(lambda: schedule.cosine_schedule(1000)), ()
 
-    Args:
-      args: The settings.
+    scanned, given = samples(sizes).program(1, arguments=True)
+    yield f"sampler, {args.steps} steps, scan", scanned, given
+    if args.system == "camdm":
+        config = workload.camdm_config(sizes)
+        params, keys, conditions = given
+        condition = jax.tree.map(lambda x: x[0], conditions)
+        loop = jax.jit(lambda *given: unrolled(config, *given))
+        name = f"sampler, {args.steps} steps, unrolled"
+        yield name, loop, (params, keys[0], condition)
 
-    Yields:
-      Name, jitted function and arguments.
-    """
-    clips = workload.make_clips()
-    model, params = workload.walker_model(
-        clips, None, steps=args.steps, width=args.width
-    )
-    config = model.config
-    yield (
-        "schedule, 1000 steps",
-        jax.jit(lambda: schedule.cosine_schedule(1000)),
-        (),
-    )
-
-    def scanned(params: Params, key: Key, condition: camdm_model.Condition) -> Array:
-        return camdm_model.sampler(params, config=config)(key, condition)
-
-    condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
-    given = (params, jax.random.key(1), condition)
-    yield f"sampler, {args.steps} steps, scan", jax.jit(scanned), given
-    loop = jax.jit(functools.partial(unrolled, config))
-    yield f"sampler, {args.steps} steps, unrolled", loop, given
+    program = train(sizes, args.batch)
+    run = training.train_chunk(program.update, program.sample, num_steps=args.updates)
+    state = program.init(jax.random.key(0))
     name = f"training, {args.updates} updates"
-    yield name, *training_program(args, model, params, clips)
+    yield name, run, (state, jax.random.key(0), program.data)
+
+    load = rollouts(sizes, None, args.seconds, False)
 
     def rolled(params: Params, key: Key, states: Any, commands: Any) -> Any:
-        controller = camdm_controller.controller(params, model.skeleton, config=config)
-        return rollout.rollout(controller, key, states, commands)
+        return rollout.rollout(load.controller(params), key, states, commands)
 
-    steered = workload.steered(model, clips, args.characters, seconds=args.seconds)
+    given = (load.params, jax.random.key(2), *load.start(args.characters))
     name = f"rollout, {args.characters} x {args.seconds:g} s"
-    yield name, jax.jit(rolled), (params, jax.random.key(2), *steered)
+    yield name, jax.jit(rolled), given
 
 
 def main() -> None:
     """Measures and writes the report."""
-    args = tyro.cli(Config, description=__doc__)
-    suite.prepare(args)
+    args = suite.parse(Config, __doc__)
+    suite.at_least(args, steps=1, updates=1, batch=1, characters=1, width=1)
     rows = [phases(*program) for program in programs(args)]
     suite.print_table(rows, COLUMNS)
     metrics = [

@@ -12,25 +12,40 @@ Examples:
 """
 
 import dataclasses
+import functools
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import memory
+import numpy as np
 import suite
-import tyro
-import workload_diversity as workload
+import workload
+from jaxtyping import Array, Float
 
 from jaxmotion import cli, files, reporting
-from jaxmotion.control import courses
-from jaxmotion.evaluation import table
+from jaxmotion.control import courses, rollout
+from jaxmotion.data import selection
+from jaxmotion.evaluation import diversity, table
+from jaxmotion.evaluators import style as style_evaluator
+from jaxmotion.motion import trajectory
+from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import training as camdm_training
+from jaxmotion.typing import Key, Params
 
 WALKER = Path(__file__).parents[1] / "jaxmotion" / "assets" / "walker.npz"
+GIB = float(2**30)
+# More rollouts at a time leave a processor's cache, and are slower.
+CPU_CHUNK = 16
+COLUMNS = ("world_m", "pose_m", "diversity_m", "variance_m2")
 
 
-@dataclasses.dataclass(frozen=True)
-class Config:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(suite.Settings):
     """Diversity against the number of rollouts, step count and guidance scale.
 
     Every rollout starts in the same state and gets the same commands; only its noise
@@ -61,8 +76,6 @@ class Config:
       memory_gib: Limit for each program: arguments, results and intermediate values.
       chunk: Rollouts at a time; None for as many as fit, but 16 on a CPU, whose cache
         more would not fit.
-      out: Folder for diversity.json and diversity.md.
-      gate: Report to compare with; exit status 1 if a program needs more memory.
     """
 
     rollouts: tuple[int, ...] = (64, 256, 1024)
@@ -81,32 +94,352 @@ class Config:
     pairs: int = 2000
     memory_gib: float = 4.0
     chunk: int | None = None
-    out: Path = Path("runs/benchmarks")
-    gate: Path | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Load:
+    """What all rollouts have in common.
+
+    Attributes:
+      name: File or folder of the model.
+      model: The model.
+      params: Its parameters.
+      state: Where they start, one character.
+      commands: What they are told, one a tick.
+    """
+
+    name: str
+    model: camdm_model.Model
+    params: Params
+    state: camdm_controller.CharacterState
+    commands: trajectory.Command
+
+
+class Motions(NamedTuple):
+    """Kept frames: joints in the world, and relative to the root, facing +z; meters."""
+
+    world: Float[Array, "rollouts frames joints 3"]
+    pose: Float[Array, "rollouts frames joints 3"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Program:
+    """Rollouts of one model, compiled.
+
+    Attributes:
+      roll: `roll(key, scale) -> Motions`; every plan is guided with the scale, none if
+        it is None.
+      steps: Diffusion steps of a plan.
+      memory: What it needs, in bytes, and the rollouts at a time.
+    """
+
+    roll: Callable[[Key, float | None], Motions]
+    steps: int
+    memory: dict[str, int]
+
+
+def make_load(
+    run: Path,
+    *,
+    style: str | None,
+    course: str,
+    speed: float | None,
+    seconds: float,
+    seed: int,
+) -> Load:
+    """Model, start state and commands; settings as of `Config`.
+
+    Raises:
+      OSError: if the run or its clips cannot be read.
+      ValueError: if the run is none, or has no such style or course.
+    """
+    if not run.exists():
+        raise ValueError(f"{run}: no such file or folder")
+    if run.is_file():
+        clips, field = workload.make_clips(), "style"
+        model, params = workload.walker_model(run)
+    else:
+        found = camdm_training.load_run(run)
+        model, params, clips, field = (
+            found.model,
+            found.params,
+            found.train,
+            found.field,
+        )
+    label = np.array([0 if style is None else model.label(style)])
+    speeds = np.asarray(selection.label_speeds(clips, field=field))[label]
+    speeds = speeds if speed is None else np.array([speed])
+    commands = courses.course_batch(
+        course, label, speeds, seconds=seconds, fps=model.config.fps
+    )
+    states = camdm_controller.start_states(clips, model, label, field=field, seed=seed)
+    state, command = jax.tree.map(lambda x: x[0], (states, commands))
+    return Load(
+        name=run.name, model=model, params=params, state=state, commands=command
+    )
+
+
+def check_same(a: Load, b: Load) -> None:
+    """Raises unless two models start alike and are told the same.
+
+    Raises:
+      ValueError: says what differs.
+    """
+    pairs = {
+        "joints": (a.model.skeleton.names, b.model.skeleton.names),
+        "styles": (a.model.labels, b.model.labels),
+        "past frames": (a.model.config.past, b.model.config.past),
+    }
+    for what, (expected, found) in pairs.items():
+        if expected != found:
+            raise ValueError(f"{b.name}: {what} {found}, {a.name} has {expected}")
+    for x, y in zip(
+        jax.tree.leaves((a.state.past, a.commands)),
+        jax.tree.leaves((b.state.past, b.commands)),
+        strict=True,
+    ):
+        if not np.allclose(x, y, atol=1e-4):
+            raise ValueError(
+                f"{b.name}: starts in another pose or is told to go at another speed "
+                f"than {a.name}; were they trained on the same data?"
+            )
+
+
+def one_rollout(
+    params: Params,
+    key: Key,
+    load: Load,
+    *,
+    control: camdm_controller.Control,
+    guided: Array | int,
+    every: int,
+) -> Motions:
+    """One rollout, to be mapped over keys and nothing else.
+
+    Then when to plan depends on nothing that is mapped, and stays a condition, where
+    otherwise every planner would run in every tick.
+
+    Args:
+      params: The network's parameters.
+      key: Consumed.
+      load: Start and commands.
+      control: Constants of the controller.
+      guided: How many plans are guided.
+      every: Keep every so many frames, the last one among them.
+
+    Returns:
+      Kept frames, without the axis of rollouts.
+    """
+    skeleton, config = load.model.skeleton, load.model.config
+    driver = camdm_controller.controller(
+        params, skeleton, config=config, control=control
+    )
+    start = dataclasses.replace(load.state, guided=jnp.asarray(guided, jnp.int32))
+
+    def body(state: Any, xs: tuple) -> tuple[Any, tuple[Array, Array]]:
+        i, command = xs
+        tick_key = jax.random.fold_in(key, i)
+        state, frame = rollout.tick(driver, tick_key, state, command)
+        return state, (frame.root_position, frame.joint_rotation)
+
+    ticks = load.commands.label.shape[0]
+    _, shown = jax.lax.scan(body, start, (jnp.arange(ticks), load.commands))
+    root, rotation = jax.tree.map(lambda x: x[(ticks - 1) % every :: every], shown)
+    motion = Motion(root_position=root, joint_rotation=rotation, fps=config.fps / every)
+    world = joint_positions(skeleton, motion)
+    pose = style_evaluator.recognizer_input(skeleton, motion).reshape(world.shape)
+    return Motions(world=world, pose=pose)
+
+
+def _function(load: Load, number: int, every: int, chunk: int) -> Callable:
+    """All rollouts: (params, key, guided, scale) -> Motions."""
+
+    def roll(params: Params, key: Key, guided: Array, scale: Array) -> Motions:
+        # The scale is traced: one program serves all of them.
+        control = dataclasses.replace(camdm_controller.Control(), guidance_scale=scale)
+
+        def one(i: Array) -> Motions:
+            return one_rollout(
+                params,
+                jax.random.fold_in(key, i),
+                load,
+                control=control,
+                guided=guided,
+                every=every,
+            )
+
+        return jax.lax.map(one, jnp.arange(number), batch_size=chunk)
+
+    return jax.jit(roll)
+
+
+def fit_program(
+    load: Load, number: int, *, every: int, limit: float, chunk: int | None
+) -> Program:
+    """Compiles rollouts, with the largest chunk whose program fits the limit.
+
+    Args:
+      load: What to roll out.
+      number: Rollouts.
+      every: Frames between kept ones.
+      limit: Bytes.
+      chunk: Rollouts at a time; None to choose it.
+
+    Raises:
+      ValueError: if it does not fit.
+    """
+    cap = CPU_CHUNK if jax.default_backend() == "cpu" else number
+    size = min(number, cap if chunk is None else chunk)
+
+    def compiled(size: int) -> Any:
+        given = load.params, jax.random.key(0), jnp.int32(0), jnp.float32(1.0)
+        return _function(load, number, every, size).lower(*given).compile()
+
+    program, needs = fit(compiled, size, limit=limit, shrink=chunk is None)
+    ticks = load.commands.label.shape[0]
+
+    def roll(key: Key, scale: float | None) -> Motions:
+        guided = 0 if scale is None else ticks
+        given = jnp.int32(guided), jnp.float32(1.0 if scale is None else scale)
+        return program(load.params, key, *given)
+
+    return Program(roll=roll, steps=load.model.config.num_steps, memory=needs)
+
+
+def measure(
+    key: Key, motions: Motions, *, num_pairs: int
+) -> dict[str, Float[Array, ""]]:
+    """Columns of the table, of one set of rollouts and random pairs of it."""
+    found = _measure(key, motions, num_pairs)
+    # Compiled functions return dictionaries in alphabetical order.
+    return {name: found[name] for name in COLUMNS}
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _measure(key: Key, motions: Motions, num_pairs: int) -> dict[str, Array]:
+    key_world, key_pose, key_frames = jax.random.split(key, 3)
+    frames = jnp.swapaxes(motions.pose, 0, 1)
+    frames = frames.reshape(*frames.shape[:2], -1)
+
+    def of_frame(x: tuple[Array, Array]) -> Array:
+        return diversity.diversity(*x, num_pairs=num_pairs)
+
+    keys = jax.random.split(key_frames, frames.shape[0])
+    distance = diversity.joint_distance
+    return {
+        "world_m": distance(key_world, motions.world, num_pairs=num_pairs),
+        "pose_m": distance(key_pose, motions.pose, num_pairs=num_pairs),
+        "diversity_m": jnp.mean(jax.lax.map(of_frame, (keys, frames))),
+        "variance_m2": diversity.intra_style_variance(motions.pose),
+    }
+
+
+def needs_of(compiled: Any, chunk: int) -> dict[str, int]:
+    """Bytes that a program needs by name, their total, and its chunk."""
+    found = compiled.memory_analysis()
+    parts = {
+        "arguments": found.argument_size_in_bytes,
+        "results": found.output_size_in_bytes,
+        "intermediate": found.temp_size_in_bytes,
+    }
+    return {"chunk": chunk, **parts, "total": sum(parts.values())}
+
+
+def next_chunk(needs: dict[str, int], limit: float) -> int:
+    """Fewer rollouts at a time that should fit, at most half as many.
+
+    What is not intermediate does not shrink with them.
+
+    Raises:
+      ValueError: if no number would fit.
+    """
+    chunk = needs["chunk"]
+    room = limit - needs["arguments"] - needs["results"]
+    if chunk == 1 or room <= 0:
+        need = needs["total"] if chunk == 1 else needs["total"] - needs["intermediate"]
+        raise ValueError(
+            f"--memory-gib {limit / GIB:g}: one rollout at a time needs "
+            f"{need / GIB:.3g} GiB or more, {needs['results'] / GIB:.3g} of it for "
+            "the frames that are kept: expected a higher limit, fewer or shorter "
+            "rollouts, or a larger --every"
+        )
+    fits = int(room / (needs["intermediate"] / chunk))
+    return max(1, min(chunk // 2, fits))
+
+
+def fit(
+    compiled: Callable[[int], Any], size: int, *, limit: float, shrink: bool
+) -> tuple[Any, dict[str, int]]:
+    """Compiles a program with the largest chunk that fits a limit.
+
+    The compiler is asked what a program needs; what does not fit is compiled again with
+    a smaller chunk.
+
+    Args:
+      compiled: Compiles the program for a chunk.
+      size: Chunk to begin with.
+      limit: Bytes.
+      shrink: Whether smaller chunks are allowed.
+
+    Raises:
+      ValueError: if it does not fit.
+    """
+    while True:
+        program = compiled(size)
+        needs = needs_of(program, size)
+        if needs["total"] <= limit:
+            return program, needs
+        if not shrink:
+            raise ValueError(
+                f"--chunk {size}: {needs['total'] / GIB:.3g} GiB, more than "
+                f"--memory-gib {limit / GIB:g}"
+            )
+        size = next_chunk(needs, limit)
+
+
+def describe(needs: dict[str, Any]) -> str:
+    """One line about what a program needs."""
+    parts = ", ".join(
+        f"{needs[name] / GIB:.3f} {name}"
+        for name in ("arguments", "results", "intermediate")
+    )
+    return (
+        f"{needs['model']}: {needs['chunk']} rollouts at a time, "
+        f"{needs['total'] / GIB:.3f} GiB ({parts})"
+    )
+
+
+def peak() -> dict[str, Any]:
+    """The most that was used at once, so far.
+
+    Returns:
+      Bytes, and of what: the accelerator, or the process where the device keeps no
+      account; 0 bytes where the system keeps none either.
+    """
+    stats = jax.devices()[0].memory_stats()
+    if stats and "peak_bytes_in_use" in stats:
+        return {"what": "peak of the device", "bytes": stats["peak_bytes_in_use"]}
+    try:
+        import resource
+    except ImportError:  # Windows
+        return {"what": "peak unknown", "bytes": 0}
+    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    unit = 1 if sys.platform == "darwin" else 1024
+    return {
+        "what": "peak of the process, JAX and compiler included",
+        "bytes": used * unit,
+    }
 
 
 def check(args: Config) -> None:
     """Raises before any work if an argument makes no sense.
 
-    Args:
-      args: The settings.
-
     Raises:
       ValueError: names the option.
     """
-    least = {
-        "--rollouts": (min(args.rollouts, default=0), 2),
-        "--steps": (min(args.steps, default=1), 1),
-        "--every": (args.every, 1),
-        "--sets": (args.sets, 2),
-        "--pairs": (args.pairs, 1),
-        "--chunk": (1 if args.chunk is None else args.chunk, 1),
-    }
-    if args.sweep_rollouts is not None:
-        least["--sweep-rollouts"] = (args.sweep_rollouts, 2)
-    for name, (found, expected) in least.items():
-        if found < expected:
-            raise ValueError(f"{name} {found}: expected {expected} or more")
+    suite.at_least(
+        args, rollouts=2, sweep_rollouts=2, steps=1, every=1, sets=2, pairs=1, chunk=1
+    )
     if args.course not in courses.COURSES:
         known = ", ".join(courses.COURSES)
         raise ValueError(f"--course {args.course}: there are {known}")
@@ -116,7 +449,7 @@ def check(args: Config) -> None:
 
 def _cells(
     args: Config,
-    program: workload.Program,
+    program: Program,
     numbers: tuple[int, ...],
     *,
     scale: float | None = None,
@@ -131,7 +464,7 @@ def _cells(
             # Rollout i has the same noise whatever their number.
             part = jax.tree.map(lambda x: x[:number], motions)  # noqa: B023
             key = jax.random.fold_in(key_pairs, number)
-            found[number].append(workload.measure(key, part, num_pairs=args.pairs))
+            found[number].append(measure(key, part, num_pairs=args.pairs))
     return {
         number: {
             column: table.cell(jnp.stack([row[column] for row in rows]))
@@ -142,31 +475,26 @@ def _cells(
 
 
 def sweep(
-    args: Config, load: workload.Load, others: list[workload.Load]
+    args: Config, load: Load, others: list[Load]
 ) -> tuple[dict[str, dict[str, table.Cell]], list[dict[str, Any]]]:
-    """All rows.
-
-    Args:
-      args: The settings.
-      load: The first model.
-      others: Those for other step counts.
+    """The table of the first model and of those for other step counts.
 
     Returns:
-      The table, and what each program needs of the memory.
+      Its rows, and what each program needs of the memory.
     """
     largest, needs = max(args.rollouts), []
     number = largest if args.sweep_rollouts is None else args.sweep_rollouts
 
-    def program(load: workload.Load, number: int) -> workload.Program:
-        made = workload.fit_program(
+    def program(load: Load, number: int) -> Program:
+        made = fit_program(
             load,
             number,
             every=args.every,
-            limit=args.memory_gib * memory.GIB,
+            limit=args.memory_gib * GIB,
             chunk=args.chunk,
         )
         needs.append({"model": load.name, **made.memory})
-        print(memory.describe(needs[-1]), flush=True)
+        print(describe(needs[-1]), flush=True)
         return made
 
     main = program(load, largest)
@@ -195,9 +523,8 @@ def sweep(
 
 def main() -> None:
     """Measures, prints the table and writes the report."""
-    args = tyro.cli(Config, description=__doc__)
+    args = suite.parse(Config, __doc__)
     check(args)
-    suite.prepare(args)
     options = dict(
         style=args.style,
         course=args.course,
@@ -205,18 +532,17 @@ def main() -> None:
         seconds=args.seconds,
         seed=args.seed,
     )
-    load = workload.make_load(args.run or WALKER, **options)
-    others = [workload.make_load(run, **options) for run in args.step_runs]
+    load = make_load(args.run or WALKER, **options)
+    others = [make_load(run, **options) for run in args.step_runs]
     for other in others:
-        workload.check_same(load, other)
+        check_same(load, other)
     rows, needs = sweep(args, load, others)
     text = table.to_markdown(rows)
-    peak = memory.peak()
-    print(text, f"{peak['what']}: {peak['bytes'] / memory.GIB:.2f} GiB", sep="\n")
+    used = peak()
+    print(text, f"{used['what']}: {used['bytes'] / GIB:.2f} GiB", sep="\n")
     files.write_text(args.out / "diversity.md", text + "\n")
     metrics = [
-        suite.Metric(f"memory {x['model']}", x["total"] / memory.GIB, "GiB")
-        for x in needs
+        suite.Metric(f"memory {x['model']}", x["total"] / GIB, "GiB") for x in needs
     ]
     suite.report(
         "diversity",
@@ -224,7 +550,7 @@ def main() -> None:
         args,
         rows=table.to_json(rows),
         memory=needs,
-        peak_memory=peak,
+        peak_memory=used,
         seeds=list(range(args.seed, args.seed + args.sets)),
         commit=reporting.git_commit(),
     )

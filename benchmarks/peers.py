@@ -10,24 +10,22 @@ Example:
 """
 
 import dataclasses
+import os
 import signal
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import machine
 import numpy as np
 import suite
-import timing
 import torch
 import torch_camdm
-import tyro
 import workload
 
 from jaxmotion import cli
+from jaxmotion.evaluation import timing
 from jaxmotion.systems.camdm import model as camdm_model
 
 EAGER = "torch eager"
@@ -46,8 +44,8 @@ COLUMNS = {
 IDLE = 0.15
 
 
-@dataclasses.dataclass(frozen=True)
-class Config:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(suite.Settings):
     """Milliseconds of one plan at batch 1, and ratios to PyTorch in eager mode.
 
     Rows: ours with the parameters as arguments and as constants of the program; PyTorch
@@ -68,8 +66,6 @@ class Config:
       compile_limit: Seconds that torch.compile may take; 0 to leave it out.
       target: Greatest ratio of "ours, constants" that passes; exit status 1 beyond
         it, and 2 where the machine was too busy to judge. 0 for no target.
-      out: Folder for peers.json.
-      gate: Report to compare with; exit status 1 if something is worse.
     """
 
     steps: int = 8
@@ -78,23 +74,25 @@ class Config:
     limit: float = 120.0
     compile_limit: int = 60
     target: float = 0.65
-    out: Path = Path("runs/benchmarks")
-    gate: Path | None = None
+
+
+def use_cores(number: int) -> int:
+    """Confines this process to so many cores, before jax starts its threads.
+
+    Returns:
+      Cores it has now: fewer if there are fewer, all where the system cannot do it.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        return os.cpu_count() or 1
+    cores = sorted(os.sched_getaffinity(0))[:number]
+    os.sched_setaffinity(0, cores)
+    return len(cores)
 
 
 def our_calls(
     config: camdm_model.Config, params: Any, given: tuple
 ) -> dict[str, Callable]:
-    """Compiled plans: parameters as arguments, and as constants.
-
-    Args:
-      config: The network.
-      params: Its parameters.
-      given: Key and condition.
-
-    Returns:
-      Calls without arguments.
-    """
+    """Compiled plans: parameters as arguments, and as constants."""
     free = jax.jit(lambda p, k, c: camdm_model.sampler(p, config=config)(k, c))
     bound = jax.jit(lambda k, c: camdm_model.sampler(params, config=config)(k, c))
     free, _ = timing.compile_program(free, params, *given)
@@ -111,13 +109,7 @@ def compiled_call(
     condition: camdm_model.Condition,
     limit: int,
 ) -> tuple[Callable | None, str]:
-    """The same through torch.compile, if that works within a time.
-
-    Args:
-      net: The network.
-      config: The method.
-      condition: Of one character.
-      limit: Seconds.
+    """The same through torch.compile, if that works within `limit` seconds.
 
     Returns:
       The call, or None; and what happened, in words.
@@ -147,17 +139,7 @@ def largest_difference(
     net: torch.nn.Module,
     condition: camdm_model.Condition,
 ) -> float:
-    """Largest difference of the two forward passes, at the last step.
-
-    Args:
-      config: The network.
-      params: Our parameters.
-      net: PyTorch's network.
-      condition: Of one character.
-
-    Returns:
-      Absolute difference, in the units of the features.
-    """
+    """Largest absolute difference of the two forward passes, at the last step."""
     given = condition.arguments(config)
     x_t = np.ones((config.future, config.num_features), np.float32)
     t = config.num_steps
@@ -172,14 +154,7 @@ def largest_difference(
 
 
 def rows_of(times: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Percentiles and ratios to eager PyTorch, by wall clock and by processor time.
-
-    Args:
-      times: From `timing.time_in_turn`.
-
-    Returns:
-      One row each.
-    """
+    """Percentiles and ratios to eager PyTorch, by wall clock and by processor time."""
     rows = []
     for name, values in times.items():
         ratio = values / times[EAGER]
@@ -232,13 +207,13 @@ def judge(
 
 def main() -> None:
     """Measures, writes the report, and checks the target."""
-    args = tyro.cli(Config, description=__doc__)
-    suite.prepare(args)
-    threads = machine.use_cores(args.threads)
+    args = suite.parse(Config, __doc__)
+    suite.at_least(args, steps=1, threads=1, rounds=1)
+    threads = use_cores(args.threads)
     torch.set_num_threads(threads)
-    config = workload.paper_config(steps=args.steps)
+    config = workload.camdm_config(workload.Sizes(steps=args.steps))
     params = camdm_model.init(jax.random.key(0), config)
-    condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
+    condition = jax.tree.map(lambda x: x[0], workload.camdm_conditions(config, 1))
     nets = [
         torch_camdm.load(torch_camdm.TorchCamdm(config, batch_first=first), params)
         for first in (False, True)
@@ -255,9 +230,9 @@ def main() -> None:
         call, note = compiled_call(nets[0], config, condition, args.compile_limit)
         if call is not None:
             calls["torch.compile"] = call
-    since = machine.busy()
+    since = suite.busy()
     times = timing.time_in_turn(calls, rounds=args.rounds, warmup=3, limit_s=args.limit)
-    load = machine.other_load(since)
+    load = suite.other_load(since)
 
     rows = rows_of(times)
     print(

@@ -10,27 +10,111 @@ Example:
 """
 
 import asyncio
+import contextlib
 import dataclasses
+import json
 import math
 import select
+import signal
 import socket
 import struct
+import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import serve_connection
 import tyro
-from serve_connection import connected
 
+SERVER = Path(__file__).parents[1] / "experiments" / "serve.py"
 MALFORMED, ABRUPT = 1000, 20
 # Seconds between two commands, as of a thumb on a stick.
 STEERING = 0.5
 # Seconds in which a server should notice that a client does not read.
 NOTICED = 60.0
+
+
+@dataclasses.dataclass(kw_only=True)
+class Connection:
+    """A client that reads all it gets.
+
+    Attributes:
+      hello: The server's first line.
+      frames: Frames so far, each with its "arrival" in seconds of `time.perf_counter`.
+      errors: Errors so far.
+      writer: Where commands go.
+      reading: The task that reads; done when the server has hung up.
+    """
+
+    hello: dict[str, Any]
+    writer: asyncio.StreamWriter
+    frames: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    errors: list[str] = dataclasses.field(default_factory=list)
+    reading: asyncio.Task | None = None
+
+    def send(self, **command: Any) -> None:
+        """Sends a command of these fields."""
+        self.writer.write(json.dumps(command).encode() + b"\n")
+
+    async def read(self, reader: asyncio.StreamReader) -> None:
+        """Keeps what arrives, until the server hangs up."""
+        while line := await reader.readline():
+            arrival, message = time.perf_counter(), json.loads(line)
+            if "error" in message:
+                self.errors.append(message["error"])
+            else:
+                self.frames.append({"arrival": arrival} | message)
+
+
+@contextlib.asynccontextmanager
+async def connected(port: int) -> AsyncIterator[Connection]:
+    """A connection for as long as the block runs.
+
+    Raises:
+      OSError: if nobody answers.
+      RuntimeError: if the server does not let the client in.
+    """
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    line = await asyncio.wait_for(reader.readline(), 10)
+    if b'"hello"' not in line:
+        raise RuntimeError(f"the server said {line!r}, expected a hello")
+    connection = Connection(hello=json.loads(line)["hello"], writer=writer)
+    connection.reading = asyncio.create_task(connection.read(reader))
+    try:
+        yield connection
+    finally:
+        connection.reading.cancel()
+        writer.close()
+
+
+def resident_mb(process: subprocess.Popen) -> float:
+    """Megabytes of memory of a process, on Linux."""
+    text = Path(f"/proc/{process.pid}/status").read_text()
+    return int(text.split("VmRSS:")[1].split()[0]) / 1000
+
+
+@contextlib.contextmanager
+def server_of(run: Path) -> Iterator[tuple[subprocess.Popen, int]]:
+    """A server of a run, its process and port, for as long as the block runs.
+
+    Raises:
+      RuntimeError: if it does not start, or does not end well.
+    """
+    command = [sys.executable, str(SERVER), "--run", str(run), "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            for line in process.stdout:
+                print(line, end="", flush=True)
+                if line.startswith("listening on"):
+                    yield process, int(line.rpartition(":")[2])
+                    break
+        finally:
+            process.send_signal(signal.SIGTERM)
+            rest, _ = process.communicate(timeout=20)
+    if process.returncode or "closed" not in rest:
+        raise RuntimeError(f"the server ended with {process.returncode}: {rest}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,12 +168,8 @@ def timing(
 async def steer(port: int, seconds: float) -> dict[str, float]:
     """Walks about, with another direction every half second and now and then a style.
 
-    Args:
-      port: Of the server.
-      seconds: How long.
-
     Returns:
-      As of `timing`.
+      What `timing` returns.
     """
     async with connected(port) as client:
         labels = client.hello["labels"]
@@ -104,14 +184,7 @@ async def steer(port: int, seconds: float) -> dict[str, float]:
 
 
 def malformed(number: int) -> Iterator[bytes]:
-    """Lines that no server should obey.
-
-    Args:
-      number: How many.
-
-    Yields:
-      A line with its newline.
-    """
+    """Lines that no server should obey, with their newlines."""
     kinds = [
         b"",
         b"hello",
@@ -146,9 +219,6 @@ def malformed(number: int) -> Iterator[bytes]:
 async def abuse(port: int) -> dict[str, float]:
     """Sends malformed lines, then a command.
 
-    Args:
-      port: Of the server.
-
     Returns:
       How many lines were sent and answered, frames meanwhile, and how far the character
       then walked in 3 s of the 3 m that it was told to.
@@ -174,11 +244,7 @@ async def abuse(port: int) -> dict[str, float]:
 
 
 def hang_up(port: int) -> None:
-    """Connects, and resets the connection at once or after some frames.
-
-    Args:
-      port: Of the server.
-    """
+    """Connects, and resets the connection at once or after some frames."""
     for i in range(ABRUPT):
         with socket.create_connection(("127.0.0.1", port)) as connection:
             at_once = struct.pack("ii", 1, 0)
@@ -188,14 +254,7 @@ def hang_up(port: int) -> None:
 
 
 def lazy_client(port: int) -> socket.socket:
-    """A client that never reads.
-
-    Args:
-      port: Of the server.
-
-    Returns:
-      Its socket.
-    """
+    """The socket of a client that never reads."""
     connection = socket.socket()
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     connection.connect(("127.0.0.1", port))
@@ -203,15 +262,7 @@ def lazy_client(port: int) -> socket.socket:
 
 
 async def dropped_after(connection: socket.socket, begin: float) -> float:
-    """Waits until the server hangs up.
-
-    Args:
-      connection: Of a client that does not read.
-      begin: When it connected.
-
-    Returns:
-      Seconds from its beginning; infinite if it took too long.
-    """
+    """Seconds from `begin` until the server hangs up; infinite if it takes too long."""
     poll = select.poll()
     poll.register(connection, 0)  # reports only that the connection has ended
     while time.perf_counter() - begin < NOTICED:
@@ -222,15 +273,7 @@ async def dropped_after(connection: socket.socket, begin: float) -> float:
 
 
 async def visit(port: int, seconds: float) -> tuple[dict[str, float], list[str]]:
-    """All that the client does.
-
-    Args:
-      port: Of the server.
-      seconds: How long to steer.
-
-    Returns:
-      What was measured, and what failed.
-    """
+    """All that the client does: what was measured, and what failed."""
     found = await steer(port, seconds)
     found |= await abuse(port)
     await asyncio.to_thread(hang_up, port)
@@ -260,11 +303,11 @@ def main() -> None:
     if args.serve is None:
         found, failed = asyncio.run(visit(args.port, args.seconds))
     else:
-        with serve_connection.server_of(args.serve) as (process, port):
-            before = serve_connection.resident_mb(process)
+        with server_of(args.serve) as (process, port):
+            before = resident_mb(process)
             found, failed = asyncio.run(visit(port, args.seconds))
             found["memory before MB"] = before
-            found["memory afterwards MB"] = serve_connection.resident_mb(process)
+            found["memory afterwards MB"] = resident_mb(process)
     for name, value in found.items():
         print(f"{name:36}{value:10.1f}" if value % 1 else f"{name:36}{value:10.0f}")
     for name in failed:

@@ -1,16 +1,24 @@
-"""What the benchmarks share: metrics, reports, and a gate against a baseline.
+"""What the benchmarks share: command lines, metrics, reports, and a gate.
 
 A report says how many calls a percentile comes from, and how busy other processes kept
 the machine meanwhile: figures from a shared machine are no figures of the program.
 """
 
 import dataclasses
+import datetime
+import importlib.metadata
 import json
+import os
+import platform
+import sys
+import time
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, TypeVar
 
-import machine
+import jax
+import tyro
 
+from jaxmotion import reporting
 from jaxmotion.learning.loop import check_writable
 
 
@@ -33,43 +41,67 @@ class Metric:
     tolerance: float = 0.3
 
 
-class Settings(Protocol):
-    """Command-line settings of a benchmark: a dataclass with these fields."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Where reports go; a benchmark adds its own settings.
 
-    @property
-    def out(self) -> Path:
-        """Folder of the report."""
-        ...
+    Attributes:
+      out: Folder of the report.
+      gate: Report to compare with; exit status 1 if something is worse.
+    """
 
-    @property
-    def gate(self) -> Path | None:
-        """Baseline report, or None."""
-        ...
+    out: Path = Path("runs/benchmarks")
+    gate: Path | None = None
 
 
-def prepare(args: Settings) -> None:
-    """Raises if the report could not be written or compared; before any work.
+S = TypeVar("S", bound=Settings)
 
-    Args:
-      args: The settings.
+
+def parse(kind: type[S], description: str | None) -> S:
+    """Settings from the command line, checked before any work.
 
     Raises:
       OSError: if the folder cannot be written, or the baseline not be read.
       ValueError: if the baseline is no report.
     """
+    args = tyro.cli(kind, description=description)
+    prepare(args)
+    return args
+
+
+def prepare(args: Settings) -> None:
+    """Raises if the report could not be written or compared."""
     check_writable(args.out)
     if args.gate is not None:
         read_baseline(args.gate)
 
 
+def at_least(args: Settings, **least: int) -> None:
+    """Raises unless options (or all values of one) are at least so large.
+
+    Raises:
+      ValueError: names the option.
+    """
+    for name, expected in least.items():
+        value = getattr(args, name)
+        for found in value if isinstance(value, tuple) else (value,):
+            if found is not None and found < expected:
+                option = name.replace("_", "-")
+                raise ValueError(f"--{option} {found}: expected {expected} or more")
+
+
+def time_metrics(name: str, row: dict[str, Any]) -> list[Metric]:
+    """Metrics of a row with the fields of a `timing.Timing` and a rate."""
+    return [
+        Metric(f"{name} frames", row["frames_per_second"], "frames/s", "higher"),
+        Metric(f"{name} p50", row["p50_ms"], "ms"),
+        Metric(f"{name} p95", row["p95_ms"], "ms", tolerance=0.6),
+        Metric(f"{name} compile", row["compile_s"], "s", tolerance=0.6),
+    ]
+
+
 def read_baseline(path: Path) -> dict[str, float]:
     """Values of a report by the names of its metrics.
-
-    Args:
-      path: Report of `report`.
-
-    Returns:
-      The values.
 
     Raises:
       OSError: if there is no such file.
@@ -86,14 +118,7 @@ def read_baseline(path: Path) -> dict[str, float]:
 
 
 def settings(args: Any) -> dict[str, Any]:
-    """Command-line settings as JSON.
-
-    Args:
-      args: A dataclass.
-
-    Returns:
-      Its fields; paths as text.
-    """
+    """Command-line settings as JSON; paths as text."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, tuple):
@@ -106,9 +131,7 @@ def settings(args: Any) -> dict[str, Any]:
 def compare(metrics: list[Metric], baseline: Path) -> list[str]:
     """Metrics that are worse than a baseline report by more than their tolerance.
 
-    Args:
-      metrics: Measured now.
-      baseline: Report of `write_report`; metrics it lacks are not compared.
+    Metrics that the baseline lacks are not compared.
 
     Returns:
       One line for each.
@@ -131,12 +154,7 @@ def compare(metrics: list[Metric], baseline: Path) -> list[str]:
 
 
 def print_table(rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
-    """Prints rows as a table.
-
-    Args:
-      rows: Their values by key.
-      columns: Title of each key to print.
-    """
+    """Prints rows as a table; `columns` are the titles of the keys to print."""
 
     def cell(value: Any) -> str:
         if isinstance(value, float):
@@ -151,17 +169,12 @@ def print_table(rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
 
 
 def report(
-    name: str,
-    metrics: list[Metric],
-    args: Settings,
-    *,
-    rows: Any,
-    **more: Any,
+    name: str, metrics: list[Metric], args: Settings, *, rows: Any, **more: Any
 ) -> None:
-    """Writes metrics as JSON, and applies the gate.
+    """Writes <out>/<name>.json, and applies the gate.
 
     Args:
-      name: Of the benchmark; the file is <out>/<name>.json.
+      name: Of the benchmark.
       metrics: What was measured.
       args: The settings.
       rows: The table.
@@ -171,7 +184,7 @@ def report(
       SystemExit: with status 1, if the gate finds something worse.
     """
     args.out.mkdir(parents=True, exist_ok=True)
-    here = machine.environment()
+    here = environment()
     value = {
         "benchmark": name,
         "environment": here,
@@ -195,3 +208,58 @@ def report(
     if worse:
         print("worse than the baseline:", *worse, sep="\n  ")
         raise SystemExit(1)
+
+
+def busy() -> tuple[float, float, float] | None:
+    """Where the clocks stand, for `other_load`.
+
+    Returns:
+      Seconds of wall clock, of all cores' work, and of this process's work; None where
+      the system does not say (it is Linux that does).
+    """
+    try:
+        fields = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
+        ticks = [int(x) for x in fields]
+    except (OSError, ValueError):
+        return None
+    idle = sum(ticks[3:5])
+    # Guest time (after the eighth field) is counted as user time already.
+    used = (sum(ticks[:8]) - idle) / os.sysconf("SC_CLK_TCK")
+    return time.perf_counter(), used, time.process_time()
+
+
+_BEGIN = busy()
+
+
+def other_load(since: tuple[float, float, float] | None = _BEGIN) -> float | None:
+    """Cores that other processes kept busy on average, by default since the start.
+
+    Returns:
+      0 on an idle machine; None where the system does not say.
+    """
+    now = busy()
+    if now is None or since is None:
+        return None
+    clock, used, own = (b - a for a, b in zip(since, now, strict=True))
+    return round(max(used - own, 0.0) / max(clock, 1e-9), 2)
+
+
+def environment() -> dict[str, Any]:
+    """Hardware, versions, command, date; "other_load" says how far to trust times."""
+    versions = {}
+    for name in ("jax", "jaxlib", "flax", "numpy", "jaxmotion"):
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "device": str(jax.devices()[0]),
+        "devices": len(jax.devices()),
+        "cpu": reporting.processor(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        **versions,
+        "other_load": other_load(),
+        "command": " ".join(["python", *sys.argv]),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }

@@ -11,28 +11,17 @@ Examples:
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import suite
-import timing
-import tyro
 import workload
 
 from jaxmotion import cli
-from jaxmotion.data import windows
+from jaxmotion.evaluation import timing
 from jaxmotion.learning import training
-from jaxmotion.systems.aamdm import loss as aamdm_loss
-from jaxmotion.systems.aamdm import model as aamdm_model
-from jaxmotion.systems.camdm import loss as camdm_loss
-from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import training as camdm_training
-from jaxmotion.typing import Key
 
 COLUMNS = {
     "width": "width",
@@ -46,11 +35,11 @@ COLUMNS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Config:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(suite.Settings):
     """Training of several models at once against one after another.
 
-    Updates per second are of single models: five models that each make one update a
+    Updates per second are of single models: five models that each make one update per
     second make five. The ratio is the median over rounds of how much faster training
     together is, with its 10th and 90th percentile.
 
@@ -63,104 +52,25 @@ class Config:
       batch: Windows of an update.
       rounds: Timed rounds; each has all models' updates both ways.
       limit: Seconds to time for, at most.
-      out: Folder for train_together.json.
-      gate: Report to compare with; exit status 1 if something is worse.
     """
 
-    system: Literal["camdm", "aamdm"] = "camdm"
+    system: str = "camdm"
     width: tuple[int, ...] = (32, 128)
     models: int = 5
     updates: int = 4
     batch: int = 48
     rounds: int = 15
     limit: float = 120.0
-    out: Path = Path("runs/benchmarks")
-    gate: Path | None = None
 
 
-class Program(NamedTuple):
-    """What trains a model: its update, its batches, and its first state."""
-
-    update: training.Update
-    sample: Callable[[Key, Any], Any]
-    init: Callable[[Key], training.TrainState]
-    data: Any
-
-
-def camdm_program(width: int, batch: int) -> Program:
-    """The transformer on windows of the walker.
-
-    Args:
-      width: Channels of a token.
-      batch: Windows of an update.
-
-    Returns:
-      The program.
-    """
-    clips = workload.make_clips()
-    sizes = camdm_training.PRESETS["small"] | {"width": width, "hidden": 4 * width}
-    model = camdm_training.make_model(clips, field="style", **sizes)
-    optimizer = training.make_optimizer("muon", learning_rate=1e-3, num_steps=1000)
-    loss = functools.partial(
-        camdm_loss.loss, skeleton=model.skeleton, config=model.config
-    )
-    return Program(
-        update=training.make_update(loss, optimizer),
-        sample=camdm_training.window_sampler(field="style", batch=batch),
-        init=lambda key: training.init_train_state(
-            camdm_model.init(key, model.config), optimizer
-        ),
-        data=(clips, windows.window_index(clips, model.config.window)),
-    )
-
-
-def aamdm_program(width: int, batch: int) -> Program:
-    """The polisher on windows of random frames.
-
-    Args:
-      width: Channels of a hidden layer.
-      batch: Windows of an update.
-
-    Returns:
-      The program.
-    """
-    config = aamdm_model.Config(features=64, width=width)
-    optimizer = training.make_optimizer("radam", learning_rate=1e-4)
-    shape = (4096, config.window + 1, config.features)
-    frames = np.random.default_rng(0).normal(size=shape)
-
-    def init(key: Key) -> training.TrainState:
-        params = aamdm_model.init(key, config)["polisher"]
-        return training.init_train_state(params, optimizer)
-
-    def sample(key: Key, data: jax.Array) -> jax.Array:
-        return data[jax.random.randint(key, (batch,), 0, data.shape[0])]
-
-    loss = functools.partial(aamdm_loss.polisher_loss, config=config)
-    return Program(
-        update=training.make_update(loss, optimizer),
-        sample=sample,
-        init=init,
-        data=jnp.asarray(frames, jnp.float32),
-    )
-
-
-SYSTEMS = {"camdm": camdm_program, "aamdm": aamdm_program}
 # Axis of the models in each field; they share the number of updates made.
 MODELS = training.TrainState(step=None, params=0, ema_params=0, opt_state=0)
 
 
 def measure(args: Config, width: int) -> dict[str, Any]:
-    """Both ways, in turn.
-
-    Args:
-      args: The settings.
-      width: Channels.
-
-    Returns:
-      One row of the report.
-    """
-    program = SYSTEMS[args.system](width, args.batch)
+    """Both ways, in turn: a row of the report."""
+    make = workload.of(args.system, "training")
+    program = make(workload.Sizes(width=width), args.batch)
     keys = jax.random.split(jax.random.key(0), args.models)
     key, data = jax.random.key(1), jax.tree.map(jnp.asarray, program.data)
     # The programs donate their state: what they return replaces it.
@@ -204,11 +114,8 @@ def measure(args: Config, width: int) -> dict[str, Any]:
 
 def main() -> None:
     """Measures, prints the table and writes the report."""
-    args = tyro.cli(Config, description=__doc__)
-    for name in ("models", "updates", "batch", "rounds"):
-        if getattr(args, name) < 1:
-            raise ValueError(f"--{name} {getattr(args, name)}: expected 1 or more")
-    suite.prepare(args)
+    args = suite.parse(Config, __doc__)
+    suite.at_least(args, width=1, models=1, updates=1, batch=1, rounds=1)
     rows = [measure(args, width) for width in args.width]
     suite.print_table(rows, COLUMNS)
     metrics = [

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.evaluation import timing
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
@@ -118,14 +119,15 @@ def test_unrolled_sampler_is_the_scanned_one(load):
     compile_times, workload = load("compile_times"), load("workload")
     config = tiny.config(num_steps=2)
     params = tiny.random_params(camdm_model.init, config)
-    condition = jax.tree.map(lambda x: x[0], workload.conditions(config, 1))
+    condition = jax.tree.map(lambda x: x[0], workload.camdm_conditions(config, 1))
     scan = jax.jit(camdm_model.sampler(params, config=config))
     loop = jax.jit(lambda k, c: compile_times.unrolled(config, params, k, c))
     found, expected = (f(jax.random.key(0), condition) for f in (loop, scan))
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-SCRIPT_NAMES = ["step_counts", "rollout_batch", "compile_times", "peers"]
+SCRIPT_NAMES = ["step_counts", "rollout_batch", "compile_times", "train_together"]
+SCRIPT_NAMES += ["peers"]
 
 
 @pytest.mark.parametrize("name", SCRIPT_NAMES)
@@ -184,20 +186,18 @@ def test_bad_input_stops_before_the_work(load, tmp_path):
         chunks_of(16, (4, 5))
 
 
-def test_time_calls_warms_up_and_stops(load):
-    timing = load("timing")
+def test_time_calls_warms_up_and_stops():
     calls = []
     work = lambda: calls.append(1) or jnp.zeros(())  # noqa: E731
-    assert len(timing.time_calls(work, runs=7, warmup=2)) == 7
+    assert len(timing.time_calls(work, rounds=7, warmup=2)) == 7
     assert len(calls) == 9
     # No time at all: one call to warm up, and the least number.
     calls.clear()
-    assert len(timing.time_calls(work, runs=7, warmup=2, limit_s=0.0, least=3)) == 3
+    assert len(timing.time_calls(work, rounds=7, warmup=2, limit_s=0.0, least=3)) == 3
     assert len(calls) == 4
 
 
-def test_time_in_turn_moves_the_order_on(load):
-    timing = load("timing")
+def test_time_in_turn_moves_the_order_on():
     order = []
     calls = {name: (lambda name=name: order.append(name)) for name in "abc"}
     times = timing.time_in_turn(calls, rounds=5, warmup=1, limit_s=60.0)

@@ -71,7 +71,7 @@ def test_the_script_measures_and_says_what_it_has_no_parameters_for(tmp_path):
 
 def test_measures_of_a_known_set(load):
     """Two groups that stand 0.5 m apart, with the same pose in both."""
-    workload = load("workload_diversity")
+    workload = load("diversity")
     pose = np.random.default_rng(0).normal(size=(1, 3, 4, 3))
     pose = np.broadcast_to(pose, (8, 3, 4, 3)).astype(np.float32)
     world = pose + np.repeat([[0.0, 0, 0], [0.3, 0, 0.4]], 4, axis=0)[:, None, None]
@@ -87,7 +87,7 @@ def test_measures_of_a_known_set(load):
 
 
 def test_chunks_shrink_to_the_limit(load):
-    memory = load("memory")
+    memory = load("diversity")
     needs = dict(chunk=64, arguments=10, results=20, intermediate=6400, total=6430)
     assert memory.next_chunk(needs, 3230.0) == 32
     assert memory.next_chunk(needs, 530.0) == 5
@@ -102,7 +102,7 @@ def test_chunks_shrink_to_the_limit(load):
 
 def test_the_program_that_fits_is_found(load):
     """Of a program that holds `chunk` matrices at a time."""
-    memory = load("memory")
+    memory = load("diversity")
     tried = []
 
     def compiled(size):
@@ -164,7 +164,7 @@ def test_bad_input_is_named_before_the_work(
 @pytest.fixture(scope="module")
 def small(load, skeleton, quick_compile):
     """`one_rollout` of a small model, and keys and states to map it over."""
-    workload = load("workload_diversity")
+    workload = load("diversity")
     model = camdm_model.Model(
         config=CONFIG, skeleton=skeleton, labels=tiny.STYLES, source="made in the tests"
     )

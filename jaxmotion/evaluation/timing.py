@@ -1,0 +1,107 @@
+"""Times of calls: the only loop that measures any.
+
+A time is measured around a call that ends with its result ready; compiling is measured
+apart; the first calls warm up and do not count. What is compared is timed in turn, so
+that what disturbs one call disturbs all.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Timing:
+    """Times of one compiled program.
+
+    Attributes:
+      compile_s: Seconds of tracing, lowering and compiling.
+      p50_ms: Median of the timed calls, milliseconds.
+      p95_ms: 95th percentile, milliseconds.
+      runs: Timed calls.
+    """
+
+    compile_s: float
+    p50_ms: float
+    p95_ms: float
+    runs: int
+
+
+def compile_program(function: Callable, *arguments: Any) -> tuple[Callable, float]:
+    """Compiles a jitted function.
+
+    Returns:
+      The program, which cannot compile again, and the seconds it took.
+    """
+    start = time.perf_counter()
+    program = function.lower(*arguments).compile()
+    return program, time.perf_counter() - start
+
+
+def time_in_turn(
+    calls: dict[str, Callable[[], Any]],
+    *,
+    rounds: int = 50,
+    warmup: int = 3,
+    limit_s: float = 60.0,
+    least: int = 5,
+) -> dict[str, np.ndarray]:
+    """Times several calls in one run, so that what disturbs one disturbs all.
+
+    Every round calls each once; the order moves on by one a round, so that none always
+    runs behind the same other.
+
+    Args:
+      calls: By name; what they return is waited for if it is JAX's.
+      rounds: Timed rounds.
+      warmup: Rounds before, fewer where they take a quarter of the limit.
+      limit_s: Stop after so many seconds, but not before the least number of rounds.
+      least: That number.
+
+    Returns:
+      For each name an array [rounds, 2]: milliseconds of wall clock, and of processor
+      time of all threads of this process.
+    """
+    names, made = list(calls), 0
+
+    def one_round() -> list[tuple[float, float]]:
+        nonlocal made
+        turn = made % len(names)
+        made += 1
+        found = {}
+        for name in names[turn:] + names[:turn]:
+            start, start_cpu = time.perf_counter(), time.process_time()
+            jax.block_until_ready(calls[name]())
+            end, end_cpu = time.perf_counter(), time.process_time()
+            found[name] = 1000 * (end - start), 1000 * (end_cpu - start_cpu)
+        return [found[name] for name in names]
+
+    begin = time.perf_counter()
+    for _ in range(warmup):
+        one_round()
+        if time.perf_counter() - begin > limit_s / 4:
+            break
+    times: list[list[tuple[float, float]]] = []
+    begin = time.perf_counter()
+    while len(times) < rounds:
+        times.append(one_round())
+        if len(times) >= least and time.perf_counter() - begin > limit_s:
+            break
+    return dict(zip(names, np.array(times).transpose(1, 0, 2), strict=True))
+
+
+def time_calls(call: Callable[[], Any], **options: Any) -> np.ndarray:
+    """Milliseconds of wall clock of each call; options as of `time_in_turn`."""
+    return time_in_turn({"": call}, **options)[""][:, 0]
+
+
+def measure(function: Callable, *arguments: Any, **options: Any) -> Timing:
+    """Compiles a jitted function, and times it; options as of `time_in_turn`."""
+    program, seconds = compile_program(function, *arguments)
+    times = time_calls(lambda: program(*arguments), **options)
+    p50, p95 = np.percentile(times, [50, 95])
+    return Timing(seconds, float(p50), float(p95), len(times))
