@@ -74,67 +74,6 @@ def multimodality(
     return jnp.mean(jax.vmap(of_one)(keys, features))
 
 
-def _random_subsets(key: Key, count: int, num_pairs: int) -> tuple[Array, Array]:
-    """Two subsets drawn without replacement, independently: a row may meet itself."""
-    if not 1 <= num_pairs <= count:
-        raise ValueError(f"{num_pairs} pairs of {count} samples, expected 1..{count}")
-    first, second = jax.random.split(key)
-    draw = lambda k: jax.random.permutation(k, count)[:num_pairs]  # noqa: E731
-    return draw(first), draw(second)
-
-
-@functools.partial(jax.jit, static_argnames=("num_pairs",))
-def diversity_emdm_release(
-    key: Key, features: Float[Array, "samples features"], *, num_pairs: int
-) -> Float[Array, ""]:
-    """Mean distance of two random subsets, paired in order, as published evaluators do.
-
-    A sample meets itself with probability 1 / samples, so that the mean is
-    (samples - 1) / samples of `diversity`'s.
-
-    Args:
-      key: Consumed.
-      features: One row a sample, of all conditions together.
-      num_pairs: Samples of each subset (300 for text, at most the samples).
-
-    Returns:
-      Mean Euclidean distance, in units of the features.
-
-    Raises:
-      ValueError: if there are fewer samples than pairs.
-
-    Source: Guo et al. 2022 (T2M), whose evaluator the released code of EMDM uses.
-    """
-    first, second = _random_subsets(key, features.shape[0], num_pairs)
-    return jnp.mean(jnp.linalg.norm(features[first] - features[second], axis=-1))
-
-
-@functools.partial(jax.jit, static_argnames=("num_pairs",))
-def multimodality_emdm_release(
-    key: Key, features: Float[Array, "conditions repeats features"], *, num_pairs: int
-) -> Float[Array, ""]:
-    """As `diversity_emdm_release` within each condition, with one draw for all.
-
-    With 30 repeats it is 29/30 of `multimodality`, whatever the number of pairs.
-
-    Args:
-      key: Consumed.
-      features: Features of several samples of each condition.
-      num_pairs: Samples of each subset (10 of 30 for text).
-
-    Returns:
-      Mean Euclidean distance, in units of the features.
-
-    Raises:
-      ValueError: if there are fewer repeats than pairs.
-
-    Source: Guo et al. 2022 (T2M), whose evaluator the released code of EMDM uses.
-    """
-    first, second = _random_subsets(key, features.shape[1], num_pairs)
-    gap = features[:, first] - features[:, second]
-    return jnp.mean(jnp.linalg.norm(gap, axis=-1))
-
-
 @functools.partial(jax.jit, static_argnames=("num_pairs",))
 def joint_distance(
     key: Key, positions: Float[Array, "samples frames joints 3"], *, num_pairs: int

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Moments:
-    """Mean and covariance of features, which can be merged.
+    """Mean and covariance of features.
 
     Leading axes come from `jax.vmap` over sets; the functions here take one set.
 
@@ -82,33 +82,6 @@ def masked_moments(
     scatter = jnp.matmul(centerd.T, centerd, precision="highest")
     covariance = jnp.where(count > 1, scatter / (count - 1), jnp.nan)
     return Moments(mean=mean, covariance=covariance, count=count)
-
-
-@jax.jit
-def merge(a: Moments, b: Moments) -> Moments:
-    """Moments of the samples of both.
-
-    Args:
-      a: Moments of some samples.
-      b: Moments of others.
-
-    Returns:
-      Moments of all.
-
-    Source: Chan et al. 1979.
-    """
-    count = a.count + b.count
-    gap = b.mean - a.mean
-    scatter = (
-        a.covariance * (a.count - 1)
-        + b.covariance * (b.count - 1)
-        + gap[:, None] * gap[None] * (a.count * b.count / count)
-    )
-    return Moments(
-        mean=a.mean + gap * (b.count / count),
-        covariance=scatter / (count - 1),
-        count=count,
-    )
 
 
 def _square_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:

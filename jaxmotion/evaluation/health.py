@@ -2,35 +2,16 @@
 
 Two ways to fail: it *diverges* (numbers that no body shows) or it *freezes* (the limbs
 stop although it is told to move). Both are yes or no, with stated bounds, for frames
-and for whole rollouts; `time_to_failure` makes a rate of them.
+and for whole rollouts.
 """
 
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxmotion.motion.spring import Scalar
-
-_SECONDS = 60.0
-
-
-class Exposure(NamedTuple):
-    """Whether a rollout failed, and for how long it was watched until then."""
-
-    failed: Bool[Array, "*batch"]
-    minutes: Float[Array, "*batch"]
-
-
-class FailureRate(NamedTuple):
-    """Failures for each minute watched, and the part that fails within a minute."""
-
-    per_minute: Float[Array, ""]
-    fraction: Float[Array, ""]
-    failures: Float[Array, ""]
-    minutes: Float[Array, ""]
 
 
 @functools.partial(jax.jit, static_argnames=("fps",))
@@ -176,50 +157,3 @@ def is_frozen(
         commanded=commanded,
     )
     return jnp.any(found, axis=-1)
-
-
-@functools.partial(jax.jit, static_argnames=("fps",))
-def time_to_failure(failed: Bool[Array, "*batch frames"], *, fps: float) -> Exposure:
-    """When rollouts fail first; what comes behind counts neither way.
-
-    Args:
-      failed: Frames that diverged or are frozen: `diverged_frames | frozen_frames`, or
-        one of both.
-      fps: Frames per second.
-
-    Returns:
-      Whether any frame failed, and the minutes up to the first that did, it included,
-      or of the whole rollout.
-    """
-    any_failed = jnp.any(failed, axis=-1)
-    frames = jnp.where(any_failed, jnp.argmax(failed, axis=-1) + 1, failed.shape[-1])
-    return Exposure(failed=any_failed, minutes=frames / fps / _SECONDS)
-
-
-@jax.jit
-def failure_rate(exposure: Exposure) -> FailureRate:
-    """Part of the characters that freeze or diverge within a minute.
-
-    With failures that come at a constant rate the maximum-likelihood rate is failures
-    over all minutes watched, however long each rollout was, and the part that fails
-    within a minute is 1 - exp(-rate). Intervals: `statistics.bootstrap_interval` over
-    the rollouts; where none failed, rates up to 3 / minutes are within 95 %.
-
-    Args:
-      exposure: Of rollouts, from `time_to_failure`.
-
-    Returns:
-      Rate a minute, part in 0..1 that fails within one, number of failures, and
-      minutes watched; a rate of NaN for no time.
-
-    Source: maximum likelihood of an exponential time to failure with censoring.
-    """
-    failures = jnp.sum(exposure.failed, dtype=exposure.minutes.dtype)
-    minutes = jnp.sum(exposure.minutes)
-    rate = failures / minutes
-    return FailureRate(
-        per_minute=rate,
-        fraction=-jnp.expm1(-rate),
-        failures=failures,
-        minutes=minutes,
-    )

@@ -1,11 +1,11 @@
 """Confidence intervals for tables."""
 
-import functools
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import scipy.stats
 from jaxtyping import Array, Float
 
 from jaxmotion.motion.spring import Scalar
@@ -15,67 +15,33 @@ from jaxmotion.typing import Key
 class Interval(NamedTuple):
     """An estimate and the ends of its confidence interval."""
 
-    estimate: Float[Array, ""]
-    low: Float[Array, ""]
-    high: Float[Array, ""]
+    estimate: float | Float[Array, ""]
+    low: float | Float[Array, ""]
+    high: float | Float[Array, ""]
 
 
-def _student_quantile(upper: Array, freedom: int) -> Array:
-    """Where Student's distribution function is 1 - upper, for 0 < upper < 1/2."""
-    # P(|T| < t) = I_u(1 / 2, freedom / 2) at u = t^2 / (freedom + t^2), which grows
-    # with u; bisection in u needs no derivative and no starting point.
-    half = jnp.asarray(freedom / 2, upper.dtype)
-
-    def bisect(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        is_low = jax.scipy.special.betainc(0.5, half, middle) < 1.0 - 2.0 * upper
-        return jnp.where(is_low, middle, low), jnp.where(is_low, high, middle)
-
-    ends = (jnp.zeros_like(upper), jnp.ones_like(upper))
-    low, high = jax.lax.fori_loop(0, 60, bisect, ends)
-    u = 0.5 * (low + high)
-    return jnp.sqrt(freedom * u / (1.0 - u))
-
-
-@functools.partial(jax.jit, static_argnames=("method",))
 def confidence_interval(
-    samples: Float[Array, " samples"],
-    *,
-    level: Scalar = 0.95,
-    method: Literal["t", "normal"] = "t",
+    samples: Float[Array, " samples"], *, level: float = 0.95
 ) -> Interval:
-    """Mean of independent samples with its confidence interval.
+    """Mean of independent samples with its confidence interval by Student's t.
+
+    The interval is right for few samples of a Gaussian; the deviation is with n - 1.
+    The literature on text to motion takes 1.96 instead of t, and its released scripts
+    divide by n: for n = 20 their half widths are 9 % less.
 
     Args:
-      samples: For example one value a seed or a clip.
+      samples: For example one value per seed or clip.
       level: Probability that the interval holds the mean, in (0, 1).
-      method: Student's "t", right for few samples of a Gaussian; or "normal", the
-        1.96 of the literature on text to motion. Both take the deviation with n - 1
-        (ddof=1); the released scripts of text to motion divide by n (NumPy's default),
-        so their half widths are sqrt(1 - 1 / n) of "normal": 2.5 % less for n = 20.
-
-    Returns:
-      Mean, and mean minus and plus the half width.
 
     Raises:
-      ValueError: if there are fewer than two samples or the method is neither.
-
-    Source: Student 1908.
+      ValueError: if there are fewer than two samples.
     """
     count = samples.shape[0]
     if count < 2:
         raise ValueError(f"{count} samples, expected at least 2 to have an interval")
-    if method not in ("t", "normal"):
-        raise ValueError(f"method is {method!r}, expected 't' or 'normal'")
-    upper = jnp.asarray((1.0 - level) / 2.0, samples.dtype)
-    if method == "t":
-        quantile = _student_quantile(upper, count - 1)
-    else:
-        quantile = -jax.scipy.special.ndtri(upper)
-    mean = jnp.mean(samples)
-    half_width = quantile * jnp.std(samples, ddof=1) / jnp.sqrt(1.0 * count)
-    return Interval(estimate=mean, low=mean - half_width, high=mean + half_width)
+    mean, error = float(jnp.mean(samples)), float(jnp.std(samples, ddof=1))
+    half = scipy.stats.t.ppf(0.5 + level / 2, count - 1) * error / count**0.5
+    return Interval(estimate=mean, low=mean - half, high=mean + half)
 
 
 def bootstrap_interval(

@@ -135,36 +135,6 @@ def on_ground(path: np.ndarray) -> np.ndarray:
     return np.stack([path[:, 0], np.zeros(len(path)), path[:, 1]], axis=-1)
 
 
-def plot_paths(
-    path: str | Path,
-    commanded: np.ndarray,
-    walked: np.ndarray,
-    *,
-    title: str = "",
-) -> None:
-    """The commanded and the walked path from above, as a picture file.
-
-    Args:
-      path: File to write; its ending says the format.
-      commanded: [F, 2] (x, z) meters.
-      walked: [F, 2] meters.
-      title: Above the picture.
-
-    Raises:
-      OSError: if the file cannot be written.
-    """
-    path = check_writable(path)
-    figure = Figure(figsize=(5, 5), dpi=100)
-    axes = figure.add_subplot()
-    axes.plot(*commanded.T, color=COMMANDED, label="commanded")
-    axes.plot(*walked.T, color=WALKED, label="walked")
-    # Seen from above with z up the page, +x (the left of +z) points left.
-    axes.invert_xaxis()
-    axes.set(xlabel="x (m)", ylabel="z (m)", title=title, aspect="equal")
-    axes.legend()
-    figure.savefig(path)
-
-
 def plot_sweep(
     path: str | Path,
     lines: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray | None]],

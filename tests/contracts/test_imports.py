@@ -57,7 +57,7 @@ DOORS = {
     "optax": ("jaxmotion/learning/training.py",),
     "orbax": ("jaxmotion/learning/checkpoint.py",),
     "tensorflow_datasets": ("jaxmotion/data/builders/",),
-    "scipy": ("jaxmotion/data/",),
+    "scipy": ("jaxmotion/data/", "jaxmotion/evaluation/statistics.py"),
     "matplotlib": ("jaxmotion/viz/",),
     "PIL": ("jaxmotion/viz/",),
     "tqdm": ("jaxmotion/learning/loop.py", "experiments/", "benchmarks/"),

@@ -33,16 +33,6 @@ def test_moments_are_numpys():
     assert got.count == 50
 
 
-def test_merged_moments_are_those_of_all():
-    x = samples(1, 90, 5, shift=3.0)
-    parts = [fit(x[:20]), fit(x[20:50]), fit(x[50:])]
-    got = frechet.merge(frechet.merge(parts[0], parts[1]), parts[2])
-    want = fit(x)
-    np.testing.assert_allclose(got.mean, want.mean, rtol=1e-5)
-    np.testing.assert_allclose(got.covariance, want.covariance, rtol=1e-4, atol=1e-4)
-    assert got.count == 90
-
-
 @pytest.mark.parametrize("features, count", [(3, 200), (32, 500)])
 def test_distance_is_that_of_scipys_matrix_root(features, count):
     a = samples(2, count, features)
