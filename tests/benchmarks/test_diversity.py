@@ -151,7 +151,7 @@ def test_help_has_an_example_and_says_what_the_columns_are(load, monkeypatch, ca
         (["--memory-gib", 0], "--memory-gib 0.0: expected more than 0"),
         (["--chunk", 0], "--chunk 0"),
         (["--run", "no/such.npz"], "no/such.npz: no such file"),
-        (["--course", "zigzag"], "--course zigzag: there are forward"),
+        (["--course", "zigzag"], "--course zigzag: there are straight"),
     ],
 )
 def test_bad_input_is_named_before_the_work(
