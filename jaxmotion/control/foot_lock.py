@@ -41,6 +41,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxmotion.control.rollout import Controller
+from jaxmotion.control.steering import Character, Method
 from jaxmotion.motion.rotation import rot6d_from_matrix, safe_normalize
 from jaxmotion.motion.rotation_vector import to_matrix
 from jaxmotion.motion.skeleton import (
@@ -98,14 +99,14 @@ class LockState:
       started: Whether there was a frame before.
     """
 
-    animated: Float[Array, "feet 3"]
-    shown: Float[Array, "feet 3"]
-    contact: Bool[Array, " feet"]
-    locked: Bool[Array, " feet"]
-    point: Float[Array, "feet 3"]
-    offset: Float[Array, "feet 3"]
-    offset_velocity: Float[Array, "feet 3"]
-    started: Bool[Array, ""]
+    animated: Float[Array, "*batch feet 3"]
+    shown: Float[Array, "*batch feet 3"]
+    contact: Bool[Array, "*batch feet"]
+    locked: Bool[Array, "*batch feet"]
+    point: Float[Array, "*batch feet 3"]
+    offset: Float[Array, "*batch feet 3"]
+    offset_velocity: Float[Array, "*batch feet 3"]
+    started: Bool[Array, "*batch"]
 
 
 def legs(skeleton: Skeleton) -> tuple[tuple[int, int, int, int], ...]:
@@ -508,7 +509,53 @@ def locked(
 
     return dataclasses.replace(
         controller,
-        urgency=lambda state, command: controller.urgency(state.inner, command),
+        plan_level=lambda state, command: controller.plan_level(state.inner, command),
         plans=tuple(planner(plan) for plan in controller.plans),
         advance=advance,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Method:
+    """Makes the controller with locked feet of parameters and the skeleton."""
+
+    method: Method
+    fps: float
+    lock: FootLock
+
+    def __call__(self, params: Any) -> Controller:
+        inner, skeleton = params
+        controller = self.method(inner)
+        return locked(controller, skeleton, fps=self.fps, lock=self.lock)
+
+
+def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
+    """A character that is displayed with locked feet.
+
+    Args:
+      character: Of any system; its skeleton has legs.
+      lock: Settings; None for the defaults.
+
+    Returns:
+      The character; its states are `LockedState`s.
+
+    Raises:
+      ValueError: if the skeleton names no feet, or a foot has no leg above it.
+    """
+    lock = FootLock() if lock is None else lock
+    feet = init_lock(character.skeleton)
+
+    def with_feet(states: Any) -> LockedState:
+        number = jax.tree.leaves(states)[0].shape[0]
+        every = jax.tree.map(lambda x: jnp.stack([x] * number), feet)
+        return LockedState(inner=states, feet=every)
+
+    clip_starts = character.clip_starts
+    return dataclasses.replace(
+        character,
+        params=(character.params, character.skeleton),
+        method=_Method(character.method, character.fps, lock),
+        starts=lambda labels, seed: with_feet(character.starts(labels, seed)),
+        clip_starts=clip_starts
+        and (lambda clips, labels, seed: with_feet(clip_starts(clips, labels, seed))),
     )

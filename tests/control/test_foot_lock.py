@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.control import foot_lock, rollout
+from jaxmotion.control import foot_lock, rollout, steering
+from jaxmotion.control.frame import Frame
+from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 
 FPS = 30.0
@@ -252,7 +254,7 @@ def test_a_controller_displays_locked_feet():
         return tick + 1, shown
 
     plays = rollout.Controller(
-        urgency=lambda state, command: jnp.zeros((), jnp.int32),
+        plan_level=lambda state, command: jnp.zeros((), jnp.int32),
         plans=(),
         advance=advance,
     )
@@ -293,6 +295,63 @@ def test_a_clip_is_cleaned():
     toes = joint_positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
     speed = np.linalg.norm(np.diff(toes, axis=0), axis=-1) * FPS
     assert speed.max() < 0.005
+
+
+def test_a_character_is_displayed_with_locked_feet_by_one_program():
+    """As its rollout locked afterwards; other values compile nothing."""
+    skeleton = SKELETON
+
+    def advance(state, command):
+        place, joints = state
+        place = place + command.velocity[0] / FPS * jnp.array([0.0, 0.0, 1.0])
+        return (place, joints), Frame(
+            root_position=place,
+            joint_rotation=joints,
+            desired_velocity=command.velocity,
+            desired_facing=command.facing,
+            planned=jnp.zeros((), bool),
+            fps=FPS,
+        )
+
+    traces = []
+
+    def method(params):
+        traces.append(params)
+        return rollout.Controller(
+            plan_level=lambda state, command: jnp.zeros((), jnp.int32),
+            plans=(),
+            advance=advance,
+        )
+
+    def starts(labels, seed):
+        number = len(labels)
+        places = jnp.tile(jnp.asarray(stood()), (number, 1))
+        return places, jnp.tile(pose(), (number, 1, 1))
+
+    plain = steering.Character(
+        skeleton=skeleton,
+        labels=(),
+        fps=FPS,
+        source="tests",
+        params={},
+        method=method,
+        starts=starts,
+    )
+    character = foot_lock.lock_feet(plain)
+    for speed in (0.05, 0.1):
+        commands = trajectory.Command(
+            velocity=jnp.full((2, 40, 2), speed),
+            facing=jnp.ones((2, 40, 2)),
+            label=jnp.zeros((2, 40), jnp.int32),
+        )
+        roll = functools.partial(steering.steered_rollouts, commands=commands)
+        frames = roll(character, jax.random.key(0), character.start(2))
+        raw = roll(plain, jax.random.key(0), plain.start(2))
+        want = foot_lock.lock_motion(skeleton, raw[0].motion, lock=LOCK)
+        np.testing.assert_allclose(
+            frames.joint_rotation[0], want.joint_rotation, atol=1e-5
+        )
+    assert len(traces) == 2
 
 
 def test_a_skeleton_without_legs_is_refused(skeleton):
