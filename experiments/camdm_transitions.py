@@ -90,7 +90,7 @@ def measure(args: Config) -> None:
         seed=args.seed,
     )
     key_fit, _ = jax.random.split(jax.random.key(args.seed))
-    judge = camdm_evaluation.recognizer(
+    judge = camdm_evaluation.load_evaluator(
         key_fit, run, evaluator, num_steps=args.recognizer_steps
     )
     rows = camdm_transitions.evaluate_transitions(

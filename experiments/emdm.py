@@ -16,12 +16,17 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from emdm_tasks import evaluation, sampling, setup
+from emdm_tasks import sampling, setup
 
-from jaxmotion import cli
+from jaxmotion import cli, reporting
+from jaxmotion.evaluation import by_frame
+from jaxmotion.evaluators import frozen
 from jaxmotion.evaluators.text_motion import Padding
 from jaxmotion.learning import loop, runs
+from jaxmotion.reporting import arguments_json
+from jaxmotion.systems.emdm import evaluation as emdm_evaluation
 from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import scoring as emdm_scoring
 from jaxmotion.systems.emdm import text as emdm_text
 from jaxmotion.systems.emdm import training as emdm_training
 
@@ -62,6 +67,7 @@ class Train:
       mask_frames: Hide what follows a motion's end, and average losses over all frames
         of a batch (ours); --no-mask-frames is the released form (see emdm.Config).
       discriminator_width: Channels of the discriminator's first layers.
+      diffusion_steps: Steps T of the row "emdm" (paper: 10); other rows have theirs.
       recon: Weight R of the features' error; None for 1 (actions) or 100 (texts).
       geometry: Joints of the losses relative to the "root" (as released) or in the
         "world" (ours, with which roots keep to their path).
@@ -101,6 +107,7 @@ class Train:
     token_margin: int = 3
     mask_frames: bool = True
     discriminator_width: int = 128
+    diffusion_steps: int = 10
     recon: float | None = None
     geometry: Literal["root", "world"] = "world"
     learning_rate: float = 2e-3
@@ -125,9 +132,9 @@ class Evaluate:
       long_replications: Likewise, of rows with 500 network calls and more.
       scale: Of classifier-free guidance; None for 1 (actions) or 2.5 (texts), the
         paper's.
-      evaluator_steps: Updates of the evaluator; None for 1500 of the recognizer of
-        actions, 600 of the text-motion evaluator, whose updates are ten times as dear.
-      evaluator: File of a frozen recognizer of actions, from evaluator.py; None trains
+      evaluator_steps: Updates of the evaluator; None for 1500 of that of
+        actions, 600 of that of texts, whose updates cost ten times as much.
+      evaluator: File of a frozen evaluator of actions, from evaluator.py; None trains
         one here.
       matcher: Published weights of the text-motion evaluator (finest.tar), beside them
         mean.npy and std.npy of its meta folder; None trains one here.
@@ -201,11 +208,11 @@ def train(args: Train) -> None:
             seed=args.seed,
             override=args.override,
         )
-        judge = dataclasses.replace(
+        discriminator = dataclasses.replace(
             budget, optimizer="adam", learning_rate=args.discriminator_rate
         )
         emdm_training.train_row(
-            args.out, task, row, generator=budget, discriminator=judge
+            args.out, task, row, generator=budget, discriminator=discriminator
         )
         print(f"{row}: {time.perf_counter() - begun:.0f} s", flush=True)
 
@@ -216,7 +223,23 @@ def evaluate(args: Evaluate) -> None:
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
     cli.announce("compiling the evaluator and the sampler of each row", 40)
-    evaluation.evaluate(args, out)
+    evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
+    names = {field.name for field in dataclasses.fields(emdm_scoring.Settings)}
+    given = {k: v for k, v in vars(args).items() if k in names}
+    settings = emdm_scoring.Settings(**given | {"evaluator": evaluator})
+    rows, places, scorer = emdm_evaluation.evaluate_run(
+        args.run, settings, rows=args.rows, long_replications=args.long_replications
+    )
+    report = {
+        "arguments": arguments_json(args),
+        "run": emdm_training.read_config(args.run),
+        "evaluator": scorer.describe,
+    } | reporting.provenance()
+    notes = (frozen.note(scorer.describe), *scorer.notes)
+    if places:
+        report["by_frame_of_the_token"] = by_frame.to_json(places)
+        notes += (by_frame.to_markdown(places),)
+    reporting.write_table(out, rows, report, notes)
 
 
 def sample(args: Sample) -> None:

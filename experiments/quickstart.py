@@ -32,9 +32,9 @@ from jaxmotion.data.gaits import GAITS, Gait
 from jaxmotion.learning import loop, training
 from jaxmotion.motion import skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
-from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import scoring as camdm_scoring
 from jaxmotion.systems.camdm import training as camdm_training
 
 # Seconds, direction of travel and facing (degrees from +z toward +x), m/s, style.
@@ -132,7 +132,7 @@ def steer_shipped(args: Config):
     toes = skeleton.joint_positions(model.skeleton, standing)[
         ..., model.skeleton.feet, 1
     ]
-    row = camdm_evaluation.metric_row(
+    row = camdm_scoring.metric_row(
         model.skeleton, made, None, height=float(toes.min()) + 0.01
     )
     reporting.write_rollout(
@@ -262,10 +262,8 @@ def train_walker(args: Config):
     real = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field="style")
     height = procedural.TOE_HEIGHT + 0.01
     rows = {
-        "data": camdm_evaluation.metric_row(model.skeleton, real, None, height=height),
-        "rollouts": camdm_evaluation.metric_row(
-            model.skeleton, made, None, height=height
-        ),
+        "data": camdm_scoring.metric_row(model.skeleton, real, None, height=height),
+        "rollouts": camdm_scoring.metric_row(model.skeleton, made, None, height=height),
     }
     reporting.write_rollout(
         args.out,

@@ -15,17 +15,21 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from smgdiff_tasks import playing, tables
+from smgdiff_tasks import playing
 
-from jaxmotion import cli, files
+from jaxmotion import cli, files, reporting
 from jaxmotion.data.ball_clips import load_ball_clips
+from jaxmotion.evaluation import by_frame
+from jaxmotion.evaluation.table import Rows
 from jaxmotion.evaluators import frozen
 from jaxmotion.learning import loop, runs
 from jaxmotion.reporting import arguments_json
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import players as smgdiff_players
 from jaxmotion.systems.smgdiff import training as smgdiff_training
-from jaxmotion.systems.smgdiff.guidance import SCHEDULES, TUNED
+from jaxmotion.systems.smgdiff.guidance import SCHEDULES, TUNED, Guidance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,11 +97,11 @@ class Evaluate:
       min_acceleration: A ball that accelerates more is being touched, m/s^2 (paper 2).
       max_distance: From here on a joint is too far from the ball's center, meters
         (paper 0.1, less than a ball's radius).
-      recognizer_steps: Updates of the recognizer of skills, if it is trained here.
-      evaluator: File of a frozen recognizer with ball, from evaluator.py; None trains
+      evaluator_steps: Updates of the evaluator of skills, if it is trained here.
+      evaluator: File of a frozen evaluator of skills, from evaluator.py; None trains
         one here.
       chunk: Plans or players at a time.
-      seed: Of windows, noise and recognizer.
+      seed: Of windows, noise and evaluator.
     """
 
     run: Path = Path("runs/smgdiff")
@@ -117,7 +121,7 @@ class Evaluate:
     last_sigma: float | None = TUNED.last_sigma
     min_acceleration: float = TUNED.min_acceleration
     max_distance: float = TUNED.max_distance
-    recognizer_steps: int = 800
+    evaluator_steps: int = 800
     evaluator: Path | None = None
     chunk: int = 4
     seed: int = 0
@@ -217,42 +221,70 @@ def train(args: Train) -> None:
         print(f"{stage}: {time.perf_counter() - begun:.0f} s", flush=True)
 
 
+def guidance_of(args: Evaluate | Rollout) -> Guidance:
+    """Constants of the guidance that the arguments give."""
+    names = ("rate", "last_sigma", "min_acceleration", "max_distance")
+    return Guidance(**{name: getattr(args, name) for name in names})
+
+
 def evaluate(args: Evaluate) -> None:
-    """Writes the tables."""
+    """Writes the tables, each into a folder of its own."""
+    guided = guidance_of(args)
     for schedule in args.schedules:
-        tables.guidance_of(args, schedule)
+        smgdiff_guidance.on_schedule(guided, schedule)
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = smgdiff_training.load_run(args.run)
     out = args.out or args.run / "evaluation"
     loop.check_writable(out)
-    cli.announce("compiling the recognizer and each row's plans", 40)
+    cli.announce("compiling the evaluator and each row's plans", 40)
     setting = smgdiff_evaluation.make_setting(
         run.train,
         run.held_out,
         run.model,
         number=args.windows,
         replications=args.replications,
-        recognizer_steps=args.recognizer_steps,
+        evaluator_steps=args.evaluator_steps,
         seed=args.seed,
         evaluator=evaluator,
     )
-    found = {
-        "windows": int(setting.known.label.shape[0]),
-        "evaluator": frozen.describe(
-            setting.judge.params,
-            evaluator,
-            reference=frozen.clips_fingerprint(run.train, smgdiff_data.FIELD),
-        ),
-    }
+    described = smgdiff_evaluation.describe_evaluator(run, setting, evaluator)
+
+    def write(name: str, rows: Rows, more: dict[str, Any], *notes: str) -> None:
+        report = {"arguments": arguments_json(args), "source": run.model.source}
+        report |= {"windows": int(setting.known.label.shape[0])}
+        report |= {"evaluator": described} | more | reporting.provenance()
+        notes = (frozen.note(described), *notes)
+        reporting.write_table(out / name, rows, report, notes)
+
+    def write_places(name: str, rows: Rows, places: smgdiff_evaluation.Places) -> None:
+        more = {"by_frame_of_the_token": by_frame.to_json(places)}
+        shown = (by_frame.to_markdown(places),) if places else ()
+        write(name, rows, more if places else {}, *shown)
+
     if "schedules" in args.tables:
-        rows, places = tables.schedules(args, run, setting)
-        tables.write(out, "schedules", rows, args, run, found, places)
+        rows, places = smgdiff_evaluation.schedule_table(
+            run,
+            setting,
+            args.schedules,
+            steps=args.steps,
+            guided=guided,
+            chunk=args.chunk,
+        )
+        write_places("schedules", rows, places)
     if "steps" in args.tables:
-        rows, places = tables.steps(args, run, setting)
-        tables.write(out, "steps", rows, args, run, found, places)
+        rows, places = smgdiff_evaluation.step_table(run, setting, chunk=args.chunk)
+        write_places("steps", rows, places)
     if "paths" in args.tables:
-        rows, more = tables.paths(args, run, setting)
-        tables.write(out, "paths", rows, args, run, found | more)
+        rows, more = smgdiff_players.path_table(
+            run,
+            setting,
+            steps=args.steps,
+            guided=guided,
+            starts=args.starts,
+            repeats=args.repeats,
+            chunk=args.chunk,
+        )
+        write("paths", rows, more)
         print(json.dumps(more, indent=1))
 
 
@@ -262,7 +294,8 @@ def rollout(args: Rollout) -> None:
     out = args.out or args.run / "rollout"
     loop.check_writable(out)
     cli.announce("compiling the rollout", 40)
-    playing.play(args, run, out)
+    guided = smgdiff_guidance.on_schedule(guidance_of(args), args.schedule)
+    playing.play(args, run, guided, out)
 
 
 Command = (

@@ -1,4 +1,4 @@
-"""Quality against time for several numbers of steps, for any of the four systems.
+"""Quality against time for several numbers of steps, for any system.
 
 Trains a model for each number of steps with the same budget, seed and data (or loads
 those that the folder has), evaluates all with the same noise, commands and samples, and
@@ -14,22 +14,22 @@ Examples:
 """
 
 import dataclasses
+import importlib
+import json
+import os
+import time
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import tyro
-from sweeps import aamdm, budgets, camdm, emdm, run, smgdiff
-from sweeps.system import Job
 
-from jaxmotion import cli
+from jaxmotion import cli, files, reporting
+from jaxmotion.evaluation import bench
 from jaxmotion.evaluators import frozen
+from jaxmotion.learning import loop
 from jaxmotion.reporting import arguments_json
-
-SYSTEMS = {
-    "camdm": camdm.SYSTEM,
-    "aamdm": aamdm.SYSTEM,
-    "emdm": emdm.SYSTEM,
-    "smgdiff": smgdiff.SYSTEM,
-}
+from jaxmotion.systems import registry
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,15 +44,13 @@ class Config:
       budget: quick (half an hour of two cores for five numbers of steps, training
         included) or full; the numbers are listed above.
       change: Numbers of the budget to change, as in updates=3000.
-      data: Clips from prepare_data.py or dribble.py; none: data/bandai2.npz (camdm),
-        data/lafan1.npz (aamdm), data/bandai1.npz and bandai2.npz (emdm),
-        data/dribble.npz (smgdiff).
+      data: Clips from prepare_data.py or dribble.py; none: the system's usual ones.
       out: Folder of the results; None for runs/sweep_<system>.
       models: Folder of the models; None for <out>/models. A model that is there is
         not trained again; one of another budget, seed or data is refused.
       replications: Sets of samples of each model, each with noise of its own;
         intervals run over these.
-      evaluator: File of a frozen recognizer, from evaluator.py; None trains one, with
+      evaluator: File of a frozen evaluator, from evaluator.py; None trains one, with
         the budget's updates. aamdm has none.
       seed: Of parameters, batches, poses, noise and evaluators.
     """
@@ -70,74 +68,160 @@ class Config:
     seed: int = 0
 
 
-def load_evaluator(args: Config, kind: frozen.Kind | None) -> frozen.Evaluator | None:
-    """The frozen recognizer that the arguments name.
-
-    Args:
-      args: Of the command line.
-      kind: That the system needs; None for none.
-
-    Returns:
-      The recognizer; None if it is to be trained.
-
-    Raises:
-      ValueError: if there is no such file, or it is of another kind.
-    """
-    if args.evaluator is None:
-        return None
-    if kind is None:
-        raise ValueError(f"evaluator: {args.system} is judged without a recognizer")
-    found = frozen.load(args.evaluator)
-    if found.kind != kind:
-        raise ValueError(
-            f"evaluator: {args.evaluator} is of kind {found.kind!r}, {args.system} "
-            f"needs {kind!r}"
-        )
-    return found
-
-
-def make_job(args: Config) -> tuple[Job, Path]:
+def make_job(args: Config) -> tuple[bench.Job, Path]:
     """The sweep that the arguments describe, and the folder of its results.
-
-    Args:
-      args: Of the command line.
-
-    Returns:
-      Both.
 
     Raises:
       ValueError: names the field that is wrong.
     """
-    if args.system not in SYSTEMS:
-        raise ValueError(
-            f"system: unknown system {args.system!r}, expected one of "
-            f"{', '.join(SYSTEMS)}"
-        )
-    system = SYSTEMS[args.system]
+    own = registry.get(args.system).bench
     out = args.out or Path(f"runs/sweep_{args.system}")
-    job = Job(
-        points=system.points(args.steps, drafts=args.drafts),
-        data=args.data or system.data,
+    job = bench.Job(
+        points=own.points(args.steps, drafts=args.drafts),
+        data=args.data or own.data,
         models=args.models or out / "models",
-        budget=budgets.resolve(system.amounts, args.budget, args.change),
+        budget=bench.resolve(own.amounts, args.budget, args.change),
         replications=args.replications,
         seed=args.seed,
-        evaluator=load_evaluator(args, system.judge),
+        evaluator=None if args.evaluator is None else frozen.load(args.evaluator),
     )
+    if job.evaluator is not None and own.evaluator is None:
+        raise ValueError(f"evaluator: {args.system} is scored without one")
+    if job.evaluator is not None and job.evaluator.kind != own.evaluator:
+        raise ValueError(
+            f"evaluator: {args.evaluator} is of kind {job.evaluator.kind!r}, "
+            f"{args.system} needs {own.evaluator!r}"
+        )
     return job, out
+
+
+def check(args: Config, job: bench.Job, out: Path) -> None:
+    """Raises before any work if files are missing or folders cannot be used.
+
+    A folder of models is marked with what they are trained with.
+
+    Raises:
+      OSError: names the field.
+      ValueError: names the field; if the folder holds models of another sweep, also
+        what differs.
+    """
+    for file in job.data:
+        if not file.is_file():
+            raise FileNotFoundError(f"data: no clips file {file}")
+    if job.replications < 2:
+        raise ValueError(
+            f"replications: {job.replications}, expected at least 2 for intervals"
+        )
+    for field, folder in (("out", out), ("models", job.models)):
+        try:
+            loop.check_writable(folder)
+        except OSError as error:
+            raise OSError(f"{field}: {error}") from error
+    amounts, path = registry.get(args.system).bench.amounts, job.models / "sweep.json"
+    wanted = {
+        "system": args.system,
+        "data": [str(file) for file in job.data],
+        "seed": job.seed,
+    } | bench.training_part(amounts, job.budget)
+    if not path.exists():
+        files.write_text(path, json.dumps(wanted, indent=1))
+        return
+    found = files.read_object(path, what="expected what step_sweep.py writes")
+    differ = [key for key in wanted | found if found.get(key) != wanted.get(key)]
+    if differ:
+        raise ValueError(
+            f"models: {job.models} has models trained with other {', '.join(differ)}: "
+            f"{[found.get(key) for key in differ]}, expected "
+            f"{[wanted.get(key) for key in differ]}; choose another folder"
+        )
+
+
+def call(script: ModuleType, command: str, options: dict[str, Any]) -> None:
+    """Runs a command of a script with options of its own."""
+    getattr(script, command)(getattr(script, command.capitalize())(**options))
+
+
+def sweep(args: Config, job: bench.Job, out: Path) -> None:
+    """Trains what is missing, scores all, times all in turn, and writes the results."""
+    own = registry.get(args.system).bench
+    script = importlib.import_module(args.system)
+    seconds: dict[str, float] = {}
+    begun = time.perf_counter()
+    for point in job.points:
+        started = time.perf_counter()
+        call(script, "train", own.train(job, point))
+        seconds[f"training, {point.row}"] = time.perf_counter() - started
+        print(f"{point.row}: {seconds[f'training, {point.row}']:.0f} s", flush=True)
+    started = time.perf_counter()
+    evaluation = own.prepare(job)
+    seconds["evaluator"] = time.perf_counter() - started
+    rows, more = bench.measure(evaluation, job)
+    load = round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+    for point in job.points:
+        command, options = own.show(job, point)
+        call(script, command, options | {"out": out / "rollouts" / point.folder})
+    seconds |= more | {"all": time.perf_counter() - begun}
+    report = {"title": f"{args.system}: steps, {args.budget} budget"}
+    report |= reporting.provenance() | {
+        "system": args.system,
+        "arguments": arguments_json(args)
+        | {
+            "data": [str(file) for file in job.data],
+            "out": str(out),
+            "models": str(job.models),
+        },
+        "budget": job.budget,
+        "seeds": {"training": job.seed, "evaluation": job.seed},
+        "replications": job.replications,
+        "load_average_1min": load,
+        "seconds": {key: round(value, 1) for key, value in seconds.items()},
+        **evaluation.describe,
+    }
+    report["notes"] = notes(own, job, report)
+    quality = dict(quality=own.quality, sample=own.sample)
+    reporting.write_sweep(out, rows, job.points, report, **quality)
+
+
+def notes(own: bench.Bench, job: bench.Job, report: dict[str, Any]) -> list[str]:
+    """Lines below the table."""
+    budget = ", ".join(f"{key} {value:g}" for key, value in job.budget.items())
+    who = [frozen.note(report["evaluator"])] if "evaluator" in report else []
+    return [
+        f"Data: {report['source']}.",
+        f"Trained with the same budget, data and seed {job.seed}: {budget} (--help "
+        "says what each is). One training a row: what another training seed would "
+        "change is in no interval.",
+        f"Evaluated with the same noise, commands and samples, {job.replications} "
+        f"replications: {report['samples']}. Intervals are of 95 %.",
+        *who,
+        f"p50 ms: {own.sample} at batch 1, all models in turn; its interval is the "
+        f"bootstrap's of the median. Load average meanwhile: "
+        f"{report['load_average_1min']}.",
+        f"{report['cpu']}, {report['cores']} cores, {', '.join(report['devices'])}; "
+        f"Python {report['python']}, jax {report['jax']}, flax {report['flax']}, numpy "
+        f"{report['numpy']}; commit {report['git_commit']}; "
+        f"{report['seconds']['all']:.0f} s in all.",
+        f"`{report['command']}`",
+    ]
+
+
+def budgets() -> str:
+    """The numbers of all budgets, for the help."""
+    lines = []
+    for name, system in registry.SYSTEMS.items():
+        lines.append(f"Budgets of {name}, quick / full:")
+        for key, amount in system.bench.amounts.items():
+            numbers = f"{amount.quick:g} / {amount.full:g}"
+            lines.append(f"  {key} {numbers}: {amount.meaning}")
+    return "\n".join(lines)
 
 
 def main() -> None:
     """Parses the command line and runs the sweep."""
-    numbers = [budgets.describe(name, x.amounts) for name, x in SYSTEMS.items()]
-    args = cli.check(tyro.cli(Config, description="\n\n".join([__doc__, *numbers])))
+    args = cli.check(tyro.cli(Config, description=f"{__doc__}\n\n{budgets()}"))
     job, out = make_job(args)
-    shown = arguments_json(args) | {
-        "data": [str(file) for file in job.data],
-        "out": str(out),
-        "models": str(job.models),
-    }
-    run.sweep(args.system, SYSTEMS[args.system], job, out, shown)
+    check(args, job, out)
+    sweep(args, job, out)
 
 
 if __name__ == "__main__":

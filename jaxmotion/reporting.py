@@ -4,10 +4,12 @@ import dataclasses
 import datetime
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmotion import files
 from jaxmotion.data import bvh
-from jaxmotion.evaluation import table
+from jaxmotion.evaluation import bench, table
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 
@@ -119,6 +121,84 @@ def write_table(
     text = "\n\n".join([table.to_markdown(rows), *notes])
     files.write_text(folder / "table.md", text + "\n")
     print(text)
+
+
+def write_sweep(
+    folder: Path,
+    rows: table.Rows,
+    points: Sequence[bench.Point],
+    report: dict[str, Any],
+    *,
+    quality: str,
+    sample: str,
+) -> None:
+    """Writes table.md, table.csv, table.json and pareto.png, and prints the table.
+
+    Args:
+      folder: Where to; it must exist.
+      rows: The table.
+      points: Its models.
+      report: What belongs beside it: its "title", which the plot has too, and "notes",
+        which stand below the Markdown table too.
+      quality: Column of the plot.
+      sample: What the times are of.
+    """
+    title, notes = report["title"], [*report["notes"]]
+    left_out = _draw(folder / "pareto.png", rows, points, quality, sample, title)
+    if left_out:
+        notes.append(f"not in the plot, for want of a finite {quality}: {left_out}")
+    whole = report | {"notes": notes, "rows": table.to_json(rows)}
+    files.write_text(folder / "table.json", json.dumps(whole, indent=1))
+    text = table.to_markdown(rows)
+    below = "\n".join(f"- {note}" for note in notes)
+    files.write_text(folder / "table.md", f"# {title}\n\n{text}\n\n{below}\n")
+    names = {point.row: point.name for point in points}
+    files.write_text(folder / "table.csv", table.to_csv(rows, names))
+    print(text)
+
+
+def _ends(cell: table.Cell) -> tuple[float, float, float]:
+    low = cell.value if cell.low is None else cell.low
+    high = cell.value if cell.high is None else cell.high
+    return cell.value, low, high
+
+
+def _draw(
+    path: Path,
+    rows: table.Rows,
+    points: Sequence[bench.Point],
+    quality: str,
+    sample: str,
+    title: str,
+) -> str:
+    """Draws quality against time; returns the points that cannot be in the plot."""
+    from jaxmotion.viz import pareto
+
+    def is_finite(row: str) -> bool:
+        return quality in rows[row] and math.isfinite(rows[row][quality].value)
+
+    shown = [point for point in points if is_finite(point.row)]
+    if shown:
+        pareto.write_pareto(
+            path,
+            tuple(point.name for point in shown),
+            *(
+                np.array([_ends(rows[point.row][column]) for point in shown])
+                for column in ("p50 ms", quality)
+            ),
+            references={
+                name: np.array(_ends(rows[name][quality]))
+                for name in (bench.GROUND_TRUTH, bench.NOISE_FLOOR)
+                if is_finite(name)
+            },
+            xlabel=f"{sample}, batch 1: p50, ms",
+            ylabel=f"{quality} (lower is better)",
+            title=title,
+            broken=tuple(
+                point.name for point in shown if bench.has_failed(rows[point.row])
+            ),
+        )
+    return ", ".join(point.row for point in points if point not in shown)
 
 
 _PACKAGES = ("jaxmotion", "jax", "jaxlib", "flax", "optax", "numpy")

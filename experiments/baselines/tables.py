@@ -9,13 +9,16 @@ import numpy as np
 
 from baselines import rows
 from jaxmotion import files, reporting
-from jaxmotion.control.frame import Frame
 from jaxmotion.evaluation import table
+from jaxmotion.evaluation.table import Row
 from jaxmotion.learning import checkpoint
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
 
-Row = dict[str, table.Cell]
+# Columns of steered rollouts that neither the paper's tables nor ours have.
+_LEFT_OUT = tuple(
+    f"{name}_uc" for name in ("div", "speed_m/s", "acceleration_m/s2", "jerk_m/s3")
+)
 
 
 def trained_rows(
@@ -38,11 +41,6 @@ def trained_rows(
                 ) from error
             print(f"{name}: not trained here, left out")
     return found
-
-
-def _skip(frames: Frame, ticks: int) -> Frame:
-    """Leaves out the start, where the data's own pose still shows."""
-    return jax.tree.map(lambda x: x[:, ticks:], frames)
 
 
 def _unbounded(
@@ -70,28 +68,20 @@ def measure(
     args: Any,
 ) -> Row:
     """One row: free, steered, and frames per second."""
-    fps, ticks = run.train.fps, round(args.seconds * run.train.fps)
-    skip = round(fps)
-    given = aamdm_evaluation.commands(
-        run, args.rollouts, ticks + skip, course=args.course, speed=args.speed
+    ticks = round(args.seconds * run.train.fps)
+    row = aamdm_evaluation.score_stepper(
+        run,
+        space,
+        step,
+        reference,
+        rollouts=args.rollouts,
+        ticks=ticks,
+        course=args.course,
+        speed=args.speed,
+        seed=args.seed,
     )
-    row: Row = {"diverged_unbounded": _unbounded(run, space, step, reference, args)}
-    for i, steered in enumerate((False, True)):
-        key, key_pairs = jax.random.split(jax.random.key(args.seed + i))
-        states = aamdm_evaluation.start_states(
-            run, space, args.rollouts, seed=args.seed
-        )
-        roll = aamdm_evaluation.roller(run, space, step, steered=steered)
-        frames = _skip(roll(key, states, given)[1], skip)
-        found = aamdm_evaluation.free_row(
-            key_pairs, run.skeleton, reference, frames, fps=fps
-        )
-        if steered:
-            wanted = ("fid", "ffr_mann", "ffr_gmd", "diverged")
-            found = {f"{k}_uc": found[k] for k in wanted if k in found}
-            if "fid_uc" in found:
-                found |= aamdm_evaluation.control_row(frames, fps=fps)
-        row |= found
+    row = {name: row[name] for name in row if name not in _LEFT_OUT}
+    row["diverged_unbounded"] = _unbounded(run, space, step, reference, args)
     ticks = 20 if name == "amdm200" else 300
     rate = aamdm_evaluation.frames_per_second(run, space, step, ticks=ticks)
     print(f"{name}: {rate:.0f} frames/s", flush=True)

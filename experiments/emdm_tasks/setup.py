@@ -39,6 +39,7 @@ def base_config(args: Any, recon: float) -> emdm_model.Config:
         norm="pre",
         mask_frames=args.mask_frames,
         discriminator_width=args.discriminator_width,
+        num_steps=args.diffusion_steps,
         weight_recon=recon if args.recon is None else args.recon,
         geometry=args.geometry,
     )

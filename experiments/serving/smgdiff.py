@@ -5,8 +5,8 @@ from pathlib import Path
 import jax
 
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
-from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import scoring as smgdiff_scoring
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from serving.controlled import ControlledSimulation
@@ -31,7 +31,7 @@ def load(run: Path, data: Path | None) -> ControlledSimulation:
     loaded = smgdiff_training.load_run(run)
     model, params = smgdiff_training.load_stage(loaded, "motion_8")
     paths, path_params = smgdiff_training.load_stage(loaded, "paths_1")
-    known = smgdiff_evaluation.situations(loaded.train, model, number=8, seed=0)
+    known = smgdiff_scoring.eval_windows(loaded.train, model, number=8, seed=0)
     past = jax.tree.map(lambda x: x[0], known.past)
     skeleton = model.representation.skeleton
     driver = smgdiff_controller.controller(

@@ -12,15 +12,15 @@ from jaxmotion.control import rollout
 from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
-from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import players as smgdiff_players
+from jaxmotion.systems.smgdiff import scoring as smgdiff_scoring
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
+from jaxmotion.systems.smgdiff.guidance import Guidance
 from jaxmotion.systems.smgdiff.model import Model
 from jaxmotion.systems.smgdiff.training import Run
 from jaxmotion.systems.smgdiff.trajectory import SamplePath
-from smgdiff_tasks.tables import guidance_of
 
 # The direction of the command turns by so much, every so often.
 _TURN, _SECONDS = np.pi / 3, 4.0
@@ -72,12 +72,13 @@ def generator_of(run: Run, stage: str) -> SamplePath:
     return smgdiff_trajectory.sampler(params, config=model.paths)
 
 
-def play(args: Any, run: Run, out: Path) -> None:
+def play(args: Any, run: Run, guided: Guidance, out: Path) -> None:
     """Rolls out and writes the files.
 
     Args:
       args: Of `smgdiff.py rollout`.
       run: The run.
+      guided: Contact guidance.
       out: Folder.
     """
     model, params = smgdiff_training.load_stage(run, f"motion_{args.steps}")
@@ -89,12 +90,12 @@ def play(args: Any, run: Run, out: Path) -> None:
             params,
             config=model.config,
             representation=features,
-            guided=guidance_of(args, args.schedule),
+            guided=guided,
         ),
         representation=features,
         config=model.config,
     )
-    known = smgdiff_evaluation.situations(run.train, model, number=2000, seed=args.seed)
+    known = smgdiff_scoring.eval_windows(run.train, model, number=2000, seed=args.seed)
     first = int(np.flatnonzero(np.asarray(known.label) == int(steered.label[0]))[0])
     past = jax.tree.map(lambda x: x[first], known.past)
     state = smgdiff_controller.init_state(skeleton, past, config=model.config)

@@ -4,7 +4,9 @@ A sample is one clip or one rollout: windows of one clip are not independent, so
 are averaged within their clip before anything is said about the spread.
 """
 
+import csv
 import dataclasses
+import io
 import math
 from typing import Any
 
@@ -30,6 +32,10 @@ class Cell:
     low: float | None = None
     high: float | None = None
     samples: int = 1
+
+
+Row = dict[str, Cell]
+Rows = dict[str, Row]
 
 
 def group_means(
@@ -83,7 +89,7 @@ def cell(
     return Cell(value=scale * estimate, low=low, high=high, samples=count)
 
 
-def to_json(rows: dict[str, dict[str, Cell]]) -> dict[str, Any]:
+def to_json(rows: Rows) -> dict[str, Any]:
     """Rows as a JSON object.
 
     Args:
@@ -115,7 +121,7 @@ def _text(x: Cell | None) -> str:
     return f"{x.value:.3g} [{x.low:.3g}, {x.high:.3g}] (n={x.samples})"
 
 
-def to_markdown(rows: dict[str, dict[str, Cell]]) -> str:
+def to_markdown(rows: Rows) -> str:
     """Rows as a Markdown table; a cell that a row lacks is a dash.
 
     Args:
@@ -130,3 +136,22 @@ def to_markdown(rows: dict[str, dict[str, Cell]]) -> str:
         cells = " | ".join(_text(row.get(column)) for column in columns)
         lines.append(f"| {name} | {cells} |")
     return "\n".join(lines)
+
+
+def to_csv(rows: Rows, names: dict[str, str]) -> str:
+    """Rows as CSV, a line for each cell, so that columns of any name can be read.
+
+    Args:
+      rows: Row names to column names to cells.
+      names: What stands in the column "steps", for rows that have any.
+    """
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["row", "steps", "column", "value", "low", "high", "samples"])
+    for row, cells in rows.items():
+        for column, x in cells.items():
+            ends = ("" if end is None else end for end in (x.low, x.high))
+            writer.writerow(
+                [row, names.get(row, ""), column, x.value, *ends, x.samples]
+            )
+    return text.getvalue()

@@ -8,6 +8,10 @@ no more than names.
 import dataclasses
 import importlib
 from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxmotion.evaluation.bench import Bench
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,6 +31,11 @@ class System:
     def room(self, name: str) -> ModuleType:
         """A module of the system's package, such as "training"."""
         return importlib.import_module(f"{__package__}.{self.name}.{name}")
+
+    @property
+    def bench(self) -> "Bench":
+        """Points, budgets and evaluation of its sweep over numbers of steps."""
+        return self.room("evaluation").BENCH
 
 
 SYSTEMS = {

@@ -232,7 +232,7 @@ def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
         invoke("evaluator", f"import --weights {weights} --out {out}")
 
     run, evaluator = samples.run(), evaluators.load(out)
-    get = functools.partial(camdm_evaluation.recognizer, jax.random.key(0))
+    get = functools.partial(camdm_evaluation.load_evaluator, jax.random.key(0))
     judge = get(run, evaluator, num_steps=1)
     found = windows.eval_windows(run.train, stride=60, field="style")
     skeleton = run.model.skeleton

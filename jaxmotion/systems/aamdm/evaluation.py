@@ -10,6 +10,8 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +20,10 @@ from jaxtyping import Array, Float
 
 from jaxmotion.control import courses, rollout
 from jaxmotion.control.frame import Frame
+from jaxmotion.data import clips_io
 from jaxmotion.evaluation import (
     alignment,
+    bench,
     contact,
     diversity,
     frechet,
@@ -27,6 +31,8 @@ from jaxmotion.evaluation import (
     smoothness,
     table,
 )
+from jaxmotion.evaluation.bench import Amount
+from jaxmotion.evaluation.table import Row
 from jaxmotion.motion import features, ground, path_features, pose
 from jaxmotion.motion.features import unpack
 from jaxmotion.motion.skeleton import Skeleton, forward_kinematics
@@ -35,7 +41,7 @@ from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm.controller import CharacterState, Stepper
 from jaxmotion.systems.aamdm.data import PoseData, starts
 from jaxmotion.systems.aamdm.space import Space
-from jaxmotion.systems.aamdm.training import Run
+from jaxmotion.systems.aamdm.training import Run, load_chain, load_run, load_space
 from jaxmotion.typing import Key
 
 
@@ -278,7 +284,7 @@ def free_row(
     *,
     fps: float,
     groups: int = 4,
-) -> dict[str, table.Cell]:
+) -> Row:
     """Columns that need no commands.
 
     Args:
@@ -347,7 +353,7 @@ def _realized(frames: Frame, fps: float) -> tuple[Array, Array]:
     return found[:, : -last - 1], frames.extra["wanted_path"][:, 1:-last]
 
 
-def control_row(frames: Frame, *, fps: float) -> dict[str, table.Cell]:
+def control_row(frames: Frame, *, fps: float) -> Row:
     """Columns of how well commands were followed.
 
     Args:
@@ -408,3 +414,199 @@ def long_health(
         "frozen": int(frozen.sum()),
         "rollouts": int(frozen.size),
     }
+
+
+def score_stepper(
+    run: Run,
+    space: Space,
+    step: Stepper,
+    reference: Reference,
+    *,
+    rollouts: int,
+    ticks: int,
+    course: str,
+    speed: float,
+    seed: int,
+    groups: int = 4,
+) -> Row:
+    """Row of free rollouts, with columns of steered ones whose names end in "_uc".
+
+    Args:
+      run: The run.
+      space: The space.
+      step: Makes the next frame.
+      reference: What frames are compared with.
+      rollouts: Characters, free and steered.
+      ticks: Length of a rollout after its first second, where the data's own pose
+        still shows.
+      course: Commands of the steered rollouts.
+      speed: Meters per second that are commanded.
+      seed: Of poses, noise and pairs.
+      groups: As in `free_row`.
+
+    Returns:
+      Columns of `free_row`, these "_uc", and those of `control_row`.
+    """
+    fps, row = run.train.fps, {}
+    skip = round(fps)
+    given = commands(run, rollouts, ticks + skip, course=course, speed=speed)
+    for i, steered in enumerate((False, True)):
+        key, key_pairs = jax.random.split(jax.random.key(seed + i))
+        states = start_states(run, space, rollouts, seed=seed)
+        roll = roller(run, space, step, steered=steered)
+        frames = jax.tree.map(lambda x: x[:, skip:], roll(key, states, given)[1])
+        found = free_row(
+            key_pairs, run.skeleton, reference, frames, fps=fps, groups=groups
+        )
+        if steered:
+            is_finite = "fid" in found
+            found = {f"{name}_uc": cell for name, cell in found.items()}
+            if is_finite:
+                found |= control_row(frames, fps=fps)
+        row |= found
+    return row
+
+
+# The guidance's strength, and the commands, of an evaluation that is given no others.
+SCALE, COURSE, SPEED = 10.0, "forward", 1.2
+# Clips that are used, where the data have this field.
+FIELD, LABELS = "theme", ("walk", "run")
+# Columns of a sweep that rollouts under control have.
+_STEERED = ("fid_uc", "te_promised", "te_realized", "trajectory_error_deg")
+_AMOUNTS = {
+    "autoencoder_updates": Amount(
+        quick=4000,
+        full=20000,
+        meaning="updates of the pose autoencoder, which all models share",
+    ),
+    "polisher_updates": Amount(
+        quick=2000, full=5000, meaning="updates of each diffusion model"
+    ),
+    "generator_updates": Amount(
+        quick=3000, full=8000, meaning="updates of each denoising-diffusion GAN"
+    ),
+    "batch": Amount(quick=64, full=64, meaning="windows per update"),
+    "width": Amount(quick=256, full=256, meaning="channels of the networks"),
+    "held_out": Amount(
+        quick=0.1, full=0.1, meaning="part of each clip, at its end, for evaluation"
+    ),
+    "characters": Amount(
+        quick=16, full=16, meaning="rollouts of a replication", training=False
+    ),
+    "seconds": Amount(
+        quick=4.0,
+        full=4.0,
+        meaning="length of a rollout after its first second, no longer than the "
+        "held-out ends",
+        training=False,
+    ),
+    "rollout_seconds": Amount(
+        quick=8.0,
+        full=20.0,
+        meaning="length of the rollout that is written to look at",
+        training=False,
+    ),
+}
+
+
+def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
+    """All models lie in one run folder."""
+    budget = job.budget
+    has = FIELD in dict(clips_io.load_clips(job.data[0]).label_names)
+    return dict(
+        data=job.data[0],
+        out=job.models,
+        rows=(point.folder,),
+        labels=LABELS if has else (),
+        held_out=budget["held_out"],
+        autoencoder_steps=budget["autoencoder_updates"],
+        polisher_steps=budget["polisher_updates"],
+        generator_steps=budget["generator_updates"],
+        batch=budget["batch"],
+        width=budget["width"],
+        seed=job.seed,
+    )
+
+
+def _show(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
+    seconds = job.budget["rollout_seconds"]
+    return "rollout", dict(
+        run=job.models, row=point.folder, seconds=seconds, seed=job.seed
+    )
+
+
+def _prepare(job: bench.Job) -> bench.Evaluation:
+    """Free and steered rollouts beside recorded windows."""
+    run, budget, seed = load_run(job.models), job.budget, job.seed
+    space = load_space(run, "embedded")
+    reference = make_reference(run.skeleton, run.train)
+    rollouts = budget["characters"] * job.replications
+    ticks = round(budget["seconds"] * run.train.fps)
+
+    def stepper(point: bench.Point) -> Stepper:
+        polishes, drafts = point.parts
+        chain = load_chain(
+            run, "embedded", space, drafts=drafts, polishes=polishes, target="frame"
+        )
+        return aamdm_controller.guided(chain, scale=SCALE)
+
+    def real(data: PoseData) -> Row:
+        frames = data_frames(run, data, rollouts, ticks, seed=seed)
+        return free_row(
+            jax.random.key(seed),
+            run.skeleton,
+            reference,
+            frames,
+            fps=run.train.fps,
+            groups=job.replications,
+        )
+
+    truth = real(run.held_out)
+
+    def score(point: bench.Point) -> Row:
+        row = score_stepper(
+            run,
+            space,
+            stepper(point),
+            reference,
+            rollouts=rollouts,
+            ticks=ticks,
+            course=COURSE,
+            speed=SPEED,
+            seed=seed,
+            groups=job.replications,
+        )
+        return {name: row[name] for name in (*truth, *_STEERED) if name in row}
+
+    def sampler(point: bench.Point) -> Callable[[Key], Any]:
+        roll = roller(run, space, stepper(point), steered=False)
+        states = start_states(run, space, 1, seed=seed)
+        given = commands(run, 1, 1, course=COURSE, speed=SPEED)
+        return lambda key: roll(key, states, given)
+
+    return bench.Evaluation(
+        real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: real(run.train)},
+        score=score,
+        sampler=sampler,
+        describe={
+            "source": run.source,
+            "samples": f"{budget['characters']} rollouts of {budget['seconds']:g} s, "
+            f"free and steered (course {COURSE!r}, {SPEED:g} m/s); Fréchet distances "
+            f"of every fifth frame to those of {run.train.num_frames} training "
+            "frames, no evaluator; other intervals over rollouts",
+            "rollouts": rollouts,
+            "frames_of_a_rollout": ticks,
+        },
+    )
+
+
+BENCH = bench.Bench(
+    data=(Path("data/lafan1.npz"),),
+    amounts=_AMOUNTS,
+    points=bench.paired_points,
+    train=_train,
+    show=_show,
+    prepare=_prepare,
+    quality="fid",
+    sample="one frame",
+)

@@ -1,8 +1,14 @@
-"""Characters of a run, steered along a course; and how they measure up."""
+"""Characters of a run, steered along a course; and how they measure up.
+
+One evaluation, for the table of a run and for a sweep over numbers of steps.
+"""
 
 import dataclasses
 import functools
+import math
 import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,327 +17,28 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmotion.control import courses, steering
-from jaxmotion.control.frame import Frame
 from jaxmotion.data import selection, windows
 from jaxmotion.data.clips import Clips
-from jaxmotion.data.windows import EvalWindows
-from jaxmotion.evaluation import (
-    diversity,
-    frechet,
-    frechet_bias,
-    health,
-    locomotion,
-    table,
-)
+from jaxmotion.evaluation import bench, table
+from jaxmotion.evaluation.bench import Amount
+from jaxmotion.evaluation.table import Row, Rows
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
-from jaxmotion.evaluators.style import Recognized, in_batches, recognized
+from jaxmotion.evaluators.style import Recognized
 from jaxmotion.motion import trajectory
-from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import loss as camdm_loss
+from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import release as camdm_release
-from jaxmotion.systems.camdm.training import Run
+from jaxmotion.systems.camdm import scoring as camdm_scoring
+from jaxmotion.systems.camdm.scoring import Reference
+from jaxmotion.systems.camdm.training import Run, load_run
 from jaxmotion.typing import Key
 
-
-def frechet_cell(
-    feature: np.ndarray,
-    reference: np.ndarray,
-    *,
-    count: int,
-    seed: int,
-    repeats: int = 5,
-) -> table.Cell:
-    """Fréchet distance to the reference, of random subsets of equal size.
-
-    Args:
-      feature: Features of the windows of a row.
-      reference: Features of the reference windows.
-      count: Windows of each subset, the same for all rows.
-      seed: Of the subsets.
-      repeats: Subsets.
-
-    Returns:
-      Mean, and interval over the subsets (not over clips); no interval where a subset
-      is all there is.
-    """
-    if count == len(feature):
-        repeats = 1
-    generator = np.random.default_rng(seed)
-    target = frechet.moments(jnp.asarray(reference))
-    found = []
-    for _ in range(repeats):
-        chosen = generator.choice(len(feature), count, replace=False)
-        own = frechet.moments(jnp.asarray(feature[chosen]))
-        found.append(frechet.frechet_distance(own, target))
-    return table.cell(jnp.stack(found))
-
-
-def unbiased_cells(
-    feature: np.ndarray, reference: np.ndarray, *, seed: int, sizes: int = 5
-) -> dict[str, table.Cell]:
-    """Fréchet distance to the reference, extrapolated to infinitely many windows.
-
-    Args:
-      feature: Features of all windows of a row.
-      reference: Features of the reference windows.
-      seed: Of the subsets.
-      sizes: Of the subsets, from as many windows as there are features to all.
-
-    Returns:
-      "fid_unbiased", without an interval; nothing if there are too few windows for
-      the extrapolation to hold.
-
-    Source: `frechet_bias`.
-    """
-    count, least = feature.shape
-    if count < least + sizes - 1:
-        return {}
-    found = frechet_bias.frechet_bias(
-        jax.random.key(seed),
-        jnp.asarray(feature),
-        frechet.moments(jnp.asarray(reference)),
-        sizes=frechet_bias.subset_sizes(count, number=sizes, least=least),
-        repeats=3,
-    )
-    return {"fid_unbiased": table.Cell(value=float(found.extrapolated), samples=count)}
-
-
-def frechet_cells(
-    feature: np.ndarray,
-    reference: np.ndarray,
-    *,
-    count: int,
-    seed: int,
-    repeats: int = 5,
-) -> dict[str, table.Cell]:
-    """Both distances to the reference.
-
-    Args:
-      feature: Features of the windows of a row.
-      reference: Features of the reference windows.
-      count: Windows of the subsets of `frechet_cell`.
-      seed: Of all subsets.
-      repeats: Subsets of `frechet_cell`.
-
-    Returns:
-      "fid", and "fid_unbiased" if there are enough windows.
-    """
-    fid = frechet_cell(feature, reference, count=count, seed=seed, repeats=repeats)
-    return {"fid": fid} | unbiased_cells(feature, reference, seed=seed)
-
-
-def random_half(clips: np.ndarray, labels: np.ndarray, seed: int) -> np.ndarray:
-    """Which windows are of a random half of each style's clips.
-
-    Args:
-      clips: Clip of each window.
-      labels: Style of each window.
-      seed: Of the choice.
-
-    Returns:
-      True for the windows of that half.
-
-    Raises:
-      ValueError: if there is one clip only.
-    """
-    different, first = np.unique(clips, return_index=True)
-    if len(different) < 2:
-        raise ValueError("one clip, expected at least two to compare halves")
-    shuffled = np.random.default_rng(seed).permutation(len(different))
-    # Sorted by style, every second one: both halves hold every style alike.
-    order = shuffled[np.argsort(labels[first][shuffled], kind="stable")]
-    return np.isin(clips, different[order][::2])
-
-
 TRUTH, ROLLOUTS = "held-out (ground truth)", "rollouts"
-_DEGREES = 180.0 / np.pi
-# Column: metric, metric that weights its windows, factor.
-_COLUMNS = {
-    "trajectory_error_deg": ("trajectory_error", "trajectory_used", _DEGREES),
-    "orientation_error_deg": ("orientation_error", None, _DEGREES),
-    "foot_slide_m/s": ("slide_speed", "slide_seconds", 1.0),
-    "skate_ratio": ("skate_ratio", None, 1.0),
-    "acceleration_m/s2": ("acceleration", None, 1.0),
-    "jerk_m/s3": ("jerk", None, 1.0),
-}
-
-
-@jax.jit
-def _metrics(skeleton: Skeleton, height: Array, x: EvalWindows) -> dict[str, Array]:
-    return locomotion.locomotion_metrics(
-        skeleton, x.motion, x.velocity, x.facing, contact_height=height
-    )
-
-
-def metric_row(
-    skeleton: Skeleton,
-    found: EvalWindows,
-    hits: np.ndarray | None,
-    *,
-    height: float,
-) -> dict[str, table.Cell]:
-    """All columns but the Fréchet distances, with intervals over clips or rollouts.
-
-    Args:
-      skeleton: The skeleton.
-      found: EvalWindows.
-      hits: From `recognized`; None to leave style accuracy out.
-      height: Below it a foot joint should not move, meters.
-
-    Returns:
-      Columns; angles in degrees.
-    """
-    run = functools.partial(_metrics, skeleton, jnp.float32(height))
-    values = in_batches(run, found)
-    row = {}
-    if hits is not None:
-        means = table.group_means(hits, found.group)
-        row["style_accuracy_%"] = table.cell(means, scale=100.0, bounds=(0.0, 1.0))
-    for column, (name, weights, scale) in _COLUMNS.items():
-        weight = None if weights is None else values[weights]
-        means = table.group_means(values[name], found.group, weight)
-        bounds = (0.0, 1.0) if name == "skate_ratio" else (-np.inf, np.inf)
-        row[column] = table.cell(means, scale=scale, bounds=bounds)
-    return row
-
-
-def rollout_health(
-    skeleton: Skeleton,
-    frames: Frame,
-    *,
-    fps: float,
-    height: float,
-) -> dict[str, int]:
-    """How many rollouts diverged or froze; bounds as in `evaluation.health`.
-
-    Args:
-      skeleton: The skeleton.
-      frames: Displayed frames [characters, ticks, ...].
-      fps: Frames per second.
-      height: Root height of the standing character, meters; half of it and 1.5
-        times of it are the bounds.
-
-    Returns:
-      Counts by name, and the number of rollouts.
-    """
-
-    @jax.jit
-    def run(x: Frame) -> tuple[Array, Array]:
-        positions = joint_positions(skeleton, x.motion)
-        diverged = health.has_diverged(
-            positions, fps=fps, min_root=0.5 * height, max_root=1.5 * height
-        )
-        return diverged, health.is_frozen(positions, x.desired_velocity, fps=fps)
-
-    diverged, frozen = in_batches(run, frames, size=10)
-    return {
-        "diverged": int(diverged.sum()),
-        "frozen": int(frozen.sum()),
-        "rollouts": int(frozen.size),
-    }
-
-
-def repeat_diversity(
-    skeleton: Skeleton, found: EvalWindows, *, repeats: int
-) -> table.Cell:
-    """Intra-style variance over characters of one style under one control.
-
-    Windows of the same time are compared in the frame of the root.
-
-    Args:
-      skeleton: The skeleton.
-      found: EvalWindows of rollouts in which every `repeats` neighboring characters
-        share style and commands.
-      repeats: Characters a style.
-
-    Returns:
-      Square meters, with an interval over styles.
-    """
-    local = in_batches(
-        jax.jit(functools.partial(style_evaluator.recognizer_input, skeleton)),
-        found.motion,
-    )
-    characters = int(found.group.max()) + 1
-    shape = (characters // repeats, repeats, -1, skeleton.num_joints, 3)
-    local = jnp.asarray(local).reshape(shape)
-    return table.cell(jax.vmap(diversity.intra_style_variance)(local))
-
-
-def contact_height(skeleton: Skeleton, real: EvalWindows) -> float:
-    """Height below which toes should not move.
-
-    Args:
-      skeleton: The skeleton.
-      real: Windows of real clips.
-
-    Returns:
-      Where toes rest (their first percentile), and one centimeter more, as the paper's
-      "below, e.g., 1 cm"; meters.
-    """
-    feet = jnp.array(skeleton.feet)
-    toes = in_batches(
-        jax.jit(lambda m: joint_positions(skeleton, m)[..., feet, :]), real.motion
-    )
-    return float(np.percentile(toes[..., 1], 1)) + 0.01
-
-
-def evaluation_table(
-    skeleton: Skeleton,
-    real: EvalWindows,
-    dense: EvalWindows,
-    made: EvalWindows,
-    frames: Frame,
-    recognizer: Recognized,
-    *,
-    repeats: int,
-    seed: int = 0,
-) -> tuple[dict[str, dict[str, table.Cell]], dict[str, Any]]:
-    """The table, and what belongs beside it.
-
-    Args:
-      skeleton: The skeleton.
-      real: Windows of held-out clips, one behind the other.
-      dense: Windows of training clips with a short stride: the reference.
-      made: Windows of the rollouts.
-      frames: The rollouts themselves.
-      recognizer: From `fit_recognizer`.
-      repeats: Neighboring characters that share style and commands; with one there
-        is no column of diversity.
-      seed: Of the subsets for Fréchet distances.
-
-    Returns:
-      Rows "held-out (ground truth)", "training half vs half (noise floor)" and
-      "rollouts"; and the contact height, window counts and health of the rollouts.
-    """
-    height = contact_height(skeleton, real)
-    real_feature, real_hits = recognized(skeleton, real, recognizer)
-    made_feature, made_hits = recognized(skeleton, made, recognizer)
-    reference, _ = recognized(skeleton, dense, recognizer)
-    own = random_half(np.asarray(dense.group), np.asarray(dense.label), seed)
-    count = min(len(real_feature), len(made_feature), int(own.sum()), int((~own).sum()))
-    distances = functools.partial(frechet_cells, count=count, seed=seed)
-    rows = {
-        TRUTH: metric_row(skeleton, real, real_hits, height=height)
-        | distances(real_feature, reference),
-        "training half vs half (noise floor)": distances(
-            reference[own], reference[~own]
-        ),
-        ROLLOUTS: metric_row(skeleton, made, made_hits, height=height)
-        | distances(made_feature, reference),
-    }
-    if repeats > 1:
-        found = repeat_diversity(skeleton, made, repeats=repeats)
-        rows[ROLLOUTS]["diversity_m2"] = found
-    root = float(np.median(np.asarray(real.motion.root_position)[..., 1]))
-    return rows, {
-        "contact_height_m": height,
-        "windows": {"held_out": len(real_hits), "rollouts": len(made_hits)},
-        "fid_windows": count,
-        "fid_reference_windows": len(reference),
-        "health": rollout_health(skeleton, frames, fps=made.motion.fps, height=root),
-    }
+FLOOR = "training half vs half (noise floor)"
 
 
 # Ticks to leave out at the start, where the data's own pose still shows.
@@ -460,6 +167,142 @@ def own_starts(run: Run, *, number: int, seed: int = 0) -> Motion:
     return jax.tree.map(lambda *x: jnp.stack(x), *found)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trial:
+    """What the characters of an evaluation are told.
+
+    Attributes:
+      labels: Style of each character; `repeats` neighbors have one style.
+      repeats: Characters of a style.
+      speeds: Meters per second, of each character.
+      commands: Of each character and tick.
+      states: In held-out poses.
+    """
+
+    labels: np.ndarray
+    repeats: int
+    speeds: np.ndarray
+    commands: trajectory.Command
+    states: camdm_controller.CharacterState
+
+    @property
+    def windows(self) -> int:
+        """Windows of each character's rollout."""
+        return (self.commands.label.shape[1] - SKIP) // windows.EVAL_WINDOW
+
+
+def make_trial(
+    run: Run,
+    course: str,
+    *,
+    repeats: int,
+    seconds: float,
+    speed: float | None,
+    seed: int,
+) -> Trial:
+    """Commands and poses for some characters of every style.
+
+    Raises:
+      ValueError: if there is no such course, rollouts are too short to measure, or a
+        style has no held-out clip.
+    """
+    labels = np.repeat(np.arange(len(run.model.labels)), repeats)
+    speeds, commands = course_of_run(run, course, labels, seconds=seconds, speed=speed)
+    fps, ticks = run.model.config.fps, commands.label.shape[1]
+    windows.check_ticks(ticks, fps=fps, skip=SKIP)
+    states = camdm_controller.start_states(
+        run.held_out, run.model, labels, field=run.field, seed=seed
+    )
+    return Trial(
+        labels=labels, repeats=repeats, speeds=speeds, commands=commands, states=states
+    )
+
+
+def reference_of_run(run: Run, evaluator: Recognized, *, seed: int) -> Reference:
+    """The reference of a run's own clips."""
+    real = windows.eval_windows(
+        run.held_out, stride=windows.EVAL_WINDOW, field=run.field
+    )
+    dense = windows.eval_windows(run.train, stride=10, field=run.field)
+    return camdm_scoring.make_reference(
+        run.model.skeleton, real, dense, evaluator, seed=seed
+    )
+
+
+def _release_cells(
+    reference: Reference,
+    whole: camdm_release.Recordings,
+    group: np.ndarray | None = None,
+) -> Row:
+    """Columns of the released evaluation."""
+    values = camdm_release.metrics(reference.skeleton, whole)
+    fid = camdm_release.distances(
+        reference.skeleton, whole, reference.evaluator, reference.styles
+    )
+    return camdm_release.row(values | {"fid": fid}, group)
+
+
+def truth_rows(
+    run: Run,
+    reference: Reference,
+    *,
+    count: int,
+    seed: int,
+    repeats: int = 5,
+) -> tuple[Row, Row]:
+    """`real_rows`, the first with the columns of the released evaluation."""
+    truth, floor = camdm_scoring.real_rows(
+        reference, count=count, seed=seed, repeats=repeats
+    )
+    whole = camdm_release.of_clips(run.held_out, field=run.field)
+    return truth | _release_cells(reference, whole), floor
+
+
+def score_run(
+    run: Run,
+    reference: Reference,
+    trial: Trial,
+    *,
+    count: int,
+    chunk: int | None,
+    seed: int,
+    replicated: bool = False,
+) -> tuple[Row, dict[str, int]]:
+    """Steers the characters of a trial from held-out poses, and measures them.
+
+    Args:
+      run: The run.
+      reference: The reference.
+      trial: Who is steered, and how.
+      count: Windows of each Fréchet distance.
+      chunk: Characters to run at a time, at most.
+      seed: Of noise and subsets.
+      replicated: As in `made_row`.
+
+    Returns:
+      The row, and how many rollouts diverged or froze.
+    """
+    model, fps = run.model, run.model.config.fps
+    _, key = jax.random.split(jax.random.key(seed))
+    frames = _timed_rollouts(run, key, trial.states, trial.commands, chunk)
+    made = windows.rollout_windows(frames, jnp.asarray(trial.labels), skip=SKIP)
+    row = camdm_scoring.made_row(
+        reference,
+        made,
+        repeats=trial.repeats,
+        count=count,
+        seed=seed,
+        replicated=replicated,
+    )
+    whole = camdm_release.of_rollouts(frames, trial.commands)
+    group = np.arange(trial.labels.size) % trial.repeats if replicated else None
+    row |= _release_cells(reference, whole, group)
+    found = camdm_scoring.rollout_health(
+        model.skeleton, frames, fps=fps, height=reference.root
+    )
+    return row, found
+
+
 def evaluate_run(
     run: Run,
     *,
@@ -468,10 +311,10 @@ def evaluate_run(
     seconds: float,
     speed: float | None = None,
     chunk: int | None = None,
-    recognizer_steps: int = 1500,
+    evaluator_steps: int = 1500,
     seed: int = 0,
     evaluator: evaluators.Evaluator | None = None,
-) -> tuple[dict[str, dict[str, table.Cell]], dict[str, Any]]:
+) -> tuple[Rows, dict[str, Any]]:
     """Steers characters in every style, and measures them beside held-out clips.
 
     Args:
@@ -481,9 +324,9 @@ def evaluate_run(
       seconds: Length of each rollout.
       speed: Meters per second; None for each style's own median speed.
       chunk: Characters to run at a time, at most.
-      recognizer_steps: Updates of the style recognizer, if it is trained here.
-      seed: Of poses, noise, recognizer and subsets.
-      evaluator: A frozen style recognizer; None to train one.
+      evaluator_steps: Updates of the evaluator of styles, if it is trained here.
+      seed: Of poses, noise, evaluator and subsets.
+      evaluator: A frozen evaluator of styles; None to train one.
 
     Returns:
       The table, and what belongs beside it: speeds, health, counts, versions.
@@ -492,43 +335,41 @@ def evaluate_run(
       ValueError: before any training, if there is no such course, rollouts are too
         short, a style has no held-out clip, or the evaluator does not fit the run.
     """
-    model, field, fps = run.model, run.field, run.model.config.fps
+    model = run.model
     repeats = max(rollouts // len(model.labels), 1)
-    labels = np.repeat(np.arange(len(model.labels)), repeats)
-    speeds, commands = course_of_run(run, course, labels, seconds=seconds, speed=speed)
-    windows.check_ticks(commands.label.shape[1], fps=fps, skip=SKIP)
-    states = camdm_controller.start_states(
-        run.held_out, model, labels, field=field, seed=seed
+    trial = make_trial(
+        run, course, repeats=repeats, seconds=seconds, speed=speed, seed=seed
     )
-    key_fit, key_roll = jax.random.split(jax.random.key(seed))
-    judge = recognizer(key_fit, run, evaluator, num_steps=recognizer_steps)
-    frames = _timed_rollouts(run, key_roll, states, commands, chunk)
-    real = windows.eval_windows(run.held_out, stride=windows.EVAL_WINDOW, field=field)
-    dense = windows.eval_windows(run.train, stride=10, field=field)
-    made = windows.rollout_windows(frames, jnp.asarray(labels), skip=SKIP)
-    rows, report = evaluation_table(
-        model.skeleton, real, dense, made, frames, judge, repeats=repeats
-    )
-    styles = camdm_release.style_features(model.skeleton, run.train, judge, field=field)
-    for name, whole in (
-        (TRUTH, camdm_release.of_clips(run.held_out, field=field)),
-        (ROLLOUTS, camdm_release.of_rollouts(frames, commands)),
-    ):
-        values = camdm_release.metrics(model.skeleton, whole)
-        fid = camdm_release.distances(model.skeleton, whole, judge, styles)
-        rows[name] |= camdm_release.row(values | {"fid": fid})
-    return rows, report | {
+    key_fit, _ = jax.random.split(jax.random.key(seed))
+    chosen = load_evaluator(key_fit, run, evaluator, num_steps=evaluator_steps)
+    reference = reference_of_run(run, chosen, seed=seed)
+    windows_made = trial.windows * trial.labels.size
+    count = reference.count(windows_made)
+    row, found = score_run(run, reference, trial, count=count, chunk=chunk, seed=seed)
+    truth, floor = truth_rows(run, reference, count=count, seed=seed)
+    return {TRUTH: truth, FLOOR: floor, ROLLOUTS: row}, {
+        "contact_height_m": reference.height,
+        "windows": {"held_out": len(reference.hits), "rollouts": windows_made},
+        "fid_windows": count,
+        "fid_reference_windows": len(reference.features),
+        "health": found,
         "source": model.source,
-        "evaluator": evaluators.describe(
-            judge.params,
-            evaluator,
-            reference=evaluators.clips_fingerprint(run.train, field),
+        "evaluator": describe_evaluator(run, chosen, evaluator),
+        "speeds": dict(
+            zip(model.labels, trial.speeds[::repeats].tolist(), strict=True)
         ),
-        "speeds": dict(zip(model.labels, speeds[::repeats].tolist(), strict=True)),
     }
 
 
-def recognizer(
+def describe_evaluator(
+    run: Run, chosen: Recognized, evaluator: Evaluator | None
+) -> dict[str, Any]:
+    """Who scored a table, for what stands beside it."""
+    reference = clips_fingerprint(run.train, run.field)
+    return evaluators.describe(chosen.params, evaluator, reference=reference)
+
+
+def load_evaluator(
     key: Key, run: Run, evaluator: evaluators.Evaluator | None, *, num_steps: int
 ) -> style_evaluator.Recognized:
     """The frozen recognizer if there is one, else one trained on the run's clips.
@@ -630,3 +471,155 @@ def train_style(
         updates=num_steps,
         accuracy=float(np.mean(hits)),
     )
+
+
+# Contents of the clips that rollouts are compared with.
+CONTENTS = ("walk", "walk-turn-left", "walk-turn-right")
+_COURSE = "forward"
+_AMOUNTS = {
+    "updates": Amount(quick=900, full=11000, meaning="optimizer updates of each model"),
+    "batch": Amount(quick=48, full=48, meaning="windows per update"),
+    "width": Amount(quick=128, full=192, meaning="channels of a token"),
+    "depth": Amount(quick=4, full=4, meaning="layers"),
+    "warmup": Amount(quick=100, full=300, meaning="updates of linear rise of the rate"),
+    "held_out": Amount(
+        quick=0.1, full=0.1, meaning="part of the clips kept for evaluation"
+    ),
+    "seconds": Amount(
+        quick=14.0,
+        full=30.0,
+        meaning="length of a rollout; each replication has one for each style",
+        training=False,
+    ),
+    "evaluator_updates": Amount(
+        quick=400, full=1500, meaning="updates of the evaluator", training=False
+    ),
+    "chunk": Amount(
+        quick=10, full=10, meaning="characters to run at a time", training=False
+    ),
+    "rollout_seconds": Amount(
+        quick=8.0,
+        full=20.0,
+        meaning="length of the rollout that is written to look at",
+        training=False,
+    ),
+}
+
+
+def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
+    budget, chunk = job.budget, math.gcd(job.budget["updates"], 50)
+    return dict(
+        data=job.data[0],
+        out=job.models / point.folder,
+        held_out=budget["held_out"],
+        steps=budget["updates"],
+        batch=budget["batch"],
+        warmup=budget["warmup"],
+        chunk=chunk,
+        save_every=10 * chunk,
+        width=budget["width"],
+        depth=budget["depth"],
+        diffusion_steps=point.steps,
+        seed=job.seed,
+    )
+
+
+def _show(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
+    folder = job.models / point.folder
+    model, _, _ = camdm_model.load(folder)
+    seconds = job.budget["rollout_seconds"]
+    options = dict(run=folder, style=model.labels[0], seconds=seconds, seed=job.seed)
+    return "rollout", options
+
+
+def _condition(run: Run, *, seed: int) -> camdm_model.Condition:
+    """One condition of a plan, from a held-out window."""
+    config = run.model.config
+    index = windows.window_index(run.held_out, config.window, short="skip")
+    key_window, key_example = jax.random.split(jax.random.key(seed))
+    motion, clip = windows.sample_windows(key_window, run.held_out, index, batch=1)
+    label = run.held_out.labels[run.field][clip]
+    first = functools.partial(jax.tree.map, lambda x: x[0])
+    make = jax.jit(functools.partial(camdm_loss.example, config=config))
+    return make(key_example, run.model.skeleton, first(motion), label[0])[0]
+
+
+def _prepare(job: bench.Job) -> bench.Evaluation:
+    """`evaluate_run` of several models, in replications."""
+    first = job.models / job.points[0].folder
+    run = load_run(first, None, CONTENTS)
+    trial = make_trial(
+        run,
+        _COURSE,
+        repeats=job.replications,
+        seconds=job.budget["seconds"],
+        speed=None,
+        seed=job.seed,
+    )
+    key_fit, _ = jax.random.split(jax.random.key(job.seed))
+    chosen = load_evaluator(
+        key_fit, run, job.evaluator, num_steps=job.budget["evaluator_updates"]
+    )
+    reference = reference_of_run(run, chosen, seed=job.seed)
+    # A replication has one character of each style.
+    count = reference.count(len(run.model.labels) * trial.windows)
+    truth, floor = truth_rows(
+        run, reference, count=count, seed=job.seed, repeats=job.replications
+    )
+
+    def run_of(point: bench.Point) -> Run:
+        model, params, _ = camdm_model.load(job.models / point.folder)
+        return dataclasses.replace(run, model=model, params=params)
+
+    def score(point: bench.Point) -> Row:
+        row, found = score_run(
+            run_of(point),
+            reference,
+            trial,
+            count=count,
+            chunk=job.budget["chunk"],
+            seed=job.seed,
+            replicated=True,
+        )
+        return row | {
+            name: table.Cell(value=float(found[name]), samples=found["rollouts"])
+            for name in ("diverged", "frozen")
+        }
+
+    def sampler(point: bench.Point) -> Callable[[Key], Array]:
+        own = run_of(point)
+        condition = _condition(own, seed=job.seed)
+        plan = camdm_model.sampler(own.params, config=own.model.config)
+        return jax.jit(lambda key: plan(key, condition))
+
+    return bench.Evaluation(
+        real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: floor},
+        score=score,
+        sampler=sampler,
+        describe={
+            "source": run.model.source,
+            "samples": f"one rollout of {job.budget['seconds']:g} s for each of "
+            f"{len(run.model.labels)} styles, course {_COURSE!r}; Fréchet distances of "
+            f"{count} windows to {len(reference.features)}; the clips' distances are "
+            "of as many random subsets, their other intervals over clips; fid_unbiased "
+            "is extrapolated to infinitely many windows from a row's subsets of at "
+            "least as many windows as features",
+            "fid_windows": count,
+            "fid_reference_windows": len(reference.features),
+            "rollouts": int(trial.labels.size),
+            "evaluator": describe_evaluator(run, chosen, job.evaluator),
+        },
+    )
+
+
+BENCH = bench.Bench(
+    data=(Path("data/bandai2.npz"),),
+    amounts=_AMOUNTS,
+    points=lambda texts, drafts: bench.plain_points(texts),
+    train=_train,
+    show=_show,
+    prepare=_prepare,
+    quality="fid",
+    sample="one plan of 45 frames",
+    evaluator="style",
+)

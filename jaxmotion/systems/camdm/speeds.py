@@ -17,7 +17,7 @@ from jaxmotion.evaluation import by_frame, locomotion, table
 from jaxmotion.evaluators.style import in_batches
 from jaxmotion.motion import skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
-from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import scoring as camdm_scoring
 from jaxmotion.systems.camdm.training import Run
 
 # Ticks to leave out at the start: characters begin with other speeds.
@@ -110,7 +110,7 @@ def speed_table(
         )
         for name, clips in (("held-out", run.held_out), ("training", run.train))
     }
-    height = camdm_evaluation.contact_height(model.skeleton, real["held-out"])
+    height = camdm_scoring.contact_height(model.skeleton, real["held-out"])
     rest = height - 0.01
     measured = {
         name: (*_row(run, found, height=height, rest=rest), np.asarray(found.label))

@@ -29,6 +29,7 @@ from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import release as camdm_release
+from jaxmotion.systems.camdm import scoring as camdm_scoring
 from jaxmotion.systems.camdm.training import Run
 
 # Frames between the windows in which the new style is looked for.
@@ -213,7 +214,7 @@ def transition_row(
     made = windows.rollout_windows(cut, jnp.asarray(changes.new), skip=0)
     owner = changes.replication[np.asarray(made.group)]
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
-    motion = camdm_evaluation.metric_row(skeleton, grouped, None, height=height)
+    motion = camdm_scoring.metric_row(skeleton, grouped, None, height=height)
     row |= {name: motion[name] for name in MOTION}
     # Of its changes of style the release measures neither direction nor facing.
     whole = camdm_release.of_rollouts(frames, changes.commands)
@@ -249,7 +250,7 @@ def evaluate_transitions(
     real = windows.eval_windows(
         run.held_out, stride=windows.EVAL_WINDOW, field=run.field
     )
-    height = camdm_evaluation.contact_height(run.model.skeleton, real)
+    height = camdm_scoring.contact_height(run.model.skeleton, real)
 
     def row(own: Changes, control: camdm_controller.Control) -> dict[str, table.Cell]:
         frames = steering.steered_rollouts(

@@ -9,19 +9,38 @@ Source: Zhou et al. 2024 (EMDM), section 4.3; the evaluation of Guo et al. 2020
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxmotion.evaluation import contact, diversity, frechet, plausibility, smoothness
+from jaxmotion.evaluation import (
+    by_frame,
+    contact,
+    diversity,
+    frechet,
+    plausibility,
+    smoothness,
+)
+from jaxmotion.evaluation.table import Row
 from jaxmotion.evaluators import action as action_evaluator
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
 from jaxmotion.learning import checkpoint, runs
 from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import features as emdm_features
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.emdm.data import ActionArrays, ActionRun
+from jaxmotion.systems.emdm.scoring import (
+    Many,
+    RowScorer,
+    Scores,
+    Settings,
+    replicated_row,
+)
 from jaxmotion.typing import Key, Params
 
 # Motions that the recognizer is trained on: most windows of the clips.
@@ -232,6 +251,118 @@ def ground_height(run: ActionRun) -> float:
     )
     positions = joint_positions(run.clips.skeleton, motion)
     return float(jnp.median(jnp.min(positions[..., 1], axis=-1)))
+
+
+def row_scorer(folder: Path, settings: Settings) -> RowScorer:
+    """The evaluator of a run folder, and real motions' scores.
+
+    Motions made from nothing are compared with real ones of all actions; they have no
+    accuracy and no multimodality.
+
+    Raises:
+      ValueError: if the run has other data, there are too few samples, or a frozen
+        evaluator does not fit.
+    """
+    for name in ("matcher", "glove"):
+        if (found := getattr(settings, name)) is not None:
+            raise ValueError(
+                f"{name} is {found}, but {folder} does not make motions from texts: "
+                "expected none"
+            )
+    if settings.padding != "zeros":
+        raise ValueError(
+            f"padding is {settings.padding!r}, but {folder} does not make motions from "
+            "texts: expected 'zeros'"
+        )
+    run = emdm_data.load_run(folder)
+    number = len(run.actions)
+    each = settings.samples // number
+    if each < 2:
+        raise ValueError(
+            f"samples is {settings.samples}, expected at least 2 for each of {number} "
+            "actions"
+        )
+    frozen = settings.evaluator
+    steps = 1500 if settings.evaluator_steps is None else settings.evaluator_steps
+    recognizer = load_recognizer(run, num_steps=steps, seed=0, evaluator=frozen)
+    trained = (run.clips.source, steps, 0)
+    if frozen is not None:
+        trained = (frozen.source, frozen.updates, frozen.seed)
+    wanted = jnp.repeat(jnp.arange(number), each)
+    key_motion, key_state, *keys_real = jax.random.split(
+        jax.random.key(settings.seed), 4
+    )
+    truth = real_positions(key_motion, wanted, run.train)
+    reference = moments(recognizer, run)(key_state, truth)
+    ground = ground_height(run)
+    score = scorer(recognizer, run, reference, ground=ground)
+
+    def score_real(key: Key, part: ActionArrays) -> Row:
+        def once(key: Key) -> Scores:
+            key_motion, key_score = jax.random.split(key)
+            positions = real_positions(key_motion, wanted, part)
+            return score(key_score, positions, wanted)
+
+        return replicated_row(key, once, number=settings.replications)
+
+    conditional = run.config["task"] == "action"
+    conditions = emdm_model.Condition(
+        vector=emdm_model.action_vectors(wanted, number if conditional else 0),
+        keep=jnp.ones(wanted.shape, bool),
+        mask=jnp.ones((*wanted.shape, run.train.frames), bool),
+    )
+
+    @jax.jit
+    def positions_of(x: Array) -> Array:
+        motion = emdm_features.to_motion(x, run.representation)
+        return joint_positions(run.clips.skeleton, motion)
+
+    def score_row(key: Key, many: Many) -> Scores:
+        key_sample, key_score = jax.random.split(key)
+        x = many(key_sample, conditions, scale)
+        found = score(key_score, positions_of(x), wanted)
+        if not conditional:
+            found = {
+                k: found[k] for k in found if k not in ("accuracy", "multimodality")
+            }
+        return found
+
+    def places(key: Key, many: Many, frames_per_token: int) -> by_frame.ByFrame:
+        positions = positions_of(many(key, conditions, scale))
+        at = jnp.arange(positions.shape[1]) % frames_per_token
+        return by_frame.by_frame(
+            positions,
+            run.clips.skeleton.feet,
+            jnp.broadcast_to(at, positions.shape[:2]),
+            run.clips.fps,
+            num_places=frames_per_token,
+            contact_height=ground + 0.05,
+        )
+
+    scale = emdm_training.guidance_scale(settings.scale, default=1.0)
+    return RowScorer(
+        by_frame=places,
+        real={
+            "real (training clips)": score_real(keys_real[0], run.train),
+            "real (held-out clips)": score_real(keys_real[1], run.held_out),
+        },
+        score=score_row,
+        scale=scale,
+        one=jax.tree.map(lambda x: x[0], conditions),
+        samples=each * number,
+        describe={
+            "recognizer": "GRU 2 x 128, tanh 30, joint positions; trained on "
+            "{}, {} updates, seed {}".format(*trained),
+            "reference": f"{each * number} real motions of training clips, actions "
+            "uniform",
+            "ground height m": ground,
+        }
+        | evaluators.describe(
+            recognizer,
+            frozen,
+            reference=evaluators.clips_fingerprint(run.train.clips, run.field),
+        ),
+    )
 
 
 # Motions of each action for the accuracy.

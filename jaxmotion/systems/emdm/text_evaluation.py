@@ -22,9 +22,21 @@ from jaxmotion.data.text_files import read_array
 from jaxmotion.data.text_motion import check_statistics
 from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
 from jaxmotion.evaluation import diversity, frechet, matching
+from jaxmotion.evaluation.table import Row
 from jaxmotion.evaluators import published
 from jaxmotion.evaluators import text_motion as text_motion_evaluator
 from jaxmotion.learning import checkpoint, runs, training
+from jaxmotion.learning.fingerprint import fingerprint
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import text as emdm_text
+from jaxmotion.systems.emdm import training as emdm_training
+from jaxmotion.systems.emdm.scoring import (
+    Many,
+    RowScorer,
+    Scores,
+    Settings,
+    replicated_row,
+)
 from jaxmotion.systems.emdm.text import TextRun
 from jaxmotion.typing import Key, Params
 
@@ -294,7 +306,7 @@ def published_evaluator(run: TextRun, path: Path, *, glove: Path) -> Evaluator:
 
 def embed(
     run: TextRun,
-    judge: Evaluator,
+    evaluator: Evaluator,
     x: Float[Array, "batch frames features"],
     frames: Int[Array, " batch"],
     *,
@@ -304,7 +316,7 @@ def embed(
 
     Args:
       run: The run.
-      judge: The evaluator.
+      evaluator: The evaluator.
       x: Z-scored features of the run.
       frames: Of each motion.
       padding: What the evaluator sees beyond a motion's end: "zeros", as beyond that
@@ -316,30 +328,33 @@ def embed(
     """
     # At once, and not by way of the raw features, which would lose digits.
     wide = lambda v: np.asarray(v, np.float64)  # noqa: E731
-    scale = wide(run.motions.std) / judge.std
-    shift = (wide(run.motions.mean) - judge.mean) / judge.std
+    scale = wide(run.motions.std) / evaluator.std
+    shift = (wide(run.motions.mean) - evaluator.mean) / evaluator.std
     row = lambda v: jnp.asarray(v, jnp.float32)[None, None]  # noqa: E731
     scored = (x * row(scale) + row(shift))[..., :-_CONTACTS]
     return text_motion_evaluator.embed_motion(
-        judge.params, scored, frames, config=judge.config, padding=padding
+        evaluator.params, scored, frames, config=evaluator.config, padding=padding
     )
 
 
 def make_scorer(
-    run: TextRun, judge: Evaluator, *, padding: text_motion_evaluator.Padding = "zeros"
+    run: TextRun,
+    evaluator: Evaluator,
+    *,
+    padding: text_motion_evaluator.Padding = "zeros",
 ) -> Callable[[Key, Array, Array, Array, frechet.Moments], dict[str, Array]]:
     """Scores of a set of motions, as one compiled program.
 
     Args:
       run: The run.
-      judge: The evaluator.
+      evaluator: The evaluator.
       padding: As in `embed`.
 
     Returns:
       `score(key, x, frames, caption, reference) -> scores`: z-scored features, frames
       and caption of each motion, and moments of the real motions' embeddings.
     """
-    coded = sentences(run, judge.vocabulary)
+    coded = sentences(run, evaluator.vocabulary)
 
     @jax.jit
     def score(
@@ -347,13 +362,13 @@ def make_scorer(
     ) -> dict[str, Array]:
         row = coded.index[caption]
         text = text_motion_evaluator.embed_text(
-            judge.params,
+            evaluator.params,
             coded.vectors[row],
             coded.tags[row],
             coded.words[row],
-            config=judge.config,
+            config=evaluator.config,
         )
-        motion = embed(run, judge, x, frames, padding=padding)
+        motion = embed(run, evaluator, x, frames, padding=padding)
         precision = matching.r_precision(text, motion)
         return {
             "R-precision 1": precision[0],
@@ -365,3 +380,126 @@ def make_scorer(
         }
 
     return score
+
+
+# Multimodality: sentences, motions of each, pairs of them.
+_SENTENCES, _REPEATS, _PAIRS = 16, 8, 10
+_SEEN = {"zeros": "zeros", "kept": "the model's output, as in the released evaluation"}
+
+
+def row_scorer(folder: Path, settings: Settings) -> RowScorer:
+    """The evaluator of a run folder, and real motions' scores.
+
+    Raises:
+      ValueError: if the run has other data, there are too few samples, or an
+        evaluator of actions is given.
+    """
+    if settings.evaluator is not None:
+        raise ValueError(
+            f"evaluator is {settings.evaluator.path}, but {folder} makes motions "
+            "from texts: expected none, or --matcher"
+        )
+    if (settings.matcher is None) != (settings.glove is None):
+        raise ValueError(
+            f"matcher is {settings.matcher} and glove is {settings.glove}: "
+            "published weights read GloVe's vectors, so give both, --glove the folder "
+            f"with {', '.join(GLOVE)}, or neither"
+        )
+    run = emdm_text.load_run(folder)
+    frames, number = run.config["frames"], settings.samples // 32 * 32
+    if number < 64:
+        raise ValueError(f"samples is {settings.samples}, expected at least 64")
+    steps = 600 if settings.evaluator_steps is None else settings.evaluator_steps
+    chosen = (
+        published_evaluator(run, settings.matcher, glove=settings.glove)
+        if settings.matcher
+        else train_evaluator(run, frames=frames, num_steps=steps, seed=0)
+    )
+    arrays = {
+        split: text_arrays(run.motions, split=split, max_frames=frames)
+        for split in ("train", "test", "val")
+        if run.motions.clips_of(split).size
+    }
+    draw = jax.jit(sample_text_batch, static_argnames="batch")
+    embed = jax.jit(
+        lambda x, frames, padding: embed(run, chosen, x, frames, padding=padding),
+        static_argnums=2,
+    )
+    score = {
+        padding: make_scorer(run, chosen, padding=padding)
+        for padding in {"zeros", settings.padding}
+    }
+
+    def moments(split: str) -> frechet.Moments:
+        key = jax.random.key(settings.seed)
+        x, length, _ = draw(key, arrays[split], batch=number)
+        return frechet.moments(embed(x, length, "zeros"))
+
+    references = {split: moments(split) for split in arrays}
+
+    def score_real(split: str) -> Row:
+        def once(key: Key) -> Scores:
+            key_draw, key_score = jax.random.split(key)
+            x, length, caption = draw(key_draw, arrays[split], batch=number)
+            return score["zeros"](key_score, x, length, caption, references[split])
+
+        key = jax.random.key(settings.seed + 7)
+        return replicated_row(key, once, number=settings.replications)
+
+    vectors, index = jnp.asarray(run.vectors, jnp.float32), jnp.asarray(run.index)
+
+    def conditions(caption: Array, length: Array) -> emdm_model.Condition:
+        return emdm_model.Condition(
+            vector=vectors[index[caption]],
+            keep=jnp.ones(caption.shape, bool),
+            mask=jnp.arange(frames)[None] < length[:, None],
+        )
+
+    scale = emdm_training.guidance_scale(settings.scale, default=2.5)
+
+    def score_split(key: Key, many: Many, split: str) -> Scores:
+        key_draw, key_sample, key_score = jax.random.split(key, 3)
+        _, length, caption = draw(key_draw, arrays[split], batch=number)
+        x = many(key_sample, conditions(caption, length), scale)
+        return score[settings.padding](key_score, x, length, caption, references[split])
+
+    def score_row(key: Key, many: Many) -> Scores:
+        key_own, key_draw, key_sample, key_pairs, key_unseen = jax.random.split(key, 5)
+        found = score_split(key_own, many, "test")
+        _, length, caption = draw(key_draw, arrays["test"], batch=_SENTENCES)
+        length, caption = (jnp.repeat(v, _REPEATS) for v in (length, caption))
+        x = many(key_sample, conditions(caption, length), scale)
+        features = embed(x, length, settings.padding).reshape(_SENTENCES, _REPEATS, -1)
+        found["multimodality"] = diversity.multimodality(
+            key_pairs, features, num_pairs=_PAIRS
+        )
+        if "val" in arrays:
+            unseen = score_split(key_unseen, many, "val")
+            found["R-precision 3, unseen pairs"] = unseen["R-precision 3"]
+        return found
+
+    names = {
+        "train": "real (training clips)",
+        "test": "real (held-out clips)",
+        "val": "real (unseen pairs)",
+    }
+    one = conditions(jnp.zeros(1, jnp.int32), jnp.full(1, frames))
+    return RowScorer(
+        real={names[split]: score_real(split) for split in arrays},
+        score=score_row,
+        scale=scale,
+        one=jax.tree.map(lambda x: x[0], one),
+        samples=number,
+        describe={
+            "fingerprint": fingerprint(chosen.params),
+            "origin": chosen.name,
+            "matcher": dataclasses.asdict(chosen.config) | {"name": chosen.name},
+            "texts": f"{run.encoder.name}, {run.config['text_form']}",
+            "padding": settings.padding,
+            "reference": f"{number} real motions of the same split",
+        },
+        notes=(
+            "Beyond the end of generated motions the evaluator sees "
+            f"{_SEEN[settings.padding]}.",
+        ),
+    )

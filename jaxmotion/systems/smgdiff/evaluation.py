@@ -10,7 +10,9 @@ Source: SMGDiff, section 5.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,293 +20,24 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.ball_clips import BallClips
-from jaxmotion.evaluation import ball, frechet, locomotion
+from jaxmotion.evaluation import bench, by_frame, columns
+from jaxmotion.evaluation.bench import Amount
+from jaxmotion.evaluation.table import Row, Rows
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
-from jaxmotion.motion import ground, rotation, trajectory
 from jaxmotion.motion.ball import Scene
-from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.systems.smgdiff import data as smgdiff_data
-from jaxmotion.systems.smgdiff import loss as smgdiff_loss
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.systems.smgdiff import scoring as smgdiff_scoring
 from jaxmotion.systems.smgdiff import training as smgdiff_training
-from jaxmotion.systems.smgdiff.guidance import SamplePlan
+from jaxmotion.systems.smgdiff.guidance import UNGUIDED, Guidance, SamplePlan
 from jaxmotion.systems.smgdiff.model import Condition, Model
-from jaxmotion.systems.smgdiff.scene import Representation
-from jaxmotion.typing import Key, Params
-
-_DEGREES = 180.0 / np.pi
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Thresholds:
-    """Where a touch begins; the same for all rows of a table.
-
-    Attributes:
-      acceleration: A ball that accelerates more is being pushed, meters per second
-        squared. Half of the weakest push of the synthetic dribble.
-      distance: From a joint to the ball's center up to which it pushes, meters: the
-        ball's radius, half a foot, and 2 cm.
-      foot_height: Below it a foot joint should not move, meters.
-    """
-
-    acceleration: float
-    distance: float
-    foot_height: float
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Judge:
-    """A trained recognizer, and what real windows look like to it.
-
-    Attributes:
-      params: Of the recognizer.
-      reference: Moments of its features over windows of training clips.
-      representation: Says what the skeleton and the ball are.
-      config: Size of the recognizer.
-    """
-
-    params: Params
-    reference: frechet.Moments
-    representation: Representation
-    config: style_evaluator.RecognizerConfig = jax.tree.static()
-
-
-def recognizer_input(
-    scene: Scene, representation: Representation
-) -> Float[Array, "*batch frames channels"]:
-    """Joints and ball relative to the root, turned to face +z, in each frame.
-
-    Args:
-      scene: Frames.
-      representation: Of their skeleton.
-
-    Returns:
-      Meters; three channels a joint, and three of the ball, no longer than the reach.
-    """
-    skeleton = representation.skeleton
-    joints = style_evaluator.recognizer_input(skeleton, scene.motion)
-    facing = trajectory.root_trajectory(skeleton, scene.motion).facing
-    away = scene.ball - scene.motion.root_position
-    away = away.at[..., ::2].set(ground.into_frame(away[..., ::2], facing))
-    length = jnp.linalg.norm(away, axis=-1, keepdims=True)
-    away = away * jnp.minimum(1.0, representation.reach / jnp.maximum(length, 1e-6))
-    return jnp.concatenate([joints, away], axis=-1)
-
-
-def make_judge(
-    key: Key,
-    scenes: Scene,
-    labels: Int[Array, " windows"],
-    *,
-    representation: Representation,
-    num_labels: int,
-    num_steps: int,
-    frozen: Params | None = None,
-) -> Judge:
-    """Trains the recognizer of skills on real windows.
-
-    Args:
-      key: Consumed.
-      scenes: Windows of training clips, as long as those that are to be judged.
-      labels: Their skills.
-      representation: Of their skeleton.
-      num_labels: Skills.
-      num_steps: Updates.
-      frozen: Parameters of a recognizer that was trained before; None to train one.
-
-    Returns:
-      The judge; the same windows are its reference.
-    """
-    config = style_evaluator.RecognizerConfig(
-        num_classes=num_labels,
-        num_joints=representation.skeleton.num_joints + 1,
-        frames=scenes.ball.shape[-2],
-    )
-    x = jax.jit(recognizer_input)(scenes, representation)
-    params = frozen
-    if params is None:
-        params, _ = style_evaluator.train_recognizer(
-            key, x, labels, config=config, num_steps=num_steps
-        )
-    features, _ = jax.jit(functools.partial(style_evaluator.recognize, config=config))(
-        params, x
-    )
-    return Judge(
-        params=params,
-        reference=frechet.moments(features),
-        representation=representation,
-        config=config,
-    )
-
-
-Score = Callable[..., dict[str, Float[Array, ""]]]
-
-
-def scorer(judge: Judge, limits: Thresholds) -> Score:
-    """Scores of a set of windows, as one compiled program.
-
-    Args:
-      judge: From `make_judge`.
-      limits: Where a touch begins.
-
-    Returns:
-      `score(scenes, wanted, labels) -> scores`: wanted is a path (world or frame of the
-      plan, as the scenes), labels the skills.
-    """
-    representation = judge.representation
-    skeleton = representation.skeleton
-
-    @jax.jit
-    def score(
-        scenes: Scene, wanted: trajectory.Trajectory, labels: Int[Array, " windows"]
-    ) -> dict[str, Array]:
-        x = recognizer_input(scenes, representation)
-        features, logits = style_evaluator.recognize(
-            judge.params, x, config=judge.config
-        )
-        moments = frechet.moments(features)
-        velocity = jnp.gradient(wanted.position, axis=-2) * representation.fps
-        body = locomotion.locomotion_metrics(
-            skeleton,
-            scenes.motion,
-            velocity,
-            wanted.facing,
-            contact_height=limits.foot_height,
-        )
-        return {
-            "FID": frechet.frechet_distance(moments, judge.reference),
-            "foot slide m/s": _weighted(body["slide_speed"], body["slide_seconds"]),
-            "skate ratio": jnp.mean(body["skate_ratio"]),
-            "acceleration m/s2": jnp.mean(body["acceleration"]),
-            "jerk m/s3": jnp.mean(body["jerk"]),
-            "trajectory error deg": _DEGREES
-            * _weighted(body["trajectory_error"], body["trajectory_used"]),
-            "orientation error deg": _DEGREES * jnp.mean(body["orientation_error"]),
-            "skill accuracy": jnp.mean(jnp.argmax(logits, axis=-1) == labels),
-        } | contact_scores(scenes, representation, limits)
-
-    return score
-
-
-def _weighted(values: Array, weights: Array) -> Array:
-    # A window without weight has no value (0 of 0).
-    used = jnp.where(weights > 0, values, 0.0)
-    return jnp.sum(used * weights) / jnp.maximum(jnp.sum(weights), 1e-9)
-
-
-def contact_scores(
-    scenes: Scene, representation: Representation, limits: Thresholds
-) -> dict[str, Float[Array, ""]]:
-    """How well foot and ball go together.
-
-    Args:
-      scenes: Windows.
-      representation: Of their skeleton.
-      limits: Where a touch begins.
-
-    Returns:
-      Touches and missed ones a minute, missed part of the touches, distance at touches,
-      penetration of the ground and of the ball, acceleration without a touch.
-    """
-    skeleton, fps = representation.skeleton, representation.fps
-    joints = jnp.array(representation.joints)
-    places = joint_positions(skeleton, scenes.motion)[..., joints, :]
-    at = dict(threshold=limits.acceleration)
-    count = ball.touch_count(
-        scenes.ball, places, fps, max_distance=limits.distance, **at
-    )
-    near = ball.foot_ball_distance(scenes.ball, places, fps, **at)
-    free = ball.untouched_acceleration(
-        scenes.ball, places, fps, max_distance=limits.distance
-    )
-    minutes, touches = jnp.sum(count.minutes), jnp.sum(count.touches)
-    sunk = ball.ground_penetration(scenes.ball, radius=representation.radius)
-    inside = ball.joint_penetration(scenes.ball, places, radius=representation.radius)
-    ratio = lambda a, b: jnp.sum(a) / jnp.maximum(jnp.sum(b), 1.0)  # noqa: E731
-    return {
-        "touches /min": touches / minutes,
-        "missed /min": jnp.sum(count.missed) / minutes,
-        "missed part": ratio(count.missed, count.touches),
-        "touch distance cm": 100.0 * ratio(near.total, near.count),
-        "ball in ground mm": jnp.mean(sunk.mean),
-        "foot in ball mm": jnp.mean(inside.mean),
-        "free acceleration m/s2": ratio(free.total, free.count),
-    }
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Situations:
-    """Moments of recordings: what is known, and what then happened.
-
-    Attributes:
-      condition: Of the plans.
-      future: What then happened, in the frame of the plan.
-      past: The frames before, likewise.
-      label: Skill.
-    """
-
-    condition: Condition
-    future: Scene
-    past: Scene
-    label: Int[Array, "*batch"]
-
-
-def situations(data: BallClips, model: Model, *, number: int, seed: int) -> Situations:
-    """Moments spread at random over clips.
-
-    Args:
-      data: The clips.
-      model: The model; windows have its lengths.
-      number: How many, at most.
-      seed: Of the choice.
-
-    Returns:
-      The moments.
-
-    Raises:
-      ValueError: if no clip is long enough, or there are fewer than 4 moments.
-    """
-    config = model.config
-    arrays = smgdiff_data.scene_arrays(data, config.window, stride=config.past)
-    total = arrays.index.starts.shape[0]
-    if min(total, number) < 4:
-        raise ValueError(f"{total} windows of {config.window} frames, expected 4")
-    order = np.random.default_rng(seed).permutation(total)[:number]
-    scenes, labels = smgdiff_data.all_scenes(arrays, jnp.asarray(order))
-    return _situations(scenes, labels, model.representation, config)
-
-
-@functools.partial(jax.jit, static_argnames=("config",))
-def _situations(scenes: Scene, labels: Array, representation, config) -> Situations:
-    matrix = trajectory.smoothing_matrices(config.window, (10.0,))[0]
-    last, skeleton = config.past - 1, representation.skeleton
-
-    @jax.vmap
-    def one(scene: Scene, label: Array) -> Situations:
-        course = trajectory.root_trajectory(skeleton, scene.motion)
-        path = trajectory.smooth(course.position, matrix)
-        path = path + (course.position[last] - path[last])[None]
-        facing = trajectory.smooth(course.facing, matrix)
-        facing = rotation.safe_normalize(facing, jnp.array([0.0, 1.0]))
-        wanted = trajectory.Trajectory(position=path, facing=facing)
-        condition, _ = smgdiff_loss.situation(
-            scene, wanted, label, representation=representation, config=config
-        )
-        past = jax.tree.map(lambda x: x[: config.past], scene.motion)
-        frame = smgdiff_scene.plan_frame(skeleton, past)
-        local = smgdiff_scene.to_frame(scene, frame)
-        return Situations(
-            condition=condition,
-            future=jax.tree.map(lambda x: x[config.past :], local),
-            past=jax.tree.map(lambda x: x[: config.past], local),
-            label=label,
-        )
-
-    return one(scenes, labels)
+from jaxmotion.systems.smgdiff.scoring import EvalWindows
+from jaxmotion.systems.smgdiff.training import Run
+from jaxmotion.typing import Key
 
 
 def plan_many(
@@ -337,48 +70,21 @@ def plan_many(
     return run
 
 
-def limits(data: BallClips, model: Model) -> Thresholds:
-    """Thresholds of the figures, from real clips.
-
-    Args:
-      data: Training clips.
-      model: The model.
-
-    Returns:
-      Feet: where toes rest (their first percentile) and one centimeter more. Touches:
-      the ball's radius and 7 cm (half a foot, and 2 cm); and an acceleration of 12
-      meters per second squared, a change of 0.4 m/s within a frame of 1/30 s.
-    """
-    feet = jnp.array(model.representation.skeleton.feet)
-    motion = Motion(
-        root_position=data.clips.root_position[::10],
-        joint_rotation=data.clips.joint_rotation[::10],
-        fps=data.clips.fps,
-    )
-    places = jax.jit(joint_positions)(data.clips.skeleton, motion)
-    heights = np.asarray(places[:, feet, 1])
-    return Thresholds(
-        acceleration=12.0,
-        distance=data.radius + 0.07,
-        foot_height=float(np.percentile(heights, 1)) + 0.01,
-    )
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Setting:
     """What all rows of a table share.
 
     Attributes:
-      judge: The recognizer.
+      evaluator: Of skills.
       score: From `smgdiff_scores.scorer`.
       known: Held-out moments.
       replications: Sets of windows and noise.
       seed: Of both.
     """
 
-    judge: Judge
-    score: Score
-    known: Situations
+    evaluator: smgdiff_scoring.SkillEvaluator
+    score: smgdiff_scoring.Score
+    known: EvalWindows
     replications: int
     seed: int
 
@@ -400,11 +106,11 @@ def make_setting(
     *,
     number: int,
     replications: int,
-    recognizer_steps: int,
+    evaluator_steps: int,
     seed: int,
     evaluator: evaluators.Evaluator | None = None,
 ) -> Setting:
-    """Trains the judge and draws the windows.
+    """Trains the evaluator and draws the windows.
 
     Args:
       train: Training clips.
@@ -412,9 +118,9 @@ def make_setting(
       model: The model.
       number: Windows of either part, at most.
       replications: Sets of half of the held-out windows.
-      recognizer_steps: Updates of the recognizer.
+      evaluator_steps: Updates of the evaluator.
       seed: Of everything random.
-      evaluator: A frozen recognizer; None to train one.
+      evaluator: A frozen evaluator; None to train one.
 
     Returns:
       The setting.
@@ -430,20 +136,21 @@ def make_setting(
         fps=model.config.fps,
         frames=model.config.future,
     )
-    reference = situations(train, model, number=2 * number, seed=seed)
-    judge = make_judge(
+    reference = smgdiff_scoring.eval_windows(train, model, number=2 * number, seed=seed)
+    chosen = smgdiff_scoring.make_evaluator(
         jax.random.key(seed),
         reference.future,
         reference.label,
         representation=model.representation,
         num_labels=len(model.labels),
-        num_steps=recognizer_steps,
+        num_steps=evaluator_steps,
         frozen=frozen,
     )
+    known = smgdiff_scoring.eval_windows(held_out, model, number=number, seed=seed + 1)
     return Setting(
-        judge=judge,
-        score=scorer(judge, limits(train, model)),
-        known=situations(held_out, model, number=number, seed=seed + 1),
+        evaluator=chosen,
+        score=smgdiff_scoring.scorer(chosen, smgdiff_scoring.limits(train, model)),
+        known=known,
         replications=replications,
         seed=seed,
     )
@@ -518,7 +225,7 @@ def train_ball(
     num_steps: int,
     seed: int,
 ) -> Evaluator:
-    """SMGDiff's recognizer of skills, of joints and ball.
+    """SMGDiff's evaluator of skills, of joints and ball.
 
     Args:
       train: Training clips.
@@ -534,9 +241,9 @@ def train_ball(
       ValueError: if clips are too short or too few.
     """
     model = smgdiff_training.make_model(train, sizes={"future": frames})
-    draw = functools.partial(situations, model=model)
+    draw = functools.partial(smgdiff_scoring.eval_windows, model=model)
     known = draw(train, number=_BALL_WINDOWS, seed=seed)
-    judge = make_judge(
+    chosen = smgdiff_scoring.make_evaluator(
         jax.random.key(seed),
         known.future,
         known.label,
@@ -545,12 +252,12 @@ def train_ball(
         num_steps=num_steps,
     )
     unseen = draw(held_out, number=_BALL_WINDOWS, seed=seed + 1)
-    x = jax.jit(recognizer_input)(unseen.future, model.representation)
-    recognize = functools.partial(style_evaluator.recognize, config=judge.config)
-    _, logits = jax.jit(recognize)(judge.params, x)
+    x = jax.jit(smgdiff_scoring.evaluator_input)(unseen.future, model.representation)
+    recognize = functools.partial(style_evaluator.recognize, config=chosen.config)
+    _, logits = jax.jit(recognize)(chosen.params, x)
     return Evaluator(
         kind="ball",
-        params=judge.params,
+        params=chosen.params,
         field=smgdiff_data.FIELD,
         labels=model.labels,
         joints=model.representation.skeleton.names,
@@ -562,3 +269,246 @@ def train_ball(
         updates=num_steps,
         accuracy=float(jnp.mean(jnp.argmax(logits, axis=-1) == unseen.label)),
     )
+
+
+_ORDER = (
+    "FID",
+    "foot slide m/s",
+    "acceleration m/s2",
+    "diversity m2",
+    "trajectory error deg",
+    "orientation error deg",
+    "skill accuracy",
+    "touches /min",
+    "missed /min",
+    "missed part",
+    "touch distance cm",
+    "ball in ground mm",
+    "foot in ball mm",
+    "free acceleration m/s2",
+    "skate ratio",
+    "jerk m/s3",
+)
+
+
+Places = dict[str, by_frame.ByFrame]
+
+
+def scores_row(scores: list[dict[str, Array]]) -> Row:
+    """A row of the scores of replications."""
+    return columns.row(scores, order=_ORDER)
+
+
+def real_rows(run: Run, setting: Setting) -> Rows:
+    """What happened in the held-out windows, and in training clips in their place."""
+    number = setting.known.label.shape[0]
+    seen = smgdiff_scoring.eval_windows(
+        run.train, run.model, number=number, seed=setting.seed + 5
+    )
+    floor = dataclasses.replace(setting, known=seen)
+    return {
+        "real (held-out clips)": scores_row(score_real(setting)),
+        "real (training clips)": scores_row(score_real(floor)),
+    }
+
+
+def _sampler(run: Run, stage: str, guided: Guidance) -> tuple[Model, SamplePlan]:
+    model, params = smgdiff_training.load_stage(run, stage)
+    return model, smgdiff_guidance.sampler(
+        params, config=model.config, representation=model.representation, guided=guided
+    )
+
+
+def _timed(plan: SamplePlan, setting: Setting) -> Callable[[Key], Array]:
+    """One plan at batch 1; its parameters are constants of the program."""
+    condition = jax.tree.map(lambda x: x[0], setting.known.condition)
+    return jax.jit(lambda key: plan(key, condition))
+
+
+def _plan_row(
+    run: Run, setting: Setting, steps: int, guided: Guidance, chunk: int
+) -> tuple[Row, by_frame.ByFrame]:
+    model, plan = _sampler(run, f"motion_{steps}", guided)
+    many = plan_many(plan, model, chunk=chunk)
+    found = scores_row(score_plans(setting, many))
+    scenes = many(jax.random.key(setting.seed), setting.known.condition)
+    positions = joint_positions(model.representation.skeleton, scenes.motion)
+    at = jnp.arange(model.config.future) % model.config.frames_per_token
+    places = by_frame.by_frame(
+        positions,
+        model.representation.skeleton.feet,
+        jnp.broadcast_to(at, positions.shape[:2]),
+        model.config.fps,
+        num_places=model.config.frames_per_token,
+        contact_height=smgdiff_scoring.limits(run.train, model).foot_height,
+    )
+    return found | {"ms a plan": bench.call_time(_timed(plan, setting))}, places
+
+
+def schedule_table(
+    run: Run,
+    setting: Setting,
+    names: Sequence[str],
+    *,
+    steps: int,
+    guided: Guidance,
+    chunk: int,
+) -> tuple[Rows, Places]:
+    """Table 4: where in the chain guidance acts.
+
+    Args:
+      run: The run.
+      setting: Of the table.
+      names: Of `SCHEDULES`.
+      steps: Motion model.
+      guided: Constants of the guidance.
+      chunk: Plans at a time.
+
+    Returns:
+      The rows, and jerk and slide by place in a token.
+    """
+    rows, places = real_rows(run, setting), {}
+    for name in names:
+        own = smgdiff_guidance.on_schedule(guided, name)
+        rows[name], places[name] = _plan_row(run, setting, steps, own, chunk)
+        print(f"{name}: done", flush=True)
+    return rows, places
+
+
+def step_table(run: Run, setting: Setting, *, chunk: int) -> tuple[Rows, Places]:
+    """Table 3: all models of other step counts that were trained, unguided."""
+    rows, places = real_rows(run, setting), {}
+    trained = sorted(
+        int(folder.name.removeprefix("motion_"))
+        for folder in run.folder.glob("motion_*")
+        if folder.name.removeprefix("motion_").isdecimal()
+    )
+    for number in trained:
+        name = f"{number} steps"
+        rows[name], places[name] = _plan_row(run, setting, number, UNGUIDED, chunk)
+        print(f"{name}: done", flush=True)
+    return rows, places
+
+
+def describe_evaluator(
+    run: Run, setting: Setting, evaluator: Evaluator | None
+) -> dict[str, Any]:
+    """Who scored a table, for what stands beside it."""
+    reference = clips_fingerprint(run.train, smgdiff_data.FIELD)
+    return evaluators.describe(setting.evaluator.params, evaluator, reference=reference)
+
+
+_AMOUNTS = {
+    "updates": Amount(quick=500, full=3000, meaning="updates of each motion model"),
+    "draft_updates": Amount(
+        quick=400,
+        full=3500,
+        meaning="updates before these in which displacements hardly count",
+    ),
+    "batch": Amount(quick=48, full=48, meaning="windows per update"),
+    "width": Amount(quick=128, full=192, meaning="channels of a token"),
+    "depth": Amount(quick=4, full=4, meaning="layers"),
+    "held_out": Amount(
+        quick=0.1, full=0.1, meaning="part of the recordings kept for evaluation"
+    ),
+    "windows": Amount(
+        quick=160,
+        full=600,
+        meaning="held-out windows, at most; a replication plans for half of them",
+        training=False,
+    ),
+    "evaluator_updates": Amount(
+        quick=300, full=800, meaning="updates of the evaluator", training=False
+    ),
+    "chunk": Amount(quick=4, full=4, meaning="plans to make at a time", training=False),
+    "rollout_seconds": Amount(
+        quick=8.0,
+        full=20.0,
+        meaning="length of the rollout that is written to look at",
+        training=False,
+    ),
+}
+
+
+def _stage(point: bench.Point) -> str:
+    return f"motion_{point.steps}"
+
+
+def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
+    """All models lie in one run folder."""
+    budget = job.budget
+    return dict(
+        data=job.data[0],
+        out=job.models,
+        stages=(_stage(point),),
+        width=budget["width"],
+        depth=budget["depth"],
+        held_out=budget["held_out"],
+        steps=budget["updates"],
+        draft_steps=budget["draft_updates"],
+        batch=budget["batch"],
+        seed=job.seed,
+    )
+
+
+def _show(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
+    return "rollout", dict(
+        run=job.models,
+        seconds=job.budget["rollout_seconds"],
+        paths="straight",
+        steps=point.steps,
+        schedule="none",
+        seed=job.seed,
+    )
+
+
+def _prepare(job: bench.Job) -> bench.Evaluation:
+    """The evaluation of the paper's table 3."""
+    run, budget = smgdiff_training.load_run(job.models), job.budget
+    setting = make_setting(
+        run.train,
+        run.held_out,
+        run.model,
+        number=budget["windows"],
+        replications=job.replications,
+        evaluator_steps=budget["evaluator_updates"],
+        evaluator=job.evaluator,
+        seed=job.seed,
+    )
+    truth, floor = real_rows(run, setting).values()
+
+    def score(point: bench.Point) -> Row:
+        _, plan = _sampler(run, _stage(point), UNGUIDED)
+        many = plan_many(plan, run.model, chunk=budget["chunk"])
+        found = scores_row(score_plans(setting, many))
+        return {column: found[column] for column in truth}
+
+    windows = int(setting.known.label.shape[0])
+    return bench.Evaluation(
+        real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: floor},
+        score=score,
+        sampler=lambda point: _timed(
+            _sampler(run, _stage(point), UNGUIDED)[1], setting
+        ),
+        describe={
+            "source": run.model.source,
+            "samples": f"plans for {windows // 2} of {windows} held-out windows along "
+            f"the path that was walked; Fréchet distances to {2 * windows} training "
+            "windows",
+            "windows": windows,
+            "evaluator": describe_evaluator(run, setting, job.evaluator),
+        },
+    )
+
+
+BENCH = bench.Bench(
+    data=(Path("data/dribble.npz"),),
+    amounts=_AMOUNTS,
+    points=lambda texts, drafts: bench.plain_points(texts),
+    train=_train,
+    show=_show,
+    prepare=_prepare,
+    quality="FID",
+    sample="one plan of 45 frames",
+    evaluator="ball",
+)

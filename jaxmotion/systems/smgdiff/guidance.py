@@ -67,6 +67,20 @@ SCHEDULES = {
 }
 
 
+def on_schedule(guided: Guidance, name: str) -> Guidance:
+    """Guidance that acts where a schedule says.
+
+    Raises:
+      ValueError: if there is no such schedule; names those there are.
+    """
+    if name not in SCHEDULES:
+        raise ValueError(
+            f"unknown schedule {name!r}: expected one of {', '.join(SCHEDULES)}"
+        )
+    start, end = SCHEDULES[name]
+    return dataclasses.replace(guided, start=start, end=end)
+
+
 def segments(guided: Guidance, num_steps: int) -> tuple[tuple[bool, int, int], ...]:
     """Cuts a chain of T steps where guidance begins and ends.
 

@@ -9,6 +9,7 @@ Source: SMGDiff, section 5.2 and table 2.
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,21 +18,27 @@ from jaxtyping import Array, Float
 from jaxmotion.control import rollout
 from jaxmotion.control.frame import Frame
 from jaxmotion.evaluation import diversity
+from jaxmotion.evaluation.table import Rows
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
+from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
-from jaxmotion.systems.smgdiff.evaluation import Setting, Situations
-from jaxmotion.systems.smgdiff.guidance import SamplePlan
+from jaxmotion.systems.smgdiff.evaluation import Setting
+from jaxmotion.systems.smgdiff.guidance import Guidance, SamplePlan
 from jaxmotion.systems.smgdiff.model import Model
+from jaxmotion.systems.smgdiff.scoring import EvalWindows
+from jaxmotion.systems.smgdiff.training import Run
 from jaxmotion.systems.smgdiff.trajectory import SamplePath, Wish
 from jaxmotion.typing import Key
 
-Play = Callable[[Key, Situations], Scene]
+Play = Callable[[Key, EvalWindows], Scene]
 
 
-def wishes(known: Situations, model: Model) -> Wish:
+def wishes(known: EvalWindows, model: Model) -> Wish:
     """What users would have asked for: the mean velocity of what was recorded.
 
     Args:
@@ -43,7 +50,7 @@ def wishes(known: Situations, model: Model) -> Wish:
     """
     skeleton, config = model.representation.skeleton, model.config
 
-    def one(known: Situations) -> Wish:
+    def one(known: EvalWindows) -> Wish:
         end = known.future.motion.root_position[-1, ::2]
         return Wish(
             past=trajectory.root_trajectory(skeleton, known.past.motion),
@@ -89,7 +96,7 @@ def player(
     skeleton = model.representation.skeleton
 
     @jax.jit
-    def play(key: Key, known: Situations) -> Scene:
+    def play(key: Key, known: EvalWindows) -> Scene:
         known = jax.tree.map(lambda x: jnp.repeat(x, repeats, axis=0), known)
         wish = wishes(known, model)
         states = jax.vmap(
@@ -169,7 +176,7 @@ def _diversity(scene: Scene, model: Model, repeats: int) -> Array:
 
 
 def noise_share(
-    key: Key, generate: SamplePath, known: Situations, model: Model, *, repeats: int
+    key: Key, generate: SamplePath, known: EvalWindows, model: Model, *, repeats: int
 ) -> dict[str, Float[Array, ""]]:
     """How much generated paths depend on their noise.
 
@@ -221,3 +228,73 @@ def straight(model: Model) -> SamplePath:
     return functools.partial(
         smgdiff_trajectory.straight, future=config.future, fps=config.fps
     )
+
+
+def _generators(run: Run) -> dict[str, SamplePath]:
+    """Trained trajectory generators by name."""
+    found = {}
+    for folder in sorted(run.folder.glob("paths_*")):
+        model, params = smgdiff_training.load_stage(run, folder.name)
+        found[f"generator, T = {model.paths.num_steps}"] = smgdiff_trajectory.sampler(
+            params, config=model.paths
+        )
+    return found
+
+
+def path_table(
+    run: Run,
+    setting: Setting,
+    *,
+    steps: int,
+    guided: Guidance,
+    starts: int,
+    repeats: int,
+    chunk: int,
+) -> tuple[Rows, dict[str, Any]]:
+    """Table 2: steered players with and without generated paths and guidance.
+
+    Args:
+      run: The run.
+      setting: Of the table.
+      steps: Motion model.
+      guided: Constants of the guidance.
+      starts: Starts of players of a replication.
+      repeats: Players of each start.
+      chunk: Players at a time.
+
+    Returns:
+      The rows, and how much each generator's paths depend on their noise.
+    """
+    model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
+    generators = _generators(run)
+    shares = {
+        name: {
+            k: float(v)
+            for k, v in noise_share(
+                jax.random.key(setting.seed), generate, setting.known, model, repeats=8
+            ).items()
+        }
+        for name, generate in generators.items()
+    }
+    rows = smgdiff_evaluation.real_rows(run, setting)
+    for name, generate in ({"straight paths": straight(model)} | generators).items():
+        for schedule in ("none", "end 2"):
+            plan = smgdiff_guidance.sampler(
+                params,
+                config=model.config,
+                representation=model.representation,
+                guided=smgdiff_guidance.on_schedule(guided, schedule),
+            )
+            play = player(
+                generate,
+                plan,
+                model,
+                ticks=2 * model.config.future,
+                repeats=repeats,
+                chunk=chunk,
+            )
+            scores = score_players(setting, model, play, repeats=repeats, starts=starts)
+            row = smgdiff_evaluation.scores_row(scores)
+            rows[f"{name}, guidance {schedule}"] = row
+            print(f"{name}, guidance {schedule}: done", flush=True)
+    return rows, {"noise of the paths": shares}

@@ -13,7 +13,7 @@ from jaxmotion import reporting
 from jaxmotion.data import selection, windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.systems.camdm import evaluation as camdm_evaluation
+from jaxmotion.systems.camdm import scoring as camdm_scoring
 from tests import samples
 
 LABELS = np.repeat([0, 1], 2)
@@ -43,9 +43,20 @@ def evaluated(kind):
     frames = samples.standing(frames) if kind == "standing" else frames
     repeats = 1 if kind == "standing" else 2
     made = windows.rollout_windows(frames, jnp.asarray(LABELS), skip=60)
-    return camdm_evaluation.evaluation_table(
-        run.model.skeleton, real, dense, made, frames, recognizer, repeats=repeats
-    )
+    skeleton = run.model.skeleton
+    reference = camdm_scoring.make_reference(skeleton, real, dense, recognizer, seed=0)
+    count = reference.count(len(made.label))
+    truth, floor = camdm_scoring.real_rows(reference, count=count, seed=0)
+    row = camdm_scoring.made_row(reference, made, repeats=repeats, count=count, seed=0)
+    report = {
+        "contact_height_m": reference.height,
+        "windows": {"held_out": len(reference.hits), "rollouts": len(made.label)},
+        "fid_windows": count,
+        "health": camdm_scoring.rollout_health(
+            skeleton, frames, fps=30.0, height=reference.root
+        ),
+    }
+    return {TRUTH: truth, FLOOR: floor, "rollouts": row}, report
 
 
 def test_the_rows_and_columns_are_there():
@@ -89,7 +100,7 @@ def test_health_counts_who_stands_although_told_to_walk():
     frames = samples.walking(LABELS[:1])
     broken = frames.root_position.at[0, 50, 1].set(5.0)
     frames = dataclasses.replace(frames, root_position=broken)
-    found = camdm_evaluation.rollout_health(
+    found = camdm_scoring.rollout_health(
         run.model.skeleton, frames, fps=30.0, height=0.95
     )
     assert found == dict(diverged=1, frozen=0, rollouts=1)
@@ -114,14 +125,14 @@ def test_diversity_is_zero_for_characters_that_do_the_same():
         lambda x: jnp.repeat(x, 2, axis=0), samples.walking(np.array([0, 1]))
     )
     found = windows.rollout_windows(same, jnp.asarray(LABELS), skip=60)
-    found = camdm_evaluation.repeat_diversity(run.model.skeleton, found, repeats=2)
+    found = camdm_scoring.repeat_diversity(run.model.skeleton, found, repeats=2)
     assert found.value == pytest.approx(0.0, abs=1e-9) and found.samples == 2
     assert evaluated("walking")[0]["rollouts"]["diversity_m2"].value > 1e-4
 
 
 def test_a_row_without_recognizer_lacks_style_accuracy_only():
     run, _, real, _ = parts()
-    row = camdm_evaluation.metric_row(run.model.skeleton, real, None, height=0.04)
+    row = camdm_scoring.metric_row(run.model.skeleton, real, None, height=0.04)
     expected = dict(evaluated("walking")[0][TRUTH])
     for column in ("style_accuracy_%", "fid"):
         del expected[column]
@@ -134,11 +145,11 @@ def test_frechet_distance_of_a_shift_is_its_square():
     rng = np.random.default_rng(0)
     reference = rng.normal(size=(400, 3)).astype(np.float32)
     shifted = reference + np.array([2.0, 0.0, 0.0], np.float32)
-    cell = camdm_evaluation.frechet_cell(shifted, reference, count=400, seed=0)
+    cell = camdm_scoring.frechet_cell(shifted, reference, count=400, seed=0)
     assert cell.value == pytest.approx(4.0, rel=1e-3)
     # All windows are one subset: five times the same have no interval.
     assert cell.samples == 1 and cell.low is None
-    half = camdm_evaluation.frechet_cell(shifted, reference, count=200, seed=0)
+    half = camdm_scoring.frechet_cell(shifted, reference, count=200, seed=0)
     assert half.samples == 5 and half.low < half.value < half.high
 
 
@@ -146,7 +157,7 @@ def test_halves_of_the_clips_share_no_clip_and_hold_each_style_alike():
     clips, styles = np.repeat(np.arange(14), 5), np.repeat([0, 1, 0], [20, 30, 20])
     halves = set()
     for seed in range(5):
-        own = camdm_evaluation.random_half(clips, styles, seed=seed)
+        own = camdm_scoring.random_half(clips, styles, seed=seed)
         assert not set(clips[own]) & set(clips[~own])
         for style in (0, 1):
             number = len(set(clips[own & (styles == style)]))
@@ -154,7 +165,7 @@ def test_halves_of_the_clips_share_no_clip_and_hold_each_style_alike():
         halves.add(tuple(own))
     assert len(halves) > 1
     with pytest.raises(ValueError, match="expected at least two"):
-        camdm_evaluation.random_half(np.zeros(5, int), np.zeros(5, int), seed=0)
+        camdm_scoring.random_half(np.zeros(5, int), np.zeros(5, int), seed=0)
 
 
 def test_batches_put_together_are_the_whole():
@@ -195,13 +206,13 @@ def test_an_unbiased_distance_is_nearer_to_the_true_one():
     biased, unbiased = [], []
     for seed in range(8):
         features = draw(size=(120, 16)).astype(np.float32) + apart
-        whole = camdm_evaluation.unbiased_cells(features, reference, seed=seed)
+        whole = camdm_scoring.unbiased_cells(features, reference, seed=seed)
         cell = whole["fid_unbiased"]
         assert cell.samples == 120 and cell.low is None
         unbiased.append(cell.value)
         whole = dict(count=120, seed=seed, repeats=1)
-        biased.append(camdm_evaluation.frechet_cell(features, reference, **whole).value)
+        biased.append(camdm_scoring.frechet_cell(features, reference, **whole).value)
     assert np.mean(biased) > 1.4
     error = np.std(unbiased, ddof=1) / np.sqrt(8)
     assert abs(np.mean(unbiased) - 1.0) < max(4 * error, 0.1) < 0.4
-    assert camdm_evaluation.unbiased_cells(features[:19], reference, seed=0) == {}
+    assert camdm_scoring.unbiased_cells(features[:19], reference, seed=0) == {}

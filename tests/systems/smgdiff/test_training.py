@@ -14,6 +14,7 @@ from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import players as smgdiff_players
+from jaxmotion.systems.smgdiff import scoring as smgdiff_scoring
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff.guidance import UNGUIDED
 from tests import ball_walker, tiny
@@ -50,7 +51,7 @@ def setting(run):
         run.model,
         number=16,
         replications=3,
-        recognizer_steps=40,
+        evaluator_steps=40,
         seed=0,
     )
 
@@ -141,7 +142,7 @@ def test_bad_folders_are_named(tmp_path):
 
 def test_situations_hold_what_was_and_what_came(run):
     model = run.model
-    known = smgdiff_evaluation.situations(run.held_out, model, number=10, seed=0)
+    known = smgdiff_scoring.eval_windows(run.held_out, model, number=10, seed=0)
     assert known.future.ball.shape[1:] == (12, 3) and known.past.ball.shape[1:] == (
         4,
         3,
@@ -152,7 +153,7 @@ def test_situations_hold_what_was_and_what_came(run):
     start = np.linalg.norm(known.condition.trajectory.position[:, 0], axis=-1)
     assert (start < 0.1).all()
     with pytest.raises(ValueError, match="expected 4"):
-        smgdiff_evaluation.situations(run.held_out, model, number=2, seed=0)
+        smgdiff_scoring.eval_windows(run.held_out, model, number=2, seed=0)
 
 
 def test_what_really_happened_scores_well(setting):
@@ -243,7 +244,7 @@ def test_the_recognizer_sees_the_ball_no_farther_than_the_reach(run):
     scene = ball_walker.scene(12, speed=1.0)
     far = dataclasses.replace(scene, ball=scene.ball.at[..., 0].add(30.0))
     near, away = (
-        np.asarray(smgdiff_evaluation.recognizer_input(x, representation))
+        np.asarray(smgdiff_scoring.evaluator_input(x, representation))
         for x in (scene, far)
     )
     np.testing.assert_allclose(near[:, :15], away[:, :15], atol=1e-6)

@@ -1,1 +1,0 @@
-"""Parts of experiments/step_sweep.py: what all systems share, and a module a system."""

@@ -1,0 +1,363 @@
+"""One evaluation of several models of a system: points, budgets, rows and times.
+
+A point is a model with a number of steps. All points are trained with the same budget,
+scored with the same noise, commands and samples, and timed in turn, so that what
+disturbs one disturbs all. A system declares its `Bench`; what scores its motion is in
+the system's package, and stands there once, for a table of its own too.
+"""
+
+import dataclasses
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion.evaluation import statistics
+from jaxmotion.evaluation.table import Cell, Row, Rows
+from jaxmotion.typing import Key
+
+# Rows of recorded motion, in the table of every sweep.
+GROUND_TRUTH = "ground truth (held-out clips)"
+NOISE_FLOOR = "noise floor (training clips)"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Point:
+    """One model of a sweep.
+
+    Attributes:
+      name: As on the command line, and in the plot: "8", or "2+3".
+      row: Its row in the table.
+      folder: Name for files and folders.
+      parts: Steps; for AAMDM polish steps and draft steps.
+    """
+
+    name: str
+    row: str
+    folder: str
+    parts: tuple[int, ...]
+
+    @property
+    def steps(self) -> int:
+        """Network calls of one sample."""
+        return sum(self.parts)
+
+
+def _number(text: str, least: int) -> int:
+    if not re.fullmatch(r"[0-9]+", text) or int(text) < least:
+        raise ValueError(
+            f"steps: {text!r} is no number of steps, expected a whole number of at "
+            f"least {least}"
+        )
+    return int(text)
+
+
+def _check_distinct(points: Sequence[Point]) -> tuple[Point, ...]:
+    if not points:
+        raise ValueError("steps: there are none, expected at least one number of steps")
+    seen: set[tuple[int, ...]] = set()
+    for point in points:
+        if point.parts in seen:
+            raise ValueError(
+                f"steps: {point.row} is given twice, expected distinct ones"
+            )
+        seen.add(point.parts)
+    return tuple(points)
+
+
+def plain_points(texts: Sequence[str]) -> tuple[Point, ...]:
+    """Numbers of steps T, from texts such as "8".
+
+    Raises:
+      ValueError: if one is no positive number, or given twice.
+    """
+    numbers = [_number(text, 1) for text in texts]
+    return _check_distinct(
+        [
+            Point(name=str(n), row=f"T = {n}", folder=f"T{n}", parts=(n,))
+            for n in numbers
+        ]
+    )
+
+
+def paired_points(texts: Sequence[str], *, drafts: int) -> tuple[Point, ...]:
+    """Polish steps preceded by draft steps.
+
+    Args:
+      texts: "2+3" for 2 polish steps after 3 draft steps (either may be 0), or "2" for
+        2 after the usual number of draft steps.
+      drafts: That number.
+
+    Returns:
+      The points, in this order.
+
+    Raises:
+      ValueError: if one is neither, has no step at all, or is given twice.
+    """
+    if drafts < 0:
+        raise ValueError(f"drafts: {drafts} draft steps, expected 0 or more")
+    points = []
+    for text in texts:
+        polish, plus, draft = text.partition("+")
+        both = (
+            (_number(polish, 0), _number(draft, 0))
+            if plus
+            else (_number(polish, 1), drafts)
+        )
+        if sum(both) < 1:
+            raise ValueError(f"steps: {text!r} has no step, expected at least one")
+        points.append(
+            Point(
+                name=f"{both[0]}+{both[1]}",
+                row=f"{both[0]} polish + {both[1]} draft",
+                folder=f"polish{both[0]}_draft{both[1]}",
+                parts=both,
+            )
+        )
+    return _check_distinct(points)
+
+
+BudgetName = Literal["quick", "full"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Amount:
+    """One number of a budget.
+
+    Attributes:
+      quick: For half an hour of two cores, training of five models included.
+      full: As long as the figures of the README, or longer.
+      meaning: What it is.
+      training: Whether trained models depend on it; otherwise only their evaluation.
+    """
+
+    quick: float | int
+    full: float | int
+    meaning: str
+    training: bool = True
+
+
+Amounts = dict[str, Amount]
+Budget = dict[str, Any]
+
+
+def resolve(amounts: Amounts, name: str, changes: Sequence[str] = ()) -> Budget:
+    """The numbers of a budget, some of them changed.
+
+    Args:
+      amounts: Of the system.
+      name: "quick" or "full".
+      changes: "number=value", for numbers of the budget.
+
+    Returns:
+      Whole numbers where the budget's are whole.
+
+    Raises:
+      ValueError: names the field that is wrong.
+    """
+    if name not in BudgetName.__args__:
+        raise ValueError(
+            f"budget: unknown budget {name!r}, expected "
+            f"{' or '.join(BudgetName.__args__)}"
+        )
+    found = {key: getattr(amount, name) for key, amount in amounts.items()}
+    for change in changes:
+        key, equals, text = change.partition("=")
+        if not equals or key not in found:
+            raise ValueError(
+                f"change: {change!r} changes no number of the budget, expected "
+                f"name=value with a name of {', '.join(found)}"
+            )
+        kind = type(found[key])
+        try:
+            value = kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise ValueError(f"change: {change!r}, expected {what}") from None
+        if not 0 < value < float("inf"):
+            raise ValueError(f"change: {change!r}, expected a positive number")
+        found[key] = value
+    return found
+
+
+def training_part(amounts: Amounts, budget: Budget) -> Budget:
+    """The numbers of a budget that trained models depend on."""
+    return {key: budget[key] for key, amount in amounts.items() if amount.training}
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Job:
+    """One sweep of one system.
+
+    Attributes:
+      points: Step counts.
+      data: Files of clips.
+      models: Folder of the trained models.
+      budget: Numbers, from `resolve`.
+      replications: Of the evaluation.
+      seed: Of everything random.
+      evaluator: A frozen evaluator; None to train one.
+    """
+
+    points: tuple[Point, ...]
+    data: tuple[Path, ...]
+    models: Path
+    budget: Budget
+    replications: int
+    seed: int
+    evaluator: Any = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """The same evaluation for every trained model of a sweep.
+
+    Attributes:
+      real: Rows of recorded motion: `GROUND_TRUTH` and `NOISE_FLOOR`.
+      score: Row of a model; every model gets the same noise and commands.
+      sampler: A jitted function of a key that makes one sample at batch 1, with the
+        parameters as constants.
+      describe: JSON: data source, sample counts, evaluator.
+    """
+
+    real: Rows
+    score: Callable[[Point], Row]
+    sampler: Callable[[Point], Callable[[Key], Any]]
+    describe: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Bench:
+    """What a system with a number of steps brings to a sweep.
+
+    Attributes:
+      data: Files of clips, where none are given.
+      amounts: Its budgets.
+      points: Reads step counts: `(texts, drafts=...) -> points`.
+      train: Options of the `train` command of the system's script that leave a point's
+        model in the job's folder; one that is there is left alone.
+      show: That command of the script, with its options, that writes a motion of a
+        point's model to look at, but for the folder that it writes to.
+      prepare: The evaluation of a job whose models are trained.
+      quality: Column of the plot, lower is better.
+      sample: What one sample is, for the time at batch 1.
+      evaluator: Kind of its evaluator; None if it needs none.
+    """
+
+    data: tuple[Path, ...]
+    amounts: Amounts
+    points: Callable[..., tuple[Point, ...]]
+    train: Callable[[Job, Point], dict[str, Any]]
+    show: Callable[[Job, Point], tuple[str, dict[str, Any]]]
+    prepare: Callable[[Job], Evaluation]
+    quality: str
+    sample: str
+    evaluator: str | None = None
+
+
+def milliseconds(
+    calls: dict[str, Callable[[Key], Any]],
+    *,
+    rounds: int = 100,
+    seconds: float = 60.0,
+    least: int = 10,
+) -> dict[str, np.ndarray]:
+    """Times several programs in turn.
+
+    Args:
+      calls: Jitted functions of a key, by name; two calls of each before the others
+        compile it and warm it up.
+      rounds: Calls of each, at most.
+      seconds: No further round begins once they have taken so long in all.
+      least: Rounds, at least.
+
+    Returns:
+      Milliseconds of each call.
+    """
+    names = list(calls)
+    for name in names:
+        for i in range(2):
+            jax.block_until_ready(calls[name](jax.random.key(i)))
+    times: dict[str, list[float]] = {name: [] for name in names}
+    begun = time.perf_counter()
+    for i in range(rounds):
+        # The order moves on, so that none always runs after the same other.
+        turn = i % len(names)
+        for name in names[turn:] + names[:turn]:
+            key = jax.random.key(i)
+            start = time.perf_counter()
+            jax.block_until_ready(calls[name](key))
+            times[name].append(1000 * (time.perf_counter() - start))
+        if i + 1 >= least and time.perf_counter() - begun > seconds:
+            break
+    return {name: np.array(found) for name, found in times.items()}
+
+
+def call_time(
+    run: Callable[[Key], Any], *, parts: int = 1, seconds: float = 2.0, least: int = 5
+) -> Cell:
+    """Time of one call, for a column beside the scores; benchmarks measure better.
+
+    Args:
+      run: A jitted function of a key.
+      parts: Of the call's time that is given, such as its frames.
+      seconds: Calls go on for so long, but for no more than 200 of them.
+      least: Number of calls, at least.
+
+    Returns:
+      Median in milliseconds, with the ends of the middle half.
+    """
+    times = milliseconds({"": run}, rounds=200, seconds=seconds, least=least)[""]
+    low, middle, high = (float(x) for x in np.quantile(times, [0.25, 0.5, 0.75]))
+    return Cell(
+        value=middle / parts, low=low / parts, high=high / parts, samples=times.size
+    )
+
+
+def time_cells(times: np.ndarray, *, seed: int) -> Row:
+    """Median with its 95 % bootstrap interval, and 95th percentile.
+
+    Args:
+      times: Milliseconds.
+      seed: Of the resamples.
+
+    Returns:
+      Two columns.
+    """
+    found = statistics.bootstrap_interval(
+        jax.random.key(seed), jnp.asarray(times, jnp.float32), jnp.median
+    )
+    estimate, low, high = (float(x) for x in found)
+    return {
+        "p50 ms": Cell(value=estimate, low=low, high=high, samples=times.size),
+        "p95 ms": Cell(value=float(np.percentile(times, 95)), samples=times.size),
+    }
+
+
+def measure(evaluation: Evaluation, job: Job) -> tuple[Rows, dict[str, float]]:
+    """Scores all models, then times them in turn.
+
+    Returns:
+      The table, and the seconds that each row's scores took.
+    """
+    rows, seconds = dict(evaluation.real), {}
+    for point in job.points:
+        started = time.perf_counter()
+        rows[point.row] = evaluation.score(point)
+        seconds[f"scores, {point.row}"] = time.perf_counter() - started
+        print(f"{point.row}: scored", flush=True)
+    calls = {point.row: evaluation.sampler(point) for point in job.points}
+    for row, times in milliseconds(calls).items():
+        rows[row] = rows[row] | time_cells(times, seed=job.seed)
+    return rows, seconds
+
+
+def has_failed(cells: Row) -> bool:
+    """Whether most rollouts diverge or freeze; then no distance speaks for them."""
+    counts = [cells[name] for name in ("diverged", "frozen") if name in cells]
+    return any(2 * cell.value > cell.samples for cell in counts)

@@ -1,0 +1,210 @@
+"""Rows of a run beside real motions, with intervals over replications.
+
+One evaluation, for the table of a run and for a sweep over numbers of steps.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+from jaxtyping import Array
+
+from jaxmotion.evaluation import bench, by_frame, columns
+from jaxmotion.evaluation.bench import Amount
+from jaxmotion.evaluation.table import Cell, Row, Rows
+from jaxmotion.systems.emdm import action_evaluation, text_evaluation
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
+from jaxmotion.systems.emdm.scoring import ORDER, Many, RowScorer, Settings
+from jaxmotion.typing import Key
+
+# Rows with so many network calls a motion are replicated less often.
+_LONG = 500
+_CHUNK = 32
+
+
+def calls(config: emdm_model.Config, row: str) -> int:
+    """Network calls of one motion of a row."""
+    samplers = emdm_training.SAMPLERS
+    return samplers[row][1] if row in samplers else config.num_steps
+
+
+def trained_rows(folder: Path) -> tuple[str, ...]:
+    """Rows and samplers that a run folder can show."""
+    rows = [
+        row for row in emdm_training.ROWS if (folder / row / "checkpoints").is_dir()
+    ]
+    more = [name for name, (row, _) in emdm_training.SAMPLERS.items() if row in rows]
+    return (*rows, *more)
+
+
+def score_row(
+    scorer: RowScorer, many: Many, settings: Settings, *, count: int
+) -> tuple[Row, Key]:
+    """Scores the first `count` replications; also returns the key of the first."""
+    key = jax.random.key(settings.seed + 1)
+    keys = jax.random.split(key, settings.replications)
+    scores = [scorer.score(key, many) for key in keys[:count]]
+    return columns.row(scores, order=ORDER), keys[0]
+
+
+def evaluate_run(
+    folder: Path,
+    settings: Settings,
+    *,
+    rows: tuple[str, ...] = (),
+    long_replications: int = 2,
+) -> tuple[Rows, dict[str, by_frame.ByFrame], RowScorer]:
+    """Scores every row of a run folder.
+
+    Args:
+      folder: The run folder.
+      settings: How.
+      rows: Which rows and samplers; none: all that were trained.
+      long_replications: Replications of rows with 500 network calls and more.
+
+    Returns:
+      The table, jerk and slide by place in a token, and what scored.
+
+    Raises:
+      ValueError: if nothing was trained, or a row was not.
+    """
+    value = emdm_training.read_config(folder)
+    rows = rows or trained_rows(folder)
+    if not rows:
+        raise ValueError(f"{folder}: no row was trained")
+    kind = text_evaluation if value["task"] == "text" else action_evaluation
+    scorer = kind.row_scorer(folder, settings)
+    found: Rows = dict(scorer.real)
+    places: dict[str, by_frame.ByFrame] = {}
+    for row in rows:
+        begun = time.perf_counter()
+        params, config = emdm_training.load_row(folder, row)
+        sample = emdm_training.row_sampler(params, config, row)
+        number, scale = calls(config, row), scorer.scale
+        count = long_replications if number >= _LONG else settings.replications
+        many = emdm_training.sample_many(sample, chunk=_CHUNK)
+        cells, key = score_row(scorer, many, settings, count=count)
+        one = jax.jit(lambda key: sample(key, scorer.one, scale=scale))  # noqa: B023
+        found[row] = cells | {
+            # Per frame, as the paper gives it.
+            "ms a frame": bench.call_time(one, parts=config.frames, least=3),
+            "network calls": Cell(value=float(number)),
+        }
+        if scorer.by_frame is not None:
+            places[row] = scorer.by_frame(key, many, config.frames_per_token)
+        seconds = time.perf_counter() - begun
+        print(f"{row}: {count} x {scorer.samples}, {seconds:.0f} s", flush=True)
+    return found, places, scorer
+
+
+_ROW = "emdm"
+_AMOUNTS = {
+    "updates": Amount(quick=1000, full=5000, meaning="updates of each GAN"),
+    "batch": Amount(quick=32, full=32, meaning="motions an update"),
+    "width": Amount(quick=128, full=128, meaning="channels of a token"),
+    "depth": Amount(quick=4, full=4, meaning="layers"),
+    "hidden": Amount(quick=384, full=384, meaning="channels of feed-forward layers"),
+    "discriminator_width": Amount(
+        quick=128, full=128, meaning="channels of the discriminator's first layers"
+    ),
+    "frames": Amount(quick=60, full=60, meaning="longest motion, at 15 per second"),
+    "least": Amount(quick=10, full=10, meaning="fewest clips of an action"),
+    "held_out": Amount(
+        quick=0.1, full=0.1, meaning="part of the clips kept for evaluation"
+    ),
+    "samples": Amount(
+        quick=225,
+        full=1000,
+        meaning="motions of a replication, rounded down to as many of each action",
+        training=False,
+    ),
+    "evaluator_updates": Amount(
+        quick=500,
+        full=1500,
+        meaning="updates of the evaluator, which the folder of models keeps",
+    ),
+}
+_DATA = (Path("data/bandai1.npz"), Path("data/bandai2.npz"))
+
+
+def _folder(job: bench.Job, point: bench.Point) -> Path:
+    return job.models / point.folder
+
+
+def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
+    budget = job.budget
+    names = ("least", "frames", "held_out", "batch", "width", "depth", "hidden")
+    options = {name: budget[name] for name in (*names, "discriminator_width")}
+    if job.data != _DATA:
+        options["merge"] = ()  # the usual data's labels that name one action
+    return options | dict(
+        task="action",
+        rows=(_ROW,),
+        data=job.data,
+        out=_folder(job, point),
+        steps=budget["updates"],
+        diffusion_steps=point.steps,
+        seed=job.seed,
+    )
+
+
+def _show(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
+    run = emdm_data.load_run(_folder(job, point))
+    return "sample", dict(run=run.folder, action=run.actions[:1], seed=job.seed)
+
+
+def _prepare(job: bench.Job) -> bench.Evaluation:
+    run, budget = emdm_data.load_run(_folder(job, job.points[0])), job.budget
+    settings = Settings(
+        samples=budget["samples"],
+        replications=job.replications,
+        evaluator_steps=budget["evaluator_updates"],
+        evaluator=job.evaluator,
+        seed=job.seed,
+    )
+    scorer = action_evaluation.row_scorer(run.folder, settings)
+    floor, truth = scorer.real.values()
+
+    def load(point: bench.Point) -> emdm_model.Sample:
+        params, config = emdm_training.load_row(_folder(job, point), _ROW)
+        return emdm_training.row_sampler(params, config, _ROW)
+
+    def score(point: bench.Point) -> Row:
+        many = emdm_training.sample_many(load(point), chunk=_CHUNK)
+        found, _ = score_row(scorer, many, settings, count=job.replications)
+        return {column: found[column] for column in truth}
+
+    def sampler(point: bench.Point) -> Callable[[Key], Array]:
+        sample = load(point)
+        return jax.jit(lambda key: sample(key, scorer.one, scale=scorer.scale))
+
+    actions = len(run.actions)
+    return bench.Evaluation(
+        real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: floor},
+        score=score,
+        sampler=sampler,
+        describe={
+            "source": run.clips.source,
+            "samples": f"{scorer.samples} motions, {scorer.samples // actions} of each "
+            f"of {actions} actions; FID against as many real ones",
+            "motions": scorer.samples,
+            "evaluator": scorer.describe,
+        },
+    )
+
+
+BENCH = bench.Bench(
+    data=_DATA,
+    amounts=_AMOUNTS,
+    points=lambda texts, drafts: bench.plain_points(texts),
+    train=_train,
+    show=_show,
+    prepare=_prepare,
+    quality="FID",
+    sample="one motion",
+    evaluator="action",
+)
