@@ -61,8 +61,8 @@ class Train:
     data: Path = Path("data/lafan1.npz")
     out: Path = Path("runs/aamdm")
     rows: tuple[str, ...] = ()
-    field: str = "theme"
-    labels: tuple[str, ...] = ("walk", "run")
+    field: str = aamdm_evaluation.FIELD
+    labels: tuple[str, ...] = aamdm_evaluation.LABELS
     fps: float = 60.0
     held_out: float = 0.1
     mirror: bool = True
@@ -106,9 +106,9 @@ class Evaluate:
     out: Path | None = None
     rollouts: int = 16
     seconds: float = 1000 / 60
-    course: Course = "forward"
-    speed: float = 1.2
-    scale: float = 10.0
+    course: Course = aamdm_evaluation.COURSE
+    speed: float = aamdm_evaluation.SPEED
+    scale: float = aamdm_evaluation.SCALE
     amdm_scale: float = 1.0
     long_minutes: float = 10.0
     long_rollouts: int = 16
@@ -137,9 +137,9 @@ class Rollout:
     row: str = "aamdm"
     steered: bool = True
     seconds: float = 20.0
-    course: Course = "forward"
-    speed: float = 1.2
-    scale: float = 10.0
+    course: Course = aamdm_evaluation.COURSE
+    speed: float = aamdm_evaluation.SPEED
+    scale: float = aamdm_evaluation.SCALE
     out: Path | None = None
     seed: int = 0
 

@@ -214,10 +214,10 @@ class Evaluate:
       speed: Meters per second; None for each style's own median walking speed.
       contents: Contents of the clips to compare with; none: all of the run's.
       chunk: Characters to run at a time, at most.
-      recognizer_steps: Updates of the style recognizer, if it is trained here.
-      evaluator: File of a frozen style recognizer, from evaluator.py; None trains one
-        here.
-      seed: Of poses, noise, recognizer and subsets.
+      evaluator_steps: Updates of the evaluator of styles, if it is trained here.
+      evaluator: File of a frozen evaluator of styles, from evaluator.py; None trains
+        one here.
+      seed: Of poses, noise, evaluator and subsets.
     """
 
     run: Path = Path("runs/camdm")
@@ -227,9 +227,9 @@ class Evaluate:
     seconds: float = 60.0
     course: Course = "forward"
     speed: float | None = None
-    contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right")
+    contents: tuple[str, ...] = camdm_evaluation.CONTENTS
     chunk: int = 5
-    recognizer_steps: int = 1500
+    evaluator_steps: int = 1500
     evaluator: Path | None = None
     seed: int = 0
 
@@ -307,7 +307,7 @@ def evaluate(args: Evaluate) -> None:
         seconds=args.seconds,
         speed=args.speed,
         chunk=args.chunk,
-        recognizer_steps=args.recognizer_steps,
+        evaluator_steps=args.evaluator_steps,
         seed=args.seed,
         evaluator=evaluator,
     )

@@ -1,9 +1,9 @@
 """CAMDM's changes of style: how many succeed, how soon, with and without guidance.
 
-Characters walk in one style, are told another, and a recognizer looks for it in what
+Characters walk in one style, are told another, and an evaluator looks for it in what
 follows: the paper's tables 2 and 4, where people judged. Rows are the run-time's
 constants of the paper, of its release, without guidance on the past, and characters who
-were told nothing, in whom what is found is a mistake of the recognizer's.
+were told nothing, in whom what is found is a mistake of the evaluator's.
 
 Examples:
   python experiments/camdm_transitions.py --run runs/camdm
@@ -50,10 +50,10 @@ class Config:
         median speed.
       contents: Contents of the clips to start from; none: all of the run's.
       chunk: Characters to run at a time, at most.
-      recognizer_steps: Updates of the style recognizer, if it is trained here.
-      evaluator: File of a frozen style recognizer, from evaluator.py; None trains one
-        here.
-      seed: Of poses, noise and recognizer.
+      evaluator_steps: Updates of the evaluator of styles, if it is trained here.
+      evaluator: File of a frozen evaluator of styles, from evaluator.py; None trains
+        one here.
+      seed: Of poses, noise and evaluator.
     """
 
     run: Path = Path("runs/camdm")
@@ -65,7 +65,7 @@ class Config:
     course: Course = "forward"
     contents: tuple[str, ...] = ("walk", "walk-turn-left", "walk-turn-right")
     chunk: int = 14
-    recognizer_steps: int = 1500
+    evaluator_steps: int = 1500
     evaluator: Path | None = None
     seed: int = 0
 
@@ -91,7 +91,7 @@ def measure(args: Config) -> None:
     )
     key_fit, _ = jax.random.split(jax.random.key(args.seed))
     judge = camdm_evaluation.load_evaluator(
-        key_fit, run, evaluator, num_steps=args.recognizer_steps
+        key_fit, run, evaluator, num_steps=args.evaluator_steps
     )
     rows = camdm_transitions.evaluate_transitions(
         run, changes, CONTROLS, judge, chunk=args.chunk, seed=args.seed

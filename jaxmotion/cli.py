@@ -78,7 +78,7 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("steps", "updates", "path_steps", "window_steps"), _UPDATES),
     **dict.fromkeys(("autoencoder_steps", "polisher_steps"), _UPDATES),
     **dict.fromkeys(("generator_steps", "amdm_steps", "full_pose_steps"), _UPDATES),
-    **dict.fromkeys(("ddpm_steps", "evaluator_steps", "recognizer_steps"), _UPDATES),
+    **dict.fromkeys(("ddpm_steps", "evaluator_steps"), _UPDATES),
 }
 
 

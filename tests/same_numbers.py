@@ -45,10 +45,10 @@ TRAIN = {
     "--batch 2 --held-out 0.3",
 }
 EVALUATE = {
-    "camdm": "--rollouts 2 --seconds 4 --recognizer-steps 20 --contents",
+    "camdm": "--rollouts 2 --seconds 4 --evaluator-steps 20 --contents",
     "aamdm": "--rows aamdm --rollouts 4 --seconds 1 --long-minutes 0",
     "emdm": "--samples 16 --replications 2 --long-replications 2 --evaluator-steps 20",
-    "smgdiff": "--tables steps --windows 8 --replications 2 --recognizer-steps 20",
+    "smgdiff": "--tables steps --windows 8 --replications 2 --evaluator-steps 20",
 }
 ROLLOUT = {
     "camdm": "rollout --seconds 2 --style calm",

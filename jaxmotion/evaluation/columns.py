@@ -1,17 +1,13 @@
 """Cells of a table from what was measured: scores of replications, and times."""
 
-import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Cell
-from jaxmotion.typing import Key
 
 # Words in the names of scores that lie in 0..1.
 _PROPORTIONS = ("accuracy", "precision", "ratio", "missed part")
@@ -41,31 +37,3 @@ def row(
         name: table.cell(jnp.stack([one[name] for one in scores]), bounds=bounds(name))
         for name in names
     }
-
-
-def milliseconds(
-    run: Callable[[Key], Any], *, parts: int = 1, seconds: float = 2.0, least: int = 5
-) -> Cell:
-    """Time of one call, for a column beside the scores; benchmarks measure better.
-
-    Args:
-      run: A jitted function of a key, whose result is waited for; the first call, which
-        compiles, does not count.
-      parts: Of the call's time that is given, such as its frames.
-      seconds: Calls go on for so long, but for no more than 200 of them.
-      least: Number of calls, at least.
-
-    Returns:
-      Median, with the ends of the middle half.
-    """
-    jax.block_until_ready(run(jax.random.key(0)))
-    times: list[float] = []
-    while len(times) < least or (sum(times) < seconds and len(times) < 200):
-        key = jax.random.key(len(times))
-        begun = time.perf_counter()
-        jax.block_until_ready(run(key))
-        times.append(time.perf_counter() - begun)
-    low, middle, high = np.quantile(times, [0.25, 0.5, 0.75]) * 1000 / parts
-    return Cell(
-        value=float(middle), low=float(low), high=float(high), samples=len(times)
-    )

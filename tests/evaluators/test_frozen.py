@@ -268,7 +268,7 @@ def setting_of(ball, evaluator):
         model,
         number=600,
         replications=2,
-        recognizer_steps=20,
+        evaluator_steps=20,
         seed=0,
         evaluator=evaluator,
     )

@@ -181,7 +181,7 @@ def test_a_rollout_is_written_as_bvh_gif_and_page(call, trained, tmp_path):
 @pytest.mark.slow
 def test_an_evaluation_writes_its_table(call, trained):
     call(
-        f"evaluate --run {trained} --rollouts 2 --seconds 4 --recognizer-steps 2 "
+        f"evaluate --run {trained} --rollouts 2 --seconds 4 --evaluator-steps 2 "
         "--chunk 2"
     )
     check_evaluation(trained / "evaluation", 2)
@@ -280,7 +280,7 @@ def test_released_weights_become_a_model_that_rolls_out(call, released):
 def test_released_weights_are_evaluated(call, released):
     call(
         f"evaluate --run {released}/released.npz --rollouts 2 --seconds 4 "
-        "--recognizer-steps 2 --chunk 2"
+        "--evaluator-steps 2 --chunk 2"
     )
     folder = released / "released" / "evaluation"
     assert json.loads((folder / "metrics.json").read_text())["rows"]["rollouts"]
@@ -413,7 +413,7 @@ def test_from_a_shell_train_resume_evaluate_and_roll_out(data, tmp_path):
     for line in (
         f"train --data {data} --out {folder} {SIZES} --steps 2",
         f"train --data {data} --out {folder} {SIZES} --steps 4 --override",
-        f"evaluate --run {folder} --rollouts 8 --seconds 6 --recognizer-steps 30",
+        f"evaluate --run {folder} --rollouts 8 --seconds 6 --evaluator-steps 30",
         f"rollout --run {folder} --style zombie --seconds 3",
     ):
         done = run(line)

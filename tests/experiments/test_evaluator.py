@@ -173,7 +173,7 @@ def test_camdm_is_judged_alike_twice(invoke, tmp_path):
     for name in ("a", "b"):
         invoke("camdm", f"{line} --evaluator {path} --out {tmp_path / name}")
     check_same([tmp_path / "a", tmp_path / "b"], made, path)
-    invoke("camdm", f"{line} --recognizer-steps 2 --out {tmp_path / 'here'}")
+    invoke("camdm", f"{line} --evaluator-steps 2 --out {tmp_path / 'here'}")
     assert "(trained here)" in (tmp_path / "here" / "table.md").read_text()
 
 

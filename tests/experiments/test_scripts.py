@@ -91,7 +91,7 @@ OUT_OF_RANGE = [
     ("camdm", "train --seed -1"),
     ("camdm", "train --seed 4294967296"),
     ("camdm", "evaluate --rollouts 0"),
-    ("camdm", "evaluate --recognizer-steps 0"),
+    ("camdm", "evaluate --evaluator-steps 0"),
     ("camdm", "rollout --seconds 0"),
     ("camdm", "speeds --speeds 1 nan"),
     ("camdm_transitions", "--before 0"),

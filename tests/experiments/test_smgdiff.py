@@ -16,7 +16,7 @@ SIZES = (
     "--width 16 --depth 1 --steps 10 --draft-steps 10 --path-steps 10 --batch 4 "
     "--held-out 0.3"
 )
-SHORT = "--windows 8 --replications 2 --recognizer-steps 20 --starts 2 --repeats 2"
+SHORT = "--windows 8 --replications 2 --evaluator-steps 20 --starts 2 --repeats 2"
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 

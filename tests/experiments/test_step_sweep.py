@@ -4,6 +4,8 @@ import csv
 import dataclasses
 import functools
 import json
+import sys
+import types
 from pathlib import Path
 
 import jax
@@ -12,35 +14,24 @@ from PIL import Image
 
 from jaxmotion.data import bvh_text, clips_io, procedural
 from jaxmotion.data.ball_clips import save_ball_clips
-from jaxmotion.evaluation import table
+from jaxmotion.evaluation import bench, table
 from jaxmotion.evaluators import frozen
+from jaxmotion.systems import registry
 from tests import ball_walker, samples
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "experiments" / "step_sweep.py"
 TINY = (
     "--replications 2 --change updates=2 batch=4 width=16 depth=1 warmup=1 "
-    "held_out=0.4 seconds=4 recognizer_updates=2 chunk=2 rollout_seconds=0.5"
+    "held_out=0.4 seconds=4 evaluator_updates=2 chunk=2 rollout_seconds=0.5"
 )
 TIMES = ("p50 ms", "p95 ms")
 
 
-def made_up(load, trained):
+def made_up(trained):
     """A system whose models are files with a number, and whose scores are noise."""
-    budgets, points, system = (
-        load(f"sweeps.{name}") for name in ("budgets", "points", "system")
-    )
 
-    def trainer(job):
-        def train(point):
-            path = job.models / point.folder
-            if not path.exists():
-                path.write_text(str(job.budget["updates"] / point.steps))
-                trained.append(point.steps)
-
-        return train
-
-    def bench(job):
+    def prepare(job):
         def row(value):
             noise = jax.random.normal(jax.random.key(job.seed), (job.replications,))
             one = table.Cell(value=1.0)
@@ -51,28 +42,44 @@ def made_up(load, trained):
                 return {"one": table.Cell(value=float("nan"))}
             return row(float((job.models / point.folder).read_text()))
 
-        return system.Bench(
-            real={system.GROUND_TRUTH: row(1.0), system.NOISE_FLOOR: row(0.5)},
+        return bench.Evaluation(
+            real={bench.GROUND_TRUTH: row(1.0), bench.NOISE_FLOOR: row(0.5)},
             score=score,
             sampler=lambda point: jax.jit(jax.random.normal),
-            rollout=lambda point, folder: (folder / "seen.txt").write_text(point.name),
             describe={"source": "noise", "samples": "one number"},
         )
 
-    return system.System(
+    def train(options):
+        if not options["path"].exists():
+            options["path"].write_text(str(options["updates"] / options["steps"]))
+            trained.append(options["steps"])
+
+    def draw(options):
+        options["out"].mkdir(parents=True)
+        (options["out"] / "seen.txt").write_text(options["name"])
+
+    own = bench.Bench(
         data=(),
         amounts={
-            "updates": budgets.Amount(quick=8, full=80, meaning="of nothing"),
-            "length": budgets.Amount(
+            "updates": bench.Amount(quick=8, full=80, meaning="of nothing"),
+            "length": bench.Amount(
                 quick=1.5, full=2.0, meaning="of nothing", training=False
             ),
         },
-        points=lambda texts, drafts: points.plain(texts),
-        trainer=trainer,
-        bench=bench,
+        points=lambda texts, drafts: bench.plain_points(texts),
+        train=lambda job, point: dict(
+            path=job.models / point.folder,
+            updates=job.budget["updates"],
+            steps=point.steps,
+        ),
+        show=lambda job, point: ("draw", {"name": point.name}),
+        prepare=prepare,
         quality="fid",
         sample="a number",
     )
+    script = types.SimpleNamespace(Train=dict, train=train, Draw=dict, draw=draw)
+    kind = type("Noise", (registry.System,), {"bench": own})
+    return kind(name="noise", title="Noise", paper="none"), script
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +89,12 @@ def trained():
 
 
 @pytest.fixture(scope="module")
-def call(load, invoke, trained):
-    """Runs a command line; there is a fifth system, "noise"."""
+def call(invoke, trained):
+    """Runs a command line; there is a fifth system, "noise", with a script."""
+    system, script = made_up(trained)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(load("step_sweep").SYSTEMS, "noise", made_up(load, trained))
+        patch.setitem(registry.SYSTEMS, "noise", system)
+        patch.setitem(sys.modules, "noise", script)
         yield functools.partial(invoke, "step_sweep")
 
 
@@ -120,15 +129,15 @@ def check_same(first, second):
 # --- step counts and budgets --------------------------------------------------------
 
 
-def test_step_counts_keep_their_order(load):
-    points = load("sweeps.points").plain(("8", "2", "32"))
+def test_step_counts_keep_their_order():
+    points = bench.plain_points(("8", "2", "32"))
     assert [p.steps for p in points] == [8, 2, 32]
     assert [p.name for p in points] == ["8", "2", "32"]
     assert len({p.folder for p in points} | {p.row for p in points}) == 6
 
 
 def test_polish_steps_have_draft_steps(load):
-    points = load("sweeps.points").pairs(("2", "0+3", "2+10"), drafts=3)
+    points = bench.paired_points(("2", "0+3", "2+10"), drafts=3)
     assert [p.parts for p in points] == [(2, 3), (0, 3), (2, 10)]
     assert [p.steps for p in points] == [5, 3, 12]
     # The rows that experiments/aamdm.py knows.
@@ -146,9 +155,9 @@ def test_polish_steps_have_draft_steps(load):
         ((), "steps: there are none"),
     ],
 )
-def test_what_is_no_step_count_is_named(load, texts, message):
+def test_what_is_no_step_count_is_named(texts, message):
     with pytest.raises(ValueError, match=message):
-        load("sweeps.points").plain(texts)
+        bench.plain_points(texts)
 
 
 @pytest.mark.parametrize(
@@ -161,25 +170,25 @@ def test_what_is_no_step_count_is_named(load, texts, message):
         (("2",), -1, "drafts: -1"),
     ],
 )
-def test_what_is_no_pair_is_named(load, texts, drafts, message):
+def test_what_is_no_pair_is_named(texts, drafts, message):
     with pytest.raises(ValueError, match=message):
-        load("sweeps.points").pairs(texts, drafts=drafts)
+        bench.paired_points(texts, drafts=drafts)
 
 
-def test_a_budget_is_changed_by_name(load):
-    budgets, amounts = load("sweeps.budgets"), load("sweeps.camdm").AMOUNTS
-    quick = budgets.resolve(amounts, "quick")
-    changed = budgets.resolve(amounts, "quick", ("updates=7", "seconds=5"))
+def test_a_budget_is_changed_by_name():
+    amounts = registry.get("camdm").bench.amounts
+    quick = bench.resolve(amounts, "quick")
+    changed = bench.resolve(amounts, "quick", ("updates=7", "seconds=5"))
     assert changed == quick | {"updates": 7, "seconds": 5.0}
     assert isinstance(changed["updates"], int)
-    trained = budgets.training_part(amounts, changed)
+    trained = bench.training_part(amounts, changed)
     assert "updates" in trained and "seconds" not in trained
 
 
-def test_the_help_has_every_number_of_every_budget(load, help_of):
+def test_the_help_has_every_number_of_every_budget(help_of):
     text = help_of("step_sweep")
-    for system in load("step_sweep").SYSTEMS.values():
-        for name, amount in system.amounts.items():
+    for system in registry.SYSTEMS.values():
+        for name, amount in system.bench.amounts.items():
             wanted = f"{name} {amount.quick:g} / {amount.full:g}: {amount.meaning}"
             assert wanted in text
 
@@ -269,8 +278,8 @@ def test_a_model_without_a_number_is_in_the_table_alone(call, tmp_path):
     assert (tmp_path / "pareto.png").exists()
 
 
-def test_distances_of_rollouts_that_diverge_stand_for_nothing(load):
-    fails = load("sweeps.report")._fails
+def test_distances_of_rollouts_that_diverge_stand_for_nothing():
+    fails = bench.has_failed
     count = lambda n: table.Cell(value=float(n), samples=40)  # noqa: E731
     assert fails({"diverged": count(21)}) and fails({"frozen": count(40)})
     assert not fails({"diverged": count(20), "frozen": count(0)})
@@ -296,14 +305,14 @@ SYSTEMS = {
         "1 2",
         "ball",
         "--replications 2 --change updates=10 draft_updates=10 batch=4 width=16 "
-        "depth=1 held_out=0.3 windows=8 recognizer_updates=20 rollout_seconds=0.5",
+        "depth=1 held_out=0.3 windows=8 evaluator_updates=20 rollout_seconds=0.5",
     ),
     "emdm": (
         "1 2",
         "actions",
         "--replications 2 --change updates=10 batch=4 width=16 depth=1 hidden=16 "
         "discriminator_width=64 frames=20 least=2 held_out=0.3 samples=8 "
-        "recognizer_updates=20",
+        "evaluator_updates=20",
     ),
     "aamdm": (
         "1+1 0+2",
@@ -331,7 +340,7 @@ def clips_for(kind, path):
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_compile")
 @pytest.mark.parametrize("system", SYSTEMS)
-def test_a_tiny_sweep_twice_gives_the_same_table(load, call, tmp_path, system):
+def test_a_tiny_sweep_twice_gives_the_same_table(call, tmp_path, system):
     steps, kind, more = SYSTEMS[system]
     clips_for(kind, tmp_path / "clips.npz")
     line = f"--system {system} --steps {steps} --data {tmp_path}/clips.npz {more}"
@@ -341,14 +350,15 @@ def test_a_tiny_sweep_twice_gives_the_same_table(load, call, tmp_path, system):
     check_same(first, second)
     truth, floor, *models = first
     assert len(models) == 2
-    quality = load("step_sweep").SYSTEMS[system].quality
+    quality = registry.get(system).bench.quality
     for name in (truth, floor, *models):
         assert first[name][quality]["samples"] == 2
     source = "made in the tests" if kind == "ball" else "rocedural"
     assert source in report_of(tmp_path / "a")["source"]
     for folder in (tmp_path / "a" / "rollouts").iterdir():
-        assert len(bvh_text.read_bvh(folder / "rollout.bvh").values) > 1
-        assert (folder / "rollout.gif").exists()
+        (path,) = folder.glob("*.bvh")
+        assert len(bvh_text.read_bvh(path).values) > 1
+        assert path.with_suffix(".gif").exists()
 
 
 # --- errors -------------------------------------------------------------------------
@@ -365,7 +375,7 @@ BAD = {
     "--system camdm --data {data} --out {file}/below": "out: .*plain/below",
     "--system camdm --data {data} --out {new} --models {file}/below": "models: .*plain",
     "--system camdm --data {data} --out {new} --replications 1": "replications: 1",
-    "--system aamdm --evaluator {judge}": "evaluator: aamdm is judged without",
+    "--system aamdm --evaluator {judge}": "evaluator: aamdm is scored without",
     "--system camdm --evaluator {judge}": "judge.npz is of kind 'ball', camdm needs",
     "--system camdm --evaluator {gone}": "gone.npz",
 }
