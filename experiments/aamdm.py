@@ -15,12 +15,12 @@ from typing import Annotated, Literal
 import jax
 import tyro
 from baselines import rows, tables
-from reports import aamdm as paper
-from reports import results, verdicts
+from reports import claims, results, verdicts
 
 from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
 from jaxmotion.learning import loop
+from jaxmotion.systems import registry
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
 
@@ -212,8 +212,9 @@ def evaluate(args: Evaluate) -> None:
     cli.announce("compiling the rollouts of each row", 40)
     table, report = tables.evaluate(run, args, out)
     here = results.Measured(path=out / "metrics.json", rows=table, about=report)
-    report["claims"] = verdicts.lines(paper.TABLES, {paper.RUN: here})
-    note = "div and fid are of joint positions in the character's axes: no recognizer."
+    papers = claims.read_paper(registry.get("aamdm")).tables
+    report["claims"] = verdicts.lines(papers, {papers[0].source: here})
+    note = "div and fid are of joint positions in the character's axes: no evaluator."
     reporting.write_table(out, table, report, (note,))
     for line in report["claims"]:
         print(line)

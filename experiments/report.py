@@ -7,7 +7,7 @@ command that would run it.
 Examples:
   python experiments/report.py
   python experiments/report.py --runs runs --out runs/report
-  python experiments/report.py --smgdiff runs/other --out runs/report
+  python experiments/report.py --elsewhere smgdiff=runs/other --out runs/report
 """
 
 import dataclasses
@@ -28,64 +28,41 @@ class Config:
     Attributes:
       runs: Folder of the run folders.
       out: Folder of the report.
-      camdm: Run of camdm.py; None, here and below, for the folder of that name in
-        `runs`, which need not exist.
-      camdm_single_token: Run of camdm.py train --network single_token.
-      camdm_mlp: Run of camdm.py train --network mlp.
-      sweep_camdm: Results of step_sweep.py --system camdm.
-      aamdm: Run of aamdm.py.
-      emdm_action: Run of emdm.py train --task action.
-      emdm_text: Run of emdm.py train --task text.
-      emdm_none: Run of emdm.py train --task none.
-      emdm_ablation: Run of emdm.py with the rows recon_0 to recon_100.
-      sweep_emdm: Results of step_sweep.py --system emdm.
-      smgdiff: Run of smgdiff.py.
+      elsewhere: Run folders that do not lie in `runs` under the names that
+        experiments/papers gives them, as in smgdiff=runs/other.
     """
 
     runs: Path = Path("runs")
     out: Path = Path("runs/report")
-    camdm: Path | None = None
-    camdm_single_token: Path | None = None
-    camdm_mlp: Path | None = None
-    sweep_camdm: Path | None = None
-    aamdm: Path | None = None
-    emdm_action: Path | None = None
-    emdm_text: Path | None = None
-    emdm_none: Path | None = None
-    emdm_ablation: Path | None = None
-    sweep_emdm: Path | None = None
-    smgdiff: Path | None = None
+    elsewhere: tuple[str, ...] = ()
 
 
 def folders_of(args: Config) -> dict[Source, Path]:
-    """Run folder of each source.
-
-    Args:
-      args: Of the command line.
-
-    Returns:
-      The folders; those that were not given need not exist.
+    """Run folder of each source; those that were not given need not exist.
 
     Raises:
-      FileNotFoundError: names an option whose folder does not exist.
+      FileNotFoundError: names what does not exist.
+      ValueError: names what is no run of the papers' tables.
     """
     if not args.runs.is_dir():
         raise FileNotFoundError(f"runs: no folder {args.runs}")
-    found = {}
-    for source in writing.SOURCES:
-        given = getattr(args, source.run)
-        if given is not None and not given.is_dir():
-            raise FileNotFoundError(f"{source.run}: no folder {given}")
-        found[source] = args.runs / source.run if given is None else given
-    return found
+    names = dict.fromkeys(source.run for source in writing.SOURCES)
+    found = {name: args.runs / name for name in names}
+    for given in args.elsewhere:
+        name, _, folder = given.partition("=")
+        if name not in names or not folder:
+            raise ValueError(
+                f"elsewhere: {given!r}, expected name=folder with a name of "
+                f"{', '.join(names)}"
+            )
+        if not Path(folder).is_dir():
+            raise FileNotFoundError(f"elsewhere: no folder {folder} for {name}")
+        found[name] = Path(folder)
+    return {source: found[source.run] for source in writing.SOURCES}
 
 
 def report(args: Config) -> None:
-    """Writes the report, and prints how the claims came out.
-
-    Args:
-      args: Of the command line.
-    """
+    """Writes the report, and prints how the claims came out."""
     folders = folders_of(args)
     found = {
         source: results.read(folder / source.file) for source, folder in folders.items()

@@ -1,7 +1,16 @@
-"""What a table of a paper is, and what an ordering that the paper claims is: data."""
+"""What a table of a paper is, and what an ordering that the paper claims is: data.
+
+The data lie in experiments/papers, a file a system.
+"""
 
 import dataclasses
-from typing import Literal
+import tomllib
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxmotion.systems import registry
+
+FOLDER = Path(__file__).parents[1] / "papers"
 
 # As printed: a value, a value with the half width of its interval, or nothing.
 Stated = float | tuple[float, float] | None
@@ -154,39 +163,80 @@ class Absent:
     reason: str
 
 
-def chain(*names: str) -> tuple[tuple[str, str], ...]:
-    """Pairs of neighbors of rows whose values rise.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Paper:
+    """What a file of experiments/papers says.
 
-    Args:
-      names: Rows, the smallest first.
-
-    Returns:
-      The pairs.
+    Attributes:
+      system: That the paper describes.
+      tables: Its tables, as far as they can be run here.
+      absent: What it reports and nothing here can run.
     """
-    return tuple(zip(names, names[1:], strict=False))
+
+    system: registry.System
+    tables: tuple[Table, ...]
+    absent: tuple[Absent, ...]
 
 
-def below(name: str, others: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-    """Pairs of a row that is smaller (nearer) than each of others.
+def _pairs(claim: dict[str, Any]) -> tuple[tuple[str, str], ...]:
+    """Comparisons (smaller, larger) of a claim as the file writes it.
 
-    Args:
-      name: The row.
-      others: The others.
-
-    Returns:
-      The pairs.
+    `rising`: rows whose values rise; `lowest` or `highest`: a row beside those in `of`.
     """
-    return tuple((name, other) for other in others)
+    if "rising" in claim:
+        rising = claim.pop("rising")
+        return tuple(zip(rising, rising[1:], strict=False))
+    if "lowest" in claim:
+        own = claim.pop("lowest")
+        return tuple((own, other) for other in claim.pop("of"))
+    own = claim.pop("highest")
+    return tuple((other, own) for other in claim.pop("of"))
 
 
-def above(name: str, others: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
-    """Pairs of a row that is larger (farther) than each of others.
+def _stated(value: Any) -> Stated:
+    return None if value == "–" else tuple(value) if isinstance(value, list) else value
 
-    Args:
-      name: The row.
-      others: The others.
 
-    Returns:
-      The pairs.
+def _row(value: dict[str, Any], sources: dict[str, Source], number: int) -> Row:
+    paper = value.pop("paper", ["–"] * number)
+    source = value.pop("source", None)
+    return Row(
+        here=value.pop("here", None),
+        paper=tuple(map(_stated, paper)),
+        source=None if source is None else sources[source],
+        **value,
+    )
+
+
+def read_paper(system: registry.System) -> Paper:
+    """Reads experiments/papers/<system>.toml.
+
+    Raises:
+      ValueError: if a field is missing, unknown or names what is not there; names the
+        file.
     """
-    return tuple((other, name) for other in others)
+    path = FOLDER / f"{system.name}.toml"
+    whole = tomllib.loads(path.read_text())
+    try:
+        sources = {
+            name: Source(**value | {"commands": tuple(value["commands"])})
+            for name, value in whole.pop("source").items()
+        }
+        columns = {k: Column(**value) for k, value in whole.pop("column").items()}
+        tables = []
+        for value in whole.pop("table"):
+            names, claims = value.pop("columns"), value.pop("claims", [])
+            rows = [_row(x, sources, len(names)) for x in value.pop("rows")]
+            table = Table(
+                paper=system.title,
+                source=sources[value.pop("source")],
+                columns=tuple(columns[name] for name in names),
+                rows=tuple(rows),
+                claims=tuple(Claim(pairs=_pairs(x), **x) for x in claims),
+                **value,
+            )
+            tables.append(table)
+        absent = [Absent(paper=system.title, **x) for x in whole.pop("absent", [])]
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    return Paper(system=system, tables=tuple(tables), absent=tuple(absent))

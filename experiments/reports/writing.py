@@ -10,24 +10,20 @@ import numpy as np
 
 from jaxmotion import files
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.systems import registry
 from jaxmotion.viz import dots
-from reports import aamdm, camdm, emdm_appendix, markdown, smgdiff, verdicts
-from reports.claims import Column, Stated, Table
+from reports import markdown, verdicts
+from reports.claims import Column, Stated, Table, read_paper
 from reports.results import Found, provenance
 
-PAPERS = {
-    "CAMDM": (camdm, "Chen et al., SIGGRAPH 2024"),
-    "AAMDM": (aamdm, "Li et al., CVPR 2024, arXiv:2401.06146"),
-    "EMDM": (emdm_appendix, "Zhou et al., ECCV 2024, arXiv:2312.02256"),
-    "SMGDiff": (smgdiff, "Yang et al., 2024, arXiv:2411.16216"),
-}
-TABLES = tuple(table for module, _ in PAPERS.values() for table in module.TABLES)
-ABSENT = tuple(what for module, _ in PAPERS.values() for what in module.ABSENT)
+PAPERS = tuple(read_paper(system) for system in registry.SYSTEMS.values())
+TABLES = tuple(table for paper in PAPERS for table in paper.tables)
+ABSENT = tuple(what for paper in PAPERS for what in paper.absent)
 # Every file that a table needs, in the tables' order.
 SOURCES = tuple(
     dict.fromkeys(table.source_of(row) for table in TABLES for row in table.rows)
 )
-# Those with values of a recognizer.
+# Those with values of an evaluator.
 JUDGED = {
     table.source_of(row)
     for table in TABLES
@@ -182,9 +178,9 @@ def _lines(
         "",
         *markdown.summary(decided),
     ]
-    for name, (module, reference) in PAPERS.items():
-        lines += [f"## {name}", "", f"{reference}.", ""]
-        for table in module.TABLES:
+    for paper in PAPERS:
+        lines += [f"## {paper.system.title}", "", f"{paper.system.paper}.", ""]
+        for table in paper.tables:
             picture = pictures.get(table.name)
             lines += markdown.section(table, decided, found, commands, picture)
     lines += ["## What cannot be run here", "", *markdown.absent_lines(ABSENT)]

@@ -1,6 +1,5 @@
 """experiments/report.py: claims decided each way, what is missing, what is damaged."""
 
-import dataclasses
 import functools
 import json
 import math
@@ -12,6 +11,7 @@ import pytest
 from PIL import Image
 
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.systems import registry
 from jaxmotion.systems.camdm import release as camdm_release
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "report.py"
@@ -79,11 +79,23 @@ def test_every_claim_holds_for_what_the_paper_prints(load):
     assert made > 100
 
 
-def test_every_source_has_an_option_and_its_command_its_folder(load):
-    options = {x.name for x in dataclasses.fields(load("report").Config)}
+def test_every_command_of_a_source_has_its_folder(load):
     for source in load("reports.writing").SOURCES:
-        assert source.run in options
         assert any("{run}" in command for command in source.commands)
+
+
+def test_a_damaged_paper_is_named(load, tmp_path, monkeypatch):
+    claims = load("reports.claims")
+    text = (claims.FOLDER / "aamdm.toml").read_text()
+    monkeypatch.setattr(claims, "FOLDER", tmp_path)
+    for old, new, what in (
+        ("[source.aamdm]", "[source.other]", "'aamdm'"),
+        ("number = ", "numbr = ", "numbr"),
+        ("rising = ", "risen = ", "highest"),
+    ):
+        (tmp_path / "aamdm.toml").write_text(text.replace(old, new, 1))
+        with pytest.raises(ValueError, match=f"aamdm.toml: .*{what}"):
+            claims.read_paper(registry.get("aamdm"))
 
 
 # --- decisions ----------------------------------------------------------------------
@@ -161,7 +173,7 @@ def decide(load, tmp_path):
     )
 
     def run(rows, *, pairs=None, judges=(None, None)):
-        pairs = pairs or claims.chain("A", "B", "C")
+        pairs = pairs or (("A", "B"), ("B", "C"))
         claim = claims.Claim(words="w", column="FID", pairs=pairs, where="here")
         found = {}
         for key, names, judge in ((source, "abc", judges[0]), (other, "d", judges[1])):
@@ -188,18 +200,18 @@ def test_a_claim_comes_out_each_way(decide):
 
 def test_claims_in_lines_say_what_was_not_run(load):
     """No row, all rows as the paper prints them, and one whose value is not finite."""
-    paper, results = load("reports.aamdm"), load("reports.results")
-    verdicts = load("reports.verdicts")
+    results, verdicts = load("reports.results"), load("reports.verdicts")
+    tables = load("reports.claims").read_paper(registry.get("aamdm")).tables
 
     def shown(rows):
         made = results.Measured(path=Path("here"), rows=rows, about={})
-        return verdicts.lines(paper.TABLES, {paper.RUN: made if rows else None})
+        return verdicts.lines(tables, {tables[0].source: made if rows else None})
 
-    claims = sum(len(table.claims) for table in paper.TABLES)
+    claims = sum(len(table.claims) for table in tables)
     assert len(shown({})) == claims
     assert all(line.startswith("not run: ") for line in shown({}))
     rows = {}
-    for table in paper.TABLES:
+    for table in tables:
         for row in table.rows:
             for column, value in zip(table.columns, row.paper, strict=True):
                 # As if times were exact, and most diverged without polishing.
@@ -231,7 +243,7 @@ def test_rows_of_two_judges_are_not_compared(decide):
 
 
 def test_beside_the_values_of_camdm_stands_what_its_release_computes(load):
-    tables = load("reports.camdm").TABLES
+    tables = load("reports.claims").read_paper(registry.get("camdm")).tables
     released = {column for column, _ in camdm_release.COLUMNS.values()}
     names = {"FID", "Ft. Slid.", "Accel.", "Traj. Err.", "Orient. Err."}
     found = {x.name: x.here for table in tables for x in table.columns}
@@ -305,7 +317,7 @@ def test_a_report_has_values_verdicts_and_what_is_missing(call, runs, tmp_path, 
 def test_a_run_folder_can_be_elsewhere(load, runs, tmp_path):
     report = load("report")
     (tmp_path / "mine").mkdir()
-    args = report.Config(runs=runs, aamdm=tmp_path / "mine")
+    args = report.Config(runs=runs, elsewhere=(f"aamdm={tmp_path / 'mine'}",))
     folders = {source.run: path for source, path in report.folders_of(args).items()}
     assert folders["aamdm"] == tmp_path / "mine" and folders["camdm"] == runs / "camdm"
 
@@ -313,8 +325,14 @@ def test_a_run_folder_can_be_elsewhere(load, runs, tmp_path):
 def test_a_missing_folder_is_named(call, runs, tmp_path):
     with pytest.raises(OSError, match="runs: no folder .*gone"):
         call(f"--runs {tmp_path}/gone --out {tmp_path}/out")
-    with pytest.raises(OSError, match="emdm_text: no folder .*gone"):
-        call(f"--runs {runs} --emdm-text {tmp_path}/gone --out {tmp_path}/out")
+    with pytest.raises(OSError, match="no folder .*gone for emdm_text"):
+        call(
+            f"--runs {runs} --elsewhere emdm_text={tmp_path}/gone --out {tmp_path}/out"
+        )
+    with pytest.raises(
+        ValueError, match="'emd=a', expected name=folder with a name of"
+    ):
+        call(f"--runs {runs} --elsewhere emd=a --out {tmp_path}/out")
     (tmp_path / "plain").write_text("")
     with pytest.raises(OSError, match="plain"):
         call(f"--runs {runs} --out {tmp_path}/plain/below")
@@ -347,5 +365,5 @@ def test_a_damaged_file_is_named_with_its_field(call, runs, tmp_path, text):
 
 def test_the_help_names_every_option(help_of):
     text = help_of("report")
-    for option in ("--runs", "--out", "--sweep-emdm", "--smgdiff"):
+    for option in ("--runs", "--out", "--elsewhere"):
         assert option in text
