@@ -7,22 +7,30 @@ says how many.
 
 import gc
 import os
+import subprocess
+import sys
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 import jax  # noqa: E402
+import jaxlib  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# Most of the suite's time is compilation: without optimizations it takes a sixth.
+jax.config.update("jax_disable_most_optimizations", True)
+QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
 # A worker takes up to 3 GB.
 MOST_WORKERS = 8
+# Compiled programs of so many modules are kept: they take memory, and time to forget.
+MODULES_REMEMBERED = 12
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config):
-    """Workers for the whole suite; files named on the command line run in one process."""
+    """Workers for the whole suite; files that are named run in one process."""
     given = getattr(config.option, "numprocesses", 0)
     if given is None and config.args_source is not config.ArgsSource.ARGS:
         config.option.numprocesses = "auto"
@@ -32,35 +40,57 @@ def pytest_cmdline_main(config):
 
 
 def pytest_configure(config):
-    """Workers and programs they start share what they compile, also with later runs."""
-    if "JAX_COMPILATION_CACHE_DIR" in os.environ or not hasattr(config, "cache"):
+    """Says, before JAX starts, how it compiles and where it keeps what it compiled.
+
+    The environment tells the workers and the programs that tests start.
+    """
+    cache = getattr(config, "cache", None)
+    if cache is None or hasattr(config, "workerinput"):
         return
-    for name, value in (
-        ("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax"))),
-        ("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", 0.0),
-        ("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", 0),
-    ):
-        os.environ[name] = str(value)
-        jax.config.update(name.lower(), value)
+    if "XLA_FLAGS" not in os.environ and _known(QUICK, cache):
+        os.environ["XLA_FLAGS"] = QUICK
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        for name, value in (
+            ("JAX_COMPILATION_CACHE_DIR", str(cache.mkdir("jax"))),
+            ("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", 0.0),
+        ):
+            os.environ[name] = str(value)
+            jax.config.update(name.lower(), value)
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _forget_programs():
-    """Compiled programs do not pile up over the modules of a process."""
-    yield
-    jax.clear_caches()
-    gc.collect()
+def _known(flags, cache):
+    """Whether this jaxlib has the flags: an unknown one would end the process."""
+    entry = f"xla_flags/{jaxlib.__version__}/{flags}"
+    known = cache.get(entry, None)
+    if known is None:
+        code = "import jax; jax.devices()"
+        environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=environment, capture_output=True)
+        known = done.returncode == 0
+        cache.set(entry, known)
+    return known
 
 
 @pytest.fixture(scope="module")
 def quick_compile():
-    """Compiles whole training and control programs a third as long, unoptimized.
+    """Nothing any more: goes with its last use."""
 
-    For modules whose subject is not the arithmetic of a single function.
-    """
-    jax.config.update("jax_disable_most_optimizations", True)
+
+@pytest.fixture(scope="session")
+def _modules():
+    """Names of the modules that ran since compiled programs were last forgotten."""
+    return []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_programs(request, _modules):
     yield
-    jax.config.update("jax_disable_most_optimizations", False)
+    _modules.append(request.node.name)
+    if len(_modules) == MODULES_REMEMBERED:
+        _modules.clear()
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

@@ -162,7 +162,7 @@ def test_bad_input_is_named_before_the_work(
 
 
 @pytest.fixture(scope="module")
-def small(load, skeleton, quick_compile):
+def small(load, skeleton):
     """`one_rollout` of a small model, and keys and states to map it over."""
     workload = load("diversity")
     model = camdm_model.Model(

@@ -17,8 +17,6 @@ from jaxmotion.systems.emdm import training as emdm_training
 from tests import tiny
 
 chex = pytest.importorskip("chex")
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = tiny.config(depth=1, heading="facing")
 
 

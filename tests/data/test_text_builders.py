@@ -232,7 +232,7 @@ def build_act(tmp_path, content):
     return base.clips_from_source(base.prepare(builder, folder))
 
 
-def test_humanact12_poses_become_clips(tmp_path, act, quick_compile):
+def test_humanact12_poses_become_clips(tmp_path, act):
     bones, content = act
     found = build_act(tmp_path, content)
     names = ("clip0000_throw", "clip0001_warm_up", "clip0002_turn_steering_wheel")

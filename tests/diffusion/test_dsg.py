@@ -17,7 +17,6 @@ N = 15
 TABLE = reference.coefficients(reference.cosine_betas(T))
 STEPS = range(1, T + 1)
 clone = jax.random.clone
-pytestmark = pytest.mark.usefixtures("quick_compile")
 
 
 def random(seed, shape=SHAPE):

@@ -15,8 +15,6 @@ from jaxmotion.evaluation import health, locomotion, plausibility
 from jaxmotion.motion import skeleton
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FPS, FRAMES = 30.0, 91
 TIME = np.arange(FRAMES) / FPS
 BONES = tiny.skeleton()

@@ -12,8 +12,6 @@ from jaxmotion.motion import features, trajectory
 from jaxmotion.motion.skeleton import joint_positions
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = action_evaluator.ActionRecognizerConfig(
     num_classes=2, num_joints=5, num_features=6, hidden=8
 )

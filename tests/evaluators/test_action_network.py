@@ -8,8 +8,6 @@ import pytest
 from jaxmotion.evaluators.network import ActionRecognizer
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 BATCH, FRAMES, CHANNELS, HIDDEN = 3, 5, 6, 4
 
 

@@ -22,8 +22,6 @@ from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from tests import ball_walker, samples, tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 KINDS = ("style", "action", "ball")
 FRAMES = 12
 

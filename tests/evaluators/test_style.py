@@ -10,8 +10,6 @@ from jaxmotion.motion import features, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = style_evaluator.RecognizerConfig(num_classes=2, num_joints=5, frames=12)
 
 

@@ -2,12 +2,9 @@
 
 import jax
 import numpy as np
-import pytest
 
 from jaxmotion.evaluators.network import Recognizer
 from tests import tiny
-
-pytestmark = pytest.mark.usefixtures("quick_compile")
 
 
 def test_shapes_and_independence_of_the_batch():

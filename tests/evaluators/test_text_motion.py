@@ -15,8 +15,6 @@ from jaxmotion.learning import training
 from tests import tiny
 from tests.reference import matching as oracle
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = text_motion_evaluator.MatcherConfig(
     num_features=6, movement_width=16, motion_width=16, text_width=16, embedding=16
 )

@@ -29,8 +29,6 @@ STAGES = {
     "embedded/lmm": "lmm",
 }
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 @pytest.fixture(scope="module")
 def call(invoke):
@@ -46,7 +44,7 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(call, data, tmp_path_factory, quick_compile):
+def trained(call, data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "run"
     call(f"train --data {data} --out {folder} {SETTINGS}")
     return folder

@@ -65,7 +65,7 @@ def contents(folder):
 
 
 @pytest.fixture(scope="module")
-def trained(call, data, tmp_path_factory, quick_compile):
+def trained(call, data, tmp_path_factory):
     """A run of two steps."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     call(f"train --data {data} --out {folder} {SIZES} --steps 2")
@@ -115,7 +115,6 @@ def test_a_preset_says_how_to_train_unless_an_option_does(call, data, tmp_path):
     assert found == ["adamw", 1e-4, 3, 0, 0.0, 0.9]
 
 
-@pytest.mark.usefixtures("quick_compile")
 def test_other_settings_can_be_meant(call, data, trained, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(trained, folder)
@@ -166,7 +165,6 @@ def check_evaluation(folder, rollouts):
     assert "(trained here)" in (folder / "table.md").read_text().splitlines()[-1]
 
 
-@pytest.mark.usefixtures("quick_compile")
 def test_a_rollout_is_written_as_bvh_gif_and_page(call, trained, tmp_path):
     out = tmp_path / "seen"
     call(
@@ -177,7 +175,6 @@ def test_a_rollout_is_written_as_bvh_gif_and_page(call, trained, tmp_path):
     assert "neutral to zombie" in (out / "rollout.html").read_text()
 
 
-@pytest.mark.usefixtures("quick_compile")
 @pytest.mark.slow
 def test_an_evaluation_writes_its_table(call, trained):
     call(
@@ -187,7 +184,6 @@ def test_an_evaluation_writes_its_table(call, trained):
     check_evaluation(trained / "evaluation", 2)
 
 
-@pytest.mark.usefixtures("quick_compile")
 @pytest.mark.slow
 def test_one_style_trains_with_clips_held_out_by_name(call, data, tmp_path):
     names = clips_io.load_clips(data).clip_names
@@ -203,7 +199,6 @@ def test_one_style_trains_with_clips_held_out_by_name(call, data, tmp_path):
     call(f"rollout --run {tmp_path} --style neutral --seconds 1")
 
 
-@pytest.mark.usefixtures("quick_compile")
 @pytest.mark.slow
 def test_speeds_are_measured_beside_data_and_by_frame_of_the_plan(call, trained):
     call(f"speeds --run {trained} --speeds 0 1 --rollouts 2 --seconds 6")
@@ -222,7 +217,6 @@ def test_speeds_are_measured_beside_data_and_by_frame_of_the_plan(call, trained)
     assert "| told 1 m/s, jerk m/s³ |" in text
 
 
-@pytest.mark.usefixtures("quick_compile")
 @pytest.mark.slow
 def test_an_export_has_poses_of_the_models_own(call, trained, tmp_path):
     call(f"export --run {trained} --out {tmp_path / 'model.npz'} --starts 2")
@@ -259,7 +253,6 @@ def released(call, data, tmp_path_factory):
     return folder
 
 
-@pytest.mark.usefixtures("quick_compile")
 def test_released_weights_become_a_model_that_rolls_out(call, released):
     model, params, _ = camdm_model.load(released / "released.npz")
     assert model.config.num_steps == 4 and model.config.norm == "post"
@@ -275,7 +268,6 @@ def test_released_weights_become_a_model_that_rolls_out(call, released):
     assert bvh_text.read_bvh(folder / "rollout.bvh").values.shape[0] == 30
 
 
-@pytest.mark.usefixtures("quick_compile")
 @pytest.mark.slow
 def test_released_weights_are_evaluated(call, released):
     call(

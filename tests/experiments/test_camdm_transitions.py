@@ -35,7 +35,6 @@ def test_what_is_missing_is_named(invoke, tmp_path, line, message):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick_compile")
 def test_a_tiny_run_twice_gives_the_same_table(invoke, tmp_path):
     clips = samples.clips()
     clips_io.save_clips(tmp_path / "clips.npz", clips)

@@ -23,8 +23,6 @@ SIZES = (
     "--discriminator-width 64 --merge"
 )
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 @pytest.fixture(scope="module")
 def call(invoke):
@@ -49,7 +47,7 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def actions(call, data, tmp_path_factory, quick_compile):
+def actions(call, data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "actions"
     call(
         f"train --task action --data {data} --out {folder} --least 2 --held-out 0.3 "
@@ -59,7 +57,7 @@ def actions(call, data, tmp_path_factory, quick_compile):
 
 
 @pytest.fixture(scope="module")
-def texts(call, data, tmp_path_factory, quick_compile):
+def texts(call, data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "texts"
     call(
         f"train --task text --data {data} --out {folder} --encoder hashed "

@@ -21,8 +21,6 @@ from tests import ball_walker, samples, tiny
 ROOT = Path(__file__).parents[2]
 FIELDS = ("fingerprint", "kind", "labels", "joints", "fps", "frames", "accuracy")
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):

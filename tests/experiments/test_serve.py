@@ -766,7 +766,7 @@ def test_a_controller_is_told_everything_in_one_program(protocol):
     assert np.all(np.asarray(simulation.start(7)[1]["root"]) == 0), "it was used up"
 
 
-def test_characters_of_camdm_are_served(exported, protocol, quick_compile):
+def test_characters_of_camdm_are_served(exported, protocol):
     simulation = load("serving.runs").load(exported)
     load("serving.simulation").warm(simulation)
     assert simulation.labels == tiny.STYLES and simulation.fps == 30.0

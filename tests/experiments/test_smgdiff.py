@@ -18,8 +18,6 @@ SIZES = (
 )
 SHORT = "--windows 8 --replications 2 --evaluator-steps 20 --starts 2 --repeats 2"
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
@@ -29,7 +27,7 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(invoke, data, tmp_path_factory, quick_compile):
+def trained(invoke, data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "run"
     invoke("smgdiff", f"train --data {data} --out {folder} {SIZES}")
     return folder

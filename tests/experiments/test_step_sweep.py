@@ -338,7 +338,6 @@ def clips_for(kind, path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("quick_compile")
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_a_tiny_sweep_twice_gives_the_same_table(call, tmp_path, system):
     steps, kind, more = SYSTEMS[system]

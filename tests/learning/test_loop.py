@@ -20,7 +20,6 @@ from jaxmotion.learning.loop import Loop, TrainingDiverged, check_writable, trai
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
 ROOT = Path(__file__).parents[2]
 
 

@@ -12,8 +12,6 @@ from tests import person
 from tests.person import float32
 from tests.reference import humanml as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FRAMES = 240  # of nearly all clips, so that each layout is compiled once
 HUMANML3D, KIT_ML = humanml.HUMANML3D, humanml.KIT_ML
 PUBLISHED = dataclasses.replace(HUMANML3D, hip_weight=-1.0)

@@ -28,8 +28,6 @@ BANDAI = (
 )
 FRAMES = 50
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 fit = humanml_skeleton.motion_from_joints
 
 

@@ -8,8 +8,6 @@ import pytest
 from jaxmotion.networks.clip import ClipText, quick_gelu
 from tests.reference import clip as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 SIZES = dict(vocabulary=30, context=9, width=12, depth=2, hidden=20, dimensions=7)
 HEADS, END = 3, 29
 IDS = [[1, 4, 7, 7, END, 0, 0], [2, END, 5, END, 8, 1, 1], [3, 3, 2, 9, 1, 28, END]]

@@ -10,8 +10,6 @@ import pytest
 from jaxmotion.networks import blocks, mlp
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 NET = mlp.ConditionedMlp(
     features=3, num_steps=4, width=16, depth=3, time_width=8, groups=4
 )

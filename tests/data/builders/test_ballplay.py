@@ -8,8 +8,6 @@ from jaxmotion.data.builders import ball_base, ballplay, base
 from jaxmotion.motion.facing import hip_facing
 from jaxmotion.motion.skeleton import forward_kinematics
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 # The file's joints, and their parents as a list of numbers.
 SIDE = "Thorax Shoulder Elbow Wrist".split()
 SIDE += [f"{f}{i}" for f in "Index Middle Pinky Ring Thumb".split() for i in (1, 2, 3)]

@@ -7,8 +7,6 @@ from scipy.spatial.transform import Rotation
 from jaxmotion.data.builders import ball_base, base, soccer_x
 from jaxmotion.motion.skeleton import forward_kinematics
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 # SMPL's kinematic tree.
 PARENTS = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
 PARENTS += [20, 21]

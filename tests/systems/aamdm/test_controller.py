@@ -17,8 +17,6 @@ from jaxmotion.systems.aamdm import space as aamdm_space
 from tests import person, tiny
 from tests.reference import pose as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FPS = 60.0
 JOINTS = 6
 SIZE = 15 * JOINTS + 8

@@ -11,8 +11,6 @@ from jaxmotion.motion import path_features, pose
 from jaxmotion.systems.aamdm import data as aamdm_data
 from tests import person
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 LENGTHS = (400, 90, 250)
 
 

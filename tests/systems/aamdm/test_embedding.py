@@ -12,8 +12,6 @@ from jaxmotion.systems.aamdm import embedding as aamdm_embedding
 from tests import person, tiny
 from tests.reference import pose as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = aamdm_embedding.Config(num_joints=6, latent=4, width=16)
 FIELDS = dict(
     position=18,

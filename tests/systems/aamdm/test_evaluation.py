@@ -17,8 +17,6 @@ from jaxmotion.systems.aamdm import training as aamdm_training
 from tests import person
 from tests.reference import pose as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FPS = 60.0
 
 

@@ -14,8 +14,6 @@ from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = aamdm_model.Config(features=3, latent=2, width=16, depth=2, window=4)
 CHANGING = dataclasses.replace(CONFIG, target="change")
 CHANGE = jnp.array([0.5, 0.1, 2.0])

@@ -8,8 +8,6 @@ import pytest
 from jaxmotion.systems.aamdm import network as aamdm_network
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 ENCODER = aamdm_network.PoseEncoder(latent=3, width=8)
 DECODER = aamdm_network.PoseDecoder(features=7, width=8)
 

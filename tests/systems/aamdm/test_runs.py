@@ -18,7 +18,6 @@ from tests import person, tiny
 
 # Orbax abandons its other reads when one fails.
 pytestmark = [
-    pytest.mark.usefixtures("quick_compile"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
@@ -37,7 +36,7 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def run(data, tmp_path_factory, quick_compile):
+def run(data, tmp_path_factory):
     """The walks, clips 0 and 2, and their mirror images."""
     folder = tmp_path_factory.mktemp("runs") / "run"
     return aamdm_training.prepare(folder, data, **MADE)

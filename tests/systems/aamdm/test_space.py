@@ -11,8 +11,6 @@ from jaxmotion.systems.aamdm import embedding as aamdm_embedding
 from jaxmotion.systems.aamdm import space as aamdm_space
 from tests import person, tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = aamdm_embedding.Config(num_joints=6, latent=4, width=16)
 LENGTHS = (70, 40)
 SIZE = CONFIG.num_features

@@ -18,7 +18,6 @@ from tests import person, tiny
 
 # Orbax abandons its other reads when one fails.
 pytestmark = [
-    pytest.mark.usefixtures("quick_compile"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
@@ -73,7 +72,7 @@ def fit(folder, *, steps=4, stage="polisher", config=CONFIG, frames=b"1", **chan
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, quick_compile):
+def trained(tmp_path_factory):
     """A stage of four updates, and the state that it returned."""
     folder = tmp_path_factory.mktemp("run") / "polisher"
     return folder, fit(folder)

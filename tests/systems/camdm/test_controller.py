@@ -19,8 +19,6 @@ from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = tiny.config(heading="facing")
 CONTROL = camdm_controller.Control(apply=5, reuse=6, seam=0.0)
 

@@ -18,8 +18,6 @@ from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 from tests.reference import camdm as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 def window_of(walker, config, start=7):
     return Motion(

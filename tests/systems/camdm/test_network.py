@@ -11,8 +11,6 @@ from jaxmotion.networks import blocks, transformer
 from jaxmotion.systems.camdm import network as camdm_network
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 SIZES = dict(
     features=12,
     past=4,

@@ -15,7 +15,6 @@ from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import samples
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
 LABELS = np.array([0, 1, 1, 0])
 
 

@@ -50,7 +50,6 @@ def test_another_network_is_refused(first):
 # --- presets -----------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("quick_compile")
 def test_the_papers_preset_is_unclipped_adamw_at_its_rate(first, tmp_path):
     """Two steps of it are optax's AdamW on the gradients, which exceed the norm 1."""
     model = first[0]

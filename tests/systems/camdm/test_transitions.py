@@ -14,8 +14,6 @@ from jaxmotion.systems.camdm.controller import Control
 from tests import samples
 from tests.reference import metrics as oracle
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FPS = 30.0
 JUDGE = style_evaluator.Recognized(
     params={},

@@ -13,8 +13,6 @@ from jaxmotion.motion import rotation, trajectory
 from jaxmotion.systems.emdm import data as emdm_data
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 LENGTHS = (12, 5, 20, 7, 9, 8)
 ACTIONS = ("walk", "run", "walk", "stroll", "run", "hop")
 

@@ -11,8 +11,6 @@ from jaxmotion.systems.emdm import network as emdm_network
 from tests import tiny
 from tests.reference import emdm as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 NET = emdm_network.SequenceDiscriminator(num_steps=4, width=128, time_width=16)
 
 

@@ -12,8 +12,6 @@ from jaxmotion.systems.emdm import features as emdm_features
 from tests import tiny
 from tests.reference import motion as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 JOINTS = len(tiny.NAMES)
 ROOT = slice(6 * JOINTS, 6 * JOINTS + 3)
 

@@ -13,8 +13,6 @@ from jaxmotion.systems.emdm import network as emdm_network
 from tests import tiny
 from tests.reference import emdm as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 NET = emdm_network.SequenceGenerator(
     features=3,
     frames=6,

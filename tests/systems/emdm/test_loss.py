@@ -17,8 +17,6 @@ from tests.reference import diffusion
 from tests.reference import emdm as reference
 from tests.systems.emdm import test_discriminator
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 # Four joints, and a translation that the velocity loss leaves out.
 CONFIG = emdm_model.Config(
     features=15,

@@ -15,8 +15,6 @@ from tests import tiny
 from tests.reference import diffusion
 from tests.reference import emdm as reference
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = emdm_model.Config(
     features=3,
     frames=6,

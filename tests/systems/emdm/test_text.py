@@ -9,8 +9,6 @@ from jaxmotion.systems.emdm import training as emdm_training
 from tests.reference import clip as oracle
 from tests.text import samples
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 # The context is 24: the longer one just fits it whole, and the release cuts it.
 SHORT, LONG = "a person turns left", "a " * 21 + "left"
 

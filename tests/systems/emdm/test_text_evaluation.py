@@ -21,8 +21,6 @@ from jaxmotion.systems.emdm import text_evaluation as emdm_text_evaluation
 from jaxmotion.text import encoder
 from tests.reference import matching as oracle
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 SIZES = dict(movement_width=16, motion_width=12, text_width=10, embedding=8)
 WIDTH = 263
 FRAMES = np.array([48, 44, 20, 8])

@@ -20,7 +20,6 @@ from tests import tiny
 
 # Orbax abandons its other reads when one fails.
 pytestmark = [
-    pytest.mark.usefixtures("quick_compile"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
@@ -144,7 +143,7 @@ def test_unknown_rows_are_named_with_the_known_ones(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory, quick_compile):
+def trained(tmp_path_factory):
     """A run folder with a row of each kind."""
     folder = tmp_path_factory.mktemp("run")
     for row in ("emdm", "ddpm_1000"):

@@ -18,8 +18,6 @@ from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff.guidance import UNGUIDED, Guidance
 from tests import ball_walker, tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 FEET = (2, 4)
 
 

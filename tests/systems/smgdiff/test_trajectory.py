@@ -13,8 +13,6 @@ from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.trajectory import Wish
 from tests import tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 CONFIG = smgdiff_trajectory.Config(
     num_labels=2,
     past=4,
