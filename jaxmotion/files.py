@@ -9,7 +9,7 @@ import json
 import os
 import stat
 import zipfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -80,6 +80,19 @@ def write_text(path: str | os.PathLike, text: str) -> None:
     """
     with replacing(path) as file:
         file.write(text.encode())
+
+
+def write_arrays(
+    path: str | os.PathLike, arrays: Mapping[str, Any], *, compress: bool = False
+) -> None:
+    """Writes named arrays as an npz file, whole or not at all.
+
+    Raises:
+      OSError: if it cannot be written; names it.
+    """
+    write = np.savez_compressed if compress else np.savez
+    with replacing(path) as file:
+        write(file, **arrays)
 
 
 def read_object(path: str | os.PathLike, *, what: str) -> dict[str, Any]:
@@ -200,6 +213,75 @@ def read_arrays(
         _check_sizes(content.zip.infolist(), size)
         wanted = [field for field in content.files if only is None or field in only]
         return {field: _array(content, field) for field in wanted}
+
+
+def read_versioned(
+    path: str | os.PathLike,
+    wanted: Mapping[str, tuple[str, int]],
+    *,
+    what: str,
+    format_name: str,
+    version: int,
+) -> dict[str, np.ndarray]:
+    """Arrays of a file that states its format and version, each of the expected kind.
+
+    Args:
+      path: The file.
+      wanted: For each field the kind of its numbers ("f" float, "i" integer, "U" text)
+        and how many axes it has.
+      what: What the file holds, for messages.
+      format_name: Expected value of its field "format".
+      version: Expected value of its field "version".
+
+    Returns:
+      All its arrays.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is damaged, foreign, of another version, or lacks a field; names
+        the file and the field.
+    """
+    path = os.fspath(path)
+    fields = read_arrays(path, name=path, what=what)
+    if str(fields.get("format")) != format_name:
+        raise ValueError(
+            f"{path}: not a {what} file: its field 'format' should be {format_name!r}; "
+            f"it has the fields {', '.join(sorted(fields)) or 'none'}"
+        )
+    found_version = fields.get("version")
+    if found_version is None or found_version.ndim or found_version != version:
+        if found_version is not None and found_version.ndim:
+            found_version = f"of shape {found_version.shape}"
+        raise ValueError(
+            f"{path}: version {found_version} of the {what} format, expected "
+            f"{version}; prepare the data again"
+        )
+    check_fields(path, fields, wanted)
+    return fields
+
+
+def check_fields(
+    path: str, fields: Mapping[str, np.ndarray], wanted: Mapping[str, tuple[str, int]]
+) -> None:
+    """Raises unless all arrays are there and of the expected kind.
+
+    Args:
+      path: The file, for messages.
+      fields: Its arrays.
+      wanted: For each field the kind of its numbers and how many axes it has.
+
+    Raises:
+      ValueError: names the file and the field.
+    """
+    for name, (kind, axes) in wanted.items():
+        if name not in fields:
+            raise ValueError(f"{path}: field {name!r} is missing")
+        found = fields[name]
+        if found.dtype.kind != kind or found.ndim != axes:
+            raise ValueError(
+                f"{path}: field {name!r} should have {axes} axes of kind {kind!r}, "
+                f"found shape {found.shape} of {found.dtype}"
+            )
 
 
 def read_array(path: str | os.PathLike, *, what: str) -> np.ndarray:

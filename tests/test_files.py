@@ -184,11 +184,11 @@ def test_a_full_disk_names_the_file(tmp_path):
     code = """
 import resource, signal, sys
 import numpy as np
-from jaxmotion.data import npz
+from jaxmotion import files
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
 try:
-    npz.write_npz(sys.argv[1], {"a": np.zeros(10_000)})
+    files.write_arrays(sys.argv[1], {"a": np.zeros(10_000)})
 except OSError as error:
     print(error)
 """

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmotion.data import clips_io, npz
+from jaxmotion import files
+from jaxmotion.data import clips_io
 from jaxmotion.data.clips import Clips, take_clips
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import MAX_METERS, Motion
@@ -117,7 +118,7 @@ def save_ball_clips(path: str | os.PathLike, data: BallClips) -> None:
         "ball_joints": np.array(data.joints, np.int64),
         "ball_radius": np.array(float(data.radius)),
     }
-    npz.write_npz(path, clips_io.to_fields(data.clips) | more)
+    files.write_arrays(path, clips_io.to_fields(data.clips) | more)
 
 
 def load_ball_clips(path: str | os.PathLike) -> BallClips:
@@ -136,7 +137,7 @@ def load_ball_clips(path: str | os.PathLike) -> BallClips:
     """
     path = os.fspath(path)
     fields = clips_io.read_fields(path)
-    npz.check_fields(path, fields, _FIELDS)
+    files.check_fields(path, fields, _FIELDS)
     clips = clips_io.from_fields(path, fields)
     try:
         return ball_clips(

@@ -5,7 +5,7 @@ import os
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion.data import npz
+from jaxmotion import files
 from jaxmotion.data.clips import Clips
 from jaxmotion.motion.skeleton import MAX_METERS, Skeleton, check_skeleton
 
@@ -77,7 +77,7 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
     """
     fields = to_fields(clips)
     _check_fields(os.fspath(path), fields)
-    npz.write_npz(path, fields)
+    files.write_arrays(path, fields)
 
 
 def read_fields(path: str | os.PathLike) -> dict[str, np.ndarray]:
@@ -95,10 +95,10 @@ def read_fields(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """
     path = os.fspath(path)
     about = dict(what="clips", format_name=_FORMAT, version=_VERSION)
-    fields = npz.read_npz(path, _FIELDS, **about)
+    fields = files.read_versioned(path, _FIELDS, **about)
     labels = {f"label.{field}": ("i", 1) for field in fields["label_fields"]}
     names = {f"names.{field}": ("U", 1) for field in fields["label_fields"]}
-    npz.check_fields(path, fields, labels | names)
+    files.check_fields(path, fields, labels | names)
     return fields
 
 

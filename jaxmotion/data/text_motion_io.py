@@ -5,7 +5,7 @@ import os
 import numpy as np
 
 from jaxmotion import files
-from jaxmotion.data import clips_io, npz
+from jaxmotion.data import clips_io
 from jaxmotion.data.text_motion import TextMotions, check_statistics
 
 _FORMAT = "jaxmotion-text-motions"
@@ -41,7 +41,7 @@ def save_text_motions(path: str | os.PathLike, motions: TextMotions) -> None:
     fields = {name: np.asarray(getattr(motions, name)) for name in _FIELDS}
     # Without the type an empty list of names would be stored as numbers.
     fields |= {name: np.array(getattr(motions, name), np.str_) for name in _TEXTS}
-    npz.write_npz(
+    files.write_arrays(
         path, {"format": np.array(_FORMAT), "version": np.array(_VERSION), **fields}
     )
 
@@ -117,7 +117,7 @@ def load_text_motions(path: str | os.PathLike) -> TextMotions:
         the file and the field.
     """
     path = os.fspath(path)
-    fields = npz.read_npz(
+    fields = files.read_versioned(
         path, _FIELDS, what="text motions", format_name=_FORMAT, version=_VERSION
     )
     with np.errstate(over="ignore"):  # what overflows is refused next

@@ -317,8 +317,8 @@ def export_params(
         raise IsADirectoryError(f"{path} is a folder, expected a file to write")
     text = json.dumps(config)
     checksum = np.array(_export_checksum(text, arrays))
-    with files.replacing(path) as file:
-        np.savez_compressed(file, config=np.array(text), checksum=checksum, **arrays)
+    head = {"config": np.array(text), "checksum": checksum}
+    files.write_arrays(path, head | arrays, compress=True)
 
 
 def _export_checksum(config: str, arrays: dict[str, np.ndarray]) -> str:

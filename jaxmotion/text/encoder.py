@@ -214,16 +214,14 @@ def encode_unique(
 
 
 def _write_cache(path: str, encoder: TextEncoder, known: dict[str, np.ndarray]) -> None:
-    """Writes vectors; the file appears under its name only when it is whole."""
     header = {"format": _FORMAT, "version": _VERSION, "encoder": encoder.name}
     # Texts as JSON: NumPy's strings all take the room of the longest.
     text = json.dumps(header | {"texts": list(known)}).encode()
-    with files.replacing(path) as file:
-        np.savez(
-            file,
-            header=np.frombuffer(text, np.uint8),
-            vectors=np.stack(list(known.values())),
-        )
+    arrays = {
+        "header": np.frombuffer(text, np.uint8),
+        "vectors": np.stack(list(known.values())),
+    }
+    files.write_arrays(path, arrays)
 
 
 def _read_cache(path: str, encoder: TextEncoder) -> dict[str, np.ndarray]:

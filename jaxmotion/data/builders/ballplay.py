@@ -36,7 +36,6 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxmotion import files
-from jaxmotion.data import npz
 from jaxmotion.data.builders import ball_base, base, chains
 from jaxmotion.motion.skeleton import MAX_METERS, Skeleton
 
@@ -151,7 +150,7 @@ def read_fields(path: str, data: bytes) -> dict[str, np.ndarray]:
     fields = files.read_arrays(io.BytesIO(data), name=path, what="BallPlay-M")
     wanted = {field: (kind, 1 + len(s)) for field, (kind, s) in _FRAMES.items()}
     wanted |= {field: (kind, 1) for field, kind in _CLIPS.items()} | {"fps": ("f", 0)}
-    npz.check_fields(path, fields, wanted)
+    files.check_fields(path, fields, wanted)
     num_frames, num_clips = len(fields["body_position"]), len(fields["clip_name"])
     shapes = {field: (num_frames, *shape) for field, (_, shape) in _FRAMES.items()}
     shapes |= {"clip_offset": (num_clips + 1,), "clip_label": (num_clips,)}

@@ -39,7 +39,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxmotion import files
-from jaxmotion.data import npz
 from jaxmotion.data.builders import ball_base, base, chains, smpl
 from jaxmotion.motion.ball import ball_accelerations
 from jaxmotion.motion.skeleton import MAX_METERS, Skeleton
@@ -88,7 +87,7 @@ def _arrays(
     """Arrays of a file; finite, of those shapes."""
     fields = files.read_arrays(io.BytesIO(data), name=path, what=what)
     kinds = {field: ("f", len(shape)) for field, shape in shapes.items()}
-    npz.check_fields(path, fields, kinds)
+    files.check_fields(path, fields, kinds)
     for field, shape in shapes.items():
         found = fields[field]
         if any(n not in (None, m) for n, m in zip(shape, found.shape, strict=True)):

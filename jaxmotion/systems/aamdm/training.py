@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxmotion import files
-from jaxmotion.data import clips_io, mirror, npz, selection
+from jaxmotion.data import clips_io, mirror, selection
 from jaxmotion.learning import adversarial, checkpoint, runs, training
 from jaxmotion.learning.runs import Budget as Budget
 from jaxmotion.learning.runs import make_optimizer as make_optimizer
@@ -185,8 +185,8 @@ def prepare(
     frames, names = aamdm_data.pose_data(clips, fps=fps)
     skipped = sorted(set(clips.clip_names) - set(names))
     print(f"{len(names)} clips, {frames.num_frames} frames; too short: {skipped}")
-    with files.replacing(folder / "frames.npz") as file:
-        np.savez(file, poses=frames.poses, paths=frames.paths, offsets=frames.offsets)
+    arrays = {name: getattr(frames, name) for name in ("poses", "paths", "offsets")}
+    files.write_arrays(folder / "frames.npz", arrays)
     value = {
         "system": "aamdm",
         "skeleton": runs.skeleton_to_json(clips.skeleton),
@@ -259,7 +259,7 @@ def _read_frames(path: Path, skeleton: Skeleton, *, fps: float) -> PoseData:
     """The frames of a run folder; raises unless its arrays agree."""
     arrays = files.read_arrays(path, name=str(path), what="frame")
     wanted = {"poses": ("f", 2), "paths": ("f", 2), "offsets": ("i", 1)}
-    npz.check_fields(str(path), arrays, wanted)
+    files.check_fields(str(path), arrays, wanted)
     offsets = arrays["offsets"].astype(np.int64)
     number = offsets[-1] if offsets.size else 0
     if offsets.size < 2 or offsets[0] != 0 or (np.diff(offsets) < 1).any():
