@@ -19,11 +19,11 @@ from jaxmotion.data import clips_io, selection
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips, take_ball_clips
 from jaxmotion.data.clips import Clips, take_clips
 from jaxmotion.data.dribble import (
+    Dribble,
     concatenate_ball_clips,
     dribble_clips,
     resting_clips,
 )
-from jaxmotion.data.dribble_touches import Dribble
 from jaxmotion.learning import loop
 
 _FAR, _NEAR = (2.5, 5.0), (0.4, 0.8)

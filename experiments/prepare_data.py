@@ -24,7 +24,7 @@ import numpy as np
 import tyro
 
 from jaxmotion import cli
-from jaxmotion.data import clips_io, mirror, resample, selection, text_motion_io
+from jaxmotion.data import clips_io, mirror, resample, selection, text_motion
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
 from jaxmotion.data.text_motion import TextMotions
@@ -293,7 +293,7 @@ def prepare(config: Config) -> None:
     else:
         clips = read_published(config)
     if isinstance(clips, TextMotions):
-        text_motion_io.save_text_motions(config.out, clips)
+        text_motion.save_text_motions(config.out, clips)
         print(describe_texts(clips, config.out))
         print(f"took     {time.time() - start:.1f} s")
         return

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from jaxmotion.data import clips_io, selection, text_motion_io
+from jaxmotion.data import clips_io, selection, text_motion
 from jaxmotion.data.text_motion import TextMotions
 from jaxmotion.learning import runs
 from jaxmotion.systems.emdm import data as emdm_data
@@ -133,7 +133,7 @@ def _prepare_texts(args: Any) -> emdm_training.Task:
         # An encoder that is not there should be said before the features are made.
         emdm_text.make_encoder(args.encoder, form)
         motions = _text_motions(args, made["fps"])
-        text_motion_io.save_text_motions(args.out / "data.npz", motions)
+        text_motion.save_text_motions(args.out / "data.npz", motions)
         emdm_training.write_config(args.out, made | runs.made_from(args.data))
     run = emdm_text.load_run(args.out)
     counts = {s: run.motions.clips_of(s).size for s in run.motions.split_names}
@@ -146,8 +146,8 @@ def _prepare_texts(args: Any) -> emdm_training.Task:
 
 def _text_motions(args: Any, fps: float) -> TextMotions:
     """Text motions of a file of them, or of labeled clips."""
-    if len(args.data) == 1 and text_motion_io.is_text_motions(args.data[0]):
-        return text_motion_io.load_text_motions(args.data[0])
+    if len(args.data) == 1 and text_motion.is_text_motions(args.data[0]):
+        return text_motion.load_text_motions(args.data[0])
     clips = selection.concatenate([clips_io.load_clips(path) for path in args.data])
     motions, error = emdm_data.from_labels(
         clips,

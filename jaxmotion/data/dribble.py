@@ -2,32 +2,364 @@
 
 No recordings of people with a ball are to be had freely, but those of people who walk
 and run are. Where a foot swings low, there might have been a ball; between two such
-places it rolls as a ball does (`rolling`), and a chain of them is a dribble
-(`dribble_search`). The person is as recorded and knows nothing of the ball: what is
-learned from this is how feet and ball go together in place and time, not how a person
-runs after a ball. Beside other clips a ball lies, far away or in front of the feet.
+places it rolls as a ball does (`rolling`), and a chain of them is a dribble. The person
+is as recorded and knows nothing of the ball: what is learned from this is how feet and
+ball go together in place and time, not how a person runs after a ball. Beside other
+clips a ball lies, far away or in front of the feet.
+
+A touch is a frame in which a foot swings low, and the place of a ball on the ground in
+front of its toe. Elsewhere a ball keeps clear of the legs and within reach. A chain
+grows from touch to touch. Of the touches that follow within the time allowed, those are
+kept to which the ball can roll without meeting a leg and toward which the foot can push
+it. One of them is taken at random; where no way leads on, another one is tried, and the
+longest chain is kept.
 
 Touches are labeled by a rule of distance as in SMGDiff, but only about the frame in
 which the ball is pushed.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxmotion.data import selection
 from jaxmotion.data.ball_clips import BallClips, ball_clips
 from jaxmotion.data.clips import Clips, take_clips
-from jaxmotion.data.dribble_search import Segment, find_segments
-from jaxmotion.data.dribble_touches import Dribble
-from jaxmotion.data.rolling import TOUCH_MARGIN, Body, bodies, leg_distances
+from jaxmotion.data.rolling import (
+    TOUCH_MARGIN,
+    Body,
+    bodies,
+    end_velocities,
+    leg_distances,
+    roll,
+)
 from jaxmotion.motion.facing import hip_facing
 
+# Frames on either side of a touch in which a leg may come nearer.
+_NEAR = 2
+# Dead ends after which a chain that did not get longer is taken as it is.
+_PATIENCE = 60
 # Places that are tried for a ball that lies.
 _TRIES = 32
+
+
+def _require(holds: bool | np.bool_, settings: "Dribble", name: str, rule: str) -> None:
+    if not holds:
+        raise ValueError(f"{name} is {getattr(settings, name)}, expected it {rule}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Dribble:
+    """How a ball is dribbled; meters, seconds.
+
+    Attributes:
+      radius: Of the ball.
+      deceleration: Of the rolling ball, meters per second squared.
+      thickness: Of foot and shank about their bones: how high a standing toe joint is
+        above the ground, and how far from it the ball's surface is when they touch.
+      max_height: Of a touching toe above the ground.
+      min_toe_speed: Of a touching toe on the ground plane.
+      gap: Shortest and longest time between touches.
+      max_speed: Of the ball.
+      min_push: Least change of the ball's velocity along that of the toe.
+      cone: Largest angle between that change and the toe's velocity, radians.
+      restitution: Most that a ball bounces off a foot: the speed at which it leaves the
+        toe, as part of the speed at which the toe came near.
+      give: How much nearer than its thickness a leg may come to the ball from two
+        frames before a touch to two frames after it.
+      reach: Largest distance of ball and root on the ground plane.
+      wait: Longest time that a ball lies before its first touch.
+      min_frames: Of a segment.
+
+    Raises:
+      ValueError: if a value is out of its range; names it.
+    """
+
+    radius: float = 0.11
+    deceleration: float = 0.8
+    thickness: float = 0.03
+    max_height: float = 0.2
+    min_toe_speed: float = 0.5
+    gap: tuple[float, float] = (0.3, 1.2)
+    max_speed: float = 8.0
+    min_push: float = 0.3
+    cone: float = np.pi / 3
+    restitution: float = 0.6
+    give: float = 0.02
+    reach: float = 2.0
+    wait: float = 1.0
+    min_frames: int = 60
+
+    def __post_init__(self):
+        for name in ("radius", "deceleration", "max_speed", "reach", "min_frames"):
+            _require(getattr(self, name) > 0, self, name, "positive")
+        for name in ("min_push", "restitution", "wait", "min_toe_speed"):
+            _require(getattr(self, name) >= 0, self, name, "0 or more")
+        # A foot farther away would not count as touching.
+        allowed = 0 <= self.thickness <= TOUCH_MARGIN
+        _require(allowed, self, "thickness", f"in 0..{TOUCH_MARGIN}")
+        _require(0 <= self.give <= self.thickness, self, "give", "in 0..thickness")
+        _require(0 < self.cone < np.pi / 2, self, "cone", "between 0 and pi / 2")
+        _require(0 < self.gap[0] <= self.gap[1], self, "gap", "positive and in order")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Touches:
+    """Possible touches of one clip, in the order of their frames.
+
+    Attributes:
+      frame: Of each touch.
+      foot: Which of the feet touches.
+      place: Of the ball's center on the ground plane, meters.
+      direction: Of the toe's velocity on the ground plane.
+      speed: Of the toe on the ground plane, meters per second.
+    """
+
+    frame: Int[np.ndarray, "touches"]
+    foot: Int[np.ndarray, "touches"]
+    place: Float[np.ndarray, "touches 2"]
+    direction: Float[np.ndarray, "touches 2"]
+    speed: Float[np.ndarray, "touches"]
+
+
+def possible_touches(body: Body, settings: Dribble) -> Touches:
+    """Frames in which a foot could touch a ball, and where that would be.
+
+    Args:
+      body: The clip.
+      settings: What counts as a touch.
+
+    Returns:
+      The touches.
+    """
+    speed = np.linalg.norm(body.velocity, axis=-1)
+    direction = body.velocity / np.maximum(speed, 1e-9)[..., None]
+    ahead = np.sum((body.toes[..., ::2] - body.root[:, None]) * direction, axis=-1)
+    height = body.toes[..., 1] - body.ground
+    # As far from the toe as foot and ball are thick, but on the ground.
+    square = (settings.radius + settings.thickness) ** 2
+    square = square - (height - settings.radius) ** 2
+    fits = ~body.standing & (speed >= settings.min_toe_speed) & (ahead > 0)
+    fits &= (height <= settings.max_height) & (square > 0)
+    away = np.sqrt(np.maximum(square, 0.0))[..., None] * direction
+    place = body.toes[..., ::2] + away
+    near = np.ones(fits.shape[0], bool)
+    fits &= is_free(body, place.swapaxes(0, 1), slice(None), near, settings).T
+    frame, foot = np.nonzero(fits)
+    return Touches(
+        frame=frame,
+        foot=foot,
+        place=place[fits],
+        direction=direction[fits],
+        speed=speed[fits],
+    )
+
+
+def is_free(
+    body: Body,
+    place: Float[np.ndarray, "*batch frames 2"],
+    frames: slice,
+    near: Bool[np.ndarray, "*other frames"],
+    settings: Dribble,
+) -> Bool[np.ndarray, "*batch frames"]:
+    """Whether a ball on the ground is clear of the legs and within reach of the root.
+
+    Args:
+      body: The clip.
+      place: Of the ball's center on the ground plane, meters.
+      frames: Of the clip.
+      near: Whether a touch is so near in time that a leg may come nearer.
+      settings: What is clear and what is near.
+
+    Returns:
+      Whether it is, frame by frame.
+    """
+    height = np.full(place.shape[:-1], body.ground + settings.radius)
+    ball = np.stack([place[..., 0], height, place[..., 1]], axis=-1)
+    least = settings.radius + settings.thickness - np.where(near, settings.give, 0.0)
+    away = np.linalg.norm(place - body.root[frames], axis=-1)
+    free = leg_distances(ball, body.legs[frames]) >= least
+    return free & (away <= settings.reach)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Segment:
+    """A ball beside some frames of a clip, from its rest to its last touch.
+
+    Attributes:
+      start: First frame.
+      ball: Its center on the ground plane, meters.
+      touch_frames: Frames of the touches, counted from `start`.
+      touch_feet: Which of the feet touches.
+    """
+
+    start: int
+    ball: Float[np.ndarray, "frames 2"]
+    touch_frames: Int[np.ndarray, "touches"]
+    touch_feet: Int[np.ndarray, "touches"]
+
+
+def _can_push(
+    touches: Touches,
+    now: int,
+    leave: Float[np.ndarray, "ways 2"],
+    arrive: Float[np.ndarray, "2"],
+    settings: Dribble,
+) -> Bool[np.ndarray, "ways"]:
+    """Whether a foot can turn the velocity of arrival into those of leaving."""
+    toe, speed = touches.direction[now], touches.speed[now]
+    change = leave - arrive
+    along = change @ toe
+    push = along >= settings.min_push
+    push &= along >= np.cos(settings.cone) * np.linalg.norm(change, axis=-1)
+    bounce = settings.restitution * (speed - arrive @ toe)
+    return push & (leave @ toe - speed <= bounce)
+
+
+def next_touches(
+    body: Body,
+    touches: Touches,
+    now: int,
+    arrive: Float[np.ndarray, "2"],
+    settings: Dribble,
+) -> tuple[Int[np.ndarray, "ways"], Float[np.ndarray, "ways 2"]]:
+    """Touches to which the ball can be sent by one touch.
+
+    Args:
+      body: The clip.
+      touches: All of the clip.
+      now: The touch that sends it.
+      arrive: Velocity with which the ball came to it, meters per second.
+      settings: What a ball may do.
+
+    Returns:
+      Those touches, and the velocity with which the ball comes to each.
+    """
+    first = int(touches.frame[now])
+    shortest, longest = (first + seconds * body.fps for seconds in settings.gap)
+    low = np.searchsorted(touches.frame, shortest - 1e-6)
+    found = np.arange(low, np.searchsorted(touches.frame, longest + 1e-6))
+    way = touches.place[found] - touches.place[now]
+    seconds = (touches.frame[found] - first) / body.fps
+    leave, comes = end_velocities(way, seconds, settings.deceleration)
+    keep = np.linalg.norm(leave, axis=-1) <= settings.max_speed
+    keep &= _can_push(touches, now, leave, arrive, settings)
+    # A foot that is hardly faster than the ball cannot push it on.
+    nears = touches.speed[found] - np.sum(comes * touches.direction[found], axis=-1)
+    keep &= nears * (1 + settings.restitution) >= settings.min_push
+    if not keep.any():
+        return found[keep], comes[keep]
+    found, way, seconds, comes = (x[keep] for x in (found, way, seconds, comes))
+    frames = (touches.frame[found] - first)[:, None]
+    count = np.arange(frames.max() + 1)
+    times = np.minimum(count / body.fps, seconds[:, None])
+    place = touches.place[now] + roll(way, seconds, settings.deceleration, times)
+    near = (count <= _NEAR) | (count >= frames - _NEAR)
+    free = is_free(body, place, slice(first, first + count.size), near, settings)
+    good = np.all(free | (count > frames), axis=-1)
+    return found[good], comes[good]
+
+
+def find_chain(
+    body: Body,
+    touches: Touches,
+    first: int,
+    tried: set[int],
+    settings: Dribble,
+    generator: np.random.Generator,
+) -> list[int]:
+    """Touches one after the other, as many as chance finds.
+
+    Args:
+      body: The clip.
+      touches: All of the clip.
+      first: The touch to begin with.
+      tried: Touches from which no way led on; those that are tried are added.
+      settings: What a ball may do.
+      generator: Of the order in which ways are tried.
+
+    Returns:
+      The touches, the first one at least.
+    """
+
+    def ways(now: int, arrive: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+        found, comes = next_touches(body, touches, now, arrive, settings)
+        order = generator.permutation(found.size)
+        return iter([(int(found[i]), comes[i]) for i in order])
+
+    tried.add(first)
+    chain, open_ways = [first], [ways(first, np.zeros(2))]
+    best, dead_ends = [first], 0
+    while chain and dead_ends < _PATIENCE:
+        step = next((way for way in open_ways[-1] if way[0] not in tried), None)
+        if step is not None:
+            tried.add(step[0])
+            chain.append(step[0])
+            open_ways.append(ways(*step))
+            continue
+        dead_ends += 1
+        if touches.frame[chain[-1]] > touches.frame[best[-1]]:
+            best, dead_ends = list(chain), 0
+        chain.pop()
+        open_ways.pop()
+    return best
+
+
+def _segment(
+    body: Body, touches: Touches, chain: list[int], earliest: int, settings: Dribble
+) -> Segment:
+    """The ball of a chain, and its rest before that."""
+    frame, place = touches.frame[chain], touches.place[chain]
+    start = max(earliest, int(frame[0]) - round(settings.wait * body.fps))
+    before = np.arange(start, frame[0])
+    lies = np.broadcast_to(place[0], (before.size, 2))
+    near = before >= frame[0] - _NEAR
+    free = is_free(body, lies, slice(start, int(frame[0])), near, settings)
+    # Not before the last frame in which a leg is where the ball lies.
+    start += int(np.flatnonzero(~free).max(initial=-1)) + 1
+    now = np.arange(start, frame[-1] + 1)
+    last = np.maximum(np.searchsorted(frame, now, side="right") - 1, 0)
+    # The last touch sends the ball nowhere.
+    way = np.diff(place, axis=0, append=place[-1:])[last]
+    seconds = np.diff(frame, append=frame[-1] + 1)[last] / body.fps
+    times = np.maximum(now - frame[last], 0)[:, None] / body.fps
+    return Segment(
+        start=start,
+        ball=place[last] + roll(way, seconds, settings.deceleration, times)[:, 0],
+        touch_frames=frame - start,
+        touch_feet=touches.foot[chain],
+    )
+
+
+def find_segments(
+    body: Body, settings: Dribble, generator: np.random.Generator
+) -> list[Segment]:
+    """Stretches of a clip beside which a ball can be dribbled; they do not overlap.
+
+    Args:
+      body: The clip.
+      settings: What a ball may do, and how long a stretch is.
+      generator: Of everything.
+
+    Returns:
+      The segments in their order, perhaps none.
+    """
+    touches = possible_touches(body, settings)
+    tried, earliest, found = set(), 0, []
+    while True:
+        left = np.setdiff1d(np.flatnonzero(touches.frame >= earliest), list(tried))
+        if left.size == 0:
+            return found
+        soon = touches.frame[left[0]] + settings.gap[1] * body.fps
+        first = int(generator.choice(left[touches.frame[left] <= soon]))
+        chain = find_chain(body, touches, first, tried, settings, generator)
+        segment = _segment(body, touches, chain, earliest, settings)
+        if len(segment.ball) >= settings.min_frames:
+            found.append(segment)
+            earliest = segment.start + len(segment.ball)
 
 
 def dribble_clips(

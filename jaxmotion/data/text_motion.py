@@ -3,20 +3,45 @@
 The feature vectors are those of `motion.humanml`, 263 numbers a frame for HumanML3D and
 251 for KIT-ML, or others that come with their mean and deviation.
 
-Everything here is NumPy on the host; `text_sampling` puts one split on a device,
-`text_motion_io` on disk.
+`TextMotions` is NumPy on the host, and one npz file on disk. `text_arrays` puts one
+split on the device, z-scored; `sample_text_batch` gathers batches from it inside jit,
+and compiles once.
 """
 
 import collections
 import dataclasses
+import os
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
+from jaxmotion import files
+from jaxmotion.data import clips_io
 from jaxmotion.motion.humanml import HUMANML3D, KIT_ML
+from jaxmotion.typing import Key
 
 SPLITS = ("train", "val", "test")
+_FORMAT = "jaxmotion-text-motions"
+_VERSION = 1
+# Kind of each field's numbers ("f" float, "i" integer, "U" text) and its axes.
+_FIELDS = {
+    "features": ("f", 2),
+    "offsets": ("i", 1),
+    "mean": ("f", 1),
+    "std": ("f", 1),
+    "captions": ("U", 1),
+    "tokens": ("U", 1),
+    "caption_clip": ("i", 1),
+    "split": ("i", 1),
+    "clip_names": ("U", 1),
+    "fps": ("f", 0),
+    "split_names": ("U", 1),
+    "source": ("U", 0),
+}
+_TEXTS = ("captions", "tokens", "clip_names", "split_names")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -254,3 +279,257 @@ def text_motions(
         fps=float(fps),
         source=source,
     )
+
+
+def save_text_motions(path: str | os.PathLike, motions: TextMotions) -> None:
+    """Writes clips with captions; the file appears only when it is whole.
+
+    Args:
+      path: File to write, conventionally .npz; its folder is made if need be.
+      motions: The clips.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    fields = {name: np.asarray(getattr(motions, name)) for name in _FIELDS}
+    # Without the type an empty list of names would be stored as numbers.
+    fields |= {name: np.array(getattr(motions, name), np.str_) for name in _TEXTS}
+    files.write_arrays(
+        path, {"format": np.array(_FORMAT), "version": np.array(_VERSION), **fields}
+    )
+
+
+def _check_fields(path: str, fields: dict[str, np.ndarray]) -> None:
+    """Raises unless the fields agree with each other."""
+    num_frames, num_features = fields["features"].shape
+    num_clips, num_captions = fields["offsets"].size - 1, fields["captions"].size
+    sizes = {
+        "tokens": num_captions,
+        "caption_clip": num_captions,
+        "split": num_clips,
+        "clip_names": num_clips,
+    }
+    for name, size in sizes.items():
+        if fields[name].size != size:
+            raise ValueError(
+                f"{path}: field {name!r} has {fields[name].size} entries, expected "
+                f"{size}"
+            )
+    if not np.isfinite(fields["features"]).all():
+        index = np.argwhere(~np.isfinite(fields["features"]))[0].tolist()
+        raise ValueError(f"{path}: field 'features' is not a finite float32 at {index}")
+    check_statistics(
+        fields["mean"],
+        fields["std"],
+        num_features,
+        names=(f"{path}: field 'mean'", f"{path}: field 'std'"),
+    )
+    _check_ranges(path, fields, num_frames, num_clips)
+
+
+def _check_ranges(
+    path: str, fields: dict[str, np.ndarray], num_frames: int, num_clips: int
+) -> None:
+    """Raises unless clips, captions, splits and rate are in range."""
+    offsets, owner, split = (fields[k] for k in ("offsets", "caption_clip", "split"))
+    if num_clips < 1 or offsets[0] != 0 or offsets[-1] != num_frames:
+        raise ValueError(
+            f"{path}: field 'offsets' should run from 0 to {num_frames} frames"
+        )
+    if (np.diff(offsets) < 1).any():
+        clip = int(np.argmax(np.diff(offsets) < 1))
+        raise ValueError(f"{path}: field 'offsets': clip {clip} has no frames")
+    if (np.diff(owner) < 0).any() or not np.array_equal(
+        np.unique(owner), np.arange(num_clips)
+    ):
+        raise ValueError(
+            f"{path}: field 'caption_clip' should ascend and give each of the "
+            f"{num_clips} clips at least one caption"
+        )
+    count = fields["split_names"].size
+    if split.min() < 0 or split.max() >= count:
+        raise ValueError(
+            f"{path}: field 'split' should be in 0..{count - 1}, found "
+            f"{split.min()}..{split.max()}"
+        )
+    clips_io.check_rate(path, fields["fps"])
+
+
+def load_text_motions(path: str | os.PathLike) -> TextMotions:
+    """Reads what `save_text_motions` wrote; checks every field.
+
+    Args:
+      path: The file.
+
+    Returns:
+      The clips, on the host.
+
+    Raises:
+      FileNotFoundError: if there is no such file.
+      ValueError: if it is damaged, foreign, of another version, or inconsistent; names
+        the file and the field.
+    """
+    path = os.fspath(path)
+    fields = files.read_versioned(
+        path, _FIELDS, what="text motions", format_name=_FORMAT, version=_VERSION
+    )
+    with np.errstate(over="ignore"):  # what overflows is refused next
+        for name in ("features", "mean", "std"):
+            fields[name] = fields[name].astype(np.float32, copy=False)
+    for name in ("offsets", "caption_clip", "split"):
+        fields[name] = fields[name].astype(np.int64)
+    _check_fields(path, fields)
+    arrays = {
+        name: fields[name]
+        for name, (_, axes) in _FIELDS.items()
+        if name not in _TEXTS and axes > 0
+    }
+    texts = {name: tuple(fields[name].tolist()) for name in _TEXTS}
+    return TextMotions(
+        **arrays, **texts, fps=float(fields["fps"]), source=str(fields["source"])
+    )
+
+
+def is_text_motions(path: str | os.PathLike) -> bool:
+    """Whether a file says that it holds text motions; nothing else of it is checked.
+
+    Args:
+      path: A file.
+
+    Returns:
+      False also for what is no npz file.
+
+    Raises:
+      OSError: if it cannot be read.
+    """
+    name = os.fspath(path)
+    try:
+        fields = files.read_arrays(path, name=name, what="motion", only=("format",))
+    except ValueError:
+        return False
+    return str(fields.get("format")) == _FORMAT
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class TextArrays:
+    """Clips of one split on the device.
+
+    Attributes:
+      features: Z-scored feature vectors of all clips behind each other, then zeros, so
+        that a window from any frame stays inside.
+      starts: First frame of each clip.
+      lengths: Frames of each clip.
+      captions: Captions of all clips behind each other, as numbers in `TextMotions`.
+      caption_starts: First entry of each clip in `captions`.
+      caption_counts: Captions of each clip.
+      max_frames: Frames of a sample, with its padding.
+      unit_length: Lengths of samples are multiples of it, frames.
+    """
+
+    features: Float[Array, "rows features"]
+    starts: Int[Array, "clips"]
+    lengths: Int[Array, "clips"]
+    captions: Int[Array, "captions"]
+    caption_starts: Int[Array, "clips"]
+    caption_counts: Int[Array, "clips"]
+    max_frames: int = jax.tree.static()
+    unit_length: int = jax.tree.static()
+
+
+def text_arrays(
+    motions: TextMotions,
+    *,
+    split: str,
+    max_frames: int,
+    unit_length: int = 4,
+) -> TextArrays:
+    """Puts the clips of a split on the default device, z-scored.
+
+    Args:
+      motions: Clips with captions.
+      split: "train", "val" or "test".
+      max_frames: Frames of a sample; 196 in the published experiments.
+      unit_length: Lengths of samples are multiples of it, frames.
+
+    Returns:
+      What `sample_text_batch` draws from.
+
+    Raises:
+      ValueError: if the split has no clips, a clip is shorter than a unit (names it),
+        or max_frames is.
+    """
+    clips = motions.clips_of(split)
+    if clips.size == 0:
+        raise ValueError(f"no clip of split {split!r}")
+    if not 0 < unit_length <= max_frames:
+        raise ValueError(
+            f"expected 0 < unit_length <= max_frames, found unit_length {unit_length} "
+            f"and max_frames {max_frames}"
+        )
+    lengths = np.diff(motions.offsets)[clips]
+    if lengths.min() < unit_length:
+        short = int(lengths.argmin())
+        raise ValueError(
+            f"clip {motions.clip_names[clips[short]]!r} has {lengths[short]} frames, "
+            f"expected at least a unit of {unit_length}"
+        )
+    # Filled in place: the published set takes gigabytes, and each copy as much.
+    scored = np.zeros((lengths.sum() + max_frames, motions.num_features), np.float32)
+    starts = np.cumsum(lengths) - lengths
+    for clip, start, length in zip(clips, starts, lengths, strict=True):
+        first = motions.offsets[clip]
+        own = motions.features[first : first + length]
+        scored[start : start + length] = (own - motions.mean) / motions.std
+    counts = np.bincount(motions.caption_clip, minlength=motions.num_clips)[clips]
+    number = lambda values: jnp.asarray(values, jnp.int32)  # noqa: E731
+    return TextArrays(
+        features=jnp.asarray(scored),
+        starts=number(starts),
+        lengths=number(lengths),
+        captions=number(np.flatnonzero(np.isin(motions.caption_clip, clips))),
+        caption_starts=number(np.cumsum(counts) - counts),
+        caption_counts=number(counts),
+        max_frames=max_frames,
+        unit_length=unit_length,
+    )
+
+
+def sample_text_batch(
+    key: Key, arrays: TextArrays, *, batch: int
+) -> tuple[
+    Float[Array, "{batch} frames features"],
+    Int[Array, "{batch}"],
+    Int[Array, "{batch}"],
+]:
+    """Draws clips uniformly, of each a caption uniformly, and a random crop.
+
+    The length is that of the clip, at most max_frames, rounded down to units; one time
+    in three it is a unit shorter still, unless that would leave nothing.
+
+    Args:
+      key: Consumed.
+      arrays: Clips of one split.
+      batch: Samples to draw.
+
+    Returns:
+      Z-scored features, zero behind their end; lengths in frames; and captions as
+      numbers in `TextMotions`.
+
+    Source: the data loader released with T2M, unit length 4.
+    """
+    key_clip, key_caption, key_length, key_start = jax.random.split(key, 4)
+    draw = lambda key, stop: jax.random.randint(key, (batch,), 0, stop)  # noqa: E731
+    clip = draw(key_clip, arrays.starts.shape[0])
+    caption = draw(key_caption, arrays.caption_counts[clip])
+    frames = arrays.lengths[clip]
+    units = jnp.minimum(frames, arrays.max_frames) // arrays.unit_length
+    shorter = draw(key_length, 3) == 0
+    length = jnp.maximum(units - shorter, 1) * arrays.unit_length
+    start = arrays.starts[clip] + draw(key_start, frames - length + 1)
+    take = lambda row: jax.lax.dynamic_slice_in_dim(  # noqa: E731
+        arrays.features, row, arrays.max_frames
+    )
+    inside = jnp.arange(arrays.max_frames)[None] < length[:, None]
+    features = jnp.where(inside[..., None], jax.vmap(take)(start), 0.0)
+    return features, length, arrays.captions[arrays.caption_starts[clip] + caption]

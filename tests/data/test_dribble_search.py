@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from jaxmotion.data.dribble_search import next_touches
-from jaxmotion.data.dribble_touches import Dribble, Touches
+from jaxmotion.data.dribble import Dribble, Touches, next_touches
 from jaxmotion.data.rolling import Body, roll
 
 FRAMES, LAST = 31, 15

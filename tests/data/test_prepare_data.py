@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxmotion.data import ball_clips, clips_io, text_motion_io
+from jaxmotion.data import ball_clips, clips_io, text_motion
 from tests.data import test_builders, test_text_builders
 from tests.data.builders import test_ballplay, test_soccer_x
 
@@ -59,7 +59,7 @@ def test_sets_with_captions_are_written(script, tmp_path, capsys):
     out = tmp_path / "data" / "k.npz"
     options = {"source": "kit_ml", "out": out, "manual_dir": tmp_path / "raw"}
     script.prepare(script.Config(**options, cut_fps=12.5))
-    found = text_motion_io.load_text_motions(out)
+    found = text_motion.load_text_motions(out)
     assert (found.num_clips, found.num_features, found.fps) == (6, 251, 12.5)
     printed = capsys.readouterr().out
     # One clip was cut by its caption, to frames 12..42.

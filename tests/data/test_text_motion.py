@@ -5,7 +5,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxmotion.data import text_files, text_motion, text_motion_io, text_sampling
+from jaxmotion.data import text_files, text_motion
 
 WIDTH = 5
 LENGTHS = (9, 30, 17, 12)
@@ -121,12 +121,12 @@ def test_what_is_wrong_is_named(case):
 
 @pytest.fixture
 def saved(tmp_path):
-    text_motion_io.save_text_motions(tmp_path / "new" / "m.npz", motions())
+    text_motion.save_text_motions(tmp_path / "new" / "m.npz", motions())
     return tmp_path / "new" / "m.npz"
 
 
 def test_round_trip_is_exact_and_leaves_one_file(saved):
-    expected, found = motions(), text_motion_io.load_text_motions(saved)
+    expected, found = motions(), text_motion.load_text_motions(saved)
     for field in dataclasses.fields(expected):
         a, b = getattr(found, field.name), getattr(expected, field.name)
         assert type(a) is type(b)
@@ -143,13 +143,13 @@ def test_an_interrupted_write_leaves_the_old_file(saved, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", stop)
     with pytest.raises(KeyboardInterrupt):
-        text_motion_io.save_text_motions(saved, motions())
+        text_motion.save_text_motions(saved, motions())
     assert saved.read_bytes() == before
     assert os.listdir(saved.parent) == ["m.npz"]
 
 
 def test_missing_damaged_and_foreign_files_are_named(saved, tmp_path):
-    load = text_motion_io.load_text_motions
+    load = text_motion.load_text_motions
     with pytest.raises(FileNotFoundError, match="no text motions file .*none.npz"):
         load(tmp_path / "none.npz")
     np.savez(tmp_path / "other.npz", weights=np.zeros(3))
@@ -189,7 +189,7 @@ def test_inconsistent_fields_are_named(saved, field):
     fields = {k: v for k, v in {**fields, **changes}.items() if v is not None}
     np.savez(saved, **fields)
     with pytest.raises(ValueError, match=f"m.npz.*{message}"):
-        text_motion_io.load_text_motions(saved)
+        text_motion.load_text_motions(saved)
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def test_clips_without_frames_are_named(saved, offsets, message):
         fields = {name: file[name] for name in file.files}
     np.savez(saved, **{**fields, "offsets": np.array(offsets)})
     with pytest.raises(ValueError, match=message):
-        text_motion_io.load_text_motions(saved)
+        text_motion.load_text_motions(saved)
 
 
 LINES = """a man, waving.#a/DET man/NOUN wave/VERB#0.0#0.0
@@ -281,12 +281,12 @@ MAX_FRAMES = 16
 
 def arrays(**changes):
     options = {"split": "train", "max_frames": MAX_FRAMES, **changes}
-    return text_sampling.text_arrays(motions(), **options)
+    return text_motion.text_arrays(motions(), **options)
 
 
 @pytest.fixture(scope="module")
 def drawn():
-    batch = text_sampling.sample_text_batch(jax.random.key(3), arrays(), batch=4000)
+    batch = text_motion.sample_text_batch(jax.random.key(3), arrays(), batch=4000)
     features, length, caption = (np.asarray(x) for x in batch)
     raw = features * motions().std + motions().mean
     return features, raw, length, caption
@@ -342,7 +342,7 @@ def test_crops_start_anywhere(drawn):
 
 def test_a_clip_of_one_unit_keeps_it():
     found = arrays(unit_length=9)
-    _, length, _ = text_sampling.sample_text_batch(jax.random.key(0), found, batch=64)
+    _, length, _ = text_motion.sample_text_batch(jax.random.key(0), found, batch=64)
     assert set(np.asarray(length).tolist()) == {9}
 
 
@@ -352,12 +352,12 @@ def test_one_compile_serves_all_keys():
     @jax.jit
     def sample(key, found):
         traces.append(key)
-        return text_sampling.sample_text_batch(key, found, batch=8)
+        return text_motion.sample_text_batch(key, found, batch=8)
 
     found = arrays()
     a, b = (sample(jax.random.key(seed), found)[0] for seed in (0, 1))
     assert len(traces) == 1 and np.abs(np.asarray(a - b)).max() > 0.1
-    eager = text_sampling.sample_text_batch(jax.random.key(0), found, batch=8)[0]
+    eager = text_motion.sample_text_batch(jax.random.key(0), found, batch=8)[0]
     np.testing.assert_allclose(eager, a, atol=1e-6)
 
 

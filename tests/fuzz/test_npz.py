@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxmotion import files
-from jaxmotion.data import ball_clips, clips_io, text_files, text_motion_io
+from jaxmotion.data import ball_clips, clips_io, text_files, text_motion
 from tests import ball_walker
 from tests.data import samples, test_text_motion
 from tests.fuzz import harness, mutations
@@ -107,11 +107,11 @@ def test_clips_with_a_ball(tmp_path, capsys):
 
 def test_motions_with_captions(tmp_path, capsys):
     path = tmp_path / "x.npz"
-    data = written(path, text_motion_io.save_text_motions, test_text_motion.motions())
+    data = written(path, text_motion.save_text_motions, test_text_motion.motions())
 
     def read(_):
-        is_one = text_motion_io.is_text_motions(path)
-        found = text_motion_io.load_text_motions(path)
+        is_one = text_motion.is_text_motions(path)
+        found = text_motion.load_text_motions(path)
         assert is_one
         return found
 

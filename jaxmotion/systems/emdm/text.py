@@ -12,9 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmotion.data import text_motion_io
-from jaxmotion.data.text_motion import TextMotions
-from jaxmotion.data.text_sampling import TextArrays, sample_text_batch, text_arrays
+from jaxmotion.data import text_motion
+from jaxmotion.data.text_motion import (
+    TextArrays,
+    TextMotions,
+    sample_text_batch,
+    text_arrays,
+)
 from jaxmotion.motion import humanml
 from jaxmotion.motion.humanml import HUMANML3D, KIT_ML
 from jaxmotion.systems.emdm import loss as emdm_loss
@@ -117,7 +121,7 @@ def load_run(folder: Path) -> TextRun:
             f"{folder / 'config.json'}: field 'task' is {value.get('task')!r}, "
             "expected 'text'"
         )
-    motions = text_motion_io.load_text_motions(folder / "data.npz")
+    motions = text_motion.load_text_motions(folder / "data.npz")
     form = value["text_form"]
     encoder = make_encoder(value["encoder"], form)
     cache = folder / "texts.npz"

@@ -19,8 +19,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.plain_pickle import read_plain_pickle
 from jaxmotion.data.text_files import read_array
-from jaxmotion.data.text_motion import check_statistics
-from jaxmotion.data.text_sampling import sample_text_batch, text_arrays
+from jaxmotion.data.text_motion import check_statistics, sample_text_batch, text_arrays
 from jaxmotion.evaluation import diversity, frechet, matching
 from jaxmotion.evaluation.table import Row
 from jaxmotion.evaluators import published

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxmotion.data import text_motion, text_motion_io
+from jaxmotion.data import text_motion
 from jaxmotion.systems.emdm import text as emdm_text
 from jaxmotion.systems.emdm import training as emdm_training
 from tests.reference import clip as oracle
@@ -37,7 +37,7 @@ def folder(tmp_path):
         fps=20.0,
         source="made in the tests",
     )
-    text_motion_io.save_text_motions(tmp_path / "data.npz", motions)
+    text_motion.save_text_motions(tmp_path / "data.npz", motions)
 
     def write(**given):
         value = {"task": "text", "encoder": str(clip)} | given
