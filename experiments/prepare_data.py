@@ -26,24 +26,12 @@ import tyro
 from jaxmotion import cli
 from jaxmotion.data import clips_io, mirror, resample, selection, text_motion
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips
+from jaxmotion.data.builders import REGISTRY
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
 from jaxmotion.data.text_motion import TextMotions
 
-Source = Literal[
-    "bandai_namco/1",
-    "bandai_namco/2",
-    "lafan1",
-    "o3de_motion_matching",
-    "style100",
-    "humanact12",
-    "humanml3d",
-    "kit_ml",
-    "ballplay",
-    "soccer_x",
-    "procedural",
-]
-TEXT_SOURCES = ("humanml3d", "kit_ml")
-BALL_SOURCES = ("ballplay", "soccer_x")
+# "procedural" generates a styled walker.
+Source = Literal[*REGISTRY, "procedural"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,9 +64,6 @@ class Config:
 def check_config(config: Config) -> None:
     """Finds what would stop the work at its end before it begins.
 
-    Args:
-      config: The settings.
-
     Raises:
       FileNotFoundError: if the folder of the published files is missing.
       FileExistsError: if the output exists and is not to be replaced.
@@ -93,16 +78,14 @@ def check_config(config: Config) -> None:
             raise ValueError(f"--{option} should be in {low:g}..{high:g}, found {rate}")
     if not 0 <= config.seed < 2**32:
         raise ValueError(f"--seed should be in 0..2**32 - 1, found {config.seed}")
-    if config.source in TEXT_SOURCES and (config.mirror or config.fps is not None):
-        raise ValueError(
-            f"{config.source} is published with mirror images and at its own rate: "
-            "--mirror and --fps do not apply"
-        )
-    if config.source in BALL_SOURCES and (config.mirror or config.fps is not None):
-        raise ValueError(
-            f"{config.source} is read at 30 frames per second, since touches of the "
-            "ball cannot be resampled: --mirror and --fps do not apply"
-        )
+    kind = "clips" if config.source == "procedural" else REGISTRY[config.source].kind
+    if kind != "clips" and (config.mirror or config.fps is not None):
+        reason = {
+            "texts": "is published with mirror images and at its own rate",
+            "ball": "is read at 30 frames per second, since touches of the ball cannot "
+            "be resampled",
+        }[kind]
+        raise ValueError(f"{config.source} {reason}: --mirror and --fps do not apply")
     if config.source != "procedural":
         if config.manual_dir is None:
             raise FileNotFoundError(f"{config.source} needs --manual-dir")
@@ -119,67 +102,24 @@ def check_config(config: Config) -> None:
 
 
 def read_published(config: Config) -> Clips | BallClips | TextMotions:
-    """A published set, by way of its tensorflow-datasets builder.
+    """A published set at its own rate, by way of its tensorflow-datasets builder."""
+    from jaxmotion.data.builders import ball_base, base, humanml3d
 
-    Args:
-      config: The settings.
-
-    Returns:
-      The clips at the rate of the set.
-    """
-    from jaxmotion.data.builders import (
-        ball_base,
-        ballplay,
-        bandai_namco,
-        base,
-        humanact12,
-        humanml3d,
-        lafan1,
-        o3de,
-        soccer_x,
-        style100,
-    )
-
-    name, _, variant = config.source.partition("/")
-    if name == "style100":
-        variant = "mirror" if config.mirror else "original"
-    if name in TEXT_SOURCES:
-        variant = name
-    classes = {
-        "bandai_namco": bandai_namco.BandaiNamco,
-        "lafan1": lafan1.Lafan1,
-        "o3de_motion_matching": o3de.O3deMotionMatching,
-        "style100": style100.Style100,
-        "humanact12": humanact12.Humanact12,
-        "humanml3d": humanml3d.HumanML3D,
-        "kit_ml": humanml3d.HumanML3D,
-        "ballplay": ballplay.Ballplay,
-        "soccer_x": soccer_x.SoccerX,
-    }
+    found = REGISTRY[config.source]
     folder = config.tfds_dir or config.out.parent / "tfds"
-    builder = classes[name](
-        config=variant or None, data_dir=str(folder), file_format="array_record"
-    )
+    builder = found.make(str(folder), mirror=config.mirror)
     if builder.data_path.exists() and not config.overwrite:
         print(f"reusing  {builder.data_path}; --overwrite reads --manual-dir again")
     base.prepare(builder, config.manual_dir, overwrite=config.overwrite)
-    if name in TEXT_SOURCES:
+    if found.kind == "texts":
         return humanml3d.text_motions_from_source(builder, cut_fps=config.cut_fps)
-    if name in BALL_SOURCES:
+    if found.kind == "ball":
         return ball_base.ball_clips_from_source(builder)
     return base.clips_from_source(builder)
 
 
 def at_rate(clips: Clips, fps: float) -> Clips:
-    """The clips at another frame rate.
-
-    Args:
-      clips: The clips.
-      fps: Frames per second.
-
-    Returns:
-      The clips themselves if they have that rate.
-    """
+    """The clips at another frame rate; themselves if they have it."""
     if clips.fps == fps:
         return clips
     motions = [clip_motion(clips, i) for i in range(clips.num_clips)]
@@ -197,15 +137,7 @@ def at_rate(clips: Clips, fps: float) -> Clips:
 
 
 def describe(clips: Clips, path: Path) -> str:
-    """Counts of what was written.
-
-    Args:
-      clips: The clips.
-      path: The file.
-
-    Returns:
-      Lines to print.
-    """
+    """Lines with counts of what was written."""
     minutes = clips.num_frames / clips.fps / 60
     lengths = np.diff(np.asarray(clips.offsets))
     lines = [
@@ -223,15 +155,7 @@ def describe(clips: Clips, path: Path) -> str:
 
 
 def describe_ball(data: BallClips, path: Path) -> str:
-    """Counts of clips with a ball.
-
-    Args:
-      data: The clips.
-      path: The file.
-
-    Returns:
-      Lines to print.
-    """
+    """Lines with counts of clips with a ball."""
     clips, touch = data.clips, np.asarray(data.touch)
     minutes = clips.num_frames / clips.fps / 60
     touch = np.concatenate([touch.any(1, keepdims=True), touch], axis=1)
@@ -255,15 +179,7 @@ def describe_ball(data: BallClips, path: Path) -> str:
 
 
 def describe_texts(motions: TextMotions, path: Path) -> str:
-    """Counts of clips with captions.
-
-    Args:
-      motions: The clips.
-      path: The file.
-
-    Returns:
-      Lines to print.
-    """
+    """Lines with counts of clips with captions."""
     lengths = np.diff(motions.offsets)
     splits = [f"{name} {motions.clips_of(name).size}" for name in motions.split_names]
     lines = [
@@ -279,35 +195,28 @@ def describe_texts(motions: TextMotions, path: Path) -> str:
 
 
 def prepare(config: Config) -> None:
-    """Prepares the data and prints what it is.
-
-    Args:
-      config: The settings.
-    """
+    """Prepares the data and prints what it is."""
     check_config(config)
-    start = time.time()
+    start, set_fps, mirrored = time.time(), 30.0, False
     if config.source == "procedural":
         from jaxmotion.data import procedural
 
-        clips = procedural.make_clips(seed=config.seed)
+        data = procedural.make_clips(seed=config.seed)
     else:
-        clips = read_published(config)
-    if isinstance(clips, TextMotions):
-        text_motion.save_text_motions(config.out, clips)
-        print(describe_texts(clips, config.out))
-        print(f"took     {time.time() - start:.1f} s")
-        return
-    if isinstance(clips, BallClips):
-        save_ball_clips(config.out, clips)
-        print(describe_ball(clips, config.out))
-        print(f"took     {time.time() - start:.1f} s")
-        return
-    default = clips.fps if config.source == "humanact12" else 30.0
-    clips = at_rate(clips, config.fps or default)
-    if config.mirror and config.source != "style100":
-        clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
-    clips_io.save_clips(config.out, clips)
-    print(describe(clips, config.out))
+        found = REGISTRY[config.source]
+        data, set_fps, mirrored = read_published(config), found.fps, found.mirrored
+    if isinstance(data, TextMotions):
+        text_motion.save_text_motions(config.out, data)
+        print(describe_texts(data, config.out))
+    elif isinstance(data, BallClips):
+        save_ball_clips(config.out, data)
+        print(describe_ball(data, config.out))
+    else:
+        clips = at_rate(data, config.fps or set_fps or data.fps)
+        if config.mirror and not mirrored:
+            clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
+        clips_io.save_clips(config.out, clips)
+        print(describe(clips, config.out))
     print(f"took     {time.time() - start:.1f} s")
 
 
