@@ -59,6 +59,7 @@ def run_script(name, *arguments):
     ).stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_scripts_write_what_they_measure(name, tmp_path):
     arguments, cases, keys = SCRIPTS[name]
@@ -114,6 +115,7 @@ def test_compile_times(tmp_path):
     assert all(row["compile"] > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_unrolled_sampler_is_the_scanned_one(load):
     """What compile_times compares computes the same."""
     compile_times, workload = load("compile_times"), load("workload")

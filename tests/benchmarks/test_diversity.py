@@ -192,6 +192,7 @@ def small(load, skeleton):
     return one, state
 
 
+@pytest.mark.slow
 def test_planners_stay_conditions_in_many_rollouts(small):
     """As long as only the keys differ; with other states all of them would run."""
     one, state = small

@@ -10,6 +10,8 @@ from jaxmotion.evaluators import text_motion as text_motion_evaluator
 torch = pytest.importorskip("torch")
 from tests.reference import matching_torch  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 CONFIG = text_motion_evaluator.MatcherConfig()
 FRAMES = np.array([40, 196, 8, 100, 196, 60])
 WORDS = np.array([22, 3, 9, 2, 14, 7])

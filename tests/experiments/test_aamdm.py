@@ -66,6 +66,7 @@ def losses(folder):
 # --- training ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_training_leaves_every_stage(trained, data):
     config = json.loads((trained / "config.json").read_text())
     assert config["system"] == "aamdm" and config["data"] == [str(data)]
@@ -86,6 +87,7 @@ def test_training_leaves_every_stage(trained, data):
             assert own and np.isfinite(own).all()
 
 
+@pytest.mark.slow
 def test_what_is_trained_is_not_trained_again(call, trained, data):
     before = losses(trained)
     call(f"train --data {data} --out {trained} {SETTINGS}")
@@ -100,6 +102,7 @@ FREE = {"diverged", "div", "fid", "ffr_mann", "ffr_gmd", "speed_m/s"}
 STEERED = {"diverged_uc", "te_promised", "te_realized", "trajectory_error_deg"}
 
 
+@pytest.mark.slow
 def test_an_evaluation_has_the_data_and_the_trained_rows(evaluated):
     found = json.loads((evaluated / "metrics.json").read_text())
     rows = found["rows"]
@@ -120,6 +123,7 @@ def test_an_evaluation_has_the_data_and_the_trained_rows(evaluated):
     assert "procedural" in found["source"]
 
 
+@pytest.mark.slow
 def test_claims_about_rows_that_are_missing_were_not_run(evaluated):
     claims = json.loads((evaluated / "metrics.json").read_text())["claims"]
     assert not any("nan" in line for line in claims)
@@ -128,6 +132,7 @@ def test_claims_about_rows_that_are_missing_were_not_run(evaluated):
     assert decided["more polishing lowers FID (1, 2, 10) (not measured"] == "not run"
 
 
+@pytest.mark.slow
 def test_long_rollouts_are_counted(evaluated):
     found = json.loads((evaluated / "metrics.json").read_text())["long"]
     assert found["ticks"] == 360
@@ -137,6 +142,7 @@ def test_long_rollouts_are_counted(evaluated):
             assert 0 <= found[kind][failure] <= 2
 
 
+@pytest.mark.slow
 def test_the_table_has_a_line_for_each_row(evaluated):
     found = json.loads((evaluated / "metrics.json").read_text())["rows"]
     *lines, _, note = (evaluated / "table.md").read_text().splitlines()
@@ -148,6 +154,7 @@ def test_the_table_has_a_line_for_each_row(evaluated):
 # --- rollouts ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "title"),
     [("", "aamdm</h1>"), ("--row lmm --no-steered", "lmm, not steered</h1>")],
@@ -203,6 +210,7 @@ BAD = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "message"), BAD)
 def test_what_is_wrong_is_said_in_one_line(
     call, trained, data, tmp_path, monkeypatch, line, message

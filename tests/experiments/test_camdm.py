@@ -90,6 +90,7 @@ def test_help_has_defaults_units_and_an_example(help_of, command, words):
         assert text.count("(default:") >= len(options) - text.count("--no-") - 3
 
 
+@pytest.mark.slow
 def test_training_leaves_a_run_that_goes_on(data, trained):
     assert checkpoint.latest_step(trained / "checkpoints") == 2
     config = json.loads((trained / "config.json").read_text())
@@ -101,6 +102,7 @@ def test_training_leaves_a_run_that_goes_on(data, trained):
     assert all(np.isfinite(row["loss"]) for row in rows)
 
 
+@pytest.mark.slow
 def test_a_preset_says_how_to_train_unless_an_option_does(call, data, tmp_path):
     fields = "optimizer learning_rate batch warmup max_norm ema".split()
 
@@ -115,6 +117,7 @@ def test_a_preset_says_how_to_train_unless_an_option_does(call, data, tmp_path):
     assert found == ["adamw", 1e-4, 3, 0, 0.0, 0.9]
 
 
+@pytest.mark.slow
 def test_other_settings_can_be_meant(call, data, trained, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(trained, folder)
@@ -165,6 +168,7 @@ def check_evaluation(folder, rollouts):
     assert "(trained here)" in (folder / "table.md").read_text().splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_a_rollout_is_written_as_bvh_gif_and_page(call, trained, tmp_path):
     out = tmp_path / "seen"
     call(
@@ -253,6 +257,7 @@ def released(call, data, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_released_weights_become_a_model_that_rolls_out(call, released):
     model, params, _ = camdm_model.load(released / "released.npz")
     assert model.config.num_steps == 4 and model.config.norm == "post"
@@ -278,6 +283,7 @@ def test_released_weights_are_evaluated(call, released):
     assert json.loads((folder / "metrics.json").read_text())["rows"]["rollouts"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "option, message",
     [
@@ -356,6 +362,7 @@ BAD = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line, error, message", BAD)
 def test_what_is_wrong_is_named_before_any_work(
     call, data, other, trained, tmp_path, line, error, message
@@ -378,6 +385,7 @@ def test_what_is_wrong_is_named_before_any_work(
     assert (contents(trained), contents(tmp_path)) == before
 
 
+@pytest.mark.slow
 def test_an_unknown_course_lists_the_known_ones(call, trained, capsys):
     with pytest.raises(SystemExit) as stop:
         call(f"rollout --run {trained} --style zombie --course waltz")

@@ -70,6 +70,7 @@ def rows_of(folder):
     return json.loads((folder / "metrics.json").read_text())
 
 
+@pytest.mark.slow
 def test_actions_are_scored_beside_real_motions(call, actions):
     call(f"evaluate --run {actions} --samples 40 --replications 2 --evaluator-steps 20")
     report = rows_of(actions / "evaluation")
@@ -104,6 +105,7 @@ def test_the_same_seed_gives_the_same_scores(call, actions, tmp_path):
             assert first[row][column] == second[row][column]
 
 
+@pytest.mark.slow
 def test_samples_of_actions_are_motions(call, actions, tmp_path):
     call(f"sample --run {actions} --action run walk --frames 12 --out {tmp_path}")
     for name in ("run", "walk"):
@@ -165,6 +167,7 @@ def test_texts_are_scored_and_sampled(call, texts, tmp_path):
     assert {f"{stem}.bvh", f"{stem}.gif", f"{stem}.html"} == names
 
 
+@pytest.mark.slow
 def test_what_was_held_out_is_not_trained_on(texts):
     with np.load(texts / "data.npz") as file:
         split, names = file["split"], file["split_names"].tolist()
@@ -214,6 +217,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", BAD)
 def test_bad_input_is_one_clear_error(call, line, actions, texts, data, tmp_path):
     places = dict(actions=actions, texts=texts, data=data, new=tmp_path / "new")
@@ -261,6 +265,7 @@ def released(call, data, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_released_weights_become_a_row(call, released, tmp_path):
     line = f"import --weights {released}/t2m.pth --run {released}/run"
     with pytest.raises(ValueError, match="32 heads do not divide width 16"):
@@ -280,6 +285,7 @@ def test_released_weights_become_a_row(call, released, tmp_path):
         call(f"{line} --heads 4")
 
 
+@pytest.mark.slow
 def test_weights_of_another_task_are_refused(call, released, texts, actions):
     weights = f"import --weights {released}/t2m.pth --heads 4 --run"
     with pytest.raises(ValueError, match="'text_form' is 'unit', expected 'released'"):

@@ -62,8 +62,8 @@ def shown(text):
     "kind",
     [
         "action",
-        pytest.param("style", marks=pytest.mark.slow),
-        pytest.param("ball", marks=pytest.mark.slow),
+        "style",
+        "ball",
     ],
 )
 def test_training_writes_a_file_and_prints_its_fingerprint(
@@ -214,6 +214,7 @@ def test_emdm_is_judged_alike_twice(invoke, data, tmp_path):
     assert np.isfinite(report["rows"]["emdm"]["FID"]["value"])
 
 
+@pytest.mark.slow
 def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
     """Four styles known, two of them the run's; against PyTorch on the same input."""
     torch = pytest.importorskip("torch")

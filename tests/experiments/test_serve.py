@@ -362,6 +362,7 @@ def test_wrong_lines_are_answered_and_change_nothing():
     run(visit())
 
 
+@pytest.mark.slow
 def test_a_flood_is_read_no_faster_than_the_limit():
     async def visit():
         async with serving(lines_per_tick=8) as (_, connect):
@@ -383,6 +384,7 @@ async def waiting(server):
     return [c.transport.get_write_buffer_size() for c in server._clients]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flood", [b"", b"{\n" * 2000, b"x" * 4096])
 def test_who_does_not_read_is_bounded_then_dropped(flood):
     """Whether it is silent, or sends nonsense all the time; others notice nothing."""
@@ -409,6 +411,7 @@ def test_who_does_not_read_is_bounded_then_dropped(flood):
     run(visit())
 
 
+@pytest.mark.slow
 def test_who_reads_slowly_misses_frames_and_is_told():
     async def visit():
         async with serving(Fake(size=600), buffer=50_000) as (server, connect):
@@ -498,6 +501,7 @@ def test_a_simulation_that_fails_ends_its_own_client_only(capsys):
     assert "no more plans" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_ticks_keep_to_the_clock_however_long_each_takes():
     """Absolute times: a delay of one tick does not move the next ones."""
     generator = np.random.default_rng(0)
@@ -518,6 +522,7 @@ def test_ticks_keep_to_the_clock_however_long_each_takes():
     run(visit())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("catch_up, least, most", [(10.0, 0, 0), (0.25, 55, 1000)])
 def test_a_short_delay_is_caught_up_and_a_long_one_left_out(catch_up, least, most):
     async def visit():
@@ -530,6 +535,7 @@ def test_a_short_delay_is_caught_up_and_a_long_one_left_out(catch_up, least, mos
     run(visit())
 
 
+@pytest.mark.slow
 def test_the_loop_answers_while_the_simulation_works():
     async def visit():
         fake = Fake(pause=lambda n: 1.0 if n == 3 else 0.0)
@@ -545,6 +551,7 @@ def test_the_loop_answers_while_the_simulation_works():
     run(visit())
 
 
+@pytest.mark.slow
 def test_stopping_hangs_up_on_everyone():
     async def visit():
         async with serving(Fake(size=600), buffer=50_000) as (server, connect):

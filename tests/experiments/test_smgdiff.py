@@ -50,6 +50,7 @@ def test_schedules_stand_beside_real_clips(invoke, trained):
         assert report["source"] and report["jax"]
 
 
+@pytest.mark.slow
 def test_a_rollout_is_a_motion_with_a_ball(invoke, trained, capsys):
     invoke("smgdiff", f"rollout --run {trained} --seconds 2 --schedule none")
     out = trained / "rollout"
@@ -101,6 +102,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", BAD)
 def test_bad_input_is_one_clear_error(invoke, trained, data, tmp_path, line):
     places = dict(

@@ -16,6 +16,8 @@ from tests import tiny
 torch = pytest.importorskip("torch")
 from benchmarks import torch_camdm  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 BATCH = 3
 CONFIG = camdm_model.Config(num_joints=25, num_labels=100)  # the paper's
 

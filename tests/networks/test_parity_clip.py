@@ -11,6 +11,8 @@ from tests.reference import clip as reference
 
 torch = pytest.importorskip("torch")
 
+pytestmark = pytest.mark.slow
+
 SIZES = dict(vocabulary=50, context=16, width=64, depth=3, hidden=128, dimensions=24)
 HEADS, END = 4, 49
 
