@@ -14,6 +14,8 @@ torch = pytest.importorskip("torch")
 from tests.reference import matching_torch  # noqa: E402
 from tests.reference import published_torch as peers  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 CONFIG = text_motion_evaluator.MatcherConfig(
     num_features=7, movement_width=8, motion_width=6, text_width=5, embedding=4
 )

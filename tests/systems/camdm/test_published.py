@@ -16,6 +16,8 @@ from jaxmotion.systems.camdm import published as camdm_published
 torch = pytest.importorskip("torch")
 from tests.reference import published_torch as peers  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 STYLES = ("Angry", "Old", "Zombie")
 
 

@@ -13,6 +13,8 @@ from jaxmotion.systems.emdm import published as emdm_published
 torch = pytest.importorskip("torch")
 from tests.reference import published_torch as peers  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 FRAMES, STEPS = 6, 10
 # Task -> (J, D), size of the condition.
 TASKS = {"text": ((9, 1), 8), "action": ((3, 6), 4)}
