@@ -1,6 +1,8 @@
 """The import contract: what each package may import, and one door a third party."""
 
 import ast
+import builtins
+import symtable
 import sys
 from pathlib import Path
 
@@ -184,3 +186,26 @@ def test_no_cycles():
 
     for name in modules:
         visit(name)
+
+
+def unknown_names(table, known):
+    """Names that a scope, or one within it, takes from the module, which lacks them."""
+    for symbol in table.get_symbols():
+        if symbol.is_global() and symbol.get_name() not in known:
+            yield symbol.get_name()
+    for child in table.get_children():
+        yield from unknown_names(child, known)
+
+
+def test_every_name_is_defined():
+    """Lint cannot say so: it takes the words of jaxtyping's shapes for names."""
+    paths = LIBRARY + SCRIPTS + files(ROOT / "tests")
+    always = {*dir(builtins), "__file__", "__path__"}
+    wrong = []
+    for path in paths:
+        table = symtable.symtable(path.read_text(), str(path), "exec")
+        own = {s.get_name() for s in table.get_symbols() if s.is_assigned()}
+        own |= {s.get_name() for s in table.get_symbols() if s.is_imported()}
+        unknown = sorted(set(unknown_names(table, own | always)))
+        wrong += [f"{relative(path)}: {name}" for name in unknown]
+    assert not wrong, "\n".join(wrong)
