@@ -177,6 +177,7 @@ def equal(found, expected):
     )
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_in_any_file_is_noticed_or_changes_nothing(tmp_path):
     folder = tmp_path / "checkpoints"
     config = {"width": 8, "name": "small"}
