@@ -1,6 +1,8 @@
-"""Real-time motion diffusion in JAX: one functional core for several systems.
+"""Real-time motion diffusion in JAX: four published systems on one functional core.
 
-Import the module that you use: `from jaxmotion.diffusion import chain`.
+The face is a handful of functions: `load` a model, `start` characters, give them
+`commands`, `rollout`, and `save` or `show` what they do. Everything they are made of is
+public: `from jaxmotion.diffusion import chain`.
 """
 
 from jaxmotion import (
@@ -14,17 +16,23 @@ from jaxmotion import (
     networks,
     systems,
 )
+from jaxmotion.face import commands, load, rollout, save, show
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "commands",
     "control",
     "data",
     "diffusion",
     "evaluation",
     "evaluators",
     "learning",
+    "load",
     "motion",
     "networks",
+    "rollout",
+    "save",
+    "show",
     "systems",
 ]

@@ -22,11 +22,14 @@ class System:
       name: Its package in `jaxmotion.systems`, and its name on command lines.
       title: As its paper writes it.
       paper: Authors, venue and number of the paper.
+      steerable: Whether its room "controller" has `load_character(path)`, which makes a
+        `control.steering.Character` of a run folder or an exported file.
     """
 
     name: str
     title: str
     paper: str
+    steerable: bool = True
 
     def room(self, name: str) -> ModuleType:
         """A module of the system's package, such as "training"."""
@@ -55,6 +58,7 @@ SYSTEMS = {
             name="emdm",
             title="EMDM",
             paper="Zhou et al., ECCV 2024, arXiv:2312.02256",
+            steerable=False,
         ),
         System(
             name="smgdiff",

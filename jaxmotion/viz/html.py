@@ -7,6 +7,7 @@ import html as escaping
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -148,8 +149,7 @@ requestAnimationFrame(loop);
 """
 
 
-def save_html(
-    path: str | Path,
+def page(
     positions: np.ndarray,
     parents: tuple[int, ...],
     *,
@@ -162,11 +162,10 @@ def save_html(
     radius: float = 0.11,
     title: str = "",
     caption: str = "",
-) -> None:
-    """Writes the page.
+) -> str:
+    """The page as text.
 
     Args:
-      path: File to write.
       positions: [F, J, 3] world positions, meters, y up.
       names: Joint names, to find the head and color left and right; None for guesses
         and gray.
@@ -180,7 +179,6 @@ def save_html(
 
     Raises:
       ValueError: if an array has a wrong shape or is not finite; names it.
-      OSError: if the file cannot be written.
     """
     positions = drawing.check_motion(
         positions, parents, fps=fps, paths={"commanded": commanded, "walked": walked}
@@ -189,7 +187,6 @@ def save_html(
     touch = np.zeros(len(positions), bool) if touch is None else np.asarray(touch, bool)
     if touch.shape != (len(positions),):
         raise ValueError(f"touch is {touch.shape}, expected {(len(positions),)}")
-    path = drawing.check_writable(path)
 
     def rounded(x: np.ndarray | None) -> list | None:
         return None if x is None else np.round(np.asarray(x, float), 3).tolist()
@@ -215,7 +212,24 @@ def save_html(
         "__DATA__": text,
     }
     # In one pass: a title may contain the name of the other slot.
-    page = re.sub(
+    return re.sub(
         "__TITLE__|__CAPTION__|__DATA__", lambda slot: filled[slot.group()], _PAGE
     )
-    path.write_text(page, encoding="utf-8")
+
+
+def save_html(
+    path: str | Path,
+    positions: np.ndarray,
+    parents: tuple[int, ...],
+    *,
+    fps: float,
+    **options: Any,
+) -> None:
+    """Writes the page; the options are those of `page`.
+
+    Raises:
+      ValueError: if an array has a wrong shape or is not finite; names it.
+      OSError: if the file cannot be written.
+    """
+    text = page(positions, parents, fps=fps, **options)
+    drawing.check_writable(path).write_text(text, encoding="utf-8")

@@ -40,6 +40,9 @@ MAY_IMPORT = {
         "text",
     },
     "viz": {"typing", "motion"},
+    # The face composes what stands below it.
+    "face.py": BASE
+    | {"motion", "control", "data", "learning", "systems", "viz", "export"},
     "reporting.py": BASE | {"motion", "data", "evaluation", "viz"},
     # learning: what a training that diverges raises ends a script with one line.
     "cli.py": BASE | {"learning"},

@@ -8,10 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
 
+import jaxmotion as jm
+from jaxmotion.control import steering
 from jaxmotion.data import bvh_text, clips_io, procedural
 from jaxmotion.learning import checkpoint
 
@@ -273,3 +276,17 @@ def test_from_a_shell_train_twice_evaluate_and_roll_out(data, tmp_path):
     found = json.loads((folder / "evaluation" / "metrics.json").read_text())["rows"]
     assert {"aamdm", "change"} < set(found) and "lmm" not in found
     assert bvh_text.read_bvh(folder / "rollout" / "rollout.bvh").values.shape[0] == 60
+
+
+def test_a_run_is_steered_by_the_face(trained):
+    """Loaded twice, steered with other values: one program."""
+    found = []
+    for seed in range(2):
+        model = jm.load(trained)
+        states = model.start(2, seed=seed)
+        commands = jm.commands("forward", model, 2, seconds=0.1, speed=0.5 + seed)
+        found.append(jm.rollout(model, jax.random.key(seed), states, commands))
+        counted = counted if seed else steering._rollouts._cache_size()
+    assert steering._rollouts._cache_size() == counted
+    assert np.isfinite(np.asarray(found[1].root_position)).all()
+    assert np.abs(found[0].root_position - found[1].root_position).max() > 1e-4

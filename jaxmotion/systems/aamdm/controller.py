@@ -20,22 +20,29 @@ What frames hold as `extra`: the simulation bone in the world ("bone_origin",
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
+from jaxmotion.control.steering import Character
 from jaxmotion.motion import features, ground, path_features, pose, spring
 from jaxmotion.motion.features import unpack
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
+from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
+from jaxmotion.systems.aamdm import training as aamdm_training
+from jaxmotion.systems.aamdm.data import PoseData
 from jaxmotion.systems.aamdm.embedding import PATH
 from jaxmotion.systems.aamdm.model import Sample
 from jaxmotion.systems.aamdm.space import Space
-from jaxmotion.typing import Key, Objective
+from jaxmotion.typing import Key, Objective, Params
 
 # `step(key, previous, goal)`; the goal is None where nothing is asked for.
 Stepper = Callable[[Key, Array, Array | None], Array]
@@ -260,4 +267,81 @@ def controller(
         plan_level=lambda state, command: jnp.ones((), jnp.int32),
         plans=(plan,),
         advance=show,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Method:
+    """What makes a controller of `(networks' parameters, space)`; hashable.
+
+    Attributes:
+      config: The networks and the chain.
+      num_joints: Joints of the skeleton.
+      fps: Frames per second.
+      scale: Strength of the guidance, epsilon of eq. 13; ours.
+    """
+
+    config: aamdm_model.Config
+    num_joints: int
+    fps: float
+    scale: float = 10.0
+
+    def __call__(self, params: tuple[Params, Space]) -> Controller:
+        """The controller."""
+        networks, space = params
+        change = space.change if self.config.target == "change" else None
+        sample = aamdm_model.sampler(networks, config=self.config, change=change)
+        return controller(
+            guided(sample, scale=self.scale),
+            space,
+            num_joints=self.num_joints,
+            fps=self.fps,
+        )
+
+
+def start_states(
+    data: PoseData, space: Space, number: int, *, num_joints: int, seed: int
+) -> CharacterState:
+    """Characters in poses of the data, each at the origin and facing +z.
+
+    Args:
+      data: Where the poses come from, such as held-out frames.
+      space: The space.
+      number: Characters.
+      num_joints: Joints of the skeleton.
+      seed: Of the choice of poses.
+
+    Returns:
+      States, batch axis first.
+    """
+    chosen = np.random.default_rng(seed).integers(0, data.num_frames, number)
+    init = functools.partial(init_state, space, num_joints=num_joints)
+    return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen])
+
+
+def load_character(path: Path) -> Character:
+    """The character of a run folder: 3 drafts and 2 polishes in the embedded space.
+
+    It starts in held-out poses. Commands have no labels.
+
+    Raises:
+      CheckpointError: if a stage was not trained.
+      ValueError: if it is no run folder of AAMDM.
+    """
+    run = aamdm_training.load_run(path)
+    space = aamdm_training.load_space(run, "embedded")
+    networks, config = aamdm_training.load_networks(
+        run, "embedded", space, drafts=3, polishes=2
+    )
+    num_joints = run.skeleton.num_joints
+    return Character(
+        skeleton=run.skeleton,
+        labels=(),
+        fps=run.train.fps,
+        source=run.source,
+        params=(networks, space),
+        method=Method(config=config, num_joints=num_joints, fps=run.train.fps),
+        starts=lambda labels, seed: start_states(
+            run.held_out, space, len(labels), num_joints=num_joints, seed=seed
+        ),
     )

@@ -46,23 +46,10 @@ from jaxmotion.typing import Key
 
 
 def start_states(run: Run, space: Space, number: int, *, seed: int) -> CharacterState:
-    """Characters in held-out poses, each at the origin and facing +z.
-
-    Args:
-      run: The run.
-      space: Their space.
-      number: Characters.
-      seed: Of the choice of poses.
-
-    Returns:
-      States, batch axis first.
-    """
-    data = run.held_out
-    chosen = np.random.default_rng(seed).integers(0, data.num_frames, number)
-    init = functools.partial(
-        aamdm_controller.init_state, space, num_joints=run.skeleton.num_joints
+    """Characters in held-out poses, each at the origin and facing +z."""
+    return aamdm_controller.start_states(
+        run.held_out, space, number, num_joints=run.skeleton.num_joints, seed=seed
     )
-    return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen])
 
 
 def commands(

@@ -19,6 +19,7 @@ paper does not say (noted at each constant).
 import dataclasses
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,7 @@ from jaxmotion.diffusion import schedule
 from jaxmotion.motion import features, spring, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.typing import Key, Params
 
 
@@ -470,6 +472,28 @@ def character(
             clips, model, labels, field=camdm_model.style_field(model, clips), seed=seed
         ),
     )
+
+
+def load_character(path: Path, *, control: Control | None = None) -> Character:
+    """The character of a run folder or an exported file.
+
+    It starts in the model's own poses where it has some, else in poses of the clips
+    that the run was trained on.
+
+    Raises:
+      CheckpointError: if there is no whole checkpoint.
+      ValueError: if it is of another system or damaged.
+    """
+    model, params, _ = camdm_model.load(path)
+    made = character(params, model, control=control)
+    if model.starts is not None:
+        return made
+
+    def starts(labels: np.ndarray, seed: int) -> CharacterState:
+        run = camdm_training.load_run(path)
+        return start_states(run.train, model, labels, field=run.field, seed=seed)
+
+    return dataclasses.replace(made, starts=starts)
 
 
 def start_states(

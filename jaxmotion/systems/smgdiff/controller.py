@@ -22,23 +22,31 @@ Source: SMGDiff, section 3; Chen et al. 2024 (CAMDM) for HFTE and the seam.
 import dataclasses
 import functools
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
+from jaxmotion.control.steering import Character, check_labels
+from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.systems.smgdiff import data as smgdiff_data
+from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
+from jaxmotion.systems.smgdiff import training as smgdiff_training
+from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.guidance import SamplePlan
-from jaxmotion.systems.smgdiff.model import Condition, Config
+from jaxmotion.systems.smgdiff.model import Condition, Config, Model
 from jaxmotion.systems.smgdiff.scene import Representation
 from jaxmotion.systems.smgdiff.trajectory import SamplePath, Wish
-from jaxmotion.typing import Key
+from jaxmotion.typing import Key, Params
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -314,4 +322,105 @@ def controller(
         plan_level=functools.partial(plan_level, control=control),
         plans=(plan,),
         advance=advance,
+    )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Method:
+    """What makes a controller of parameters; hashable.
+
+    Those are of the motion model and of the paths, and the representation.
+
+    Attributes:
+      config: The motion model.
+      paths: The generator of paths.
+      guided: Contact guidance; tuned for short trainings.
+      control: Constants of the run-time; None for the defaults.
+    """
+
+    config: Config
+    paths: smgdiff_trajectory.Config
+    guided: smgdiff_guidance.Guidance = smgdiff_guidance.TUNED
+    control: Control | None = None
+
+    def __call__(self, params: tuple[Params, Params, Representation]) -> Controller:
+        """The controller."""
+        motion, paths, representation = params
+        return controller(
+            smgdiff_trajectory.generator(paths, config=self.paths),
+            smgdiff_guidance.sampler(
+                motion,
+                config=self.config,
+                representation=representation,
+                guided=self.guided,
+            ),
+            representation=representation,
+            config=self.config,
+            control=self.control,
+        )
+
+
+def start_states(
+    data: BallClips, model: Model, labels: np.ndarray, *, seed: int
+) -> PlayerState:
+    """States of players that start with real frames of their skill.
+
+    Each is moved so that it stands at the origin and faces +z.
+
+    Args:
+      data: Clips with a ball.
+      model: The model.
+      labels: Skill of each player.
+      seed: Of the choice of frames.
+
+    Returns:
+      States, batch axis first.
+
+    Raises:
+      ValueError: if a label is none of the model's, or a skill has no clip that is
+        long enough; names it.
+    """
+    check_labels(labels, model.labels)
+    arrays = smgdiff_data.scene_arrays(data, model.config.past)
+    owner = np.asarray(data.clips.labels[smgdiff_data.FIELD])[arrays.index.clips]
+    generator = np.random.default_rng(seed)
+    chosen = []
+    for label in labels:
+        known = np.flatnonzero(owner == label)
+        if known.size == 0:
+            raise ValueError(f"no clip of skill {model.labels[label]!r} to start from")
+        chosen.append(int(generator.choice(known)))
+    scenes, _ = smgdiff_data.all_scenes(arrays, jnp.asarray(chosen))
+    skeleton = model.representation.skeleton
+
+    @jax.jit
+    @jax.vmap
+    def state(past: Scene) -> PlayerState:
+        frame = smgdiff_scene.plan_frame(skeleton, past.motion)
+        local = smgdiff_scene.to_frame(past, frame)
+        return init_state(skeleton, local, config=model.config)
+
+    return state(scenes)
+
+
+def load_character(path: Path) -> Character:
+    """The player of a run folder: 8 steps of motion, 1 of paths.
+
+    It starts in frames that the run was trained on, and frames show its ball.
+
+    Raises:
+      CheckpointError: if a stage was not trained.
+      ValueError: if it is no run folder of SMGDiff.
+    """
+    run = smgdiff_training.load_run(path)
+    model, motion = smgdiff_training.load_stage(run, "motion_8")
+    paths, path_params = smgdiff_training.load_stage(run, "paths_1")
+    return Character(
+        skeleton=model.representation.skeleton,
+        labels=model.labels,
+        fps=model.config.fps,
+        source=model.source,
+        params=(motion, path_params, model.representation),
+        method=Method(config=model.config, paths=paths.paths),
+        starts=lambda labels, seed: start_states(run.train, model, labels, seed=seed),
     )

@@ -1,0 +1,327 @@
+"""The library in a few lines: load, start, command, roll out, save, show.
+
+    model = jm.load("locomotion")
+    states = model.start(256)
+    commands = jm.commands("figure_eight", model, 256, seconds=10.0, speed=1.4)
+    frames = jm.rollout(model, jax.random.key(0), states, commands)
+    jm.save("walk.gif", model.skeleton, frames[0])
+
+Only composes what stands below it, and checks what it is given with one clear line.
+What is slow to import (Flax, Orbax, matplotlib) is imported by those who need it.
+"""
+
+import dataclasses
+import html as escaping
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from jaxmotion import files
+from jaxmotion.control import courses, steering
+from jaxmotion.control.frame import Frame
+from jaxmotion.control.steering import Character
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+from jaxmotion.motion.trajectory import Command, integrate_path
+from jaxmotion.systems import registry
+from jaxmotion.typing import Key
+
+ASSETS = Path(__file__).with_name("assets")
+# Characters at a time on a CPU, where one large batch falls out of the cache.
+_CPU_CHUNK = 4
+
+
+def load(source: str | Path, **options: Any) -> Character:
+    """A model to be steered.
+
+    Args:
+      source: Name of a shipped model ("locomotion", "walker"), a run folder of a
+        steerable system, or a file of `experiments/camdm.py export`.
+      **options: Of the system's `controller.load_character`, such as CAMDM's `control`.
+
+    Returns:
+      The character: its skeleton, labels, rate, source and licence; `start` makes
+      states.
+
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if there is no such model, or its system is not steered.
+    """
+    path = Path(source)
+    if not path.exists():
+        shipped = sorted(file.stem for file in ASSETS.glob("*.npz"))
+        if str(source) not in shipped:
+            raise ValueError(
+                f"{source}: no such file or folder, and no shipped model "
+                f"({', '.join(shipped)})"
+            )
+        path = ASSETS / f"{source}.npz"
+    found = registry.SYSTEMS.get(_system(path))
+    known = [system.name for system in registry.SYSTEMS.values() if system.steerable]
+    if found is None or not found.steerable:
+        raise ValueError(
+            f"{path}: field 'system' is {_system(path)!r}, expected one that is "
+            f"steered ({', '.join(known)})"
+        )
+    return found.room("controller").load_character(path, **options)
+
+
+def _system(path: Path) -> Any:
+    """What a run folder or an exported file says that it is."""
+    if path.is_file():
+        from jaxmotion.learning import checkpoint
+
+        return checkpoint.import_params(path)[1].get("system")
+    value = files.read_object(path / "config.json", what="expected a run folder")
+    return value.get("system")
+
+
+def commands(
+    course: str | Sequence[tuple],
+    model: Character,
+    number: int | None = None,
+    *,
+    seconds: float | None = None,
+    speed: float | Sequence[float] = 1.2,
+    labels: Any = None,
+) -> Command:
+    """Commands along a course for many characters.
+
+    Args:
+      course: One of `control.courses.COURSES`; or a list of segments (seconds,
+        direction of travel and facing in degrees from +z toward +x, m/s, and, if it
+        changes, the label), which begin again at their end.
+      model: Says the rate and the labels.
+      number: Characters; None for one per label or speed that is given, or one.
+      seconds: Length; None for 10 s, or for a list's own length.
+      speed: Meters per second, for all or one per character; a list of segments has
+        its own.
+      labels: Name or index of a style or skill for all characters, or one for each;
+        None for the first.
+
+    Returns:
+      Commands [number, ticks, ...] for characters that start facing +z.
+
+    Raises:
+      ValueError: if the course or a label is unknown, or numbers do not agree.
+    """
+    if np.ndim(speed) and number is None and (labels is None or np.ndim(labels) == 0):
+        number = len(speed)
+    found = steering.label_indices(model.labels, labels, number)
+    speeds = np.asarray(speed, float)
+    if speeds.ndim > 1 or (speeds.ndim and len(speeds) != len(found)):
+        raise ValueError(f"speeds of shape {speeds.shape} for {len(found)} characters")
+    if isinstance(course, str):
+        return courses.course_batch(
+            course,
+            found,
+            np.broadcast_to(speeds, found.shape),
+            seconds=10.0 if seconds is None else seconds,
+            fps=model.fps,
+        )
+    return _segments(course, model, found, seconds)
+
+
+def _segments(
+    course: Sequence[tuple], model: Character, labels: np.ndarray, seconds: float | None
+) -> Command:
+    rows = []
+    for number, segment in enumerate(course):
+        if len(segment) not in (4, 5) or not segment[0] > 0 or not segment[3] >= 0:
+            raise ValueError(
+                f"segment {number} of the course is {segment!r}, expected (seconds, "
+                "direction, facing, m/s) and perhaps a label, with positive seconds"
+            )
+        own = (model.label(segment[4]),) if len(segment) == 5 else (-1,)
+        rows.append((*segment[:4], *own))
+    if not rows:
+        raise ValueError("the course has no segments")
+    length = sum(row[0] for row in rows) if seconds is None else seconds
+    one = courses.segment_commands(rows, seconds=length, fps=model.fps)
+    many = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(labels), *x.shape)), one)
+    given = jnp.where(many.label < 0, jnp.asarray(labels)[:, None], many.label)
+    return dataclasses.replace(many, label=given)
+
+
+def rollout(
+    model: Character,
+    key: Key,
+    states: Any,
+    commands: Command,
+    *,
+    chunk: int | None = None,
+    mesh: Mesh | None = None,
+) -> Frame:
+    """Frames of steered characters: one program, compiled once per shape.
+
+    Args:
+      model: From `load`.
+      key: Consumed. Character c draws from `fold_in(key, c)`, however many there are.
+      states: From `model.start`.
+      commands: From `commands`.
+      chunk: Characters to run at a time, at most; None for what suits the processor.
+      mesh: Devices to split the characters over; None for one.
+
+    Returns:
+      Frames [characters, ticks, ...]; `frames[0].motion` is the first one's motion.
+
+    Raises:
+      ValueError: if states and commands are of different numbers of characters, or a
+        label is none of the model's.
+    """
+    if chunk is None and jax.default_backend() == "cpu":
+        chunk = _CPU_CHUNK
+    return steering.steered_rollouts(
+        model, key, states, commands, chunk=chunk, mesh=mesh
+    )
+
+
+def _one(frames: Frame | Motion) -> Motion:
+    """The motion of one character; raises for several."""
+    motion = frames.motion if isinstance(frames, Frame) else frames
+    if not isinstance(motion, Motion):
+        raise ValueError(f"frames are a {type(frames).__name__}, expected a Frame")
+    shape = motion.root_position.shape
+    if len(shape) != 2:
+        raise ValueError(
+            f"frames of shape {shape[:-1]}: expected those of one character, such as "
+            "frames[0]"
+        )
+    return motion
+
+
+def _drawing(skeleton: Skeleton, frames: Frame | Motion) -> dict[str, Any]:
+    """What pictures of one character are drawn from."""
+    motion = _one(frames)
+    positions = np.asarray(joint_positions(skeleton, motion))
+    found = dict(
+        positions=positions,
+        parents=skeleton.parents,
+        fps=motion.fps,
+        names=skeleton.names,
+        walked=positions[:, 0, ::2],
+    )
+    if isinstance(frames, Frame):
+        path = np.asarray(integrate_path(frames.desired_velocity, motion.fps))
+        found["commanded"] = path + found["walked"][0]
+        if "ball" in frames.extra:
+            found["ball"] = np.asarray(frames.extra["ball"])
+    return found
+
+
+def _save_bvh(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
+    from jaxmotion.data import bvh
+
+    bvh.write_bvh(path, bvh.bvh_from_motion(skeleton, _one(frames)))
+
+
+def _save_gif(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
+    from jaxmotion.viz import animation
+
+    animation.save_gif(path, **_drawing(skeleton, frames))
+
+
+def _save_html(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
+    from jaxmotion.viz import html
+
+    html.save_html(path, title=path.stem, **_drawing(skeleton, frames))
+
+
+def _save_npz(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
+    motion = _one(frames)
+    with files.replacing(path) as file:
+        np.savez(
+            file,
+            root_position=np.asarray(motion.root_position),
+            joint_rotation=np.asarray(motion.joint_rotation),
+            joint_position=np.asarray(joint_positions(skeleton, motion)),
+            offsets=np.asarray(skeleton.offsets),
+            parents=np.array(skeleton.parents),
+            names=np.array(skeleton.names),
+            fps=motion.fps,
+        )
+
+
+def _save_csv(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
+    motion = _one(frames)
+    positions = np.asarray(joint_positions(skeleton, motion))
+    head = [f"{name}.{axis}" for name in skeleton.names for axis in "xyz"]
+    lines = [",".join(["seconds", *head])]
+    for number, row in enumerate(positions.reshape(len(positions), -1)):
+        values = ",".join(f"{value:.4f}" for value in row)
+        lines.append(f"{number / motion.fps:.4f},{values}")
+    files.write_text(path, "\n".join(lines) + "\n")
+
+
+SAVERS: dict[str, Callable[[Path, Skeleton, Frame | Motion], None]] = {
+    ".bvh": _save_bvh,
+    ".csv": _save_csv,
+    ".gif": _save_gif,
+    ".html": _save_html,
+    ".npz": _save_npz,
+}
+
+
+def save(path: str | Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
+    """Writes one character's motion in the format of the suffix.
+
+    .bvh rotations for animation tools; .csv world positions of all joints, meters;
+    .gif a moving picture; .html a page to turn and play; .npz arrays: root_position,
+    joint_rotation (6D, two columns), joint_position, and the skeleton.
+
+    Raises:
+      OSError: if the file cannot be written.
+      ValueError: if the suffix is unknown, or frames are not those of one character.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SAVERS:
+        raise ValueError(
+            f"{path}: unknown suffix {path.suffix!r}, expected one of "
+            f"{', '.join(SAVERS)}"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    SAVERS[path.suffix.lower()](path, skeleton, frames)
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A page that a notebook shows, and keeps when it is saved."""
+
+    page: str
+    height: int
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{escaping.escape(self.page)}" width="100%" '
+            f'height="{self.height}" style="border:0"></iframe>'
+        )
+
+
+def show(
+    skeleton: Skeleton,
+    frames: Frame | Motion,
+    *,
+    title: str = "",
+    caption: str = "",
+    height: int = 480,
+) -> View:
+    """What a notebook cell displays: play, pause, turn and zoom, also without a kernel.
+
+    Args:
+      skeleton: The skeleton.
+      frames: Of one character, such as `frames[0]`.
+      title: Above the picture.
+      caption: Below it, such as the data's source and license.
+      height: Of the view, pixels.
+
+    Raises:
+      ValueError: if frames are not those of one character, or not finite.
+    """
+    from jaxmotion.viz import html
+
+    drawn = _drawing(skeleton, frames)
+    return View(html.page(**drawn, title=title, caption=caption), height)

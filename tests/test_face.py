@@ -1,0 +1,153 @@
+"""The face: what a stranger types first, and what it says to wrong input."""
+
+import csv
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import jaxmotion as jm
+from jaxmotion.control import steering
+from jaxmotion.data import bvh, bvh_text
+from jaxmotion.motion.skeleton import joint_positions
+from tests import samples
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+
+@pytest.fixture(scope="module")
+def model():
+    return jm.load("locomotion")
+
+
+@pytest.fixture(scope="module")
+def frames(model):
+    """256 characters steered from nothing, in six lines with `model`."""
+    states = model.start(256)
+    commands = jm.commands("figure_eight", model, 256, seconds=0.1, speed=1.4)
+    return jm.rollout(model, jax.random.key(0), states, commands)
+
+
+def test_many_characters_in_six_lines(model, frames):
+    assert frames.root_position.shape == (256, 3, 3)
+    assert np.isfinite(np.asarray(frames.joint_rotation)).all()
+    assert frames.fps == 30.0 and frames.planned[:, 0].all()
+    # They begin where they stand, each with noise of its own.
+    assert np.abs(np.asarray(frames.root_position)[..., ::2]).max() < 0.3
+    assert len(np.unique(np.asarray(frames.root_position)[:, -1], axis=0)) > 200
+
+
+def test_a_second_call_compiles_nothing(model, frames):
+    """Other start poses, commands, labels, speeds, keys; and the model loaded again."""
+    counted = steering._rollouts._cache_size()
+    again = jm.load("locomotion")
+    labels = np.arange(256) % 2
+    states = again.start(256, labels=labels, seed=3)
+    commands = jm.commands(
+        "strafe", again, labels=labels, speed=np.linspace(0, 2, 256), seconds=0.1
+    )
+    other = jm.rollout(again, jax.random.key(7), states, commands)
+    assert steering._rollouts._cache_size() == counted
+    assert np.abs(other.root_position - frames.root_position).max() > 0.01
+
+
+def test_a_list_of_segments_is_a_course(model):
+    course = [(1.0, 0, 0, 0.5), (0.5, 90, 0, 1.0, "crouch")]
+    found = jm.commands(course, model, 3)
+    assert found.velocity.shape == (3, 45, 2)
+    np.testing.assert_allclose(found.velocity[2, 0], [0.0, 0.5], atol=1e-6)
+    np.testing.assert_allclose(found.velocity[2, 40], [1.0, 0.0], atol=1e-6)
+    crouch = model.label("crouch")
+    assert np.unique(found.label[:, :30]).tolist() == [0]
+    assert np.unique(found.label[:, 30:]).tolist() == [crouch]
+
+
+def test_a_run_starts_from_clips():
+    """A model without poses of its own; its styles are found among the clips' fields."""
+    from jaxmotion.systems.camdm import controller
+
+    run = samples.run()
+    made = controller.character(run.params, run.model)
+    states = made.start(clips=run.train, labels=["zombie", "neutral"])
+    assert states.past.root_position.shape == (2, run.model.config.past, 3)
+    with pytest.raises(ValueError, match="no poses to start from: give clips"):
+        made.start(2)
+    other = dataclasses.replace(run.train, label_names=(("style", ("a", "b")),))
+    with pytest.raises(ValueError, match=r"no label field \(of style\) has the styles"):
+        made.start(clips=other)
+
+
+@pytest.mark.parametrize("suffix", ["bvh", "csv", "gif", "html", "npz"])
+def test_each_suffix_is_written(model, frames, tmp_path, suffix):
+    path = tmp_path / "deep" / f"walk.{suffix}"
+    jm.save(path, model.skeleton, frames[0])
+    joints = np.asarray(joint_positions(model.skeleton, frames[0].motion))
+    if suffix == "bvh":
+        _, motion = bvh.motion_from_bvh(bvh_text.read_bvh(path))
+        assert motion.root_position.shape == (3, 3)
+    elif suffix == "csv":
+        head, *rows = csv.reader(path.read_text().splitlines())
+        assert head[:2] == ["seconds", f"{model.skeleton.names[0]}.x"]
+        found = np.array(rows, float)[:, 1:].reshape(joints.shape)
+        np.testing.assert_allclose(found, joints, atol=1e-4)
+    elif suffix == "npz":
+        with np.load(path) as found:
+            assert found["fps"] == 30.0
+            np.testing.assert_array_equal(found["joint_position"], joints)
+            assert found["names"].tolist() == list(model.skeleton.names)
+    else:
+        assert path.stat().st_size > 1000
+
+
+def test_a_view_lives_without_a_kernel(model, frames):
+    """The whole page is in the cell's output, and nothing of it is elsewhere."""
+    page = jm.show(model.skeleton, frames[0], title="a & b")._repr_html_()
+    assert page.startswith("<iframe srcdoc=") and page.count("<iframe") == 1
+    assert "&lt;script&gt;" in page and "<script" not in page
+    assert "http://" not in page and "https://" not in page
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda m, f: jm.load("walk"), r"no such file.*\(locomotion, walker\)"),
+        (lambda m, f: jm.commands("waltz", m, 2), "'waltz': there are straight"),
+        (lambda m, f: jm.commands("forward", m, 3, speed=[1, 2]), r"\(2,\) for 3"),
+        (lambda m, f: jm.commands("forward", m, 3, speed=-1.0), "-1.0 m/s"),
+        (lambda m, f: jm.commands([], m, 3), "no segments"),
+        (lambda m, f: jm.commands([(1, 0, 0)], m), "segment 0 of the course"),
+        (lambda m, f: jm.commands("forward", m, 2, labels="x"), "unknown label 'x'"),
+        (lambda m, f: m.start(0), "number of characters is 0"),
+        (lambda m, f: m.start(3, labels=[0, 1]), "2 labels for 3 characters"),
+        (lambda m, f: m.start(labels=[0, 7]), "labels are in 0..7, expected 0..1"),
+        (lambda m, f: m.start(labels=0.5), "label is 0.5"),
+        (
+            lambda m, f: jm.rollout(
+                m, jax.random.key(0), m.start(2), jm.commands("forward", m, 3)
+            ),
+            "2 states and commands for 3 characters",
+        ),
+        (lambda m, f: jm.save("a.fbx", m.skeleton, f[0]), "'.fbx', expected one of"),
+        (lambda m, f: jm.save("a.gif", m.skeleton, f), r"\(256, 3\): expected those"),
+        (lambda m, f: jm.show(m.skeleton, f[0, 0]), "expected those of one"),
+        (lambda m, f: jm.show(m.skeleton, 3), "frames are a int"),
+    ],
+)
+def test_wrong_input_is_one_clear_line(model, frames, call, message):
+    with pytest.raises(ValueError, match=message) as found:
+        call(model, frames)
+    assert "\n" not in str(found.value)
+
+
+def test_a_system_that_is_not_steered_is_named(tmp_path):
+    (tmp_path / "config.json").write_text('{"system": "emdm"}')
+    with pytest.raises(ValueError, match="'emdm', expected one that is steered"):
+        jm.load(tmp_path)
+
+
+def test_frames_are_indexed_and_never_looped_over(frames):
+    assert frames[3].root_position.shape == (3, 3)
+    assert frames[:2, 1].joint_rotation.shape[:1] == (2,)
+    with pytest.raises(TypeError, match="not iterable"):
+        iter(frames)
