@@ -86,7 +86,7 @@ def commands(
     number: int | None = None,
     *,
     seconds: float | None = None,
-    speed: float | Sequence[float] = 1.2,
+    speed: float | Sequence[float] | np.ndarray = 1.2,
     labels: Any = None,
 ) -> Command:
     """Commands along a course for many characters.
@@ -137,7 +137,7 @@ def _segments(
                 "direction, facing, m/s) and perhaps a label, with positive seconds"
             )
         own = (model.label(segment[4]),) if len(segment) == 5 else (-1,)
-        rows.append((*segment[:4], *own))
+        rows.append((*map(float, segment[:4]), *own))
     if not rows:
         raise ValueError("the course has no segments")
     length = sum(row[0] for row in rows) if seconds is None else seconds
@@ -182,16 +182,15 @@ def rollout(
 
 def _one(frames: Frame | Motion) -> Motion:
     """The motion of one character; raises for several."""
-    motion = frames.motion if isinstance(frames, Frame) else frames
-    if not isinstance(motion, Motion):
+    if not isinstance(frames, Frame | Motion):
         raise ValueError(f"frames are a {type(frames).__name__}, expected a Frame")
-    shape = motion.root_position.shape
+    shape = frames.root_position.shape
     if len(shape) != 2:
         raise ValueError(
             f"frames of shape {shape[:-1]}: expected those of one character, such as "
             "frames[0]"
         )
-    return motion
+    return frames.motion if isinstance(frames, Frame) else frames
 
 
 def _drawing(skeleton: Skeleton, frames: Frame | Motion) -> dict[str, Any]:
