@@ -1,1 +1,21 @@
-"""AAMDM: frame by frame in a learned space, a GAN drafts and diffusion polishes."""
+"""AAMDM: frame by frame in a learned space, a GAN drafts and diffusion polishes.
+
+Source: T. Li, C. Qiao, G. Ren, K. Yin, S. Ha, "AAMDM: Accelerated Auto-regressive
+Motion Diffusion Model", CVPR 2024, arXiv:2401.06146.
+
+What differs
+------------
+
+The paper of AAMDM gives no sizes, weights or schedule, and there is no code: those here
+are ours, or Learned Motion Matching's where the paper follows it. Two things of ours
+keep short trainings alive: noise on the given previous frames in training
+(`aamdm.Config(previous_noise=0.0)` is without; `train` has 0.05), and frames that are
+kept within the bounds of the data in a rollout
+(`aamdm_control.controller(bounded=False)` is without). `aamdm.Config(target="change")`
+denoises scaled changes of the frame; trained as briefly as here it diverges. Where the
+paper has equations, these differ: the loss of changes (eq. 2) has local positions and
+rotations too, that of the latent (eq. 3) also its absolute values and changes;
+velocities in eq. 8 are not divided by the window's length; the GAN learns from three
+frames at a time (the paper trains both modules on windows of ten), with a gradient
+penalty.
+"""

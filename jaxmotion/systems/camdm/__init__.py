@@ -1,1 +1,66 @@
-"""CAMDM: a transformer that steers a character in many styles, in 8 steps."""
+"""CAMDM: a transformer that steers a character in many styles, in 8 steps.
+
+Source: R. Chen, M. Shi, S. Huang, P. Tan, T. Komura, X. Chen, "Taming Diffusion
+Probabilistic Models for Character Control", SIGGRAPH 2024.
+
+What differs
+------------
+
+Where the paper and the released code differ, the default of the library is the paper's,
+and the released variant is a named option, but for what the list names.
+
+* diffusion steps: 8; released code: `model.Config(num_steps=4)`.
+* style change: scale of the guidance on the past: 0.7; released code: 0.5, in
+  `controller.RELEASED`.
+* style change: guided plans: 1; released code: 2, in `RELEASED`.
+* plans after the start: not guided; released code: the first 2 are guided, in
+  `RELEASED`.
+* points that HFTE reflects: 15; released code: 23, in `RELEASED`.
+* facing of those points: the last one is held, as released (the paper copies theirs:
+  `trajectory.extend(mirror_facing=True)`, which no run-time uses); released code: the
+  same.
+* new plan: when the command changes, or after 15 frames; released code: every 15
+  frames, in `RELEASED`.
+* exponent of the blend of positions: 0.7, as in the released scene (the paper has
+  none); released code: 0.4, in `RELEASED`.
+* metrics: as the paper defines them, angles wrapped; released code: columns with
+  `camdm_release` in their names, of whole clips: what `report.py` sets beside the
+  paper's values.
+* fifth loss (velocities of positions), not in the paper's equation: weight 1; released
+  code: the same; `weight_position_velocity=0.0` turns it off.
+
+The paper does not give the width of the network, its layers, or the layout of
+rotations: these are the released code's; so are places relative to the last past pose
+(the paper's are relative to the first), the random yaw of samples and the smoothed
+paths of training (facings are smoothed within the window, there within the clip). Three
+things of the released run-time are not offered: it smooths commands by interpolation
+(here springs), solves the seam of two plans anew in every tick (here once per plan, so
+that velocity is continuous; see `jaxmotion/control/inertia.py`), and takes the facing
+of what it displays from the root joint's own axis (here from the hips, as in training;
+`jaxmotion/motion/facing.py`).
+
+Options of our own, all off in `model.Config()` and in `train --preset paper`:
+
+* `frames_per_token=5`: five frames are one token: 31 tokens instead of 147.
+* `token_margin=4`: each output token predicts four frames more on either side,
+  cross-faded with its neighbors': motion no longer jumps where tokens meet.
+* `heading="facing"`: samples face +z, instead of a random yaw.
+* `rotation_scale=4.0`: rotations are centered and scaled to about unit variance.
+* `norm="pre"`: layer norms before the branches instead of after the sums.
+* other weights of the losses: see `training.PRESETS` for them, and why.
+* `train --optimizer muon`: Muon in place of AdamW: 0.022 instead of 0.049 after 1000
+  steps of the walker.
+* `train --warmup 300 --max-norm 1 --ema 0.999`: a rate that rises first, clipped
+  gradients, averaged parameters.
+* `Control(follow=...)`: the wanted path returns to the commanded one.
+
+`experiments/camdm.py train` starts from `--preset small`, which uses all but the last
+and no dropout, since it is meant for a CPU; the shipped walker is such a model, without
+margins, whose feet were planted by a second training (`--preset planted`). `--preset
+paper` trains as the authors do (AdamW, 1e-4, batch 512; their 100 epochs are for
+`--steps` to say); every such option can still be given. In every preset all clips get a
+mirrored copy, where the release mirrors the symmetric styles only (`--no-mirror`), and
+the rate falls with every step, there with every epoch. The recognizer that scores
+styles has layer and group norms in place of batch norms (`evaluator.py import` takes
+the released one).
+"""

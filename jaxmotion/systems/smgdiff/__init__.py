@@ -1,1 +1,19 @@
-"""SMGDiff: a soccer player and his ball, guided to touch each other."""
+"""SMGDiff: a soccer player and his ball, guided to touch each other.
+
+Source: H. Yang, C. Li, Z. Wu, G. Li, J. Wang, J. Yu, Z. Su, L. Xu, "SMGDiff: Soccer
+Motion Generation using diffusion probabilistic models", 2024, arXiv:2411.16216.
+
+What differs
+------------
+
+SMGDiff's supplement, which has its networks and weights, was not to be had, and there
+is no code. Its motion model is CAMDM's network with the paper's terms at weight 1, its
+path generator a smaller one of ours. Other than in the paper: features are
+standardized; the ball's weight is clamped to 0..1; the path is blended at every plan,
+not only when the control changes. The last guided step is as long as in DSG's released
+code (`Guidance(last_sigma=...)` shortens it). What `experiments/smgdiff.py` uses by
+default since trainings here are short: `--preset small`, with losses of the ball and
+other weights (`--preset paper` is without), and `smgdiff_guidance.TUNED` (rate 0.9,
+touches from 12 m/s² on, within 18 cm) where the paper has 0.5, 2 m/s² and 10 cm
+(`Guidance()`).
+"""
