@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.diffusion import chain, guidance, schedule
+from tests import mostly_slow
 from tests.reference import diffusion as reference
 from tests.reference import smgdiff as oracle
 
@@ -61,7 +62,7 @@ def published(key, x_t, t, rate, last_sigma=None):
     return oracle.dsg_update(mean, sigma, gradient, noise, rate)
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.2, 0.5, 1.0])
+@pytest.mark.parametrize("rate", mostly_slow([0.0, 0.2, 0.5, 1.0], [0.5]))
 @pytest.mark.parametrize("last_sigma", [None, 0.02])
 def test_the_step_is_the_published_update(rate, last_sigma):
     step = dsg(rate=rate, last_sigma=last_sigma)
@@ -91,7 +92,7 @@ def test_the_step_ends_on_the_sphere(rate):
         np.testing.assert_allclose(oracle.length(moved), radius, rtol=2e-6)
 
 
-@pytest.mark.parametrize("t", range(2, T + 1))
+@pytest.mark.parametrize("t", mostly_slow(range(2, T + 1), [2]))
 def test_the_ends_of_the_rate_are_the_noise_and_the_descent(t):
     key, x_t = jax.random.key(t), random(t)
     mean, gradient, noise = by_hand(key, x_t, t)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.diffusion import chain, gan, schedule
+from tests import mostly_slow
 
 NUMBER = 200_000
 
@@ -16,7 +17,7 @@ def coefficients(table, t):
     return beta[t], alpha_bar[t - 1], alpha_bar[t]
 
 
-@pytest.mark.parametrize("t", [1, 2, 5])
+@pytest.mark.parametrize("t", mostly_slow([1, 2, 5], [2]))
 @pytest.mark.parametrize("make", [schedule.cosine_schedule, schedule.vp_schedule])
 def test_pairs_have_the_joint_gaussian_of_the_chain(make, t):
     """Given x_0: means, variances and the covariance of x_{t-1} and x_t."""
@@ -44,7 +45,7 @@ def test_each_sample_has_its_own_step():
             np.testing.assert_allclose(a[i], b[i], rtol=1e-6)
 
 
-@pytest.mark.parametrize("t", [1, 3])
+@pytest.mark.parametrize("t", mostly_slow([1, 3], [3]))
 def test_posterior_samples_have_the_posteriors_moments(t):
     """Oracle: Bayes' rule for the two Gaussians of x_{t-1}."""
     table = schedule.vp_schedule(4)

@@ -63,7 +63,7 @@ def rows(folder):
 
 def test_half_stop_restore_and_resume_is_the_whole_to_the_bit(tmp_path):
     """With the real loss and network; the second half starts from what is on disk."""
-    config = tiny.config(dropout=0.1)
+    config = tiny.config(dropout=0.1, depth=1)
     run, state, key, data = tiny.training_parts(config, num_steps=3)
     fresh = lambda: jax.tree.map(jnp.copy, state)  # noqa: E731
     first = fresh()
@@ -178,6 +178,7 @@ def test_the_log_forgets_steps_that_no_checkpoint_has(tmp_path):
     assert [row["step"] for row in rows(tmp_path)] == [2, 4, 6, 8]
 
 
+@pytest.mark.slow
 def test_a_chunk_in_pieces_is_the_whole_to_the_bit():
     config = tiny.config(dropout=0.1)
     run, state, key, data = tiny.training_parts(config, num_steps=6)

@@ -17,7 +17,7 @@ from jaxmotion.motion import features, rotation, trajectory
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
-from tests import tiny
+from tests import mostly_slow, tiny
 
 CONFIG = tiny.config(heading="facing")
 CONTROL = camdm_controller.Control(apply=5, reuse=6, seam=0.0)
@@ -123,7 +123,8 @@ def heights(frames, character):
 
 
 @pytest.mark.parametrize(
-    ("guided_plans", "replan_on_change"), [(0, True), (1, True), (1, False), (2, False)]
+    ("guided_plans", "replan_on_change"),
+    mostly_slow([(0, True), (1, True), (1, False), (2, False)], [(1, True)]),
 )
 def test_guidance_only_in_the_first_plans_after_a_style_change(
     skeleton, use, guided_plans, replan_on_change
@@ -195,7 +196,7 @@ def test_displayed_poses_are_fed_back(skeleton, use):
     )
 
 
-@pytest.mark.parametrize("heading", ["facing", "random"])
+@pytest.mark.parametrize("heading", mostly_slow(["facing", "random"], ["facing"]))
 def test_the_past_is_seen_from_the_last_pose(skeleton, use, heading):
     seen = []
 
@@ -230,7 +231,7 @@ def test_the_past_is_seen_from_the_last_pose(skeleton, use, heading):
 # Where it goes
 
 
-@pytest.mark.parametrize("heading", ["facing", "random"])
+@pytest.mark.parametrize("heading", mostly_slow(["facing", "random"], ["facing"]))
 def test_a_model_that_obeys_goes_where_it_is_told(skeleton, use, heading):
     """Then it reaches the commanded velocity and facing, from any start."""
     use(lambda condition, scale: jnp.float32(0.9))
@@ -395,6 +396,7 @@ def test_chunks_and_batches_change_nothing(params, skeleton, whole):
     assert np.abs(whole[1].root_position[2] - whole[1].root_position[3]).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_256_characters_at_a_time_are_256_alone(params, skeleton):
     """Over the first plan; later ones repeat what rounding there was."""
     number, ticks = 256, CONTROL.apply
