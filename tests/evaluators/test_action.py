@@ -125,6 +125,7 @@ def test_the_loss_is_the_cross_entropy(params):
     )
 
 
+@pytest.mark.slow
 def test_it_learns_to_tell_two_actions(skeleton):
     """Left turns from right turns; every second walk is held out."""
     walks = [

@@ -79,6 +79,7 @@ def windows_of_styles(skeleton):
     return jnp.stack(x), jnp.asarray(labels, jnp.int32)
 
 
+@pytest.mark.slow
 def test_it_learns_to_tell_two_styles(windows_of_styles):
     x, labels = windows_of_styles
     params, info = style_evaluator.train_recognizer(

@@ -127,6 +127,7 @@ def sample_batch(key, data):
     return jax.tree.map(lambda x: x[chosen], data)
 
 
+@pytest.mark.slow
 def test_it_learns_to_match_new_motions():
     """Of 16 different sentences; chance is 1/16, 2/16, 3/16."""
     steps = 200

@@ -14,7 +14,7 @@ from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
-from tests import person, tiny
+from tests import mostly_slow, person, tiny
 from tests.reference import pose as reference
 
 FPS = 60.0
@@ -93,8 +93,8 @@ def wanted_path(state, command, fps=FPS, half_life=0.27):
 # --- the wanted path ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("fps", [30.0, 60.0])
-@pytest.mark.parametrize("yaw", [0.0, 2.2])
+@pytest.mark.parametrize("fps", mostly_slow([30.0, 60.0], [60.0]))
+@pytest.mark.parametrize("yaw", mostly_slow([0.0, 2.2], [2.2]))
 def test_whoever_goes_on_as_before_wants_a_straight_line(fps, yaw):
     velocity = 1.3 * person.directions(yaw + 0.5)
     state = character(velocity, yaw)

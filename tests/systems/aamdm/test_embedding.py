@@ -9,7 +9,7 @@ import pytest
 
 from jaxmotion.learning import training
 from jaxmotion.systems.aamdm import embedding as aamdm_embedding
-from tests import person, tiny
+from tests import mostly_slow, person, tiny
 from tests.reference import pose as reference
 
 CONFIG = aamdm_embedding.Config(num_joints=6, latent=4, width=16)
@@ -208,7 +208,7 @@ def expected_terms(found, poses, latent, fps):
     return value / len(poses), change / len(poses), regular
 
 
-@pytest.mark.parametrize("fps", [60.0, 30.0])
+@pytest.mark.parametrize("fps", mostly_slow([60.0, 30.0], [60.0]))
 def test_loss_is_that_of_the_definition(fps):
     config = aamdm_embedding.Config(num_joints=6, latent=4, width=16, fps=fps)
     params, statistics = fitted()
@@ -279,6 +279,7 @@ def test_gradients_are_finite_and_reach_every_layer():
             assert np.abs(leaf).max() > 0
 
 
+@pytest.mark.slow
 def test_training_on_a_few_poses_lowers_the_loss():
     poses, paths = batch()
     statistics = fitted()[1]

@@ -12,7 +12,7 @@ import pytest
 from jaxmotion.diffusion import chain, schedule
 from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
-from tests import tiny
+from tests import mostly_slow, tiny
 
 CONFIG = aamdm_model.Config(features=3, latent=2, width=16, depth=2, window=4)
 CHANGING = dataclasses.replace(CONFIG, target="change")
@@ -29,7 +29,9 @@ def normal(*shape, seed=0):
     return jnp.asarray(values, jnp.float32)
 
 
-@pytest.mark.parametrize(("drafts", "polishes"), [(3, 2), (5, 0), (0, 5), (1, 1)])
+@pytest.mark.parametrize(
+    ("drafts", "polishes"), mostly_slow([(3, 2), (5, 0), (0, 5), (1, 1)], [(3, 2)])
+)
 def test_drafts_come_before_polishes(drafts, polishes):
     """Each step, one by one, with the network that its number belongs to."""
     config = dataclasses.replace(CONFIG, drafts=drafts, polishes=polishes)

@@ -10,7 +10,7 @@ import pytest
 
 from jaxmotion.networks import blocks
 from jaxmotion.systems.emdm import network as emdm_network
-from tests import tiny
+from tests import mostly_slow, tiny
 from tests.reference import emdm as reference
 
 NET = emdm_network.SequenceGenerator(
@@ -141,7 +141,7 @@ def codes(num, width):
     return out
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", mostly_slow(KINDS, ["action", "folded", "pre"]))
 def test_network_is_the_formula(name):
     """Also for a sample whose condition is dropped."""
     net, params = network(name), parameters(name)["params"]
@@ -195,7 +195,7 @@ def test_actions_start_as_a_table_of_unit_normal_draws():
     np.testing.assert_allclose(found, table[:2], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["action", "folded"])
+@pytest.mark.parametrize("name", mostly_slow(["action", "folded"], ["folded"]))
 @pytest.mark.parametrize("masked", [True, False])
 def test_frames_behind_the_end_are_seen_only_without_a_mask(name, masked):
     net, params = network(name), parameters(name)
@@ -302,7 +302,7 @@ def test_published_sizes(name):
 
 
 @pytest.mark.parametrize("norm", ["post", "pre"])
-@pytest.mark.parametrize("activation", ["gelu", "selu"])
+@pytest.mark.parametrize("activation", mostly_slow(["gelu", "selu"], ["gelu"]))
 def test_a_masked_layer_is_one_of_fewer_tokens(norm, activation):
     net = blocks.EncoderLayer(8, 2, 12, 0.0, norm, activation)
     x, mask = normal(2, 5, 8), jnp.array([[1, 0, 1, 1, 0], [0, 1, 1, 0, 0]], bool)

@@ -12,7 +12,7 @@ import pytest
 from jaxmotion.learning import adversarial, training
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
-from tests import tiny
+from tests import mostly_slow, tiny
 from tests.reference import diffusion
 from tests.reference import emdm as reference
 from tests.systems.emdm import test_discriminator
@@ -282,7 +282,7 @@ def test_pairs_are_those_of_the_diffusion(watch):
 
 
 @pytest.mark.parametrize("mask_frames", [True, False])
-@pytest.mark.parametrize("conditional", [True, False])
+@pytest.mark.parametrize("conditional", mostly_slow([True, False], [True]))
 def test_the_discriminator_sees_motions_to_their_end(watch, mask_frames, conditional):
     config = dataclasses.replace(
         CONFIG, mask_frames=mask_frames, discriminator_condition=conditional
@@ -304,7 +304,7 @@ def test_the_discriminator_sees_motions_to_their_end(watch, mask_frames, conditi
             np.testing.assert_array_equal(vector, data.vector)
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("rate", mostly_slow([0.0, 0.3, 1.0], [0.3]))
 def test_the_generator_loses_its_condition_at_a_rate(watch, rate):
     """In both ways to train one; the discriminator keeps it."""
     config = dataclasses.replace(ONE, drop_condition=rate)
@@ -378,7 +378,7 @@ def test_geometric_terms_are_the_formulas():
     np.testing.assert_allclose(total, weighted, rtol=1e-4)
 
 
-@pytest.mark.parametrize("length", [1, 3, 6])
+@pytest.mark.parametrize("length", mostly_slow([1, 3, 6], [3]))
 def test_geometric_terms_of_a_motion_are_of_its_frames(length):
     data = batch(length)
     prediction = guess(data)
@@ -566,6 +566,7 @@ def test_no_player_moves_the_other(mover):
     assert np.mean(loss[-20:]) < np.mean(loss[:20]) - 0.05
 
 
+@pytest.mark.slow
 def test_two_players_learn_a_mean_and_a_spread():
     @jax.jit
     def moments(params, key):

@@ -11,7 +11,7 @@ import pytest
 from jaxmotion.diffusion import chain
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
-from tests import tiny
+from tests import mostly_slow, tiny
 from tests.reference import diffusion
 from tests.reference import emdm as reference
 
@@ -87,7 +87,7 @@ def draws(key, num_steps, latent):
 # --- sampling ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("num_steps", [1, 4])
+@pytest.mark.parametrize("num_steps", mostly_slow([1, 4], [4]))
 @pytest.mark.parametrize("mask_frames", [True, False])
 def test_sampling_is_algorithm_2(num_steps, mask_frames):
     """Oracle: its schedule, its posterior and its loop around the network."""

@@ -16,7 +16,7 @@ from jaxmotion.learning import checkpoint, runs, training
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
-from tests import tiny
+from tests import mostly_slow, tiny
 
 # Orbax abandons its other reads when one fails.
 pytestmark = [
@@ -318,7 +318,8 @@ def many():
 
 
 @pytest.mark.parametrize(
-    ("scale", "chunk", "number"), [(None, 8, 1), (2.5, 3, 8), (2.5, 100, 5)]
+    ("scale", "chunk", "number"),
+    mostly_slow([(None, 8, 1), (2.5, 3, 8), (2.5, 100, 5)], [(2.5, 3, 8)]),
 )
 def test_a_motion_does_not_depend_on_how_many_are_made(many, scale, chunk, number):
     sample, conditions, run = many

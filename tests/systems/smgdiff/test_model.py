@@ -268,6 +268,7 @@ def test_a_shifted_person_costs_its_shift(scenes, representation):
     assert float(terms["velocity"]) == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_training_lowers_the_loss(scenes, representation, config, params):
     data = (scenes, jnp.array([0, 1, 0]))
     loss = functools.partial(

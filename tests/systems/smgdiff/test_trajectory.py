@@ -90,6 +90,7 @@ def test_generated_paths_have_unit_facings(params, steps):
     np.testing.assert_allclose(np.hypot(*path.facing.T), 1.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_training_makes_paths_of_what_was_seen():
     """Straight walks at two speeds: the error falls to a part of the first."""
     motions = [tiny.walk(16, speed=s, start=a) for s in (0.5, 1.5) for a in (0.0, 2.0)]
