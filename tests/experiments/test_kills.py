@@ -119,6 +119,7 @@ def check(system, folder, kills):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("system", COMMANDS)
 def test_kills_change_nothing(tmp_path, system):
     prepare(tmp_path)
