@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion.evaluation import statistics
+from jaxmotion.evaluation import statistics, timing
 from jaxmotion.evaluation.table import Cell, Row, Rows
 from jaxmotion.typing import Key
 
@@ -260,42 +259,8 @@ class Bench:
     evaluator: str | None = None
 
 
-def milliseconds(
-    calls: dict[str, Callable[[Key], Any]],
-    *,
-    rounds: int = 100,
-    seconds: float = 60.0,
-    least: int = 10,
-) -> dict[str, np.ndarray]:
-    """Times several programs in turn.
-
-    Args:
-      calls: Jitted functions of a key, by name; two calls of each before the others
-        compile it and warm it up.
-      rounds: Calls of each, at most.
-      seconds: No further round begins once they have taken so long in all.
-      least: Rounds, at least.
-
-    Returns:
-      Milliseconds of each call.
-    """
-    names = list(calls)
-    for name in names:
-        for i in range(2):
-            jax.block_until_ready(calls[name](jax.random.key(i)))
-    times: dict[str, list[float]] = {name: [] for name in names}
-    begun = time.perf_counter()
-    for i in range(rounds):
-        # The order moves on, so that none always runs after the same other.
-        turn = i % len(names)
-        for name in names[turn:] + names[:turn]:
-            key = jax.random.key(i)
-            start = time.perf_counter()
-            jax.block_until_ready(calls[name](key))
-            times[name].append(1000 * (time.perf_counter() - start))
-        if i + 1 >= least and time.perf_counter() - begun > seconds:
-            break
-    return {name: np.array(found) for name, found in times.items()}
+def _key(i: int) -> tuple[Key]:
+    return (jax.random.key(i),)
 
 
 def call_time(
@@ -312,7 +277,9 @@ def call_time(
     Returns:
       Median in milliseconds, with the ends of the middle half.
     """
-    times = milliseconds({"": run}, rounds=200, seconds=seconds, least=least)[""]
+    times = timing.time_calls(
+        run, arguments=_key, rounds=200, warmup=2, limit_s=seconds, least=least
+    )
     low, middle, high = (float(x) for x in np.quantile(times, [0.25, 0.5, 0.75]))
     return Cell(
         value=middle / parts, low=low / parts, high=high / parts, samples=times.size
@@ -329,12 +296,11 @@ def time_cells(times: np.ndarray, *, seed: int) -> Row:
     Returns:
       Two columns.
     """
-    found = statistics.bootstrap_interval(
-        jax.random.key(seed), jnp.asarray(times, jnp.float32), jnp.median
-    )
-    estimate, low, high = (float(x) for x in found)
+    found = statistics.bootstrap_interval(times, np.median, seed=seed)
     return {
-        "p50 ms": Cell(value=estimate, low=low, high=high, samples=times.size),
+        "p50 ms": Cell(
+            value=found.estimate, low=found.low, high=found.high, samples=times.size
+        ),
         "p95 ms": Cell(value=float(np.percentile(times, 95)), samples=times.size),
     }
 
@@ -352,8 +318,9 @@ def measure(evaluation: Evaluation, job: Job) -> tuple[Rows, dict[str, float]]:
         seconds[f"scores, {point.row}"] = time.perf_counter() - started
         print(f"{point.row}: scored", flush=True)
     calls = {point.row: evaluation.sampler(point) for point in job.points}
-    for row, times in milliseconds(calls).items():
-        rows[row] = rows[row] | time_cells(times, seed=job.seed)
+    times = timing.time_in_turn(calls, arguments=_key, rounds=100, warmup=2, least=10)
+    for row, found in times.items():
+        rows[row] = rows[row] | time_cells(found[:, 0], seed=job.seed)
     return rows, seconds
 
 

@@ -1,23 +1,20 @@
 """Confidence intervals for tables."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+import numpy as np
 import scipy.stats
 from jaxtyping import Array, Float
-
-from jaxmotion.motion.spring import Scalar
-from jaxmotion.typing import Key
 
 
 class Interval(NamedTuple):
     """An estimate and the ends of its confidence interval."""
 
-    estimate: float | Float[Array, ""]
-    low: float | Float[Array, ""]
-    high: float | Float[Array, ""]
+    estimate: float
+    low: float
+    high: float
 
 
 def confidence_interval(
@@ -45,42 +42,37 @@ def confidence_interval(
 
 
 def bootstrap_interval(
-    key: Key,
-    samples: Any,
-    statistic: Callable[[Any], Float[Array, ""]],
+    samples: np.ndarray,
+    statistic: Callable[..., np.ndarray],
     *,
+    seed: int,
+    level: float = 0.95,
     num_resamples: int = 1000,
-    level: Scalar = 0.95,
 ) -> Interval:
-    """Confidence interval of any statistic by resampling clips.
+    """Percentile interval of a statistic such as `np.median`, by resampling.
 
     Args:
-      key: Consumed.
-      samples: Arrays (one or a pytree of them) whose first axis is the clips; whole
-        clips are drawn with replacement, because frames of one clip are not
-        independent.
-      statistic: Function of such arrays.
-      num_resamples: How often to draw.
+      samples: Independent ones, [samples].
+      statistic: Function of them, with an argument `axis`.
+      seed: Of what is drawn.
       level: Part of the resampled values that the interval holds, in (0, 1).
-
-    Returns:
-      Statistic of the samples themselves, and the percentile interval.
+      num_resamples: How often to draw.
 
     Raises:
-      ValueError: if there are fewer than two clips or their numbers differ.
+      ValueError: if there are fewer than two samples.
 
     Source: Efron 1979.
     """
-    counts = {leaf.shape[0] for leaf in jax.tree.leaves(samples)}
-    if len(counts) != 1 or min(counts) < 2:
-        raise ValueError(f"numbers of clips {sorted(counts)}, expected one, at least 2")
-    count = counts.pop()
-
-    def resampled(key: Key) -> Array:
-        chosen = jax.random.randint(key, (count,), 0, count)
-        return statistic(jax.tree.map(lambda leaf: leaf[chosen], samples))
-
-    values = jax.lax.map(resampled, jax.random.split(key, num_resamples), batch_size=64)
-    tail = (1.0 - level) / 2.0
-    low, high = jnp.quantile(values, jnp.asarray([tail, 1.0 - tail]))
-    return Interval(estimate=statistic(samples), low=low, high=high)
+    if len(samples) < 2:
+        raise ValueError(f"{len(samples)} samples, expected at least 2")
+    found = scipy.stats.bootstrap(
+        (samples,),
+        statistic,
+        n_resamples=num_resamples,
+        confidence_level=level,
+        method="percentile",
+        random_state=np.random.default_rng(seed),
+    ).confidence_interval
+    return Interval(
+        estimate=float(statistic(samples)), low=float(found.low), high=float(found.high)
+    )

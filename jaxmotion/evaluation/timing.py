@@ -43,8 +43,9 @@ def compile_program(function: Callable, *arguments: Any) -> tuple[Callable, floa
 
 
 def time_in_turn(
-    calls: dict[str, Callable[[], Any]],
+    calls: dict[str, Callable[..., Any]],
     *,
+    arguments: Callable[[int], tuple] = lambda i: (),
     rounds: int = 50,
     warmup: int = 3,
     limit_s: float = 60.0,
@@ -57,6 +58,7 @@ def time_in_turn(
 
     Args:
       calls: By name; what they return is waited for if it is JAX's.
+      arguments: Of the calls of round i, warm-up included; making them is not timed.
       rounds: Timed rounds.
       warmup: Rounds before, fewer where they take a quarter of the limit.
       limit_s: Stop after so many seconds, but not before the least number of rounds.
@@ -71,13 +73,14 @@ def time_in_turn(
     def one_round() -> list[tuple[float, float]]:
         nonlocal made
         turn = made % len(names)
-        made += 1
         found = {}
         for name in names[turn:] + names[:turn]:
+            given = arguments(made)
             start, start_cpu = time.perf_counter(), time.process_time()
-            jax.block_until_ready(calls[name]())
+            jax.block_until_ready(calls[name](*given))
             end, end_cpu = time.perf_counter(), time.process_time()
             found[name] = 1000 * (end - start), 1000 * (end_cpu - start_cpu)
+        made += 1
         return [found[name] for name in names]
 
     begin = time.perf_counter()
@@ -94,7 +97,7 @@ def time_in_turn(
     return dict(zip(names, np.array(times).transpose(1, 0, 2), strict=True))
 
 
-def time_calls(call: Callable[[], Any], **options: Any) -> np.ndarray:
+def time_calls(call: Callable[..., Any], **options: Any) -> np.ndarray:
     """Milliseconds of wall clock of each call; options as of `time_in_turn`."""
     return time_in_turn({"": call}, **options)[""][:, 0]
 

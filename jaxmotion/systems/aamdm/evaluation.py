@@ -8,7 +8,6 @@ Source: Li et al. 2024 (AAMDM), section 4.1.
 
 import dataclasses
 import functools
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from jaxmotion.evaluation import (
     health,
     smoothness,
     table,
+    timing,
 )
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Row
@@ -191,13 +191,14 @@ def frames_per_second(
     states = start_states(run, space, 1, seed=0)
     given = commands(run, 1, ticks, course="forward", speed=1.0)
     roll = roller(run, space, step, steered=False)
-    jax.block_until_ready(roll(jax.random.key(0), states, given))
-    times = []
-    for i in range(repeats):
-        begun = time.perf_counter()
-        jax.block_until_ready(roll(jax.random.key(i), states, given))
-        times.append(time.perf_counter() - begun)
-    return ticks / float(np.median(times))
+    times = timing.time_calls(
+        roll,
+        arguments=lambda i: (jax.random.key(i), states, given),
+        rounds=repeats,
+        warmup=1,
+        least=repeats,
+    )
+    return 1000 * ticks / float(np.median(times))
 
 
 PAIRS = 2000
