@@ -289,26 +289,6 @@ def _palette(scene: _Scene) -> np.ndarray:
     return np.round(np.array(found))
 
 
-class _Quantizer:
-    """Nearest colors of a palette, not dithered, looked up by 6 bits per channel."""
-
-    def __init__(self, palette: np.ndarray):
-        self.palette = palette.astype(np.uint8)
-        steps = np.arange(64) * 4.0 + 2.0
-        self.table = np.zeros((64, 64, 64), np.uint8)
-        square = (palette**2).sum(axis=1)
-        cells = np.stack(np.meshgrid([0.0], steps, steps, indexing="ij"), axis=-1)
-        for i, red in enumerate(steps):
-            distance = square - 2 * (cells[0] + [red, 0.0, 0.0]) @ palette.T
-            self.table[i] = distance.argmin(axis=-1)
-
-    def __call__(self, picture: Image.Image) -> Image.Image:
-        r, g, b = np.moveaxis(np.asarray(picture) >> 2, -1, 0)
-        image = Image.fromarray(self.table[r, g, b], "P")
-        image.putpalette(self.palette.ravel().tolist())
-        return image
-
-
 def _durations(number: int, seconds: float) -> list[int]:
     """Milliseconds of each picture; a GIF counts hundredths, so these must vary."""
     times = np.round(100 * seconds * np.arange(number + 1)).astype(int)
@@ -412,9 +392,13 @@ def save_gif(
         ball=ball,
         radius=radius,
     )
-    quantize = _Quantizer(_palette(scene))
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(_palette(scene).astype(np.uint8).ravel().tolist())
     frames = range(0, len(positions), every)
-    images = [quantize(_draw(scene, frame)) for frame in frames]
+    images = [
+        _draw(scene, frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
     times = _durations(len(images), every / fps)
     images[0].save(
         path, save_all=True, append_images=images[1:], duration=times, loop=0
