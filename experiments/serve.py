@@ -1,7 +1,8 @@
-"""Serves characters of a run over TCP, for a game engine to steer and to show.
+"""Serves characters of a model over TCP, for a game engine to steer and to show.
 
 Examples:
-  python experiments/serve.py --run runs/camdm
+  python experiments/serve.py
+  python experiments/serve.py --run runs/smgdiff
   python benchmarks/serve_client.py --port 7777 --seconds 60
 """
 
@@ -17,10 +18,12 @@ import time
 from pathlib import Path
 
 import tyro
-from serving import protocol, runs, simulation
+from serving import protocol, simulation
 from serving.server import Limits, Server
 
+import jaxmotion
 from jaxmotion import cli
+from jaxmotion.data import clips_io
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,10 +31,9 @@ class Config:
     """The command line.
 
     Attributes:
-      run: Run folder of `camdm.py train` or `smgdiff.py train`, or a file of
-        `camdm.py export`.
-      data: Clips to start from; None for the mean pose of the model (of the clips
-        that it was trained on where it has none).
+      run: Name of a shipped model, run folder of a system whose characters are
+        steered (CAMDM, AAMDM, SMGDiff), or file of `camdm.py export`.
+      data: Clips to start from, for CAMDM; None for the model's own start.
       host: Address to listen on. Anyone who reaches it can connect: there is no
         authentication.
       port: Port to listen on; 0 for any that is free.
@@ -40,7 +42,7 @@ class Config:
       seed: Of the noise of the first character; the next ones count on.
     """
 
-    run: Path = Path("runs/camdm")
+    run: str = "locomotion"
     data: Path | None = None
     host: str = "127.0.0.1"
     port: int = 7777
@@ -49,14 +51,7 @@ class Config:
 
 
 def is_local(host: str) -> bool:
-    """Whether only this machine reaches an address.
-
-    Args:
-      host: Address or name.
-
-    Returns:
-      A truth value; False where it is not known.
-    """
+    """Whether only this machine reaches an address; False where it is not known."""
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
     return host == "localhost"
@@ -82,12 +77,7 @@ def check_address(host: str, port: int) -> None:
 
 
 async def listen(args: Config, characters: simulation.Simulation) -> None:
-    """Serves until SIGINT or SIGTERM.
-
-    Args:
-      args: The arguments.
-      characters: What to serve.
-    """
+    """Serves until SIGINT or SIGTERM."""
     stop = asyncio.Event()
     if sys.platform != "win32":  # where Ctrl-C cancels this coroutine instead
         for number in (signal.SIGINT, signal.SIGTERM):
@@ -98,15 +88,18 @@ async def listen(args: Config, characters: simulation.Simulation) -> None:
     print("closed", flush=True)
 
 
+def load(run: str, data: Path | None) -> simulation.Simulation:
+    """A model's characters; of clips only what a start needs is kept."""
+    clips = None if data is None else clips_io.load_clips(data)
+    return simulation.Characters(jaxmotion.load(run), clips=clips)
+
+
 def serve(args: Config) -> None:
     """Loads, compiles, and serves.
 
-    Args:
-      args: The arguments.
-
     Raises:
-      OSError: if the run cannot be read or the address not be listened on.
-      ValueError: if the run cannot be served.
+      OSError: if the model cannot be read or the address not be listened on.
+      ValueError: if the model cannot be served.
     """
     cli.check(args)
     if not is_local(args.host):
@@ -117,7 +110,7 @@ def serve(args: Config) -> None:
             flush=True,
         )
     check_address(args.host, args.port)
-    characters = runs.load(args.run, args.data)
+    characters = load(args.run, args.data)
     begin = time.perf_counter()
     cli.announce("compiling all that a tick may need", 60)
     simulation.warm(characters)

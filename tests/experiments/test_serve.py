@@ -23,11 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.control import rollout
+from jaxmotion.control import rollout, steering
+from jaxmotion.control.frame import Frame
+from jaxmotion.data import clips_io
 from jaxmotion.learning import checkpoint
-from jaxmotion.motion import skeleton
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm import training as camdm_training
 from tests import samples, tiny
 
 ROOT = Path(__file__).parents[2]
@@ -574,7 +574,7 @@ def test_stopping_hangs_up_on_everyone():
 def script(monkeypatch):
     """The script, with a simulation that costs nothing; its garbage is thawed."""
     module = load("serve")
-    monkeypatch.setattr(module.runs, "load", lambda run, data: Fake())
+    monkeypatch.setattr(module, "load", lambda run, data: Fake())
     yield module
     gc.unfreeze()
 
@@ -585,7 +585,8 @@ def test_help_has_defaults_the_protocol_and_an_example(help_of):
         "(default: 127.0.0.1)",
         "(default: 8)",
         "no authentication",
-        "--run runs/camdm",
+        "--run runs/smgdiff",
+        "(default: locomotion)",
         '{"velocity": [0.0, 1.2], "facing": [0.0, 1.0], "label": "elderly"}',
         '{"error": "busy"}',
     ):
@@ -638,7 +639,7 @@ def test_other_addresses_are_warned_of(script, monkeypatch, capsys, host, local)
     def stop(run, data):
         raise ValueError("here")
 
-    monkeypatch.setattr(script.runs, "load", stop)
+    monkeypatch.setattr(script, "load", stop)
     monkeypatch.setattr(script, "check_address", lambda host, port: None)
     with pytest.raises(ValueError, match="here"):
         script.serve(script.Config(host=host))
@@ -651,7 +652,7 @@ def test_at_least_one_client(script):
 
 
 def test_an_address_is_tried_before_anything_is_loaded(script, monkeypatch):
-    monkeypatch.setattr(script.runs, "load", None)
+    monkeypatch.setattr(script, "load", None)
     with pytest.raises(ValueError, match="--port is 70000, expected .* 65535"):
         script.serve(script.Config(port=70000))
     with socket.create_server(("127.0.0.1", 0)) as other:
@@ -662,13 +663,14 @@ def test_an_address_is_tried_before_anything_is_loaded(script, monkeypatch):
         script.serve(script.Config(host="no.such.host.invalid"))
 
 
-def test_only_known_systems_are_served(tmp_path):
-    runs = load("serving.runs")
+def test_what_cannot_be_served_is_named(tmp_path, script_load):
     (tmp_path / "config.json").write_text('{"system": "emdm"}')
-    with pytest.raises(ValueError, match="'system' is 'emdm', expected one of camdm"):
-        runs.load(tmp_path)
-    with pytest.raises(OSError):
-        runs.load(tmp_path / "nowhere")
+    with pytest.raises(ValueError, match="'system' is 'emdm', expected .*camdm, aamdm"):
+        script_load(str(tmp_path), None)
+    with pytest.raises(ValueError, match="nowhere: no such file .*locomotion"):
+        script_load(str(tmp_path / "nowhere"), None)
+    with pytest.raises(OSError, match="none.npz"):
+        script_load("locomotion", tmp_path / "none.npz")
 
 
 # The scripted client.
@@ -696,35 +698,15 @@ def test_all_that_the_client_calls_malformed_is(protocol):
             protocol.parse_command(line, protocol.Command(), LABELS)
 
 
-# CAMDM.
+# Characters.
 
 
-def model_and_params():
-    still = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(tiny.NAMES)
-    config = tiny.config(
-        heading="facing",
-        rotation_scale=4.0,
-        rotation_mean=still,
-        future=16,
-        depth=1,
-        network="mlp",
-    )
-    model = camdm_model.Model(
-        config=config, skeleton=tiny.skeleton(), labels=tiny.STYLES, source="tests"
-    )
-    return model, tiny.random_params(camdm_model.init, config, seed=1)
+@pytest.fixture
+def script_load():
+    return load("serve").load
 
 
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    """A file of `camdm.py export`."""
-    path = tmp_path_factory.mktemp("exported") / "camdm.npz"
-    model, params = model_and_params()
-    checkpoint.export_params(path, params, camdm_model.to_json(model))
-    return path
-
-
-def counting_controller():
+def counting_controller(_):
     """Walks as told; a plan, made when the label changes, draws a number."""
 
     def plan(key, state, command):
@@ -732,7 +714,16 @@ def counting_controller():
 
     def advance(state, command):
         root = state["root"] + jnp.array([1.0, 0.0, 1.0]) * command.velocity[0]
-        return state | {"root": root}, state | {"facing": command.facing}
+        shown = Frame(
+            root_position=state["root"],
+            joint_rotation=jnp.full((len(tiny.NAMES), 6), state["drawn"]),
+            desired_velocity=command.velocity,
+            desired_facing=command.facing,
+            planned=jnp.zeros((), bool),
+            extra={"ball": jnp.append(command.facing, state["label"])},
+            fps=30.0,
+        )
+        return state | {"root": root}, shown
 
     return rollout.Controller(
         plan_level=lambda state, command: jnp.int32(state["label"] != command.label),
@@ -743,14 +734,16 @@ def counting_controller():
 
 def test_a_controller_is_told_everything_in_one_program(protocol):
     first = {"root": jnp.zeros(3), "label": jnp.int32(-1), "drawn": jnp.zeros(())}
-    simulation = load("serving.controlled").ControlledSimulation(
-        counting_controller(),
-        tiny.skeleton(),
-        first,
-        lambda frame: frame,
+    character = steering.Character(
+        skeleton=tiny.skeleton(),
         labels=tiny.STYLES,
         fps=30.0,
+        source="made in the tests",
+        params=None,
+        method=counting_controller,
+        starts=lambda labels, seed: jax.tree.map(lambda x: x[None], first),
     )
+    simulation = load("serving.simulation").Characters(character)
     assert simulation.joints == tiny.NAMES and simulation.parents == tiny.PARENTS
     np.testing.assert_array_equal(simulation.offsets, np.float32(tiny.OFFSETS))
     calm = protocol.Command(velocity=(0.5, 1.0), facing=(0.6, 0.8), label="calm")
@@ -764,56 +757,56 @@ def test_a_controller_is_told_everything_in_one_program(protocol):
             if n == 0 or own != calm and n == 2:
                 key = jax.random.fold_in(jax.random.key(seed), n)
                 drawn[seed] = float(jax.random.normal(key))
-            assert frame["drawn"] == pytest.approx(drawn[seed], abs=1e-6)
-            assert frame["label"] == tiny.STYLES.index(own.label)
-            np.testing.assert_allclose(frame["facing"], own.facing)
+            np.testing.assert_allclose(frame["rotations"], drawn[seed], atol=1e-6)
+            *facing, label = frame["ball"]
+            assert label == tiny.STYLES.index(own.label)
+            np.testing.assert_allclose(facing, own.facing)
             walked = sum(c.velocity[0] for c in given[:n]) if seed == 5 else 0.5 * n
             np.testing.assert_allclose(frame["root"], [walked, 0, walked])
     assert simulation._tick._cache_size() == 1
     assert np.all(np.asarray(simulation.start(7)[1]["root"]) == 0), "it was used up"
 
 
-def test_characters_of_camdm_are_served(exported, protocol):
-    simulation = load("serving.runs").load(exported)
+def test_the_shipped_locomotion_is_served(script_load, protocol):
+    simulation = script_load("locomotion", None)
     load("serving.simulation").warm(simulation)
-    assert simulation.labels == tiny.STYLES and simulation.fps == 30.0
+    assert simulation.labels == ("neutral", "crouch") and simulation.fps == 30.0
+    joints = len(simulation.joints)
     state, roots = simulation.start(0), []
     for n in range(20):  # plans at 0 and 15, a guided one at 10
-        command = protocol.Command(velocity=(0.0, 1.0), label=tiny.STYLES[n // 10])
+        command = protocol.Command(
+            velocity=(0.0, 1.0), label=simulation.labels[n // 10]
+        )
         state, frame = simulation.step(state, command, n)
         assert sorted(frame) == ["root", "rotations"]
-        columns = frame["rotations"].reshape(5, 2, 3)
+        columns = frame["rotations"].reshape(joints, 2, 3)
         np.testing.assert_allclose(
-            columns @ columns.swapaxes(1, 2), np.tile(np.eye(2), (5, 1, 1)), atol=1e-4
+            columns @ columns.swapaxes(1, 2),
+            np.tile(np.eye(2), (joints, 1, 1)),
+            atol=1e-4,
         )
         roots.append(frame["root"])
     assert np.all(np.isfinite(roots)) and np.all(np.std(roots, axis=0) > 0)
+    assert roots[-1][2] > 0.05, "it did not walk"
     assert simulation._tick._cache_size() == 1
 
 
-def test_the_mean_pose_stands_on_the_ground():
-    module = load("serving.camdm")
-    model, _ = model_and_params()
-    motion = module.mean_pose(model)
-    assert motion.root_position.shape == (model.config.past, 3)
-    feet = skeleton.joint_positions(model.skeleton, motion)[:, [2, 4], 1]
-    np.testing.assert_allclose(feet, 0.0, atol=1e-6)
-    np.testing.assert_allclose(motion.root_position[-1], [0, 0.9, 0], atol=1e-6)
-    state = module.first_state(Path("nowhere"), None, model)
-    np.testing.assert_allclose(state.facing, [0, 1], atol=1e-6)
-    np.testing.assert_allclose(state.velocity, 0, atol=1e-6)
-
-
-def test_without_a_mean_pose_characters_start_with_real_ones(monkeypatch):
-    module, found = load("serving.camdm"), samples.run()
-    asked = []
-    monkeypatch.setattr(
-        camdm_training, "load_run", lambda run, data: asked.append((run, data)) or found
-    )
-    state = module.first_state(Path("run"), None, found.model)
-    assert asked == [(Path("run"), None)]
+@pytest.mark.parametrize("name", ["locomotion", "walker"])
+def test_shipped_models_start_without_clips(script_load, name):
+    state = script_load(name, None).start(0)[1]
     np.testing.assert_allclose(state.past.root_position[-1, ::2], 0, atol=1e-5)
     np.testing.assert_allclose(state.facing, [0, 1], atol=1e-4)
+
+
+def test_characters_start_from_clips(script_load, tmp_path):
+    """Of an exported model, which has no poses of its own."""
+    found = samples.run()
+    clips_io.save_clips(tmp_path / "clips.npz", found.train)
+    value = camdm_model.to_json(found.model)
+    checkpoint.export_params(tmp_path / "camdm.npz", found.params, value)
+    simulation = script_load(str(tmp_path / "camdm.npz"), tmp_path / "clips.npz")
+    past = simulation.start(0)[1].past
+    np.testing.assert_allclose(past.root_position[-1, ::2], 0, atol=1e-5)
     rotations = np.asarray(found.train.joint_rotation[:, 1:])
-    shown = np.asarray(state.past.joint_rotation[-1, 1:])
+    shown = np.asarray(past.joint_rotation[-1, 1:])
     assert np.abs(rotations - shown[None]).max(axis=(1, 2)).min() < 1e-5

@@ -34,7 +34,7 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import schedule
 from jaxmotion.motion import features, spring, trajectory
-from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.typing import Key, Params
@@ -477,8 +477,8 @@ def character(
 def load_character(path: Path, *, control: Control | None = None) -> Character:
     """The character of a run folder or an exported file.
 
-    It starts in the model's own poses where it has some, else in poses of the clips
-    that the run was trained on.
+    It starts in the model's own poses where it has some, else in the mean pose of its
+    data where it knows that, else in poses of the clips that the run was trained on.
 
     Raises:
       CheckpointError: if there is no whole checkpoint.
@@ -490,6 +490,11 @@ def load_character(path: Path, *, control: Control | None = None) -> Character:
         return made
 
     def starts(labels: np.ndarray, seed: int) -> CharacterState:
+        if model.config.rotation_mean and model.config.heading == "facing":
+            check_labels(labels, model.labels)
+            one, many = mean_pose(model), len(labels)
+            same = jax.tree.map(lambda x: jnp.broadcast_to(x, (many, *x.shape)), one)
+            return _states_of(model.skeleton, same, config=model.config)
         run = camdm_training.load_run(path)
         return start_states(run.train, model, labels, field=run.field, seed=seed)
 
@@ -556,6 +561,23 @@ def own_states(
     which = np.random.default_rng(seed).integers(number, size=labels.shape)
     chosen = jax.tree.map(lambda x: x[labels, which], model.starts)
     return _states_of(model.skeleton, chosen, config=model.config)
+
+
+def mean_pose(model: camdm_model.Model) -> Motion:
+    """A character that stands at the origin in the mean pose of its data, facing +z.
+
+    Args:
+      model: One with a mean pose (`Config.rotation_mean`) of samples that face +z.
+
+    Returns:
+      As many equal frames as a plan wants to see; the lowest joint is on the ground.
+    """
+    config = model.config
+    zeros = jnp.zeros((config.past, config.num_features))
+    motion = camdm_model.to_motion(zeros, config=config)
+    lowest = jnp.min(joint_positions(model.skeleton, motion)[..., 1])
+    raised = motion.root_position.at[:, 1].set(-lowest)
+    return dataclasses.replace(motion, root_position=raised)
 
 
 def at_origin(skeleton: Skeleton, motion: Motion) -> Motion:

@@ -14,7 +14,7 @@ import pytest
 
 from jaxmotion.control import rollout
 from jaxmotion.motion import features, rotation, trajectory
-from jaxmotion.motion.skeleton import Motion
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import mostly_slow, tiny
@@ -472,3 +472,16 @@ def test_more_frames_than_a_plan_has_cannot_be_played(params, skeleton, apply):
     control = dataclasses.replace(CONTROL, apply=apply)
     with pytest.raises(ValueError, match=f"apply is {apply}, expected 1..12"):
         camdm_controller.controller(params, skeleton, config=CONFIG, control=control)
+
+
+def test_the_mean_pose_stands_on_the_ground():
+    still = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(tiny.NAMES)
+    config = tiny.config(heading="facing", rotation_scale=4.0, rotation_mean=still)
+    model = camdm_model.Model(
+        config=config, skeleton=tiny.skeleton(), labels=tiny.STYLES, source="tests"
+    )
+    motion = camdm_controller.mean_pose(model)
+    assert motion.root_position.shape == (config.past, 3)
+    feet = joint_positions(model.skeleton, motion)[:, [2, 4], 1]
+    np.testing.assert_allclose(feet, 0.0, atol=1e-6)
+    np.testing.assert_allclose(motion.root_position[-1], [0, 0.9, 0], atol=1e-6)
