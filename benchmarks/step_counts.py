@@ -15,7 +15,7 @@ import workload
 
 from jaxmotion import cli
 from jaxmotion.evaluation import timing
-from jaxmotion.viz import figure
+from jaxmotion.viz import plots
 
 COLUMNS = {
     "batch": "batch",
@@ -113,7 +113,7 @@ def main() -> None:
             )
             rows += own
     suite.print_table(rows, COLUMNS)
-    figure.plot_sweep(
+    plots.plot_sweep(
         args.out / "step_counts.png",
         lines,
         xlabel="diffusion steps",

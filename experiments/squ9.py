@@ -27,7 +27,7 @@ from jaxmotion.evaluation import modes
 from jaxmotion.learning import adversarial, loop, training
 from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
-from jaxmotion.viz import scatter
+from jaxmotion.viz import plots
 
 CENTERS = np.stack(np.meshgrid(*2 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(9, 2)
 SIGMA = 0.1
@@ -191,7 +191,7 @@ def main() -> None:
         "platform": jax.devices()[0].platform,
     }
     files.write_text(args.out / "scores.json", json.dumps(report, indent=1))
-    scatter.write_scatter(
+    plots.write_scatter(
         args.out / "squ9.png",
         {name: x.reshape(-1, 2) for name, x in points.items()},
         marks=CENTERS,

@@ -172,14 +172,14 @@ def _draw(
     title: str,
 ) -> str:
     """Draws quality against time; returns the points that cannot be in the plot."""
-    from jaxmotion.viz import pareto
+    from jaxmotion.viz import plots
 
     def is_finite(row: str) -> bool:
         return quality in rows[row] and math.isfinite(rows[row][quality].value)
 
     shown = [point for point in points if is_finite(point.row)]
     if shown:
-        pareto.write_pareto(
+        plots.write_pareto(
             path,
             tuple(point.name for point in shown),
             *(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxmotion import files
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.systems import registry
-from jaxmotion.viz import dots
+from jaxmotion.viz import plots
 from reports import markdown, verdicts
 from reports.claims import Column, Stated, Table, read_paper
 from reports.results import Found, provenance
@@ -59,7 +59,7 @@ def draw(path: Path, table: Table, found: Found) -> None:
         cells = (verdicts.cell_of(table, row, column, found) for row in table.rows)
         target = 0 if column.better == "real" else None
         panels.append(
-            dots.Panel(
+            plots.Panel(
                 title=f"{column.name} {markdown.ARROWS[column.better]}",
                 left=np.array([_printed(row.paper[place]) for row in table.rows]),
                 right=np.array([_ends(cell, column) for cell in cells]),
@@ -68,7 +68,7 @@ def draw(path: Path, table: Table, found: Found) -> None:
         )
     names = tuple(row.name.removesuffix(" (not in the paper)") for row in table.rows)
     title = f"{table.name}: {table.title}"
-    dots.write_dots(
+    plots.write_dots(
         path,
         names,
         tuple(panels),

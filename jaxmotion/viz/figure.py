@@ -1,4 +1,4 @@
-"""What pictures share: the view, colors, checks; and plots of paths and sweeps.
+"""What pictures share: the view, colors, and checks.
 
 Figures are made without pyplot, so that neither a display is needed nor the backend of
 a notebook changed.
@@ -7,7 +7,6 @@ a notebook changed.
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
 LEFT, RIGHT, MIDDLE = "#2878c8", "#d63a3a", "#6b7480"
 COMMANDED, WALKED = "#2ca02c", "#ff7f0e"
@@ -133,38 +132,3 @@ def on_ground(path: np.ndarray) -> np.ndarray:
     """
     path = np.asarray(path, float)
     return np.stack([path[:, 0], np.zeros(len(path)), path[:, 1]], axis=-1)
-
-
-def plot_sweep(
-    path: str | Path,
-    lines: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray | None]],
-    *,
-    xlabel: str,
-    ylabel: str,
-    log: bool = True,
-) -> None:
-    """Lines with upper whiskers, such as latency over the number of steps.
-
-    Args:
-      path: File to write.
-      lines: Label to (x, y, upper end of the whisker or None).
-      xlabel: Quantity and unit.
-      ylabel: Quantity and unit.
-      log: Logarithmic axes.
-
-    Raises:
-      OSError: if the file cannot be written.
-    """
-    path = check_writable(path)
-    figure = Figure(figsize=(6, 4), dpi=110, layout="constrained")
-    axes = figure.add_subplot()
-    for label, (x, y, upper) in lines.items():
-        whisker = None if upper is None else np.stack([np.zeros(len(y)), upper - y])
-        axes.errorbar(x, y, yerr=whisker, marker="o", capsize=3, label=label)
-    if log:
-        axes.set_xscale("log", base=2)
-        axes.set_yscale("log")
-    axes.set(xlabel=xlabel, ylabel=ylabel)
-    axes.grid(alpha=0.3, which="both")
-    axes.legend()
-    figure.savefig(path)

@@ -1,11 +1,11 @@
-"""jaxmotion.viz.dots: values, intervals and lines where they belong."""
+"""jaxmotion.viz.plots: values, intervals and lines where they belong."""
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from jaxmotion.viz import dots, figure
+from jaxmotion.viz import figure, plots
 
 NAN = float("nan")
 OPTIONS = dict(sources=("paper", "here"), absent=("none", "–"), title="a title")
@@ -23,7 +23,7 @@ def drawn(monkeypatch, tmp_path):
         monkeypatch.setattr(
             Figure, "savefig", lambda self, p: (kept.append(self), save(self, p))
         )
-        dots.write_dots(tmp_path / "a.png", ("A", "B", "C"), panels, **OPTIONS)
+        plots.write_dots(tmp_path / "a.png", ("A", "B", "C"), panels, **OPTIONS)
         with Image.open(tmp_path / "a.png") as image:
             assert min(image.size) > 100
         return kept[0]
@@ -38,7 +38,7 @@ def places(axes):
 
 
 def test_dots_are_at_the_values_and_missing_ones_are_said(drawn):
-    canvas = drawn((dots.Panel(title="FID", left=LEFT, right=RIGHT, target=1),))
+    canvas = drawn((plots.Panel(title="FID", left=LEFT, right=RIGHT, target=1),))
     left, right = canvas.axes
     np.testing.assert_allclose(places(left), ([1.0, 2.0], [0, 1]))
     np.testing.assert_allclose(places(right), ([0.2, 30.0, 900.0], [0, 1, 2]))
@@ -52,7 +52,7 @@ def test_dots_are_at_the_values_and_missing_ones_are_said(drawn):
 
 
 def test_wide_values_are_logarithmic_even_where_an_interval_is_not_positive(drawn):
-    canvas = drawn((dots.Panel(title="FID", left=LEFT, right=RIGHT),))
+    canvas = drawn((plots.Panel(title="FID", left=LEFT, right=RIGHT),))
     left, right = canvas.axes
     assert left.get_xscale() == "linear" and right.get_xscale() == "log"
     low, high = right.get_xlim()
@@ -63,7 +63,7 @@ def test_wide_values_are_logarithmic_even_where_an_interval_is_not_positive(draw
 
 def test_a_target_is_a_line(drawn):
     panels = tuple(
-        dots.Panel(title="DIV", left=LEFT, right=RIGHT, target=target)
+        plots.Panel(title="DIV", left=LEFT, right=RIGHT, target=target)
         for target in (None, 1, 2)
     )
     lines = [
@@ -76,7 +76,7 @@ def test_a_target_is_a_line(drawn):
 
 def test_many_metrics_are_wrapped_and_nothing_measured_is_no_error(drawn):
     empty = np.full((3, 3), NAN)
-    panels = (dots.Panel(title="m", left=empty, right=empty),) * 4
+    panels = (plots.Panel(title="m", left=empty, right=empty),) * 4
     canvas = drawn(panels)
     assert len(canvas.axes) == 12
     assert sum(axes.axison for axes in canvas.axes) == 8
@@ -84,8 +84,8 @@ def test_many_metrics_are_wrapped_and_nothing_measured_is_no_error(drawn):
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
-    panel = dots.Panel(title="m", left=LEFT, right=RIGHT)
+    panel = plots.Panel(title="m", left=LEFT, right=RIGHT)
     with pytest.raises(OSError, match="file"):
-        dots.write_dots(
+        plots.write_dots(
             tmp_path / "file" / "a.png", ("A", "B", "C"), (panel,), **OPTIONS
         )

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.viz import figure
+from jaxmotion.viz import figure, plots
 
 
 def test_the_axes_of_a_view():
@@ -55,7 +55,7 @@ def test_plots_are_pictures_that_change_with_their_data(tmp_path):
     found = []
     for log in (True, False):
         out = tmp_path / f"sweep{log}.png"
-        figure.plot_sweep(out, lines, xlabel="steps", ylabel="ms", log=log)
+        plots.plot_sweep(out, lines, xlabel="steps", ylabel="ms", log=log)
         found.append(np.asarray(Image.open(out).convert("L")))
         assert found[-1].std() > 5
     assert np.mean(found[0] != found[1]) > 0.001
@@ -65,7 +65,7 @@ def test_plots_check_their_file_first(tmp_path):
     (tmp_path / "plain").write_text("")
     bad = tmp_path / "plain" / "a.png"
     with pytest.raises(OSError, match="plain"):
-        figure.plot_sweep(bad, {}, xlabel="", ylabel="")
+        plots.plot_sweep(bad, {}, xlabel="", ylabel="")
 
 
 def test_a_notebook_keeps_its_backend():

@@ -2,17 +2,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.viz import pareto
+from jaxmotion.viz import plots
 
 X = np.array([[1.0, 0.9, 1.1], [4.0, 3.9, 4.2], [16.0, 15.0, 17.0]])
 Y = np.array([[9.0, 8.0, 10.0], [2.0, 1.8, 2.2], [3.0, 2.5, 3.5]])
 
 
 def test_the_front_is_what_nothing_beats():
-    assert pareto.pareto_front(X[:, 0], Y[:, 0]).tolist() == [True, True, False]
+    assert plots.pareto_front(X[:, 0], Y[:, 0]).tolist() == [True, True, False]
     # Equal points do not beat each other; equal in one and lower in the other does.
     x, y = np.array([1.0, 1.0, 1.0]), np.array([2.0, 2.0, 3.0])
-    assert pareto.pareto_front(x, y).tolist() == [True, True, False]
+    assert plots.pareto_front(x, y).tolist() == [True, True, False]
 
 
 def test_the_front_against_every_pair():
@@ -24,7 +24,7 @@ def test_the_front_against_every_pair():
         )
         for i in range(40)
     ]
-    assert pareto.pareto_front(x, y).tolist() == expected
+    assert plots.pareto_front(x, y).tolist() == expected
 
 
 def draw(path, **more):
@@ -34,7 +34,7 @@ def draw(path, **more):
         ylabel="FID",
         title="a",
     )
-    pareto.write_pareto(path, ("2", "8", "32"), X, Y, **(settings | more))
+    plots.write_pareto(path, ("2", "8", "32"), X, Y, **(settings | more))
     with Image.open(path) as image:
         return np.asarray(image.convert("RGB")).astype(int)
 

@@ -1,0 +1,328 @@
+"""Plots of tables: dots with intervals, quality against time, clouds, and sweeps.
+
+Figures are made without pyplot, so that neither a display is needed nor the backend of
+a notebook changed.
+"""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+from jaxmotion.viz import figure
+
+# Values that differ by so much are drawn on logarithmic axes.
+_LOG_FROM = 20.0
+# Metrics next to each other, each with two pairs of axes.
+_ACROSS = 3
+# Axes whose largest value is so many times the smallest are logarithmic.
+_WIDE_FROM = 5.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Panel:
+    """One metric of several methods, by two sources that need not compare.
+
+    Attributes:
+      title: The metric.
+      left: Value, lower and upper end of each method; nan for none.
+      right: Likewise, by the second source.
+      target: Method whose value is drawn as a line; None for no line.
+    """
+
+    title: str
+    left: Float[np.ndarray, "methods 3"]
+    right: Float[np.ndarray, "methods 3"]
+    target: int | None = None
+
+
+def _scale(axes: Axes, values: np.ndarray) -> None:
+    """Limits and ticks that show all values; long error bars may leave the axes."""
+    middles = values[:, 0][np.isfinite(values[:, 0])]
+    if not middles.size:
+        axes.set_xticks([])
+        return
+    if middles.min() > 0 and middles.max() > _LOG_FROM * middles.min():
+        axes.set_xscale("log", nonpositive="clip")
+        shown = values[np.isfinite(values) & (values > middles.min() / 10)]
+        axes.set_xlim(shown.min() / 2, 2 * shown.max())
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        return
+    shown = values[np.isfinite(values)]
+    low, high = shown.min(), shown.max()
+    room = 0.12 * (high - low) or 0.12 * abs(high) or 1.0
+    axes.set_xlim(low - room, high + room)
+    axes.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 2.5, 5, 10]))
+
+
+def _draw(
+    axes: Axes, values: np.ndarray, *, color: str, target: int | None, absent: str
+) -> None:
+    lines = np.arange(len(values))
+    known = np.isfinite(values[:, 0])
+    bars = np.abs(values[:, 1:] - values[:, :1]).T
+    bars = np.where(np.isfinite(bars), bars, 0.0)
+    axes.errorbar(
+        values[known, 0], lines[known], xerr=bars[:, known], fmt="o", markersize=5,
+        color=color, capsize=3, lw=1.4,
+    )  # fmt: skip
+    if target is not None and known[target]:
+        axes.axvline(values[target, 0], color=figure.COMMANDED, lw=1, ls="--")
+    _scale(axes, values)
+    for line in lines[~known]:
+        axes.annotate(
+            absent, (0.5, line), xycoords=("axes fraction", "data"), fontsize=7,
+            color="#888888", ha="center", va="center",
+        )  # fmt: skip
+    axes.set_ylim(len(values) - 0.5, -0.5)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.3)
+
+
+def write_dots(
+    path: str | Path,
+    methods: tuple[str, ...],
+    panels: tuple[Panel, ...],
+    *,
+    sources: tuple[str, str],
+    absent: tuple[str, str],
+    title: str,
+) -> None:
+    """Draws two axes a metric, with one line a method and a scale of their own.
+
+    Args:
+      path: The picture.
+      methods: Names, from above.
+      panels: Metrics.
+      sources: Names of the left and the right source of every panel.
+      absent: What stands where the left or the right source has no value.
+      title: Above the picture.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    path = figure.check_writable(path)
+    across = min(_ACROSS, len(panels))
+    down = math.ceil(len(panels) / across)
+    size = (1.6 + 3.5 * across, 0.5 + down * (0.9 + 0.26 * len(methods)))
+    canvas = Figure(figsize=size, dpi=110, layout="constrained")
+    # Or the last tick of one axes runs into the first of the next.
+    canvas.get_layout_engine().set(w_pad=0.08)
+    canvas.suptitle(title, fontsize=11)
+    grid = canvas.subplots(down, 2 * across, squeeze=False)
+    pairs = grid.reshape(down * across, 2)
+    for place, axes in enumerate(pairs):
+        if place >= len(panels):
+            for one in axes:
+                one.set_axis_off()
+            continue
+        panel = panels[place]
+        for one, values, color, name, word in zip(
+            axes,
+            (panel.left, panel.right),
+            (figure.MIDDLE, figure.LEFT),
+            sources,
+            absent,
+            strict=True,
+        ):
+            _draw(one, values, color=color, target=panel.target, absent=word)
+            one.set_title(f"{panel.title}, {name}", fontsize=9, parse_math=False)
+            one.set_yticks(range(len(methods)), [""] * len(methods))
+        if place % across == 0:
+            axes[0].set_yticks(range(len(methods)), methods, fontsize=8)
+    canvas.savefig(path)
+
+
+def pareto_front(
+    x: Float[np.ndarray, " points"], y: Float[np.ndarray, " points"]
+) -> Bool[np.ndarray, " points"]:
+    """Which points no other beats: none is as low in both, and lower in one.
+
+    Args:
+      x: First cost.
+      y: Second cost.
+
+    Returns:
+      True for those of the front.
+    """
+    no_worse = (x[:, None] <= x) & (y[:, None] <= y)
+    lower = (x[:, None] < x) | (y[:, None] < y)
+    return ~np.any(no_worse & lower, axis=0)
+
+
+def _is_wide(values: Float[np.ndarray, "_"]) -> bool:
+    return bool(values.min() > 0 and values.max() > _WIDE_FROM * values.min())
+
+
+def _draw_references(axes: Axes, references: dict[str, np.ndarray]) -> None:
+    colors = (figure.COMMANDED, figure.WALKED, figure.MIDDLE)
+    for i, (name, (value, low, high)) in enumerate(references.items()):
+        color = colors[i % len(colors)]
+        axes.axhline(value, color=color, ls="--", lw=1.2, label=name)
+        axes.axhspan(low, high, color=color, alpha=0.15, lw=0)
+
+
+def _plain_ticks(axis: Axis) -> None:
+    """1, 2, 5, 10, 20, ... on a logarithmic axis, instead of powers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(NullFormatter())
+
+
+def write_pareto(
+    path: str | Path,
+    names: tuple[str, ...],
+    x: Float[np.ndarray, "points 3"],
+    y: Float[np.ndarray, "points 3"],
+    *,
+    references: dict[str, Float[np.ndarray, "3"]],
+    xlabel: str,
+    ylabel: str,
+    title: str = "",
+    broken: tuple[str, ...] = (),
+) -> None:
+    """Draws named points with error bars in both directions, lower left is best.
+
+    Args:
+      path: The picture.
+      names: Of the points; written beside them.
+      x: Value, lower and upper end of each point's first cost.
+      y: Likewise, of its second.
+      references: Value, lower and upper end of second costs that are lines.
+      xlabel: Quantity and unit.
+      ylabel: Quantity and unit.
+      title: Above the picture.
+      broken: Names of points that fail in other ways: hollow, and beaten by all.
+
+    Raises:
+      OSError: if the file cannot be written.
+      ValueError: if a broken name is of no point.
+    """
+    unknown = set(broken) - set(names)
+    if unknown:
+        raise ValueError(f"broken: no point is named {', '.join(sorted(unknown))}")
+    path = figure.check_writable(path)
+    canvas = Figure(figsize=(7.5, 5), dpi=120, layout="constrained")
+    axes = canvas.add_subplot()
+    sound = np.array([name not in broken for name in names])
+    whole = np.flatnonzero(sound)
+    front = whole[pareto_front(x[whole, 0], y[whole, 0])]
+    front = front[np.argsort(x[front, 0])]
+    axes.plot(x[front, 0], y[front, 0], color=figure.LEFT, lw=1, alpha=0.5)
+    bars = [np.abs(z[:, 1:] - z[:, :1]).T for z in (x, y)]
+    labels = "95 % intervals; line: none is better in both", "fails in other ways"
+    for which, label, fill in zip(
+        (sound, ~sound), labels, ("full", "none"), strict=True
+    ):
+        if which.any():
+            axes.errorbar(
+                x[which, 0], y[which, 0], xerr=bars[0][:, which],
+                yerr=bars[1][:, which], fmt="o", color=figure.LEFT, capsize=3,
+                fillstyle=fill, label=label,
+            )  # fmt: skip
+    for name, place in zip(names, zip(x[:, 0], y[:, 0], strict=True), strict=True):
+        axes.annotate(
+            name, place, xytext=(7, 7), textcoords="offset points", fontsize=11,
+            fontweight="bold",
+        )  # fmt: skip
+    _draw_references(axes, references)
+    if _is_wide(x[:, 0]):
+        axes.set_xscale("log")
+        _plain_ticks(axes.xaxis)
+    if _is_wide(np.concatenate([y.ravel(), *references.values()])):
+        axes.set_yscale("log")
+        _plain_ticks(axes.yaxis)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.set_title(title, parse_math=False)
+    axes.margins(0.12)
+    axes.grid(alpha=0.3, which="both")
+    axes.legend(fontsize=8)
+    canvas.savefig(path)
+
+
+def write_scatter(
+    path: str | Path,
+    clouds: dict[str, Float[np.ndarray, "_ 2"]],
+    *,
+    marks: Float[np.ndarray, "marks 2"],
+    title: str,
+    shown: int = 20_000,
+    seed: int = 0,
+) -> None:
+    """Draws one panel a cloud, all with the same axes.
+
+    Axes end where the marks end, plus half as much again; points outside are counted
+    in the panel's title, not drawn.
+
+    Args:
+      path: The PNG.
+      clouds: Points by name.
+      marks: Points drawn as crosses in every panel.
+      title: Over all panels.
+      shown: Points drawn of a cloud, at most.
+      seed: Of the choice of these.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    path = figure.check_writable(path)
+    center = (marks.max(axis=0) + marks.min(axis=0)) / 2
+    reach = 1.5 * max(float(np.abs(marks - center).max()), 1e-6)
+    canvas = Figure(figsize=(3 * len(clouds), 3.4), layout="constrained")
+    canvas.suptitle(title)
+    generator = np.random.default_rng(seed)
+    for axes, (name, points) in zip(
+        canvas.subplots(1, len(clouds), squeeze=False)[0], clouds.items(), strict=True
+    ):
+        inside = (np.abs(points - center) <= reach).all(axis=-1)
+        drawn = generator.permutation(points[inside])[:shown]
+        axes.plot(*drawn.T, ".", markersize=1, alpha=0.3, color=figure.LEFT)
+        axes.plot(*marks.T, "x", markersize=6, color=figure.RIGHT)
+        axes.set(
+            xlim=(center[0] - reach, center[0] + reach),
+            ylim=(center[1] - reach, center[1] + reach),
+            aspect="equal",
+            title=name if inside.all() else f"{name} ({(~inside).mean():.0%} outside)",
+        )
+    canvas.savefig(path, dpi=110)
+
+
+def plot_sweep(
+    path: str | Path,
+    lines: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray | None]],
+    *,
+    xlabel: str,
+    ylabel: str,
+    log: bool = True,
+) -> None:
+    """Lines with upper whiskers, such as latency over the number of steps.
+
+    Args:
+      path: File to write.
+      lines: Label to (x, y, upper end of the whisker or None).
+      xlabel: Quantity and unit.
+      ylabel: Quantity and unit.
+      log: Logarithmic axes.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    path = figure.check_writable(path)
+    drawing = Figure(figsize=(6, 4), dpi=110, layout="constrained")
+    axes = drawing.add_subplot()
+    for label, (x, y, upper) in lines.items():
+        whisker = None if upper is None else np.stack([np.zeros(len(y)), upper - y])
+        axes.errorbar(x, y, yerr=whisker, marker="o", capsize=3, label=label)
+    if log:
+        axes.set_xscale("log", base=2)
+        axes.set_yscale("log")
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    axes.grid(alpha=0.3, which="both")
+    axes.legend()
+    drawing.savefig(path)
