@@ -87,16 +87,14 @@ def write(args: Config, model, frames, made, real=None, *, height, title):
 
 def steer_shipped(args: Config):
     """Steers the shipped model along the course; writes files and metrics."""
-    shipped, params, _ = camdm_model.load("locomotion")
-    model = character(params, shipped, control=Control(follow=1.0))
+    model = jm.load("locomotion")
     print(f"locomotion: {model.source}; compiling, about 15 s", flush=True)
     commands = jm.commands(COURSE, model, args.characters)
     states = model.start(args.characters, seed=args.seed)
     frames = jm.rollout(model, jax.random.key(args.seed), states, commands)
     made = windows.rollout_windows(frames, commands.label[:, 0], skip=0)
-    standing = jax.tree.map(lambda x: x[0], shipped.starts)
-    toes = joint_positions(model.skeleton, standing)[..., model.skeleton.feet, 1]
-    height = float(toes.min()) + 0.01
+    toes = joint_positions(model.skeleton, frames.motion)[..., model.skeleton.feet, 1]
+    height = float(toes[:, 0].min()) + 0.01  # they stand
     title = "stand, walk, turn, jog, run, stop, crouch"
     rows = write(args, model, frames, made, height=height, title=title)
     return rows, {"source": model.source, "course": COURSE}

@@ -23,6 +23,7 @@ from jax.sharding import Mesh
 
 from jaxmotion import files
 from jaxmotion.control import courses, steering
+from jaxmotion.control.foot_lock import FootLock, lock_feet
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.steering import Character
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
@@ -35,12 +36,17 @@ ASSETS = Path(__file__).with_name("assets")
 _CPU_CHUNK = 4
 
 
-def load(source: str | Path, **options: Any) -> Character:
+def load(
+    source: str | Path, *, foot_lock: FootLock | bool | None = None, **options: Any
+) -> Character:
     """A model to be steered.
 
     Args:
       source: Name of a shipped model ("locomotion", "walker"), a run folder of a
         steerable system, or a file of `experiments/camdm.py export`.
+      foot_lock: Settings of the lock that keeps planted feet in place; True for the
+        defaults, False for none. None: on for shipped models, off for runs and files,
+        whose frames are then what the network makes.
       **options: Of the system's `controller.load_character`, such as CAMDM's `control`.
 
     Returns:
@@ -52,7 +58,8 @@ def load(source: str | Path, **options: Any) -> Character:
       ValueError: if there is no such model, or its system is not steered.
     """
     path = Path(source)
-    if not path.exists():
+    is_shipped = not path.exists()
+    if is_shipped:
         shipped = sorted(file.stem for file in ASSETS.glob("*.npz"))
         if str(source) not in shipped:
             raise ValueError(
@@ -67,7 +74,11 @@ def load(source: str | Path, **options: Any) -> Character:
             f"{path}: field 'system' is {_system(path)!r}, expected one that is "
             f"steered ({', '.join(known)})"
         )
-    return found.room("controller").load_character(path, **options)
+    character = found.room("controller").load_character(path, **options)
+    wanted = is_shipped if foot_lock is None else foot_lock
+    if wanted is False:
+        return character
+    return lock_feet(character, wanted if isinstance(wanted, FootLock) else None)
 
 
 def _system(path: Path) -> Any:

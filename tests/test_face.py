@@ -150,3 +150,16 @@ def test_frames_are_indexed_and_never_looped_over(frames):
     assert frames[:2, 1].joint_rotation.shape[:1] == (2,)
     with pytest.raises(TypeError, match="not iterable"):
         iter(frames)
+
+
+def test_shipped_models_lock_their_feet_unless_told_otherwise(model):
+    """Told to stand, toes stay where they are on the ground; else they creep."""
+    free = jm.load("locomotion", foot_lock=False)
+    moved = []
+    for each in (model, free):
+        commands = jm.commands("stand", each, 2, seconds=1.0)
+        frames = jm.rollout(each, jax.random.key(0), each.start(2), commands)
+        joints = joint_positions(each.skeleton, frames.motion)
+        toes = np.asarray(joints)[:, 15:, list(each.skeleton.feet), ::2]
+        moved.append(np.linalg.norm(toes - toes[:, :1], axis=-1).max())
+    assert moved[0] < 1e-3 < 5e-3 < moved[1]

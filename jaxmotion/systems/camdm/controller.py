@@ -91,6 +91,10 @@ RELEASED = Control(
 )
 
 
+# Of models that ship: the walked path is the commanded one.
+OWN_STARTS = Control(follow=1.0)
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class CharacterState:
@@ -458,8 +462,11 @@ def character(
     Args:
       params: The network's parameters.
       model: The model. Without poses of its own (`starts`) it starts from clips alone.
-      control: Constants of the run-time; None for the defaults.
+      control: Constants of the run-time; None for `OWN_STARTS` where the model has
+        poses of its own, else for the paper's.
     """
+    if control is None and model.starts is not None:
+        control = OWN_STARTS
     return Character(
         skeleton=model.skeleton,
         labels=model.labels,
