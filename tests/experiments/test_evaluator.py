@@ -58,6 +58,7 @@ def shown(text):
     return dict(re.findall(r"^([\w ]+): (.*)$", text, re.MULTILINE))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [

@@ -767,6 +767,7 @@ def test_a_controller_is_told_everything_in_one_program(protocol):
     assert np.all(np.asarray(simulation.start(7)[1]["root"]) == 0), "it was used up"
 
 
+@pytest.mark.slow
 def test_the_shipped_locomotion_is_served(script_load, protocol):
     simulation = script_load("locomotion", None)
     load("serving.simulation").warm(simulation)
