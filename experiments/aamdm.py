@@ -19,7 +19,7 @@ from reports import claims, results, verdicts
 
 from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
-from jaxmotion.learning import loop
+from jaxmotion.learning import loop, runs
 from jaxmotion.systems import registry
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
@@ -165,8 +165,8 @@ def train(args: Train) -> None:
         previous_noise=args.previous_noise,
     )
 
-    def budget(steps: int, **more) -> aamdm_training.Budget:
-        return aamdm_training.Budget(
+    def budget(steps: int, **more) -> runs.Budget:
+        return runs.Budget(
             steps=steps,
             batch=args.batch,
             seed=args.seed,

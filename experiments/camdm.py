@@ -5,21 +5,17 @@ Examples:
   python experiments/camdm.py train --data data/bandai2.npz --out runs/camdm
   python experiments/camdm.py evaluate --run runs/camdm
   python experiments/camdm.py rollout --run runs/camdm --style elderly --seconds 20
-  python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --out camdm_released.npz
+  python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --out runs/camdm_released
 """  # noqa: E501
 
 import dataclasses
-import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-import jax
-import numpy as np
 import tyro
 
-from jaxmotion import cli, files, reporting
+from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
-from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluators import frozen
@@ -40,7 +36,7 @@ class Train:
 
     Attributes:
       data: Clips from prepare_data.py.
-      out: Run folder: checkpoints, config.json, losses.jsonl.
+      out: Run folder: config.json, data, and the stage motion with its losses.jsonl.
       preset: Sizes, weights and how they are trained: "small" for a CPU or a short run,
         "paper" (AdamW, 1e-4, batch 512, no warm-up, clipping or averaging; its authors
         made 100 epochs), or "planted" for a second training of a small model in which
@@ -103,10 +99,6 @@ class Train:
     override: bool = False
 
 
-# Options that do not change what is trained, or whose effect the clips show.
-FREE = ("data", "out", "chunk", "save_every", "devices", "override")
-
-
 def with_preset(args: Train) -> Train:
     """The arguments, with the preset's values of how to train in place of None."""
     preset = camdm_training.FITTING[args.preset]
@@ -114,87 +106,59 @@ def with_preset(args: Train) -> Train:
     return dataclasses.replace(args, **open_)
 
 
-def model_of(args: Train, clips: Clips) -> camdm_model.Model:
-    """The model that the arguments describe, for these clips."""
+def sizes_of(args: Train) -> dict[str, Any]:
+    """Sizes and weights of the model that the arguments describe."""
     sizes = camdm_training.PRESETS[args.preset] | {
         "num_steps": args.diffusion_steps,
         "network": args.network,
+        "token_window": args.token_window,
     }
     if args.width is not None:
         sizes |= {"width": args.width, "hidden": 4 * args.width}
-    if args.depth is not None:
-        sizes |= {"depth": args.depth}
-    if args.token_margin is not None:
-        sizes |= {"token_margin": args.token_margin}
-    sizes |= {"token_window": args.token_window}
-    return camdm_training.make_model(clips, field=args.label, **sizes)
+    for name in ("depth", "token_margin"):
+        if (value := getattr(args, name)) is not None:
+            sizes[name] = value
+    return sizes
 
 
 def train(args: Train) -> None:
     """Trains, with checkpoints."""
     args = with_preset(args)
     loop.check_writable(args.out)
-    clips, _ = camdm_training.split_data(
-        args.data,
-        args.contents,
-        args.label,
-        args.held_out,
-        labels=args.labels,
-        held_out_clips=args.held_out_clips,
-    )
-    if args.mirror:  # first, for it may add labels: left of what was only right
-        clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
-    model, params = model_of(args, clips), None
-    if args.init:
-        model, params = camdm_training.continued(model, args.init)
-    made_by = reporting.arguments_json(args) | {
-        "clips": frozen.clips_fingerprint(clips, args.label)
-    }
-    config = camdm_model.to_json(model) | {"experiment": made_by}
-    if checkpoint.latest_step(args.out / "checkpoints") is not None:
-        runs.check_resumed(
-            args.out,
-            checkpoint.load_config(args.out / "checkpoints").get("experiment", {}),
-            {name: value for name, value in made_by.items() if name not in FREE},
-            steps=args.steps,
-            override=args.override,
-        )
-    run, state, key, data = camdm_training.start(
-        clips,
-        model,
-        args.out / "checkpoints",
-        field=args.label,
-        num_steps=args.steps,
+    sizes = sizes_of(args)
+    budget = runs.Budget(
+        steps=args.steps,
         batch=args.batch,
         optimizer=args.optimizer,
         learning_rate=args.learning_rate,
         warmup=args.warmup,
+        final=0.1,
         max_norm=args.max_norm,
         ema=args.ema,
-        chunk=args.chunk,
         devices=args.devices,
-        seed=args.seed,
-        params=params,
-    )
-    files.write_text(args.out / "config.json", json.dumps(config, indent=1))
-    lengths = np.diff(np.asarray(clips.offsets))
-    short = int(np.sum(lengths < model.config.window))
-    parameters = sum(x.size for x in jax.tree.leaves(state.params))
-    print(
-        f"{clips.num_clips} clips ({short} too short to use), {clips.num_frames} "
-        "frames, "
-        f"{data[1].starts.shape[0]} windows of {data[1].length} frames; {parameters} "
-        f"parameters on {jax.devices()[0].platform}, from step {int(state.step)}"
-    )
-    settings = loop.Loop(
-        num_steps=args.steps,
         chunk=args.chunk,
         save_every=args.save_every,
-        folder=args.out,
-        config=config,
-        show=("loss", "data", "position", "foot"),
+        seed=args.seed,
+        override=args.override,
     )
-    loop.train(run, state, key, data, loop=settings)
+
+    def make(clips: Clips) -> camdm_model.Model:
+        model = camdm_training.make_model(clips, field=args.label, **sizes)
+        return camdm_training.continued(model, args.init)[0] if args.init else model
+
+    run = camdm_training.prepare(
+        args.out,
+        args.data,
+        label=args.label,
+        contents=args.contents,
+        labels=args.labels,
+        held_out=args.held_out,
+        held_out_clips=args.held_out_clips,
+        mirrored=args.mirror,
+        make=make,
+        settings={"sizes": sizes, "init": args.init and str(args.init)},
+    )
+    camdm_training.train(run, budget, init=args.init)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,8 +170,7 @@ class Evaluate:
     Attributes:
       run: Run folder of `train`.
       data: Clips; None for those that the run was trained on.
-      out: Folder for metrics.json and table.md; None for <run>/evaluation
-        (beside an exported file).
+      out: Folder for metrics.json and table.md; None for <run>/evaluation.
       rollouts: Characters; spread evenly over the styles.
       seconds: Length of each rollout, seconds; 4 at least.
       course: Commands.
@@ -278,7 +241,7 @@ class Rollout:
       seconds: Length, seconds.
       course: Commands.
       speed: Meters per second; None for the style's own median speed.
-      out: Folder; None for <run>/rollout (beside an exported file).
+      out: Folder; None for <run>/rollout.
       seed: Of the start pose and the noise.
     """
 
@@ -297,7 +260,7 @@ def evaluate(args: Evaluate) -> None:
     """Writes the table."""
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = camdm_training.load_run(args.run, args.data, args.contents)
-    out = args.out or _beside(args.run) / "evaluation"
+    out = args.out or args.run / "evaluation"
     loop.check_writable(out)
     cli.announce("compiling the rollouts", 40)
     rows, report = camdm_evaluation.evaluate_run(
@@ -341,7 +304,7 @@ def speeds(args: Speeds) -> None:
 def rollout(args: Rollout) -> None:
     """Writes rollout.bvh, rollout.gif and rollout.html."""
     run = camdm_training.load_run(args.run, args.data)
-    out = args.out or _beside(args.run) / "rollout"
+    out = args.out or args.run / "rollout"
     loop.check_writable(out)
     cli.announce("compiling the rollout", 40)
     motion, velocity = camdm_evaluation.steer_one(
@@ -384,18 +347,15 @@ def export(args: Export) -> None:
         run = camdm_training.load_run(args.run)
         starts = camdm_evaluation.own_starts(run, number=args.starts)
         model = dataclasses.replace(model, starts=starts)
-    config = camdm_model.to_json(model) | {"experiment": {"label": "style"}}
-    checkpoint.export_params(args.out, params, config)
+    checkpoint.export_params(args.out, params, camdm_model.to_json(model))
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
 
 
 @dataclasses.dataclass(frozen=True)
 class Import:
-    """Write the authors' weights as one npz file; no code of theirs is run.
+    """Make a run folder of the authors' weights; no code of theirs is run.
 
-    What other commands and serve.py take as --run is then this file.
-
-    Example: python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --labels 100style_conditions.json --out camdm_released.npz
+    Example: python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --labels 100style_conditions.json --out runs/camdm_released
 
     Attributes:
       weights: Their checkpoint (.pt) or one of their ONNX files.
@@ -403,38 +363,46 @@ class Import:
         left out.
       labels: JSON with the styles' names as "styles"; None for 100style_conditions.json
         beside the weights.
-      data: Clips from prepare_data.py to start from and compare with, where a command
-        is given no others.
+      data: Clips from prepare_data.py, of the same skeleton and styles, to start from
+        and to compare with.
+      held_out: Fraction of clips that count as held out.
       scale: Meters per unit of the BVH file.
-      out: File to write; parameters are stored as float32.
+      out: Run folder.
     """  # noqa: E501
 
     weights: Path
     skeleton: Path
     labels: Path | None = None
     data: Path = Path("data/style100.npz")
+    held_out: float = 0.1
     scale: float = 0.01
-    out: Path = Path("camdm_released.npz")
+    out: Path = Path("runs/camdm_released")
 
 
 def import_weights(args: Import) -> None:
-    """Writes the file."""
-    bones = camdm_training.released_skeleton(args.skeleton, scale=args.scale)
+    """Writes the run folder."""
+    loop.check_writable(args.out)
+    skeleton = camdm_training.released_skeleton(args.skeleton, scale=args.scale)
     labels = args.labels and camdm_published.read_styles(args.labels)
-    model, params = camdm_published.load(args.weights, skeleton=bones, labels=labels)
-    # Which clips to use, as `train` would note it.
-    clips = reporting.arguments_json(Train(data=args.data, contents=()))
-    config = camdm_model.to_json(model) | {"experiment": clips}
-    checkpoint.export_params(args.out, params, config, dtype=np.float32)
+    model, params = camdm_published.load(args.weights, skeleton=skeleton, labels=labels)
+    run = camdm_training.prepare(
+        args.out,
+        args.data,
+        label="style",
+        held_out=args.held_out,
+        make=lambda clips: model,
+        settings={"weights": args.weights.name},
+    )
+    runs.store(
+        run,
+        camdm_model.STAGE,
+        {"ema_params": params},
+        model=dataclasses.asdict(model.config),
+    )
     print(
-        f"wrote {args.out}: {len(model.labels)} styles, {bones.num_joints} joints, "
+        f"wrote {args.out}: {len(model.labels)} styles, {skeleton.num_joints} joints, "
         f"{model.config.num_steps} steps; {model.source}"
     )
-
-
-def _beside(run: Path) -> Path:
-    """Where what is made with a run folder, or with an exported file, goes."""
-    return run.with_suffix("") if run.is_file() else run
 
 
 Command = (

@@ -212,7 +212,7 @@ def train(args: Train) -> None:
             budget, optimizer="adam", learning_rate=args.discriminator_rate
         )
         emdm_training.train_row(
-            args.out, task, row, generator=budget, discriminator=discriminator
+            task, row, generator=budget, discriminator=discriminator
         )
         print(f"{row}: {time.perf_counter() - begun:.0f} s", flush=True)
 
@@ -232,7 +232,7 @@ def evaluate(args: Evaluate) -> None:
     )
     report = {
         "arguments": arguments_json(args),
-        "run": emdm_training.read_config(args.run),
+        "run": runs.load(args.run, system="emdm").settings,
         "evaluator": scorer.describe,
     } | reporting.provenance()
     notes = (frozen.note(scorer.describe), *scorer.notes)
@@ -276,15 +276,15 @@ class Import:
 def import_weights(args: Import) -> None:
     """Writes the row's checkpoint."""
     run = emdm_text.load_run(args.run)
-    if (form := run.config["text_form"]) != "released":
+    if (form := run.record.settings["text_form"]) != "released":
         raise ValueError(
             f"{args.run}: field 'text_form' is {form!r}, expected 'released': CLIP's "
             "vectors are what the weights know"
         )
-    base, frames = emdm_model.Config(features=1), run.config["frames"]
+    base, frames = emdm_model.Config(features=1), run.record.settings["frames"]
     task = emdm_text.make_task(run, base, frames=frames)
     config = emdm_training.import_row(
-        args.run, task, args.weights, heads=args.heads, num_steps=args.diffusion_steps
+        task, args.weights, heads=args.heads, num_steps=args.diffusion_steps
     )
     print(
         f"wrote row 'emdm' of {args.run}: {config.depth} layers of {config.width} "

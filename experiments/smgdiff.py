@@ -17,14 +17,11 @@ from typing import Annotated, Any, Literal
 import tyro
 from smgdiff_tasks import playing
 
-from jaxmotion import cli, files, reporting
-from jaxmotion.data.ball_clips import load_ball_clips
+from jaxmotion import cli, reporting
 from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluation.table import Rows
 from jaxmotion.evaluators import frozen
 from jaxmotion.learning import loop, runs
-from jaxmotion.reporting import arguments_json
-from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import players as smgdiff_players
@@ -162,10 +159,6 @@ class Rollout:
     seed: int = 0
 
 
-# What of a training's options decides the model and its clips, for all stages.
-MADE = ("preset", "width", "depth", "held_out")
-
-
 def sizes_of(args: Train) -> dict[str, Any]:
     """Sizes of the motion model that the arguments describe."""
     sizes = dict(smgdiff_training.PRESETS[args.preset])
@@ -183,23 +176,9 @@ def train(args: Train) -> None:
     for stage in args.stages:
         smgdiff_training.check_stage_name(stage)
     loop.check_writable(args.out)
-    arguments = args.out / "arguments.json"
-    how = {name: getattr(args, name) for name in MADE}
-    if (args.out / "config.json").exists():
-        found = files.read_object(arguments, what="expected what `train` writes")
-        runs.check_made(args.out, found, [args.data], how)
-        run = smgdiff_training.load_run(args.out)
-    else:
-        data = load_ball_clips(args.data)
-        kept, held_out = smgdiff_data.split(data, fraction=args.held_out)
-        model = smgdiff_training.make_model(kept, sizes=sizes_of(args))
-        run = smgdiff_training.Run(
-            folder=args.out, model=model, train=kept, held_out=held_out
-        )
-        prints = runs.made_from([args.data])["fingerprints"]
-        value = arguments_json(args) | {"fingerprints": prints}
-        files.write_text(arguments, json.dumps(value))
-        smgdiff_training.write_run(run)
+    run = smgdiff_training.prepare(
+        args.out, args.data, held_out=args.held_out, sizes=sizes_of(args)
+    )
     clips = run.train.clips
     print(
         f"{clips.num_clips} clips, {clips.num_frames / clips.fps / 60:.1f} minutes, of "
@@ -250,7 +229,10 @@ def evaluate(args: Evaluate) -> None:
     described = smgdiff_evaluation.describe_evaluator(run, setting, evaluator)
 
     def write(name: str, rows: Rows, more: dict[str, Any], *notes: str) -> None:
-        report = {"arguments": arguments_json(args), "source": run.model.source}
+        report = {
+            "arguments": reporting.arguments_json(args),
+            "source": run.model.source,
+        }
         report |= {"windows": int(setting.known.label.shape[0])}
         report |= {"evaluator": described} | more | reporting.provenance()
         notes = (frozen.note(described), *notes)

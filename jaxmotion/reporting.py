@@ -2,7 +2,6 @@
 
 import dataclasses
 import datetime
-import importlib.metadata
 import json
 import math
 import os
@@ -20,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jaxmotion import files
 from jaxmotion.data import bvh
 from jaxmotion.evaluation import bench, table
+from jaxmotion.learning import runs
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 
@@ -201,9 +201,6 @@ def _draw(
     return ", ".join(point.row for point in points if point not in shown)
 
 
-_PACKAGES = ("jaxmotion", "jax", "jaxlib", "flax", "optax", "numpy")
-
-
 def processor() -> str:
     """Name of the processor.
 
@@ -247,13 +244,8 @@ def provenance() -> dict[str, Any]:
     Returns:
       Versions, hardware, commit, command and date, as a JSON object.
     """
-    found: dict[str, Any] = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = None
-    return found | {
+    return {
+        **runs.versions(),
         "machine": platform.machine(),
         "cpu": processor(),
         "cores": os.cpu_count(),

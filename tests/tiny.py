@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips, clips_from_motions
-from jaxmotion.learning import training
+from jaxmotion.learning import runs, training
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
@@ -156,3 +156,9 @@ def training_parts(
     params = random_params(camdm_model.init, config, seed=3)
     state = training.init_train_state(params, optimizer)
     return run, state, jax.random.key(3), (walker, index)
+
+
+def run_folder(folder, system="tests", **changes):
+    """A run folder that no file says anything of."""
+    fields = dict(model={}, settings={}, source="made in the tests", split={}, files={})
+    return runs.Run(folder=folder, system=system, **fields | changes)

@@ -12,13 +12,13 @@ lmm                 Learned Motion Matching in the embedded space
 import dataclasses
 import functools
 import re
-from pathlib import Path
 from typing import Any, Literal
 
 import jax
 
 from baselines import amdm, lmm, mvae
-from jaxmotion.learning import training
+from jaxmotion.learning import runs
+from jaxmotion.learning.runs import Budget
 from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
@@ -26,7 +26,7 @@ from jaxmotion.systems.aamdm import space as aamdm_space
 from jaxmotion.systems.aamdm import training as aamdm_training
 from jaxmotion.systems.aamdm.controller import Stepper
 from jaxmotion.systems.aamdm.space import Space
-from jaxmotion.systems.aamdm.training import Budget, Run, SpaceName
+from jaxmotion.systems.aamdm.training import Run, SpaceName
 
 TABLE_1 = ("aamdm", "amdm5", "lmm", "mvae")
 TABLE_2 = tuple(
@@ -108,8 +108,8 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
     return amdm.Config(**common, num_steps=int(name.removeprefix("amdm")))
 
 
-def _folder(run: Run, name: str) -> Path:
-    return run.folder / space_of(name) / name
+def _stage(name: str) -> str:
+    return f"{space_of(name)}/{name}"
 
 
 def _baseline_loss(name: str, frames: jax.Array, space: Space, config: Any):
@@ -125,8 +125,6 @@ def train_baseline(
 ) -> None:
     """Trains a row that is not AAMDM."""
     config = _config(name, space, sizes)
-    optimizer = aamdm_training.make_optimizer(budget)
-    params = _BASELINES[name].init(jax.random.key(budget.seed), config)
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     loss = _baseline_loss(name, frames, space, config)
     length, given = _WINDOWS[name]
@@ -142,16 +140,15 @@ def train_baseline(
         )
         return found.at[:, given].add(noise)
 
-    aamdm_training.fit(
-        _folder(run, name),
-        training.init_train_state(params, optimizer),
-        training.make_update(loss, optimizer, ema_decay=budget.ema),
+    runs.minimize(
+        run.record,
+        _stage(name),
+        loss,
+        _BASELINES[name].init(jax.random.key(budget.seed), config),
         sample,
         arrays,
-        stage=name,
         budget=budget,
-        config={"config": dataclasses.asdict(config), "source": run.source},
-        source=run.frames,
+        model=dataclasses.asdict(config),
         settings={"previous_noise": sizes.previous_noise},
     )
 
@@ -203,11 +200,10 @@ def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
             target=_target(name),
         )
         return aamdm_controller.guided(transition, scale=scale)
-    module, folder = _BASELINES[name], _folder(run, name)
-    stored = aamdm_training.check_stage(folder, name)["config"]
-    config = module.Config(**stored)
-    params = aamdm_training.load_params(
-        folder, name, lambda: module.init(jax.random.key(0), config)
+    module = _BASELINES[name]
+    config = runs.stage_config(run.record, _stage(name), module.Config)
+    params = runs.load_params(
+        run.record, _stage(name), lambda: module.init(jax.random.key(0), config)
     )
     if name == "lmm":
         return lmm.stepper(params, config=config, change=space.change)

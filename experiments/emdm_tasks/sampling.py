@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion import reporting
+from jaxmotion.learning import runs
 from jaxmotion.motion import humanml_skeleton
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.systems.emdm import data as emdm_data
@@ -29,7 +30,8 @@ def sample(args: Any, out: Path) -> None:
       ValueError: if an action is unknown, a text is empty or too long, the length is
         out of range, or the run has another task.
     """
-    task = emdm_training.read_config(args.run).get("task")
+    run = runs.load(args.run, system=emdm_training.SYSTEM)
+    task = run.settings["task"]
     given = {"action": args.action, "text": args.text}
     for name, values in given.items():
         if values and name != task:
@@ -43,7 +45,8 @@ def sample(args: Any, out: Path) -> None:
 
 def _generate(args: Any, vectors: Any, scale: float) -> np.ndarray:
     """Features of one motion for each vector, cut to their length."""
-    params, config = emdm_training.load_row(args.run, args.row)
+    run = runs.load(args.run, system=emdm_training.SYSTEM)
+    params, config = emdm_training.load_row(run, args.row)
     length = config.frames if args.frames is None else args.frames
     conditions = emdm_model.make_condition(
         vectors, (length,) * vectors.shape[0], config=config

@@ -1,11 +1,7 @@
 """The data of a run folder: made once, then loaded."""
 
-from pathlib import Path
 from typing import Any
 
-from jaxmotion.data import clips_io, selection, text_motion
-from jaxmotion.data.text_motion import TextMotions
-from jaxmotion.learning import runs
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import text as emdm_text
@@ -43,14 +39,6 @@ def base_config(args: Any, recon: float) -> emdm_model.Config:
         weight_recon=recon if args.recon is None else args.recon,
         geometry=args.geometry,
     )
-
-
-def _same(folder: Path, paths: tuple[Path, ...], made: dict[str, Any]) -> bool:
-    """Whether the folder has data made so; an error if it has other data."""
-    if not (folder / "config.json").exists():
-        return False
-    runs.check_made(folder, emdm_training.read_config(folder), paths, made)
-    return True
 
 
 def prepare(args: Any) -> emdm_training.Task:
@@ -91,27 +79,20 @@ def merges(pairs: tuple[str, ...]) -> dict[str, str]:
 
 
 def _prepare_actions(args: Any) -> emdm_training.Task:
-    merge = merges(args.merge)
-    made = dict(
+    run = emdm_data.prepare(
+        args.out,
+        args.data,
         task=args.task,
         field=args.field,
-        merge=merge,
+        merge=merges(args.merge),
         least=args.least,
         fps=15.0 if args.fps is None else args.fps,
         frames=60 if args.frames is None else args.frames,
         held_out=args.held_out,
     )
-    if not _same(args.out, args.data, made):
-        clips, left_out = emdm_data.prepare_clips(
-            args.data, field=args.field, merge=merge, least=args.least, fps=made["fps"]
-        )
-        clips_io.save_clips(args.out / "data.npz", clips)
-        made |= runs.made_from(args.data) | {"left_out": list(left_out)}
-        emdm_training.write_config(args.out, made)
-    run = emdm_data.load_run(args.out)
     print(
         f"{run.clips.num_clips} clips of {len(run.actions)} actions: "
-        f"{', '.join(run.actions)}; left out: {', '.join(run.config['left_out'])}"
+        f"{', '.join(run.actions)}"
     )
     return emdm_data.make_task(
         run, base_config(args, 1.0), conditional=args.task == "action"
@@ -120,45 +101,21 @@ def _prepare_actions(args: Any) -> emdm_training.Task:
 
 def _prepare_texts(args: Any) -> emdm_training.Task:
     form = args.text_form or emdm_text.default_form(args.encoder)
-    made = dict(
-        task=args.task,
+    frames = 120 if args.frames is None else args.frames
+    run = emdm_text.prepare(
+        args.out,
+        args.data,
         encoder=args.encoder,
-        text_form=form,
-        unseen=list(args.unseen),
+        form=form,
+        unseen=args.unseen,
+        least=_SHORTEST,
         fps=20.0 if args.fps is None else args.fps,
-        frames=120 if args.frames is None else args.frames,
+        frames=frames,
         held_out=args.held_out,
     )
-    if not _same(args.out, args.data, made):
-        # An encoder that is not there should be said before the features are made.
-        emdm_text.make_encoder(args.encoder, form)
-        motions = _text_motions(args, made["fps"])
-        text_motion.save_text_motions(args.out / "data.npz", motions)
-        emdm_training.write_config(args.out, made | runs.made_from(args.data))
-    run = emdm_text.load_run(args.out)
     counts = {s: run.motions.clips_of(s).size for s in run.motions.split_names}
     print(
         f"{run.motions.num_clips} clips {counts}, {len(run.vectors)} distinct "
         f"captions, encoded by {run.encoder.name}, {form}"
     )
-    return emdm_text.make_task(run, base_config(args, 100.0), frames=made["frames"])
-
-
-def _text_motions(args: Any, fps: float) -> TextMotions:
-    """Text motions of a file of them, or of labeled clips."""
-    if len(args.data) == 1 and text_motion.is_text_motions(args.data[0]):
-        return text_motion.load_text_motions(args.data[0])
-    clips = selection.concatenate([clips_io.load_clips(path) for path in args.data])
-    motions, error = emdm_data.from_labels(
-        clips,
-        unseen=args.unseen,
-        held_out=args.held_out,
-        least=_SHORTEST,
-        fps=fps,
-        seed=0,
-    )
-    print(
-        f"HumanML3D features of {motions.num_clips} clips; joints -> features -> "
-        f"joints: {error:.1e} m at most"
-    )
-    return motions
+    return emdm_text.make_task(run, base_config(args, 100.0), frames=frames)

@@ -1,55 +1,282 @@
-"""Stages of a system's training and what each leaves behind.
+"""Run folders and the trainer of all systems.
 
-Every stage has a folder of its own with checkpoints and losses. Its JSON says which
-system and stage it is, so that one cannot be taken for another.
+config.json     what the run is: system, model, settings, source, split; written last
+data/           clips or frames as the system uses them: the original is not needed
+<stage>/        checkpoints and losses.jsonl of one training; a system has one or more
+
+Every checkpoint says which system and stage it is of, which networks it holds, and how
+and on what they were trained, so that one cannot be taken for another. This module
+knows no system: what a model's JSON means, its systems know.
 """
 
 import dataclasses
+import importlib.metadata
 import json
 import math
+import platform
+import sys
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxmotion import files
 from jaxmotion.learning import checkpoint, fingerprint, loop, training
+from jaxmotion.learning.training import OptimizerName
 from jaxmotion.motion.skeleton import Skeleton, check_skeleton
 from jaxmotion.typing import Key, Params
 
+# Of config.json: folders of another number are refused.
+FORMAT = 1
+_CONFIG = "config.json"
+_PACKAGES = ("jaxmotion", "jax", "jaxlib", "flax", "optax", "numpy")
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of Python and of the packages that numbers depend on."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+# --- the folder --------------------------------------------------------------------
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Budget:
-    """How a stage is trained.
+class Content:
+    """What a system puts into a new run folder.
 
     Attributes:
-      steps: Updates.
-      batch: Samples per update (papers: 64).
-      optimizer: "muon" or "adamw" with cosine decay, AAMDM's "radam" or EMDM's "adam".
-      learning_rate: Of the optimizer.
-      ema: Decay of the parameters' moving average.
-      chunk: Updates of one compiled call, at most.
-      save_every: Updates between checkpoints.
-      seed: Of parameters and batches.
-      override: Go on even if the checkpoint was trained with another budget or data.
+      model: JSON of what rebuilds the model.
+      source: The data, and their license.
+      split: Names of the clips of each part.
+      files: Writers of the files in `data`, by file name.
     """
 
-    steps: int
-    batch: int = 64
-    optimizer: Literal["muon", "adamw", "radam", "adam"] = "muon"
-    learning_rate: float = 2e-3
-    ema: float = 0.999
-    chunk: int = 100
-    save_every: int = 1000
-    seed: int = 0
-    override: bool = False
+    model: dict[str, Any]
+    source: str
+    split: dict[str, list[str]]
+    files: Mapping[str, Callable[[Path], None]]
 
 
-# What of a budget does not change what is trained.
-_FREE = ("chunk", "save_every", "override")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Run:
+    """A run folder.
+
+    Attributes:
+      folder: Where it is.
+      system: Whose run it is.
+      model: JSON of what rebuilds the model.
+      settings: JSON of how model and data were made.
+      source: The data, and their license.
+      split: Names of the clips of each part.
+      files: Fingerprint of each file in `data`, by file name.
+    """
+
+    folder: Path
+    system: str
+    model: dict[str, Any]
+    settings: dict[str, Any]
+    source: str
+    split: dict[str, list[str]]
+    files: dict[str, str]
+
+    @property
+    def config(self) -> Path:
+        """The file that says what the run is."""
+        return self.folder / _CONFIG
+
+    def file(self, name: str) -> Path:
+        """A file of the data.
+
+        Raises:
+          ValueError: if config.json lists no such file.
+        """
+        if name not in self.files:
+            raise ValueError(
+                f"{self.config}: field 'files' lists {sorted(self.files)}, expected "
+                f"{name!r} among them"
+            )
+        return self.folder / "data" / name
+
+    def checkpoints(self, stage: str) -> Path:
+        """Folder of a stage's checkpoints; it need not exist."""
+        return self.folder / stage / "checkpoints"
+
+
+def begin(
+    folder: Path,
+    *,
+    system: str,
+    data: Sequence[Path],
+    settings: dict[str, Any],
+    make: Callable[[], Content],
+) -> Run:
+    """Makes a run folder, or loads the one that is there.
+
+    A start that is killed leaves no config.json, so nothing that looks whole.
+
+    Args:
+      folder: Where.
+      system: Whose run it is.
+      data: Files that its data are made from. Files that are gone are taken to be those
+        of that name; those that are there may have moved.
+      settings: JSON of how model and data are made.
+      make: Reads the files and makes the content; not called for a folder that is
+        there.
+
+    Returns:
+      The run.
+
+    Raises:
+      OSError: if a file cannot be read or written.
+      ValueError: if the folder is of another system, of other data, or was made with
+        other settings; names what differs.
+    """
+    path = folder / _CONFIG
+    if path.exists():
+        _check_same(path, _read(folder, system), data, settings)
+        return load(folder, system=system)
+    prints = [fingerprint.file_fingerprint(one) for one in data]
+    content = make()
+    for name, write in content.files.items():
+        write(folder / "data" / name)
+    value = {
+        "format": FORMAT,
+        "system": system,
+        "model": content.model,
+        "settings": settings,
+        "source": content.source,
+        "data": {str(one): found for one, found in zip(data, prints, strict=True)},
+        "split": content.split,
+        "files": {
+            name: fingerprint.file_fingerprint(folder / "data" / name)
+            for name in content.files
+        },
+        "versions": versions(),
+        "command": " ".join(["python", *sys.argv]),
+    }
+    files.write_text(path, json.dumps(value, indent=1))
+    return load(folder, system=system)
+
+
+def _check_same(
+    path: Path, value: dict[str, Any], data: Sequence[Path], settings: dict[str, Any]
+) -> None:
+    """Raises unless a run would be made now as it was."""
+    found, names = value["data"], [str(one) for one in data]
+    if all(one.is_file() for one in data):
+        given = [fingerprint.file_fingerprint(one) for one in data]
+        same = list(found.values()) == given
+    else:
+        given, same = ["gone"] * len(names), list(found) == names
+    if not same:
+        raise ValueError(
+            f"{path}: field 'data' is {_listed(found.items())}, given "
+            f"{_listed(zip(names, given, strict=True))}: other data; use another folder"
+        )
+    differ = differences(value["settings"], settings)
+    if differ:
+        raise ValueError(f"{path}: made otherwise: {differ}; use another folder")
+
+
+def _listed(pairs: Any) -> str:
+    return ", ".join(f"{name} ({found})" for name, found in pairs)
+
+
+def _is_names(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(x, str) for x in value)
+
+
+# Fields of config.json: what they should be, and whether a value is that.
+_FIELDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "model": ("an object", lambda x: isinstance(x, dict)),
+    "settings": ("an object", lambda x: isinstance(x, dict)),
+    "source": ("a text", lambda x: isinstance(x, str)),
+    "data": (
+        "fingerprints of files",
+        lambda x: isinstance(x, dict) and _is_names(list(x.values())),
+    ),
+    "split": (
+        "lists of names",
+        lambda x: isinstance(x, dict) and all(map(_is_names, x.values())),
+    ),
+    "files": (
+        "fingerprints of file names",
+        lambda x: (
+            isinstance(x, dict)
+            and all(Path(name).name == name and isinstance(x[name], str) for name in x)
+        ),
+    ),
+}
+
+
+def _read(folder: Path, system: str | None) -> dict[str, Any]:
+    """config.json of a run folder, each field of its kind."""
+    path, whose = folder / _CONFIG, system or "<system>"
+    what = f"expected a run folder of `experiments/{whose}.py train`"
+    value = files.read_object(path, what=what)
+    found = value.get("format")
+    if found != FORMAT or isinstance(found, bool):
+        newer = isinstance(found, int) and found > FORMAT
+        why = "a newer version of jaxmotion wrote it" if newer else what
+        raise ValueError(
+            f"{path}: field 'format' is {found!r:.80}, expected {FORMAT}: {why}"
+        )
+    found = value.get("system")
+    if not isinstance(found, str) or (system and found != system):
+        raise ValueError(
+            f"{path}: field 'system' is {found!r:.80}, expected {system or 'a name'!r}"
+        )
+    for name, (kind, right) in _FIELDS.items():
+        if name not in value:
+            raise ValueError(f"{path}: field {name!r} is missing, expected {kind}")
+        if not right(value[name]):
+            raise ValueError(
+                f"{path}: field {name!r} is {value[name]!r:.80}, expected {kind}"
+            )
+    return value
+
+
+def load(folder: Path, *, system: str | None = None) -> Run:
+    """Loads a run folder and checks that its data are those it was made with.
+
+    Args:
+      folder: Where it is.
+      system: Whose run it must be; None for any system's.
+
+    Raises:
+      OSError: if a file is missing or cannot be read.
+      ValueError: if it is no run folder, one of another system or of a newer format, or
+        its data are other than they were; names the file and the field.
+    """
+    value = _read(folder, system)
+    run = Run(
+        folder=folder,
+        **{
+            field.name: value[field.name]
+            for field in dataclasses.fields(Run)
+            if field.name != "folder"
+        },
+    )
+    for name, expected in run.files.items():
+        path = run.file(name)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file: {run.config} lists it")
+        if (found := fingerprint.file_fingerprint(path)) != expected:
+            raise ValueError(
+                f"{path}: fingerprint is {found}, expected {expected} of {run.config}: "
+                "damaged, or of other data"
+            )
+    return run
 
 
 def differences(
@@ -72,10 +299,7 @@ def differences(
         if isinstance(value, dict) and isinstance(old, dict):
             lines.append(differences(old, value, prefix=f"{prefix}{name}."))
         elif old != value:
-            data = " (other data)" if name in ("data", "clips") else ""
-            lines.append(
-                f"{prefix}{name} is {_short(old)}, given {_short(value)}{data}"
-            )
+            lines.append(f"{prefix}{name} is {_short(old)}, given {_short(value)}")
     return "; ".join(filter(None, lines))
 
 
@@ -84,133 +308,295 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def check_resumed(
-    folder: Path,
-    found: dict[str, Any],
-    given: dict[str, Any],
-    *,
-    steps: int,
-    override: bool,
-) -> None:
-    """Raises unless a run would go on as it began.
+# --- stages ------------------------------------------------------------------------
 
-    Args:
-      folder: Of the run, with `checkpoints`.
-      found: Settings that its newest checkpoint was trained with.
-      given: Settings to go on with.
-      steps: Updates of the whole run that are asked for.
-      override: Whether other settings are meant so.
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Budget:
+    """How a stage is trained.
+
+    Attributes:
+      steps: Updates.
+      batch: Samples per update (papers: 64).
+      optimizer: "muon" or "adamw" with warm-up and cosine decay, or AAMDM's "radam" or
+        EMDM's "adam" at a constant rate.
+      learning_rate: Of the optimizer; where it varies, its peak.
+      warmup: Updates of linear rise; None for a tenth of them, 100 at most.
+      final: Rate at the end of the decay, as a fraction of the peak.
+      max_norm: Gradients are clipped to this global norm; 0 for no clipping.
+      ema: Decay per update of the parameters' moving average; 0 for no average.
+      devices: Split each batch over so many.
+      chunk: Updates of one compiled call, at most.
+      save_every: Updates between checkpoints.
+      seed: Of parameters and batches.
+      override: Go on even if the checkpoint was trained with another budget or data.
+    """
+
+    steps: int
+    batch: int = 64
+    optimizer: OptimizerName = "muon"
+    learning_rate: float = 2e-3
+    warmup: int | None = None
+    final: float = 0.05
+    max_norm: float = 0.0
+    ema: float = 0.999
+    devices: int = 1
+    chunk: int = 100
+    save_every: int = 1000
+    seed: int = 0
+    override: bool = False
+
+    def __post_init__(self):
+        """Raises if there are fewer devices, before any work."""
+        if self.devices > 1 and self.devices > jax.device_count():
+            raise ValueError(
+                f"devices is {self.devices}, {jax.device_count()} are there"
+            )
+
+
+# What of a budget does not change what is trained.
+_FREE = ("devices", "chunk", "save_every", "override")
+
+
+def make_optimizer(budget: Budget) -> training.Optimizer:
+    """The optimizer of a budget."""
+    clip = budget.max_norm or None
+    if budget.optimizer in ("radam", "adam"):
+        return training.make_optimizer(
+            budget.optimizer, learning_rate=budget.learning_rate, max_norm=clip
+        )
+    warmup = budget.warmup
+    return training.make_optimizer(
+        budget.optimizer,
+        learning_rate=budget.learning_rate,
+        num_steps=budget.steps,
+        warmup_steps=min(100, budget.steps // 10) if warmup is None else warmup,
+        final_fraction=budget.final,
+        max_norm=clip,
+    )
+
+
+def check_stage(run: Run, stage: str) -> dict[str, Any]:
+    """JSON of a stage's newest checkpoint.
 
     Raises:
-      ValueError: names the settings that differ, or says that more steps are done.
+      CheckpointError: if there is no checkpoint, or it is of another stage or system;
+        names the folder.
     """
-    done = checkpoint.latest_step(folder / "checkpoints") or 0
-    if done > steps:
+    value = checkpoint.load_config(run.checkpoints(stage))
+    for field, expected in (("system", run.system), ("stage", stage)):
+        if value.get(field) != expected:
+            raise checkpoint.CheckpointError(
+                f"{run.folder / stage}: field {field!r} is {value.get(field)!r}, "
+                f"expected {expected!r}: the checkpoint is of another stage"
+            )
+    return value
+
+
+def check_model(run: Run, stage: str, model: dict[str, Any]) -> None:
+    """Raises unless a stage's newest checkpoint is of this model.
+
+    Raises:
+      CheckpointError: if there is none, or of another stage or system.
+      ValueError: if its networks are others; names the fields that differ.
+    """
+    differ = differences(check_stage(run, stage).get("model", {}), model)
+    if differ:
+        raise ValueError(f"{run.folder / stage}: of another model: {differ}")
+
+
+def stage_config(run: Run, stage: str, kind: type, **more: Any) -> Any:
+    """The configuration that a stage was trained with.
+
+    Args:
+      run: The run.
+      stage: Name of the stage.
+      kind: Its dataclass.
+      **more: Fields that stages of that kind do not decide.
+
+    Raises:
+      CheckpointError: if there is no checkpoint, or it is of another stage or system.
+      ValueError: if its fields are not those of the dataclass; names the first.
+    """
+    value = check_stage(run, stage).get("model")
+    try:
+        return config_from_json(kind, value | more if isinstance(value, dict) else None)
+    except ValueError as error:
+        raise ValueError(f"{run.folder / stage}: field 'model': {error}") from error
+
+
+def _stage_json(run: Run, stage: str, model: dict[str, Any]) -> dict[str, Any]:
+    return {"system": run.system, "stage": stage, "model": model}
+
+
+def store(run: Run, stage: str, state: Any, *, model: dict[str, Any]) -> None:
+    """Writes what is made without training as a stage: its checkpoint of step 0.
+
+    Args:
+      run: The run.
+      stage: Name of the stage.
+      state: A pytree of arrays.
+      model: JSON of what rebuilds its structure.
+
+    Raises:
+      OSError: if it cannot be written.
+      ValueError: if the stage has a checkpoint.
+    """
+    place = run.checkpoints(stage)
+    if checkpoint.latest_step(place) is not None:
+        raise ValueError(f"{run.folder}: {stage!r} exists; use another folder")
+    checkpoint.save(place, 0, state, _stage_json(run, stage, model))
+
+
+def _check_resumed(
+    run: Run, stage: str, model: dict[str, Any], how: dict[str, Any], budget: Budget
+) -> None:
+    """Raises unless a stage would go on as it began."""
+    check_model(run, stage, model)
+    folder, found = run.folder / stage, check_stage(run, stage)
+    done = checkpoint.latest_step(run.checkpoints(stage)) or 0
+    if done > budget.steps:
         raise ValueError(
-            f"{folder}: has {done} steps, expected at most the {steps} to train"
+            f"{folder}: has {done} steps, expected at most the {budget.steps} to train"
         )
-    differ = differences(found, given)
-    if differ and not override:
+    differ = differences(found.get("training", {}), how)
+    if differ and not budget.override:
         raise ValueError(
             f"{folder}: at step {done}, and trained with other settings: {differ}; "
             "--override goes on with those given"
         )
 
 
-def made_from(paths: Sequence[Path]) -> dict[str, Any]:
-    """JSON of the files that a run folder's data are made from.
-
-    Raises:
-      OSError: if one cannot be read.
-    """
-    return {
-        "data": [str(path) for path in paths],
-        "fingerprints": [fingerprint.file_fingerprint(path) for path in paths],
-    }
-
-
-def check_made(
-    folder: Path, found: dict[str, Any], paths: Sequence[Path], given: dict[str, Any]
-) -> None:
-    """Raises unless a run folder's data are those that would be made now.
-
-    Files that are gone are taken to be the ones of that name; those that are there may
-    have other names.
+def fit(
+    run: Run,
+    stage: str,
+    state: Any,
+    update: training.Update,
+    sample_batch: Callable[[Key, Any], Any],
+    data: Any,
+    *,
+    budget: Budget,
+    model: dict[str, Any],
+    settings: dict[str, Any] | None = None,
+    key: Key | None = None,
+    show: tuple[str, ...] = ("loss",),
+) -> Any:
+    """Trains a stage, from its newest checkpoint if there is one.
 
     Args:
-      folder: The run folder.
-      found: Its JSON, with what `made_from` gave.
-      paths: Files to make data from.
-      given: How.
-
-    Raises:
-      OSError: if a file is there but cannot be read.
-      ValueError: names what differs.
-    """
-    names, old = [str(path) for path in paths], found.get("data")
-    old = [old] if isinstance(old, str) else old
-    if all(path.is_file() for path in paths) and "fingerprints" in found:
-        now = made_from(paths)["fingerprints"]
-        same = found["fingerprints"] == now
-    else:
-        same, now = old == names, "unknown"
-    if not same:
-        raise ValueError(
-            f"{folder}: made from other data: {old} (fingerprint "
-            f"{found.get('fingerprints')}), given {names} ({now}); use another folder"
-        )
-    differ = differences(found, given)
-    if differ:
-        raise ValueError(
-            f"{folder}: its data were made otherwise: {differ}; use another folder"
-        )
-
-
-def make_optimizer(budget: Budget) -> training.Optimizer:
-    """The optimizer of a budget.
-
-    Args:
-      budget: How a stage is trained.
+      run: The run.
+      stage: Name of the stage, which is its folder in the run.
+      state: A new one.
+      update: Of the state by a batch.
+      sample_batch: `(key, data) -> batch`.
+      data: Arrays.
+      budget: How long.
+      model: JSON of what rebuilds the stage's networks.
+      settings: JSON of how the stage is trained besides the budget.
+      key: Of batches and noise; None for one of the budget's seed.
+      show: Names on the progress bar.
 
     Returns:
-      The optimizer.
+      The last state.
+
+    Raises:
+      CheckpointError: if the folder holds another stage.
+      ValueError: if the checkpoint has other sizes, or other settings or data and the
+        budget does not override them, or more steps; names the fields.
+      TrainingDiverged: if a loss is not finite.
     """
-    if budget.optimizer in ("radam", "adam"):
-        return training.make_optimizer(
-            budget.optimizer, learning_rate=budget.learning_rate
-        )
-    return training.make_optimizer(
-        budget.optimizer,
-        learning_rate=budget.learning_rate,
+    own = {k: v for k, v in dataclasses.asdict(budget).items() if k not in _FREE}
+    how = own | {"files": run.files} | (settings or {})
+    if checkpoint.latest_step(run.checkpoints(stage)) is not None:
+        _check_resumed(run, stage, model, how, budget)
+        state = checkpoint.restore(run.checkpoints(stage), state)
+    mesh = None
+    if budget.devices > 1:
+        mesh = jax.make_mesh((budget.devices,), ("data",))
+    chunk = min(budget.steps, budget.chunk)
+    lengths = loop.Loop(
         num_steps=budget.steps,
-        warmup_steps=min(100, budget.steps // 10),
-        final_fraction=0.05,
+        chunk=chunk,
+        save_every=budget.save_every,
+        folder=run.folder / stage,
+        config=_stage_json(run, stage, model) | {"training": how},
+        show=show,
+    )
+    if key is None:
+        key = jax.random.fold_in(jax.random.key(budget.seed), 1)
+    return loop.train(
+        training.train_chunk(update, sample_batch, num_steps=chunk, mesh=mesh),
+        training.replicate(state, mesh),
+        key,
+        training.replicate(data, mesh),
+        loop=lengths,
     )
 
 
-def check_stage(folder: Path, stage: str, *, system: str) -> dict[str, Any]:
-    """JSON of a stage's newest checkpoint.
+def minimize(
+    run: Run,
+    stage: str,
+    loss: training.Loss,
+    params: Params,
+    sample_batch: Callable[[Key, Any], Any],
+    data: Any,
+    *,
+    budget: Budget,
+    **more: Any,
+) -> training.TrainState:
+    """Trains a stage of one network by a loss, with the budget's optimizer.
 
     Args:
-      folder: The stage's folder.
-      stage: Which stage it must be.
-      system: Which system it must be of.
+      run: The run.
+      stage: Name of the stage.
+      loss: `(params, key, batch) -> (loss, info)`.
+      params: Initial parameters.
+      sample_batch: `(key, data) -> batch`.
+      data: Arrays.
+      budget: How long.
+      **more: As `fit` takes them.
 
     Returns:
-      The JSON object.
+      The last state.
+    """
+    optimizer = make_optimizer(budget)
+    return fit(
+        run,
+        stage,
+        training.init_train_state(params, optimizer),
+        training.make_update(loss, optimizer, ema_decay=budget.ema),
+        sample_batch,
+        data,
+        budget=budget,
+        **more,
+    )
+
+
+def load_params(
+    run: Run,
+    stage: str,
+    init: Callable[[], Params],
+    *,
+    adversarial: bool = False,
+) -> Params:
+    """Averaged parameters of a stage.
+
+    Args:
+      run: The run.
+      stage: Name of the stage.
+      init: Makes parameters of the same shapes; never run.
+      adversarial: Whether the stage trained a generator against a discriminator.
 
     Raises:
-      CheckpointError: if there is no checkpoint, or it is of another stage or system;
-        names the folder.
+      CheckpointError: if there is none, or it is of another stage or size.
     """
-    value = checkpoint.load_config(folder / "checkpoints")
-    for field, expected in (("system", system), ("stage", stage)):
-        if value.get(field) != expected:
-            raise checkpoint.CheckpointError(
-                f"{folder}: field {field!r} is {value.get(field)!r}, expected "
-                f"{expected!r}: the checkpoint is of another stage"
-            )
-    return value
+    check_stage(run, stage)
+    found = checkpoint.restore_part(
+        run.checkpoints(stage),
+        {"ema_params": jax.eval_shape(init)},
+        within="generator" if adversarial else None,
+    )
+    return found["ema_params"]
 
 
 def restore_evaluator(
@@ -240,106 +626,33 @@ def restore_evaluator(
     return checkpoint.restore(folder, {"params": jax.eval_shape(init)})["params"]
 
 
-def fit(
-    folder: Path,
-    state: Any,
-    update: Callable,
-    sample_batch: Callable[[Key, Any], Any],
-    data: Any,
-    *,
-    system: str,
-    stage: str,
-    budget: Budget,
-    config: dict[str, Any],
-    source: Path,
-    settings: dict[str, Any] | None = None,
-    show: tuple[str, ...] = ("loss",),
-) -> Any:
-    """Trains a stage, from its newest checkpoint if there is one.
+# --- JSON of what models are made of ------------------------------------------------
+
+
+def decode(
+    value: dict[str, Any], where: str, parts: Mapping[str, Callable[[Any], Any]]
+) -> dict[str, Any]:
+    """Fields of a JSON object, each made into what it stands for.
 
     Args:
-      folder: The stage's folder.
-      state: Of a new run.
-      update: Of the state by a batch.
-      sample_batch: `(key, data) -> batch`.
-      data: Arrays.
-      system: Name of the system.
-      stage: Name of the stage.
-      budget: How long.
-      config: JSON of what rebuilds the stage's networks.
-      source: File of the data, by which other data are told.
-      settings: JSON of how the stage is trained besides the budget.
-      show: Names on the progress bar.
-
-    Returns:
-      The last state.
+      value: The JSON object.
+      where: Its file, for messages.
+      parts: What makes each field; other fields are left out.
 
     Raises:
-      CheckpointError: if the folder holds another stage.
-      ValueError: if the checkpoint has other sizes, or other settings or data and the
-        budget does not override them, or more steps; names the fields.
-      TrainingDiverged: if a loss is not finite.
+      ValueError: names the file and the field that is missing or wrong.
     """
-    value = {"system": system, "stage": stage} | config
-    own = {k: v for k, v in dataclasses.asdict(budget).items() if k not in _FREE}
-    how = own | {"data": fingerprint.file_fingerprint(source)} | (settings or {})
-    if checkpoint.latest_step(folder / "checkpoints") is not None:
-        found = check_stage(folder, stage, system=system)
-        differ = differences(found, value)
-        if differ:
-            raise ValueError(f"{folder}: of another model: {differ}")
-        check_resumed(
-            folder,
-            found.get("training", {}),
-            how,
-            steps=budget.steps,
-            override=budget.override,
-        )
-        state = checkpoint.restore(folder / "checkpoints", state)
-    chunk = min(budget.steps, budget.chunk)
-    run = training.train_chunk(update, sample_batch, num_steps=chunk)
-    lengths = loop.Loop(
-        num_steps=budget.steps,
-        chunk=chunk,
-        save_every=budget.save_every,
-        folder=folder,
-        config=value | {"training": how},
-        show=show,
-    )
-    key = jax.random.fold_in(jax.random.key(budget.seed), 1)
-    return loop.train(run, state, key, data, loop=lengths)
-
-
-def load_params(
-    folder: Path,
-    stage: str,
-    init: Callable[[], Params],
-    *,
-    system: str,
-    adversarial: bool = False,
-) -> Params:
-    """Averaged parameters of a stage.
-
-    Args:
-      folder: The stage's folder.
-      stage: Which stage it must be.
-      init: Makes parameters of the same shapes; never run.
-      system: Which system it must be of.
-      adversarial: Whether the stage trained a generator against a discriminator.
-
-    Returns:
-      The parameters.
-
-    Raises:
-      CheckpointError: if there is none, or it is of another stage or size.
-    """
-    check_stage(folder, stage, system=system)
-    found = checkpoint.restore_part(
-        folder / "checkpoints",
-        {"ema_params": jax.eval_shape(init)},
-        within="generator" if adversarial else None,
-    )
-    return found["ema_params"]
+    made = {}
+    for field, make in parts.items():
+        if field not in value:
+            raise ValueError(f"{where}: field {field!r} is missing")
+        try:
+            made[field] = make(value[field])
+        except KeyError as error:
+            raise ValueError(f"{where}: field {field!r}: {error} is missing") from error
+        except (TypeError, ValueError, IndexError) as error:
+            raise ValueError(f"{where}: field {field!r}: {error}") from error
+    return made
 
 
 def skeleton_to_json(skeleton: Skeleton) -> dict[str, Any]:
@@ -410,6 +723,8 @@ _LIMITS: dict[str, tuple[float | int, float | int]] = {
 def _check_field(name: str, kind: Any, value: Any) -> Any:
     """The value as a configuration has it; raises unless it is of its kind."""
     choices = typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        return config_from_json(typing.cast(type, kind), value)
     if typing.get_origin(kind) is typing.Literal:
         right = isinstance(value, str) and value in choices
         expected = f"one of {', '.join(map(repr, choices))}"
@@ -437,7 +752,8 @@ def config_from_json(kind: type, value: Any) -> Any:
     """A configuration from its JSON, of which every field is checked.
 
     Args:
-      kind: Its dataclass, of whole numbers, numbers, truth values, choices and lists.
+      kind: Its dataclass, of whole numbers, numbers, truth values, choices, lists and
+        such dataclasses.
       value: What `dataclasses.asdict` gave, read back.
 
     Returns:

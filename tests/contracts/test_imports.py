@@ -40,6 +40,7 @@ MAY_IMPORT = {
         "text",
     },
     "viz": {"typing", "motion"},
+    # learning: versions, as run folders have them.
     # The face composes what stands below it.
     "face.py": BASE
     | {"motion", "control", "data", "learning", "systems", "viz", "export"},

@@ -16,7 +16,6 @@ from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.emdm import action_evaluation as emdm_action_evaluation
 from jaxmotion.systems.emdm import data as emdm_data
-from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import training as smgdiff_training
@@ -211,10 +210,18 @@ def test_an_evaluator_of_styles_judges_from_its_file_as_when_it_was_trained(tmp_
 def actions(tmp_path_factory):
     """A run of actions without models."""
     folder = tmp_path_factory.mktemp("run")
-    clips_io.save_clips(folder / "data.npz", tiny.clips(40))
-    value = dict(task="action", field="style", frames=8, held_out=0.5)
-    emdm_training.write_config(folder, value)
-    return emdm_data.load_run(folder)
+    clips_io.save_clips(folder / "clips.npz", tiny.clips(40))
+    return emdm_data.prepare(
+        folder / "run",
+        (folder / "clips.npz",),
+        task="action",
+        field="style",
+        merge={},
+        least=1,
+        fps=tiny.clips(40).fps,
+        frames=8,
+        held_out=0.5,
+    )
 
 
 @pytest.mark.slow
@@ -227,7 +234,7 @@ def test_an_evaluator_of_actions_is_the_recognizer_a_run_trains(actions, tmp_pat
     call = dict(num_steps=3, seed=0)
     load = emdm_action_evaluation.load_recognizer
     same(load(actions, evaluator=loaded, **call), made.params)
-    assert not (actions.folder / "recognizer").exists()
+    assert not (actions.record.folder / "recognizer").exists()
     same(load(actions, **call), made.params)
     assert 0.0 <= made.accuracy <= 1.0 and made.frames == 8
     # Twice from the file, and once from the run's folder: the same judgment.

@@ -25,12 +25,12 @@ SETTINGS = (
     "--polisher-steps 10 --generator-steps 10 --window-steps 10 --batch 8 "
     "--width 32"
 )
-STAGES = {
-    "autoencoder": "autoencoder",
-    "embedded/T5/polisher": "polisher",
-    "embedded/T5/generator": "generator",
-    "embedded/lmm": "lmm",
-}
+STAGES = (
+    "autoencoder",
+    "embedded/T5/polisher",
+    "embedded/T5/generator",
+    "embedded/lmm",
+)
 
 
 @pytest.fixture(scope="module")
@@ -72,16 +72,16 @@ def losses(folder):
 @pytest.mark.slow
 def test_training_leaves_every_stage(trained, data):
     config = json.loads((trained / "config.json").read_text())
-    assert config["system"] == "aamdm" and config["data"] == [str(data)]
-    assert config["labels"] == [] and config["fps"] == 60.0
+    assert config["system"] == "aamdm" and list(config["data"]) == [str(data)]
+    assert config["settings"]["labels"] == [] and config["settings"]["fps"] == 60.0
+    assert "procedural" in config["source"]
     # Sixteen clips and their mirror images.
-    assert len(config["clips"]) == 32
-    for name, stage in STAGES.items():
+    assert len(config["split"]["train"]) == 32
+    for name in STAGES:
         checkpoints = trained / name / "checkpoints"
         assert checkpoint.latest_step(checkpoints) == 10
         value = checkpoint.load_config(checkpoints)
-        assert (value["system"], value["stage"]) == ("aamdm", stage)
-        assert "procedural" in value["source"]
+        assert (value["system"], value["stage"]) == ("aamdm", name)
     for text in losses(trained).values():
         rows = [json.loads(line) for line in text.splitlines()]
         assert [row["step"] for row in rows] == [10]
@@ -187,14 +187,17 @@ BAD = [
     ("train --data {data} --out {out} {settings} --fps 24", "resampled to 24"),
     (
         "train --data {data} --out {run} {settings} --fps 120",
-        "{run}: .*otherwise: fps is 60.0, given 120.0",
+        "{run}/config.json: made otherwise: fps is 60.0, given 120.0",
     ),
     (
         "train --data {data} --out {run} {settings} --width 48",
-        "T5/polisher: of another model: config.width is 32, given 48",
+        "T5/polisher: of another model: width is 32, given 48",
     ),
     ("train --data {data} --out {run} {settings} --seed 1", "seed is 0, given 1"),
-    ("train --data {other} --out {run} {settings}", "{run}: made from other data"),
+    (
+        "train --data {other} --out {run} {settings}",
+        "{run}/config.json: .* other data",
+    ),
     (
         "train --data {data} --out {run} {settings} --polisher-steps 5",
         "polisher: has 10 steps, expected at most the 5 to train",

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from jaxmotion.data import bvh_text, clips_io, procedural
+from jaxmotion.learning import runs
 from jaxmotion.systems.emdm import published as emdm_published
 from jaxmotion.systems.emdm import training as emdm_training
 
@@ -169,7 +170,7 @@ def test_texts_are_scored_and_sampled(call, texts, tmp_path):
 
 @pytest.mark.slow
 def test_what_was_held_out_is_not_trained_on(texts):
-    with np.load(texts / "data.npz") as file:
+    with np.load(texts / "data" / "motions.npz") as file:
         split, names = file["split"], file["split_names"].tolist()
         owner, captions = file["caption_clip"], file["captions"]
     trained = captions[split[owner] == names.index("train")]
@@ -191,7 +192,7 @@ BAD = {
     "sample --run {new} --action run": "no such file: expected a run folder",
     "train --task action --data {data} --out {actions} --least 2 --fps 9": "fps is",
     "train --task action --data {data} --out {actions} --least 2 --fps 10 --merge": (
-        "its data were made otherwise"
+        "made otherwise"
     ),
     "train --data {data} --out {new} --merge walk": "expected old=new",
     "train --data {data} --out {new} --merge hop=walk": "unknown content",
@@ -272,7 +273,7 @@ def test_released_weights_become_a_row(call, released, tmp_path):
         call(line)
     assert not (released / "run" / "emdm").exists()
     call(f"{line} --heads 4")
-    params, config = emdm_training.load_row(released / "run", "emdm")
+    params, config = emdm_training.load_row(runs.load(released / "run"), "emdm")
     assert (config.frames, config.num_steps, config.latent) == (40, 10, 5)
     wanted = emdm_published.load(released / "t2m.pth", frames=40, heads=4)
     assert config == wanted[0]

@@ -9,10 +9,12 @@ import optax
 import pytest
 
 from jaxmotion.data import clips_io
+from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.evaluators import frozen
-from jaxmotion.learning import checkpoint, training
+from jaxmotion.learning import checkpoint, runs, training
 from jaxmotion.systems.aamdm import training as aamdm_training
 from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import model as smgdiff_model
@@ -197,42 +199,55 @@ def spoil(folder, random, names):
     return path, before
 
 
-def test_runs_of_smgdiff(tmp_path, capsys):
+def fuzz_folder(tmp_path, capsys, name, load, confirm, *, accepted):
+    """Feeds a run folder of which one file is spoiled at a time."""
     folder = tmp_path / "run"
-    train, held_out = smgdiff_data.split(ball_walker.clips(60), fraction=0.3)
-    model = smgdiff_training.make_model(train, sizes=SIZES, paths=PATHS)
-    smgdiff_training.write_run(
-        smgdiff_training.Run(folder=folder, model=model, train=train, held_out=held_out)
-    )
-
-    def confirm(_, run):
-        value = json.loads((folder / "config.json").read_text())
-        says(smgdiff_model.to_json(run.model), value)
-        for leaf in jax.tree.leaves((run.train, run.held_out)):
-            assert np.isfinite(np.asarray(leaf)).all()
-
     target = harness.Target(
-        "runs of SMGDiff",
-        lambda _: smgdiff_training.load_run(folder),
-        confirm,
-        names=("run",),
+        f"runs of {name}", lambda _: load(folder), confirm, names=("run",)
     )
     target.feed("untouched", None)
-    for seed in range(1, INPUTS["smgdiff"]):
+    names = ["config.json"] * 3 + [
+        f"data/{x.name}" for x in (folder / "data").iterdir()
+    ]
+    for seed in range(1, INPUTS[name]):
         random = np.random.default_rng(seed)
-        names = ["config.json", "config.json", "train.npz", "held_out.npz"]
         path, before = spoil(folder, random, names)
         target.feed(f"seed {seed}", None)
         path.write_bytes(before)
-    target.report(capsys.disabled, accepted=10, refused=100)
+    target.report(capsys.disabled, accepted=accepted, refused=60)
+
+
+def stored(run):
+    """What the config of a run that was loaded says now."""
+    value = json.loads(run.record.config.read_text())
+    assert run.record.model == value["model"] and run.record.source == value["source"]
+    return value
+
+
+def test_runs_of_smgdiff(tmp_path, capsys):
+    save_ball_clips(tmp_path / "clips.npz", ball_walker.clips(60))
+    smgdiff_training.prepare(
+        tmp_path / "run",
+        tmp_path / "clips.npz",
+        held_out=0.3,
+        sizes=SIZES,
+        paths=PATHS,
+    )
+
+    def confirm(_, run):
+        says(smgdiff_model.to_json(run.model), stored(run)["model"])
+        for leaf in jax.tree.leaves((run.train, run.held_out)):
+            assert np.isfinite(np.asarray(leaf)).all()
+
+    load = smgdiff_training.load_run
+    fuzz_folder(tmp_path, capsys, "smgdiff", load, confirm, accepted=10)
 
 
 def test_runs_of_aamdm(tmp_path, capsys):
-    folder, data = tmp_path / "run", tmp_path / "clips.npz"
-    clips_io.save_clips(data, person.clips((160, 90, 160, 30)))
+    clips_io.save_clips(tmp_path / "clips.npz", person.clips((160, 90, 160, 30)))
     aamdm_training.prepare(
-        folder,
-        data,
+        tmp_path / "run",
+        tmp_path / "clips.npz",
         field="theme",
         labels=("walk",),
         fps=60.0,
@@ -241,72 +256,61 @@ def test_runs_of_aamdm(tmp_path, capsys):
     )
 
     def confirm(_, run):
-        value = json.loads((folder / "config.json").read_text())
-        assert run.config == value and run.skeleton.names == tuple(
-            value["skeleton"]["names"]
-        )
-        with np.load(folder / "frames.npz") as file:
-            frames = file["poses"].shape[0]
-        # The second before a clip's end that is held out is in neither part.
-        gap = round(run.train.fps) * (run.train.offsets.size - 1)
-        assert run.train.num_frames + gap + run.held_out.num_frames <= frames
+        assert run.skeleton.names == tuple(stored(run)["model"]["skeleton"]["names"])
         for leaf in jax.tree.leaves((run.train, run.held_out, run.skeleton)):
             assert np.isfinite(np.asarray(leaf)).all()
         assert 0 < run.train.fps < np.inf
 
-    target = harness.Target(
-        "runs of AAMDM",
-        lambda _: aamdm_training.load_run(folder),
-        confirm,
-        names=("run",),
-    )
-    target.feed("untouched", None)
-    for seed in range(1, INPUTS["aamdm"]):
-        random = np.random.default_rng(seed)
-        path, before = spoil(folder, random, ["config.json", "frames.npz"])
-        target.feed(f"seed {seed}", None)
-        path.write_bytes(before)
-    target.report(capsys.disabled, accepted=10, refused=60)
+    load = aamdm_training.load_run
+    fuzz_folder(tmp_path, capsys, "aamdm", load, confirm, accepted=10)
 
 
 def test_runs_of_emdm(tmp_path, capsys):
-    value = {"task": "text", "data": "data.npz", "frames": 60, "classes": ["a", "b"]}
-    emdm_training.write_config(tmp_path, value)
-    path = tmp_path / "config.json"
-
-    def confirm(data, found):
-        value = json.loads(data)
-        assert {name: found[name] for name in value} == value
-        assert value["system"] == "emdm"
-
-    target = harness.Target(
-        "configs of EMDM",
-        lambda _: emdm_training.read_config(tmp_path),
-        confirm,
-        names=("config.json",),
+    clips_io.save_clips(tmp_path / "clips.npz", tiny.clips())
+    emdm_data.prepare(
+        tmp_path / "run",
+        (tmp_path / "clips.npz",),
+        task="action",
+        field="style",
+        merge={},
+        least=1,
+        fps=tiny.clips().fps,
+        frames=20,
+        held_out=0.3,
     )
-    whole = json.loads(path.read_text())
-    for seed in range(INPUTS["emdm"]):
-        random = np.random.default_rng(seed)
-        data = mutations.mutate_json_text(random, whole)
-        path.write_bytes(data)
-        target.feed(f"seed {seed}", data)
-    target.report(capsys.disabled, accepted=20, refused=20)
+
+    def load(folder):
+        run = runs.load(folder, system="emdm")
+        emdm_training.check_task(run, ("action", "none"))
+        return run
+
+    def confirm(_, run):
+        value = json.loads(run.config.read_text())
+        assert run.settings == value["settings"] and run.split == value["split"]
+        assert 2 <= run.settings["frames"] <= 10**5
+
+    fuzz_folder(tmp_path, capsys, "emdm", load, confirm, accepted=10)
 
 
 def test_runs_of_camdm(tmp_path, capsys, camdm_value, params):
     folder = tmp_path / "run"
     state = training.init_train_state(params, optax.adam(1e-3))
-    value = camdm_value | {"experiment": {"steps": 1}}
-    checkpoint.save(folder / "checkpoints", 1, state, value)
+    run = runs.begin(
+        folder,
+        system="camdm",
+        data=[],
+        settings={},
+        make=lambda: runs.Content(model=camdm_value, source="", split={}, files={}),
+    )
+    runs.store(run, camdm_model.STAGE, state, model=camdm_value["config"])
     expected = dict(flat(state.ema_params))
     whole = tmp_path / "whole"
     shutil.copytree(folder, whole)
     paths = sorted(x.relative_to(whole) for x in whole.rglob("*") if x.is_file())
 
     def confirm(_, found):
-        _, loaded, stored = found
-        assert json.loads(json.dumps(stored)) == json.loads(json.dumps(value))
+        model, loaded, _ = found
+        says(camdm_model.to_json(model), json.loads(json.dumps(camdm_value)))
         for name, array in flat(loaded):
             np.testing.assert_array_equal(array, expected[name])
 

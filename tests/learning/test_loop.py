@@ -356,12 +356,12 @@ def test_a_killed_training_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
     quick = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     process = subprocess.Popen(command(killed, steps), cwd=ROOT, env=quick)
     give_up = time.monotonic() + 300
-    reached = lambda: checkpoint.latest_step(killed / "checkpoints") or 0  # noqa: E731
+    reached = lambda: checkpoint.latest_step(killed / "motion" / "checkpoints") or 0  # noqa: E731
     while reached() < 3 and process.poll() is None and time.monotonic() < give_up:
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
-    step = checkpoint.latest_step(killed / "checkpoints")
+    step = checkpoint.latest_step(killed / "motion" / "checkpoints")
     assert 3 <= step < steps
     camdm_model.load(killed)
 
@@ -369,12 +369,12 @@ def test_a_killed_training_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
         subprocess.run(command(folder, steps), cwd=ROOT, env=quick, check=True)
     states = []
     for folder in (killed, whole):
-        model, _, config = camdm_model.load(folder)
-        assert config["experiment"]["steps"] == steps
-        assert checkpoint.latest_step(folder / "checkpoints") == steps
+        model, _, _ = camdm_model.load(folder)
+        stage = folder / "motion" / "checkpoints"
+        assert checkpoint.latest_step(stage) == steps
         params = jax.eval_shape(
             lambda m=model: camdm_model.init(jax.random.key(0), m.config)
         )
         like = {"params": params, "ema_params": params}
-        states.append(checkpoint.restore_part(folder / "checkpoints", like))
+        states.append(checkpoint.restore_part(stage, like))
     jax.tree.map(np.testing.assert_array_equal, *states)

@@ -1,8 +1,12 @@
-"""Stages 2 and 3: the polisher and the generator of a chain of some length."""
+"""How AAMDM is trained: poses and paths of clips, and its three stages.
+
+autoencoder                             poses to embeddings
+embedded/T<n>/polisher, .../generator   both networks of chains of n steps
+full_pose/T<n>/...                      the same without the embedding
+"""
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -15,8 +19,7 @@ from jaxtyping import Array, Int
 from jaxmotion import files
 from jaxmotion.data import clips_io, mirror, selection
 from jaxmotion.learning import adversarial, checkpoint, runs, training
-from jaxmotion.learning.runs import Budget as Budget
-from jaxmotion.learning.runs import make_optimizer as make_optimizer
+from jaxmotion.learning.runs import Budget
 from jaxmotion.motion import pose
 from jaxmotion.motion.skeleton import MAX_METERS, Skeleton
 from jaxmotion.systems.aamdm import data as aamdm_data
@@ -29,9 +32,8 @@ from jaxmotion.systems.aamdm.model import Sample
 from jaxmotion.systems.aamdm.space import Autoencoder, Space
 from jaxmotion.typing import Key, Params
 
-check_stage = functools.partial(runs.check_stage, system="aamdm")
-fit = functools.partial(runs.fit, system="aamdm")
-load_params = functools.partial(runs.load_params, system="aamdm")
+SYSTEM = "aamdm"
+SpaceName = Literal["embedded", "full_pose"]
 
 
 def frame_windows(
@@ -61,80 +63,28 @@ def frame_windows(
     return sample, (frames, starts(data, length))
 
 
-def save_space(folder: Path, space: Space, config: dict[str, Any]) -> None:
-    """Writes a space.
-
-    Args:
-      folder: Of the space.
-      space: The space.
-      config: JSON of what it was made from.
-    """
-    value = {"system": "aamdm", "stage": "space"} | config
-    leaves = {str(i): x for i, x in enumerate(jax.tree.leaves(space))}
-    checkpoint.save(folder / "checkpoints", 0, leaves, value)
-
-
-def restore_space(folder: Path, like: Callable[[], Space]) -> Space:
-    """Reads what `save_space` wrote.
-
-    Args:
-      folder: Of the space.
-      like: Makes a space of the same shapes; never run.
-
-    Returns:
-      The space.
-
-    Raises:
-      CheckpointError: if there is none, or it is of another kind.
-    """
-    check_stage(folder, "space")
-    structure = []
-
-    def leaves() -> dict[str, Array]:
-        found, tree = jax.tree.flatten(like())
-        structure.append(tree)
-        return {str(i): x for i, x in enumerate(found)}
-
-    stored = checkpoint.restore(folder / "checkpoints", jax.eval_shape(leaves))
-    return jax.tree.unflatten(
-        structure[0], [stored[str(i)] for i in range(len(stored))]
-    )
-
-
-SpaceName = Literal["embedded", "full_pose"]
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """Data of a run folder.
+    """A run folder and its data.
 
     Attributes:
-      folder: The folder.
+      record: What the folder is.
       skeleton: The skeleton.
+      embedding: Sizes of the autoencoder.
       train: Training frames.
       held_out: Frames that no network saw.
-      source: The data, and its license.
-      config: JSON of how the frames were made.
     """
 
-    folder: Path
+    record: runs.Run
     skeleton: Skeleton
+    embedding: aamdm_embedding.Config
     train: PoseData
     held_out: PoseData
-    source: str
-    config: dict[str, Any]
 
     @property
-    def frames(self) -> Path:
-        """File of the frames."""
-        return self.folder / "frames.npz"
-
-    @property
-    def embedding(self) -> aamdm_embedding.Config:
-        """Sizes of the autoencoder."""
-        return aamdm_embedding.Config(
-            num_joints=self.skeleton.num_joints, fps=self.train.fps
-        )
+    def source(self) -> str:
+        """The data, and its license."""
+        return self.record.source
 
 
 def prepare(
@@ -158,100 +108,90 @@ def prepare(
       held_out: Part of each clip, at its end, to hold out.
       mirrored: Whether mirrored clips are added.
 
-    Returns:
-      The run.
-
     Raises:
       OSError: if the clips cannot be read.
       ValueError: if the folder's frames were made otherwise, or the clips do not fit.
     """
-    made = dict(
+
+    def make() -> runs.Content:
+        clips = clips_io.load_clips(data)
+        if labels:
+            clips = selection.select(clips, field, labels)
+        if mirrored:
+            clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
+        frames, names = aamdm_data.pose_data(clips, fps=fps)
+        skipped = sorted(set(clips.clip_names) - set(names))
+        print(f"{len(names)} clips, {frames.num_frames} frames; too short: {skipped}")
+        parts = aamdm_data.split_ends(frames, held_out)
+        config = aamdm_embedding.Config(num_joints=clips.skeleton.num_joints, fps=fps)
+        return runs.Content(
+            model={
+                "config": dataclasses.asdict(config),
+                "skeleton": runs.skeleton_to_json(clips.skeleton),
+            },
+            source=clips.source,
+            # Of each clip the end is held out.
+            split={"train": list(names), "held_out": list(names)},
+            files={
+                name: functools.partial(_write_frames, part)
+                for name, part in zip(_FILES, parts, strict=True)
+            },
+        )
+
+    settings = dict(
         field=field,
         labels=list(labels),
         fps=fps,
         held_out=held_out,
         mirrored=mirrored,
     )
-    if (folder / "config.json").exists():
-        run = load_run(folder)
-        runs.check_made(folder, run.config, [data], made)
-        return run
-    source = runs.made_from([data])
-    clips = clips_io.load_clips(data)
-    if labels:
-        clips = selection.select(clips, field, labels)
-    if mirrored:
-        clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
-    frames, names = aamdm_data.pose_data(clips, fps=fps)
-    skipped = sorted(set(clips.clip_names) - set(names))
-    print(f"{len(names)} clips, {frames.num_frames} frames; too short: {skipped}")
-    arrays = {name: getattr(frames, name) for name in ("poses", "paths", "offsets")}
-    files.write_arrays(folder / "frames.npz", arrays)
-    value = {
-        "system": "aamdm",
-        "skeleton": runs.skeleton_to_json(clips.skeleton),
-        "source": clips.source,
-        "clips": list(names),
-    } | source
-    files.write_text(folder / "config.json", json.dumps(value | made, indent=1))
-    return load_run(folder)
+    record = runs.begin(
+        folder, system=SYSTEM, data=[data], settings=settings, make=make
+    )
+    return _decode(record)
+
+
+_FILES = ("train.npz", "held_out.npz")
 
 
 def load_run(folder: Path) -> Run:
-    """Loads the frames of a run folder.
-
-    Args:
-      folder: Its path.
-
-    Returns:
-      The run.
+    """Loads the data of a run folder.
 
     Raises:
+      OSError: if a file is missing.
       ValueError: if it is no run folder of AAMDM; names the file and the field.
     """
-    path = folder / "config.json"
-    for needed in (path, folder / "frames.npz"):
-        if not needed.is_file():
-            raise ValueError(
-                f"{folder}: no run folder of `experiments/aamdm.py train`: "
-                f"{needed.name} is missing"
-            )
-    value = files.read_object(
-        path, what="expected a run folder of `experiments/aamdm.py train`"
-    )
-    if value.get("system") != "aamdm":
+    return _decode(runs.load(folder, system=SYSTEM))
+
+
+def _decode(record: runs.Run) -> Run:
+    parts = {
+        "config": lambda x: runs.config_from_json(aamdm_embedding.Config, x),
+        "skeleton": runs.skeleton_from_json,
+    }
+    found = runs.decode(record.model, str(record.config), parts)
+    config, skeleton = found["config"], found["skeleton"]
+    if config.num_joints != skeleton.num_joints:
         raise ValueError(
-            f"{path}: field 'system' is {value.get('system')!r:.80}, expected 'aamdm'"
+            f"{record.config}: field 'skeleton' has {skeleton.num_joints} joints, the "
+            f"config {config.num_joints}"
         )
-    for name in ("skeleton", "fps", "held_out", "source"):
-        if name not in value:
-            raise ValueError(f"{path}: field {name!r} is missing")
-    limits = {"fps": (5, clips_io.RATES[1]), "held_out": (0, 1)}
-    for name, (low, high) in limits.items():
-        right = isinstance(value[name], int | float) and low < value[name] < high
-        if not right or isinstance(value[name], bool):
-            raise ValueError(
-                f"{path}: field {name!r} is {value[name]!r:.80}, expected more than "
-                f"{low:g} and less than {high:g}"
-            )
-    if not isinstance(value["source"], str):
-        raise ValueError(f"{path}: field 'source' is no text: {value['source']!r:.80}")
-    try:
-        skeleton = runs.skeleton_from_json(value["skeleton"])
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{path}: field 'skeleton': {error}") from None
-    frames = _read_frames(folder / "frames.npz", skeleton, fps=float(value["fps"]))
-    try:
-        train, held_out = aamdm_data.split_ends(frames, value["held_out"])
-    except ValueError as error:
-        raise ValueError(f"{folder}: {error}") from None
+    train, held_out = (
+        _read_frames(record.file(name), skeleton, fps=config.fps) for name in _FILES
+    )
     return Run(
-        folder=folder,
+        record=record,
         skeleton=skeleton,
+        embedding=config,
         train=train,
         held_out=held_out,
-        source=value["source"],
-        config=value,
+    )
+
+
+def _write_frames(frames: PoseData, path: Path) -> None:
+    fields = ("poses", "paths", "offsets")
+    files.write_arrays(
+        path, {name: np.asarray(getattr(frames, name)) for name in fields}
     )
 
 
@@ -285,15 +225,7 @@ def _read_frames(path: Path, skeleton: Skeleton, *, fps: float) -> PoseData:
 
 
 def train_autoencoder(run: Run, budget: Budget) -> Autoencoder:
-    """Stage 1.
-
-    Args:
-      run: The run.
-      budget: How long.
-
-    Returns:
-      The autoencoder, with averaged parameters.
-    """
+    """Stage 1; returns the autoencoder with averaged parameters."""
     config, data = run.embedding, run.train
     statistics = aamdm_embedding.fit_statistics(data.poses, data.paths, config=config)
     loss = functools.partial(
@@ -302,26 +234,23 @@ def train_autoencoder(run: Run, budget: Budget) -> Autoencoder:
         parents=run.skeleton.parents,
         config=config,
     )
-    optimizer = make_optimizer(budget)
-    params = aamdm_embedding.init(jax.random.key(budget.seed), config)
     both = jnp.concatenate([data.poses, data.paths], axis=-1)
     windows, arrays = frame_windows(both, data, 2, batch=budget.batch)
     size = config.num_features
 
-    def sample(key, arrays):
+    def sample(key: Key, arrays: Any) -> tuple[Array, Array]:
         found = windows(key, arrays)
         return found[..., :size], found[..., size:]
 
-    state = fit(
-        run.folder / "autoencoder",
-        training.init_train_state(params, optimizer),
-        training.make_update(loss, optimizer, ema_decay=budget.ema),
+    state = runs.minimize(
+        run.record,
+        "autoencoder",
+        loss,
+        aamdm_embedding.init(jax.random.key(budget.seed), config),
         sample,
         arrays,
-        stage="autoencoder",
         budget=budget,
-        config={"config": dataclasses.asdict(config), "source": run.source},
-        source=run.frames,
+        model=dataclasses.asdict(config),
         show=("loss", "value", "change"),
     )
     return Autoencoder(params=state.ema_params, statistics=statistics, config=config)
@@ -342,71 +271,67 @@ def make_space(run: Run, autoencoder: Autoencoder | None) -> Space:
     Args:
       run: The run.
       autoencoder: For the embedded space; None for full poses.
-
-    Returns:
-      The space.
     """
     name: SpaceName = "full_pose" if autoencoder is None else "embedded"
-    if checkpoint.latest_step(run.folder / name / "checkpoints") is not None:
+    if checkpoint.latest_step(run.record.checkpoints(name)) is not None:
         return load_space(run, name)
     space = jax.jit(functools.partial(_space, run))(autoencoder)
-    save_space(run.folder / name, space, {"source": run.source})
+    leaves = {str(i): x for i, x in enumerate(jax.tree.leaves(space))}
+    runs.store(run.record, name, leaves, model=dataclasses.asdict(run.embedding))
     return space
 
 
 def load_space(run: Run, name: SpaceName) -> Space:
     """A space of a run folder.
 
-    Args:
-      run: The run.
-      name: Which.
-
-    Returns:
-      The space.
-
     Raises:
       CheckpointError: if the run has not made it.
     """
+    structure = []
 
-    def like() -> Space:
-        if name == "full_pose":
-            return _space(run, None)
-        config = run.embedding
-        params = aamdm_embedding.init(jax.random.key(0), config)
-        statistics = aamdm_embedding.fit_statistics(
-            run.train.poses, run.train.paths, config=config
-        )
-        own = Autoencoder(params=params, statistics=statistics, config=config)
-        return _space(run, own)
+    def leaves() -> dict[str, Array]:
+        own, config = None, run.embedding
+        if name == "embedded":
+            own = Autoencoder(
+                params=aamdm_embedding.init(jax.random.key(0), config),
+                statistics=aamdm_embedding.fit_statistics(
+                    run.train.poses, run.train.paths, config=config
+                ),
+                config=config,
+            )
+        found, tree = jax.tree.flatten(_space(run, own))
+        structure.append(tree)
+        return {str(i): x for i, x in enumerate(found)}
 
-    return restore_space(run.folder / name, like)
+    runs.check_stage(run.record, name)
+    like = jax.eval_shape(leaves)
+    stored = checkpoint.restore(run.record.checkpoints(name), like)
+    return jax.tree.unflatten(
+        structure[0], [stored[str(i)] for i in range(len(stored))]
+    )
 
 
-def chain_folder(run: Run, space: SpaceName, *, num_steps: int, target: str) -> Path:
-    """Where the networks of a chain lie.
+def chain_stage(space: SpaceName, *, num_steps: int, target: str) -> str:
+    """Name that the stages of a chain share.
 
     Args:
-      run: The run.
       space: Its space.
       num_steps: T.
       target: What the chain denoises.
-
-    Returns:
-      The folder.
     """
-    name = f"T{num_steps}" + ("" if target == "frame" else f"_{target}")
-    return run.folder / space / name
+    return f"{space}/T{num_steps}" + ("" if target == "frame" else f"_{target}")
 
 
-def _shared(config: aamdm_model.Config) -> dict:
+def _stage(space: SpaceName, config: aamdm_model.Config, network: str) -> str:
+    chain = chain_stage(space, num_steps=config.num_steps, target=config.target)
+    return f"{chain}/{network}"
+
+
+def _shared(config: aamdm_model.Config) -> dict[str, Any]:
     """What chains of one length have in common, as JSON."""
-    value = dataclasses.asdict(config) | {"num_steps": config.num_steps}
+    value = dataclasses.asdict(config)
     del value["drafts"], value["polishes"]
     return value
-
-
-def _folder(run: Run, name: SpaceName, config: aamdm_model.Config) -> Path:
-    return chain_folder(run, name, num_steps=config.num_steps, target=config.target)
 
 
 def train_polisher(
@@ -426,22 +351,14 @@ def train_polisher(
     """
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     change = space.change if config.target == "change" else None
-    loss = functools.partial(aamdm_loss.polisher_loss, config=config, change=change)
-    optimizer = make_optimizer(budget)
-    params = aamdm_model.init(jax.random.key(budget.seed), config)["polisher"]
-    sample, arrays = frame_windows(
-        frames, run.train, config.window + 1, batch=budget.batch
-    )
-    state = fit(
-        _folder(run, name, config) / "polisher",
-        training.init_train_state(params, optimizer),
-        training.make_update(loss, optimizer, ema_decay=budget.ema),
-        sample,
-        arrays,
-        stage="polisher",
+    state = runs.minimize(
+        run.record,
+        _stage(name, config, "polisher"),
+        functools.partial(aamdm_loss.polisher_loss, config=config, change=change),
+        aamdm_model.init(jax.random.key(budget.seed), config)["polisher"],
+        *frame_windows(frames, run.train, config.window + 1, batch=budget.batch),
         budget=budget,
-        config={"config": _shared(config), "space": name, "source": run.source},
-        source=run.frames,
+        model=_shared(config),
         show=("loss", "value", "velocity"),
     )
     return state.ema_params
@@ -464,53 +381,29 @@ def train_generator(
     """
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     change = space.change if config.target == "change" else None
-    judge, make = (
+    discriminate, generate = (
         functools.partial(loss, config=config, change=change)
         for loss in (aamdm_loss.discriminator_loss, aamdm_loss.generator_loss)
     )
-    optimizer = make_optimizer(budget)
+    optimizer = runs.make_optimizer(budget)
     params = aamdm_model.init(jax.random.key(budget.seed), config)
     players = {
         player: training.init_train_state(params[player], optimizer)
         for player in ("generator", "discriminator")
     }
-    sample, arrays = frame_windows(frames, run.train, 3, batch=budget.batch)
-    state = fit(
-        _folder(run, name, config) / "generator",
+    state = runs.fit(
+        run.record,
+        _stage(name, config, "generator"),
         adversarial.GanState(**players),
         adversarial.make_gan_update(
-            judge, make, (optimizer, optimizer), ema_decay=budget.ema
+            discriminate, generate, (optimizer, optimizer), ema_decay=budget.ema
         ),
-        sample,
-        arrays,
-        stage="generator",
+        *frame_windows(frames, run.train, 3, batch=budget.batch),
         budget=budget,
-        config={"config": _shared(config), "space": name, "source": run.source},
-        source=run.frames,
+        model=_shared(config),
         show=("generator/loss", "discriminator/loss"),
     )
     return state.generator.ema_params
-
-
-def _stored_config(folder: Path, *, drafts: int, polishes: int) -> aamdm_model.Config:
-    """The configuration that a chain was trained with."""
-    stage = "polisher" if polishes else "generator"
-    value = check_stage(folder / stage, stage)
-    try:
-        stored = dict(value["config"])
-        num_steps = stored.pop("num_steps")
-        own = {"drafts": drafts, "polishes": polishes}
-        config = runs.config_from_json(aamdm_model.Config, stored | own)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{folder / stage}: field 'config' is wrong: {error}"
-        ) from error
-    if num_steps != config.num_steps:
-        raise ValueError(
-            f"{folder / stage}: trained for chains of {num_steps} steps, expected "
-            f"{config.num_steps}"
-        )
-    return config
 
 
 def load_networks(
@@ -538,46 +431,33 @@ def load_networks(
 
     Raises:
       CheckpointError: if a stage that it needs is missing, or of another kind.
-      ValueError: if a stage was trained for another chain or another space.
+      ValueError: if a stage was trained for another space.
     """
-    folder = chain_folder(run, name, num_steps=drafts + polishes, target=target)
-    config = _stored_config(folder, drafts=drafts, polishes=polishes)
+    chain = chain_stage(name, num_steps=drafts + polishes, target=target)
+    stage = f"{chain}/{'polisher' if polishes else 'generator'}"
+    own = {"drafts": drafts, "polishes": polishes}
+    config = runs.stage_config(run.record, stage, aamdm_model.Config, **own)
     if config.features != space.num_features:
         raise ValueError(
-            f"{folder}: networks of {config.features} channels, expected the "
-            f"{space.num_features} of the space"
+            f"{run.record.folder / chain}: networks of {config.features} channels, "
+            f"expected the {space.num_features} of the space"
         )
     init = functools.partial(aamdm_model.init, jax.random.key(0), config)
-    params = {}
-    if drafts:
-        params["generator"] = load_params(
-            folder / "generator",
-            "generator",
-            lambda: init()["generator"],
-            adversarial=True,
+    params = {
+        network: runs.load_params(
+            run.record,
+            f"{chain}/{network}",
+            lambda network=network: init()[network],
+            adversarial=network == "generator",
         )
-    if polishes:
-        params["polisher"] = load_params(
-            folder / "polisher", "polisher", lambda: init()["polisher"]
-        )
+        for network, steps in (("generator", drafts), ("polisher", polishes))
+        if steps
+    }
     return params, config
 
 
 def load_chain(run: Run, name: SpaceName, space: Space, **chain: Any) -> Sample:
-    """The sampler of a trained chain.
-
-    Args:
-      run: The run.
-      name: Of the space.
-      space: The space.
-      **chain: As of `load_networks`.
-
-    Returns:
-      The sampler.
-
-    Raises:
-      CheckpointError, ValueError: as `load_networks`.
-    """
+    """The sampler of a trained chain, named as `load_networks` takes it."""
     params, config = load_networks(run, name, space, **chain)
     change = space.change if config.target == "change" else None
     return aamdm_model.sampler(params, config=config, change=change)

@@ -32,6 +32,10 @@ from jaxmotion.networks import transformer
 from jaxmotion.systems.camdm import network as camdm_network
 from jaxmotion.typing import Key, Params
 
+SYSTEM = "camdm"
+# Of the one training, in a run folder.
+STAGE = "motion"
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config:
@@ -351,7 +355,7 @@ def to_json(model: Model) -> dict[str, Any]:
       A JSON object.
     """
     value = {
-        "system": "camdm",
+        "system": SYSTEM,
         "config": dataclasses.asdict(model.config),
         "skeleton": runs.skeleton_to_json(model.skeleton),
         "labels": list(model.labels),
@@ -407,9 +411,9 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
     Raises:
       ValueError: names the file and the field that is missing or wrong.
     """
-    if value.get("system") != "camdm":
+    if value.get("system") != SYSTEM:
         raise ValueError(
-            f"{where}: field 'system' is {value.get('system')!r}, expected 'camdm'"
+            f"{where}: field 'system' is {value.get('system')!r}, expected {SYSTEM!r}"
         )
     parts = {
         "config": lambda x: runs.config_from_json(Config, x),
@@ -417,15 +421,8 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         "labels": runs.names_from_json,
         "source": lambda x: runs.names_from_json([x])[0],
     }
-    made = {}
-    for field, make in parts.items():
-        if field not in value:
-            raise ValueError(f"{where}: field {field!r} is missing")
-        try:
-            made[field] = make(value[field])
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{where}: field {field!r}: {error}") from error
-    model = Model(skeleton=made.pop("skeleton"), **made)
+    made = runs.decode(value, where, parts)
+    model = Model(**made)
     config = model.config
     for name, found, expected in (
         ("skeleton", model.skeleton.num_joints, config.num_joints),
@@ -503,9 +500,10 @@ def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
         `experiments/camdm.py train` made, or npz file that `camdm.py export` wrote.
 
     Returns:
-      The model, its parameters, and the whole JSON that was stored with it.
+      The model, its parameters, and the JSON of the model.
 
     Raises:
+      OSError: if there is no such file, or no run folder.
       CheckpointError: if there is no checkpoint, or it is corrupt or foreign.
       ValueError: if its JSON is not that of a CAMDM model.
     """
@@ -517,9 +515,7 @@ def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
         model = from_json(value, where=str(path))
         params, _ = checkpoint.import_params(path, like=_shapes(model, path))
         return model, params, value
-    steps = path / "checkpoints"
-    value = checkpoint.load_config(steps)
-    model = from_json(value, where=str(steps))
-    shapes = _shapes(model, path)
-    found = checkpoint.restore_part(steps, {"ema_params": shapes})
-    return model, found["ema_params"], value
+    run = runs.load(path, system=SYSTEM)
+    model = from_json(run.model, where=str(run.config))
+    runs.check_model(run, STAGE, dataclasses.asdict(model.config))
+    return model, runs.load_params(run, STAGE, lambda: _shapes(model, path)), run.model

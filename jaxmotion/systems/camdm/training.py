@@ -1,23 +1,31 @@
-"""How CAMDM is trained: data, objective, optimizer and state of a run, put together."""
+"""How CAMDM is trained: clips of styles, and its one stage, "motion"."""
 
 import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from jaxmotion.data import bvh, bvh_text, clips_io, selection, windows
+from jaxmotion.data import bvh, bvh_text, clips_io, mirror, selection, windows
 from jaxmotion.data.clips import Clips
-from jaxmotion.learning import checkpoint, runs, training
+from jaxmotion.learning import checkpoint, runs
 from jaxmotion.motion import skeleton
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
-from jaxmotion.systems.camdm.model import Model, load, to_json
+from jaxmotion.systems.camdm.model import (
+    STAGE,
+    SYSTEM,
+    Model,
+    from_json,
+    load,
+    to_json,
+)
 from jaxmotion.typing import Key, Params
 
 # Sizes and weights of `camdm.Config`, by name.
@@ -51,7 +59,7 @@ PRESETS["planted"] = PRESETS["small"] | dict(
     weight_position_velocity=20.0,
     weight_foot=20.0,
 )
-# How the presets are trained, for `start`.
+# How the presets are trained, as fields of `runs.Budget`.
 FITTING: dict[str, dict[str, Any]] = {
     # The paper: as MDM, that is AdamW at 1e-4. The released code: the same, batch 512,
     # a moving average that is never saved; neither clips, decays or warms up.
@@ -170,78 +178,6 @@ def window_sampler(
     return sample_batch
 
 
-def start(
-    clips: Clips,
-    model: Model,
-    checkpoints: Path,
-    *,
-    field: str,
-    num_steps: int,
-    batch: int,
-    optimizer: Literal["muon", "adamw"],
-    learning_rate: float,
-    warmup: int,
-    max_norm: float,
-    ema: float,
-    chunk: int,
-    devices: int = 1,
-    seed: int = 0,
-    params: Params | None = None,
-) -> tuple[Callable, training.TrainState, Key, Any]:
-    """All that `loop.train` needs: a new run, or the newest checkpoint of an old one.
-
-    Args:
-      clips: Training clips; those shorter than a window are left out.
-      model: The model.
-      checkpoints: Folder of the run's checkpoints; it need not exist.
-      field: Label field that is the style.
-      num_steps: Optimizer steps of the whole run.
-      batch: Windows a step.
-      optimizer: "muon" for short runs, or the paper's "adamw".
-      learning_rate: Peak of its rate; cosine to a tenth.
-      warmup: Steps of linear rise.
-      max_norm: Gradients are clipped to this global norm; 0 for no clipping.
-      ema: Decay per step of the parameters' moving average; 0 for no average.
-      chunk: Steps of one compiled call.
-      devices: Split each batch over so many; 1 for no mesh.
-      seed: Of the parameters and of all that training draws.
-      params: Where a new run starts; None for random parameters.
-
-    Returns:
-      The compiled chunk, the state, the key, and the data on the device.
-
-    Raises:
-      ValueError: if no clip is as long as a window, or the checkpoint is of another
-        model.
-    """
-    index = windows.window_index(clips, model.config.window, short="skip")
-    transformation = training.make_optimizer(
-        optimizer,
-        learning_rate=learning_rate,
-        num_steps=num_steps,
-        warmup_steps=warmup,
-        max_norm=max_norm or None,
-    )
-    objective = functools.partial(
-        camdm_loss.loss, skeleton=model.skeleton, config=model.config
-    )
-    update = training.make_update(objective, transformation, ema_decay=ema)
-    if devices > jax.device_count():
-        raise ValueError(f"devices is {devices}, {jax.device_count()} are there")
-    mesh = jax.make_mesh((devices,), ("data",)) if devices > 1 else None
-
-    sample_batch = window_sampler(field=field, batch=batch)
-    key_init, key_train = jax.random.split(jax.random.key(seed))
-    if params is None:
-        params = camdm_model.init(key_init, model.config)
-    state = training.init_train_state(params, transformation)
-    if checkpoint.latest_step(checkpoints) is not None:
-        state = checkpoint.restore(checkpoints, state)
-    run = training.train_chunk(update, sample_batch, num_steps=chunk, mesh=mesh)
-    data = training.replicate(jax.tree.map(jnp.asarray, (clips, index)), mesh)
-    return run, training.replicate(state, mesh), key_train, data
-
-
 # Locomotion of Bandai-Namco: what a model and its evaluator are trained on.
 CONTENTS = ("walk", "walk-turn-left", "walk-turn-right", "run")
 
@@ -321,14 +257,142 @@ def released_skeleton(path: Path, *, scale: float) -> Skeleton:
     return dataclasses.replace(skeleton, feet=style100.toes(skeleton, str(path)))
 
 
-def load_run(
-    run: Path, data: Path | None = None, contents: tuple[str, ...] = ()
-) -> Run:
-    """Loads a run of `experiments/camdm.py train`.
+def _splitter(settings: dict[str, Any]) -> Callable[[Path], tuple[Clips, Clips]]:
+    """`split_data` with the settings of a run."""
+    return functools.partial(
+        split_data,
+        contents=tuple(settings["contents"]),
+        label=settings["label"],
+        held_out=settings["held_out"],
+        labels=tuple(settings["labels"]),
+        held_out_clips=tuple(settings["held_out_clips"]),
+    )
+
+
+_FILES = ("train.npz", "held_out.npz")
+
+
+def prepare(
+    folder: Path,
+    data: Path,
+    *,
+    label: str,
+    contents: tuple[str, ...] = (),
+    labels: tuple[str, ...] = (),
+    held_out: float = 0.1,
+    held_out_clips: tuple[str, ...] = (),
+    mirrored: bool = False,
+    make: Callable[[Clips], Model],
+    settings: dict[str, Any],
+) -> runs.Run:
+    """Makes model and clips of a run folder, or loads those it has.
 
     Args:
-      run: Its folder.
-      data: Clips; None for those that it was trained on.
+      folder: The run folder.
+      data: Clips; which of them, the next five arguments say as for `split_data`.
+      label: Label field that is the style.
+      contents: Contents of the clips.
+      labels: Styles of the clips.
+      held_out: Part of each style's clips to hold out.
+      held_out_clips: Clips to hold out.
+      mirrored: Whether it is trained on mirrored copies of the clips as well.
+      make: The model for the training clips.
+      settings: JSON of what it makes them from.
+
+    Raises:
+      OSError: if the clips cannot be read.
+      ValueError: if the folder was made otherwise, or the clips do not fit.
+    """
+    chosen = dict(
+        label=label,
+        contents=list(contents),
+        labels=list(labels),
+        held_out=held_out,
+        held_out_clips=list(held_out_clips),
+        mirror=mirrored,
+    )
+
+    def content() -> runs.Content:
+        parts = _splitter(chosen)(data)
+        model = make(with_mirrored(parts[0]) if mirrored else parts[0])
+        camdm_model.check_clips(model, parts[0], label)
+        return runs.Content(
+            model=to_json(model),
+            source=model.source,
+            split={
+                name: list(part.clip_names)
+                for name, part in zip(("train", "held_out"), parts, strict=True)
+            },
+            files={
+                name: functools.partial(clips_io.save_clips, clips=part)
+                for name, part in zip(_FILES, parts, strict=True)
+            },
+        )
+
+    return runs.begin(
+        folder, system=SYSTEM, data=[data], settings=chosen | settings, make=content
+    )
+
+
+def with_mirrored(clips: Clips) -> Clips:
+    """Clips and their mirrored copies."""
+    # First, for it may add labels: left of what was only right.
+    return selection.concatenate([clips, mirror.mirror_clips(clips)])
+
+
+def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> None:
+    """Trains the model of a run, from its newest checkpoint if there is one.
+
+    Args:
+      run: The run folder.
+      budget: How long.
+      init: Run folder or exported model whose parameters a new training starts with;
+        None for random ones.
+
+    Raises:
+      ValueError: if no clip is as long as a window, or the checkpoint has other
+        settings.
+      TrainingDiverged: if a loss is not finite.
+    """
+    model = from_json(run.model, where=str(run.config))
+    clips = clips_io.load_clips(run.file(_FILES[0]))
+    if run.settings["mirror"]:
+        clips = with_mirrored(clips)
+    config, field = model.config, run.settings["label"]
+    index = windows.window_index(clips, config.window, short="skip")
+    short = int(np.sum(np.diff(np.asarray(clips.offsets)) < config.window))
+    print(
+        f"{clips.num_clips} clips ({short} too short to use), {clips.num_frames} "
+        f"frames, {index.starts.shape[0]} windows of {index.length} frames"
+    )
+    key_init, key_train = jax.random.split(jax.random.key(budget.seed))
+    if init is None or checkpoint.latest_step(run.checkpoints(STAGE)) is not None:
+        params = camdm_model.init(key_init, config)
+    else:
+        _, params = continued(model, init)
+    runs.minimize(
+        run,
+        STAGE,
+        functools.partial(camdm_loss.loss, skeleton=model.skeleton, config=config),
+        params,
+        window_sampler(field=field, batch=budget.batch),
+        jax.tree.map(jnp.asarray, (clips, index)),
+        budget=budget,
+        model=dataclasses.asdict(config),
+        key=key_train,
+        show=("loss", "data", "position", "foot"),
+    )
+
+
+def load_run(
+    folder: Path, data: Path | None = None, contents: tuple[str, ...] = ()
+) -> Run:
+    """Loads a run folder.
+
+    Args:
+      folder: Where it is.
+      data: Other clips, to choose and split as those that it was trained on; None for
+        these.
       contents: Keep only clips of these contents, of those that the run used; none:
         keep all.
 
@@ -340,24 +404,13 @@ def load_run(
       ValueError: if the folder has no whole checkpoint of such a run, or the clips are
         not the model's; names the folder or what differs.
     """
-    model, params, value = camdm_model.load(run)
-    made_by = value.get("experiment", {})
-    wanted = {"data", "contents", "label", "labels", "held_out", "held_out_clips"}
-    missing = wanted - set(made_by)
-    if missing:
-        raise ValueError(
-            f"{run}: field 'experiment' lacks {', '.join(sorted(missing))}: expected a "
-            "run folder of `experiments/camdm.py train`"
-        )
-    field = made_by["label"]
-    parts = split_data(
-        Path(data or made_by["data"]),
-        tuple(made_by["contents"]),
-        field,
-        made_by["held_out"],
-        labels=tuple(made_by["labels"]),
-        held_out_clips=tuple(made_by["held_out_clips"]),
-    )
+    run = runs.load(folder, system=SYSTEM)
+    model, params, _ = load(folder)
+    field = run.settings["label"]
+    if data is None:
+        parts = tuple(clips_io.load_clips(run.file(name)) for name in _FILES)
+    else:
+        parts = _splitter(run.settings)(data)
     if contents and "content" in dict(parts[0].label_names):
         parts = tuple(selection.select(part, "content", contents) for part in parts)
     camdm_model.check_clips(model, parts[0], field)

@@ -118,7 +118,7 @@ def load_recognizer(
     )
     if frozen is not None:
         return frozen
-    folder = run.folder / "recognizer"
+    folder = run.record.folder / "recognizer"
     config = recognizer_config(run)
     value = {
         "system": "emdm",
@@ -305,7 +305,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
 
         return replicated_row(key, once, number=settings.replications)
 
-    conditional = run.config["task"] == "action"
+    conditional = run.record.settings["task"] == "action"
     conditions = emdm_model.Condition(
         vector=emdm_model.action_vectors(wanted, number if conditional else 0),
         keep=jnp.ones(wanted.shape, bool),

@@ -6,6 +6,7 @@ its last pose, as in the released code.
 """
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from jaxtyping import Array, Float, Int
 from jaxmotion.data import captions, clips_io, resample, selection, text_motion
 from jaxmotion.data.clips import Clips
 from jaxmotion.data.text_motion import TextMotions
+from jaxmotion.learning import runs
 from jaxmotion.motion import features, humanml, humanml_skeleton, skeleton
 from jaxmotion.motion.humanml import HUMANML3D
 from jaxmotion.systems.emdm import features as emdm_features
@@ -149,20 +151,18 @@ _FIT = 2048
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ActionRun:
-    """Data of a run folder.
+    """A run folder and its data.
 
     Attributes:
-      folder: The folder.
-      config: JSON of how the data were made.
-      clips: All clips, at the run's rate.
+      record: What the folder is.
+      clips: All clips, at the run's rate, those that are held out last.
       train: Training clips on the device.
       held_out: Clips that no network saw.
       representation: Features of the skeleton's motions.
       field: Label field that is the action.
     """
 
-    folder: Path
-    config: dict[str, Any]
+    record: runs.Run
     clips: Clips
     train: ActionArrays
     held_out: ActionArrays
@@ -175,42 +175,101 @@ class ActionRun:
         return self.clips.names(self.field)
 
 
+_FILES = ("train.npz", "held_out.npz")
+
+
+def prepare(
+    folder: Path,
+    data: tuple[Path, ...],
+    *,
+    task: emdm_training.TaskName,
+    field: str,
+    merge: Mapping[str, str],
+    least: int,
+    fps: float,
+    frames: int,
+    held_out: float,
+) -> ActionRun:
+    """Makes the clips of a run folder, or loads those it has.
+
+    Args:
+      folder: The run folder.
+      data: As `prepare_clips` takes them; so are field, merge, least and fps.
+      task: "action", or "none" for motions from nothing.
+      field: Label field that is the action.
+      merge: Labels that are the same action as others, and those others.
+      least: Fewest clips of an action.
+      fps: Frames per second.
+      frames: Frames of a sample.
+      held_out: Part of each action's clips to hold out.
+
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if the folder was made otherwise, or files or labels do not fit.
+    """
+
+    def make() -> runs.Content:
+        clips, left_out = prepare_clips(
+            data, field=field, merge=merge, least=least, fps=fps
+        )
+        print(f"{field}s left out: {', '.join(left_out) or 'none'}")
+        parts = selection.split_clips(clips, fraction=held_out, seed=0, field=field)
+        return runs.Content(
+            model={"actions": list(clips.names(field))},
+            source=clips.source,
+            split={
+                name: list(part.clip_names)
+                for name, part in zip(("train", "held_out"), parts, strict=True)
+            },
+            files={
+                name: functools.partial(clips_io.save_clips, clips=part)
+                for name, part in zip(_FILES, parts, strict=True)
+            },
+        )
+
+    settings = dict(
+        task=task,
+        field=field,
+        merge=dict(merge),
+        least=least,
+        fps=fps,
+        frames=frames,
+        held_out=held_out,
+    )
+    return _decode(
+        runs.begin(
+            folder,
+            system=emdm_training.SYSTEM,
+            data=data,
+            settings=settings,
+            make=make,
+        )
+    )
+
+
 def load_run(folder: Path) -> ActionRun:
     """Loads the data of a run folder.
 
-    Args:
-      folder: Its path.
-
-    Returns:
-      The run.
-
     Raises:
-      OSError: if the clips cannot be read.
+      OSError: if a file is missing.
       ValueError: if it is no run folder of EMDM with actions; names the field.
     """
-    value = emdm_training.read_config(folder)
-    try:
-        field, frames = value["field"], value["frames"]
-        clips = clips_io.load_clips(folder / "data.npz")
-        parts = selection.split_clips(
-            clips, fraction=value["held_out"], seed=0, field=field
-        )
-        train, held_out = (
-            action_arrays(part, field=field, frames=frames) for part in parts
-        )
-    except KeyError as error:
-        raise ValueError(
-            f"{folder / 'config.json'}: field {error} is missing: no run of actions"
-        ) from error
+    return _decode(runs.load(folder, system=emdm_training.SYSTEM))
+
+
+def _decode(record: runs.Run) -> ActionRun:
+    emdm_training.check_task(record, ("action", "none"))
+    field, frames = record.settings["field"], record.settings["frames"]
+    parts = [clips_io.load_clips(record.file(name)) for name in _FILES]
+    train, held_out = (action_arrays(x, field=field, frames=frames) for x in parts)
     actions = jnp.arange(_FIT) % train.counts.shape[0]
     motions = sample_motions(jax.random.key(0), train, actions)
     return ActionRun(
-        folder=folder,
-        config=value,
-        clips=clips,
+        record=record,
+        clips=selection.concatenate(parts),
         train=train,
         held_out=held_out,
-        representation=emdm_features.fit(clips.skeleton, motions),
+        representation=emdm_features.fit(parts[0].skeleton, motions),
         field=field,
     )
 
@@ -249,19 +308,13 @@ def make_task(
         )
 
     return emdm_training.Task(
+        run=run.record,
         base=base,
         data=run.train,
         batch=batch,
         geometry=emdm_features.geometry(
             representation, relative=base.geometry == "root"
         ),
-        source=run.folder / "data.npz",
-        describe={
-            "task": base.condition,
-            "actions": list(run.actions),
-            "source": run.clips.source,
-            "fps": run.clips.fps,
-        },
     )
 
 

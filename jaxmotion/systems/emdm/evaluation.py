@@ -14,6 +14,7 @@ from jaxtyping import Array
 from jaxmotion.evaluation import bench, by_frame, columns
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Cell, Row, Rows
+from jaxmotion.learning import runs
 from jaxmotion.systems.emdm import action_evaluation, text_evaluation
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import model as emdm_model
@@ -72,17 +73,17 @@ def evaluate_run(
     Raises:
       ValueError: if nothing was trained, or a row was not.
     """
-    value = emdm_training.read_config(folder)
+    run = runs.load(folder, system=emdm_training.SYSTEM)
     rows = rows or trained_rows(folder)
     if not rows:
         raise ValueError(f"{folder}: no row was trained")
-    kind = text_evaluation if value["task"] == "text" else action_evaluation
+    kind = text_evaluation if run.settings["task"] == "text" else action_evaluation
     scorer = kind.row_scorer(folder, settings)
     found: Rows = dict(scorer.real)
     places: dict[str, by_frame.ByFrame] = {}
     for row in rows:
         begun = time.perf_counter()
-        params, config = emdm_training.load_row(folder, row)
+        params, config = emdm_training.load_row(run, row)
         sample = emdm_training.row_sampler(params, config, row)
         number, scale = calls(config, row), scorer.scale
         count = long_replications if number >= _LONG else settings.replications
@@ -154,7 +155,7 @@ def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
 
 def _show(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
     run = emdm_data.load_run(_folder(job, point))
-    return "sample", dict(run=run.folder, action=run.actions[:1], seed=job.seed)
+    return "sample", dict(run=run.record.folder, action=run.actions[:1], seed=job.seed)
 
 
 def _prepare(job: bench.Job) -> bench.Evaluation:
@@ -166,11 +167,12 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         evaluator=job.evaluator,
         seed=job.seed,
     )
-    scorer = action_evaluation.row_scorer(run.folder, settings)
+    scorer = action_evaluation.row_scorer(run.record.folder, settings)
     floor, truth = scorer.real.values()
 
     def load(point: bench.Point) -> emdm_model.Sample:
-        params, config = emdm_training.load_row(_folder(job, point), _ROW)
+        record = runs.load(_folder(job, point), system=emdm_training.SYSTEM)
+        params, config = emdm_training.load_row(record, _ROW)
         return emdm_training.row_sampler(params, config, _ROW)
 
     def score(point: bench.Point) -> Row:

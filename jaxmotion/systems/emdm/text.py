@@ -4,23 +4,26 @@ A caption's vector comes from a text encoder once and is data from then on.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmotion.data import text_motion
+from jaxmotion.data import clips_io, selection, text_motion
 from jaxmotion.data.text_motion import (
     TextArrays,
     TextMotions,
     sample_text_batch,
     text_arrays,
 )
+from jaxmotion.learning import runs
 from jaxmotion.motion import humanml
 from jaxmotion.motion.humanml import HUMANML3D, KIT_ML
+from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
@@ -37,11 +40,10 @@ _RELEASED_TOKENS = 22
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TextRun:
-    """Data of a run folder.
+    """A run folder and its data.
 
     Attributes:
-      folder: The folder.
-      config: JSON of how the data were made.
+      record: What the folder is.
       motions: Clips with captions.
       encoder: Of sentences.
       vectors: Of the captions' distinct sentences, as the networks take them.
@@ -49,8 +51,7 @@ class TextRun:
       scale: What the encoder's vectors were multiplied with; 1 as released.
     """
 
-    folder: Path
-    config: dict[str, Any]
+    record: runs.Run
     motions: TextMotions
     encoder: text_encoder.TextEncoder
     vectors: Float[np.ndarray, "sentences channels"]
@@ -102,35 +103,106 @@ def check_words(texts: Sequence[str]) -> None:
             )
 
 
-def load_run(folder: Path) -> TextRun:
-    """Loads the data of a run folder; captions are encoded once and kept there.
+_FILE = "motions.npz"
+
+
+def prepare(
+    folder: Path,
+    data: tuple[Path, ...],
+    *,
+    encoder: str,
+    form: TextForm,
+    unseen: Sequence[str],
+    least: int,
+    fps: float,
+    frames: int,
+    held_out: float,
+) -> TextRun:
+    """Makes the text motions of a run folder, or loads those it has.
 
     Args:
-      folder: Its path.
+      folder: The run folder.
+      data: One file of text motions, or files of labeled clips.
+      encoder: Of sentences.
+      form: How much of a text it reads, and how its vectors are scaled.
+      unseen: Of labeled clips, pairs "content/style" to keep for evaluation.
+      least: Of labeled clips, the shortest that gets a caption, frames.
+      fps: Frames per second of labeled clips' features.
+      frames: Longest motion.
+      held_out: Part of labeled clips to hold out.
 
-    Returns:
-      The run.
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if the folder was made otherwise, or an argument is wrong.
+    """
+
+    def make() -> runs.Content:
+        # An encoder that is not there should be said before the features are made.
+        make_encoder(encoder, form)
+        if len(data) == 1 and text_motion.is_text_motions(data[0]):
+            motions = text_motion.load_text_motions(data[0])
+        else:
+            clips = selection.concatenate([clips_io.load_clips(x) for x in data])
+            motions, error = emdm_data.from_labels(
+                clips, unseen=unseen, held_out=held_out, least=least, fps=fps, seed=0
+            )
+            print(
+                f"HumanML3D features of {motions.num_clips} clips; joints -> features "
+                f"-> joints: {error:.1e} m at most"
+            )
+        return runs.Content(
+            model={},
+            source=motions.source,
+            split={
+                split: [motions.clip_names[i] for i in motions.clips_of(split)]
+                for split in motions.split_names
+            },
+            files={
+                _FILE: functools.partial(text_motion.save_text_motions, motions=motions)
+            },
+        )
+
+    settings = dict(
+        task="text",
+        encoder=encoder,
+        text_form=form,
+        unseen=list(unseen),
+        fps=fps,
+        frames=frames,
+        held_out=held_out,
+    )
+    return _decode(
+        runs.begin(
+            folder,
+            system=emdm_training.SYSTEM,
+            data=data,
+            settings=settings,
+            make=make,
+        )
+    )
+
+
+def load_run(folder: Path) -> TextRun:
+    """Loads the data of a run folder; captions are encoded once and kept there.
 
     Raises:
       OSError: if a file cannot be read.
       ValueError: if it is no run folder of EMDM with texts; names the field.
     """
-    value = emdm_training.read_config(folder)
-    if value.get("task") != "text":
-        raise ValueError(
-            f"{folder / 'config.json'}: field 'task' is {value.get('task')!r}, "
-            "expected 'text'"
-        )
-    motions = text_motion.load_text_motions(folder / "data.npz")
-    form = value["text_form"]
-    encoder = make_encoder(value["encoder"], form)
-    cache = folder / "texts.npz"
+    return _decode(runs.load(folder, system=emdm_training.SYSTEM))
+
+
+def _decode(record: runs.Run) -> TextRun:
+    emdm_training.check_task(record, ("text",))
+    motions = text_motion.load_text_motions(record.file(_FILE))
+    form = record.settings["text_form"]
+    encoder = make_encoder(record.settings["encoder"], form)
+    cache = record.folder / "data" / "texts.npz"
     unique = text_encoder.encode_unique(encoder, motions.captions, cache=cache)
     vectors = np.asarray(unique.vectors)
     scale = 1.0 if form == "released" else float(np.mean(vectors**2) ** -0.5)
     return TextRun(
-        folder=folder,
-        config=value,
+        record=record,
         motions=motions,
         encoder=encoder,
         vectors=vectors * scale,
@@ -196,17 +268,11 @@ def make_task(
         )
 
     return emdm_training.Task(
+        run=run.record,
         base=base,
         data=data,
         batch=batch,
         geometry=None,
-        source=run.folder / "data.npz",
-        describe={
-            "task": "text",
-            "encoder": run.encoder.name,
-            "source": run.motions.source,
-            "fps": run.motions.fps,
-        },
     )
 
 

@@ -127,7 +127,7 @@ def train_evaluator(
     Raises:
       ValueError: if the folder's was trained otherwise; names the field.
     """
-    folder = run.folder / "matcher"
+    folder = run.record.folder / "matcher"
     config = text_motion_evaluator.MatcherConfig(
         num_features=run.motions.num_features - _CONTACTS, **SMALL
     )
@@ -405,7 +405,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
             f"with {', '.join(GLOVE)}, or neither"
         )
     run = emdm_text.load_run(folder)
-    frames, number = run.config["frames"], settings.samples // 32 * 32
+    frames, number = run.record.settings["frames"], settings.samples // 32 * 32
     if number < 64:
         raise ValueError(f"samples is {settings.samples}, expected at least 64")
     steps = 600 if settings.evaluator_steps is None else settings.evaluator_steps
@@ -493,7 +493,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
             "fingerprint": fingerprint(chosen.params),
             "origin": chosen.name,
             "matcher": dataclasses.asdict(chosen.config) | {"name": chosen.name},
-            "texts": f"{run.encoder.name}, {run.config['text_form']}",
+            "texts": f"{run.encoder.name}, {run.record.settings['text_form']}",
             "padding": settings.padding,
             "reference": f"{number} real motions of the same split",
         },

@@ -1,13 +1,7 @@
-"""A folder of EMDM: the data it was made from, and what was trained on them.
-
-data.npz, config.json     clips or text motions as they are used, and their making
-<row>/                    one trained model each: EMDM, its comparators, ablations
-recognizer/ or matcher/   the evaluator
-"""
+"""How EMDM is trained: a stage a row, which is EMDM, a comparator or an ablation."""
 
 import dataclasses
 import functools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -16,9 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxmotion import files
 from jaxmotion.diffusion import chain
-from jaxmotion.learning import adversarial, checkpoint, runs, training
+from jaxmotion.learning import adversarial, runs, training
 from jaxmotion.learning.runs import Budget
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
@@ -26,6 +19,7 @@ from jaxmotion.systems.emdm import published as emdm_published
 from jaxmotion.systems.emdm.model import Config
 from jaxmotion.typing import Key, Params
 
+SYSTEM = "emdm"
 _FLAT = dict(weight_position=0.0, weight_velocity=0.0, weight_foot=0.0)
 _DDPM = dict(latent=0, schedule="cosine", weight_recon=1.0)
 # Changes of the base configuration, by row.
@@ -105,29 +99,41 @@ def ddim_steps(num_steps: int, count: int) -> tuple[int, ...]:
 TaskName = Literal["action", "text", "none"]
 
 
+def check_task(run: runs.Run, expected: tuple[TaskName, ...]) -> None:
+    """Raises unless a run is of one of these tasks, and has what its data need."""
+    settings, own = run.settings, ("field",)
+    if "text" in expected:
+        own = ("encoder", "text_form")
+    wrong = {x: "a text" for x in ("task", *own) if type(settings.get(x)) is not str}
+    if settings.get("task") not in expected:
+        wrong["task"] = " or ".join(map(repr, expected))
+    frames = settings.get("frames")
+    if type(frames) is not int or not 2 <= frames <= 10**5:
+        wrong["frames"] = "a whole number from 2 to 100000"
+    for name, what in wrong.items():
+        raise ValueError(
+            f"{run.config}: field 'settings.{name}' is {settings.get(name)!r:.80}, "
+            f"expected {what}"
+        )
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Task:
     """What models are trained on, the same for all rows.
 
     Attributes:
+      run: The run folder.
       base: Configuration of the row "emdm".
       data: Arrays on the device.
       batch: `(key, data, size) -> Batch`.
       geometry: For the losses of joints; None if there are none.
-      describe: JSON that says what the data are; stored with each checkpoint.
-      source: File of the data.
     """
 
+    run: runs.Run
     base: Config
     data: Any
     batch: Callable[[Key, Any, int], emdm_loss.Batch]
     geometry: emdm_loss.Geometry | None
-    describe: dict[str, Any]
-    source: Path
-
-
-def _config_json(config: Config) -> dict[str, Any]:
-    return {"config": dataclasses.asdict(config)}
 
 
 def gan_update(
@@ -163,8 +169,13 @@ def gan_update(
     return update
 
 
+def _stage(row: str) -> str:
+    """Name of a row's stage; a sampler's is that of the row it samples."""
+    check_rows((row,))
+    return SAMPLERS[row][0] if row in SAMPLERS else row
+
+
 def train_row(
-    folder: Path,
     task: Task,
     row: str,
     *,
@@ -174,7 +185,6 @@ def train_row(
     """Trains a row, from its newest checkpoint if there is one.
 
     Args:
-      folder: The run folder.
       task: Data and configuration.
       row: Its name.
       generator: How long, and the generator's optimizer.
@@ -188,49 +198,43 @@ def train_row(
     flat = not (config.weight_position or config.weight_velocity or config.weight_foot)
     geometry = None if flat else task.geometry
     params = emdm_model.init(jax.random.key(generator.seed), config)
-    optimizer = runs.make_optimizer(generator)
-    if config.latent:
-        judge = runs.make_optimizer(discriminator)
-        state = adversarial.GanState(
-            generator=training.init_train_state(params["generator"], optimizer),
-            discriminator=training.init_train_state(params["discriminator"], judge),
-        )
-        update = gan_update(
-            (optimizer, judge), config=config, geometry=geometry, ema=generator.ema
-        )
-        show = ("loss", "discriminator/loss")
-    else:
-        state = training.init_train_state(params["generator"], optimizer)
+    common: dict[str, Any] = dict(budget=generator, model=dataclasses.asdict(config))
+    stage = _stage(row)
+
+    def sample(key: Key, data: Any) -> emdm_loss.Batch:
+        return task.batch(key, data, generator.batch)
+
+    if not config.latent:
         loss = functools.partial(
             emdm_loss.diffusion_loss, config=config, geometry=geometry
         )
-        update = training.make_update(loss, optimizer, ema_decay=generator.ema)
-        show = ("loss",)
+        runs.minimize(
+            task.run, stage, loss, params["generator"], sample, task.data, **common
+        )
+        return
+    optimizers = runs.make_optimizer(generator), runs.make_optimizer(discriminator)
+    names = ("generator", "discriminator")
+    players = {
+        name: training.init_train_state(params[name], optimizer)
+        for name, optimizer in zip(names, optimizers, strict=True)
+    }
     runs.fit(
-        folder / row,
-        state,
-        update,
-        lambda key, data: task.batch(key, data, generator.batch),
+        task.run,
+        stage,
+        adversarial.GanState(**players),
+        gan_update(optimizers, config=config, geometry=geometry, ema=generator.ema),
+        sample,
         task.data,
-        system="emdm",
-        stage=row,
-        budget=generator,
-        config=_config_json(config) | task.describe,
-        source=task.source,
-        settings={"discriminator_rate": discriminator.learning_rate}
-        if config.latent
-        else None,
-        show=show,
+        settings={"discriminator_rate": discriminator.learning_rate},
+        show=("loss", "discriminator/loss"),
+        **common,
     )
 
 
-def import_row(
-    folder: Path, task: Task, weights: Path, *, heads: int, num_steps: int
-) -> Config:
+def import_row(task: Task, weights: Path, *, heads: int, num_steps: int) -> Config:
     """Puts the authors' weights into a run folder, as its row "emdm".
 
     Args:
-      folder: The run folder.
       task: Its data; only what it is conditioned on and how it looks counts.
       weights: As of `emdm_published.load`; so are heads and steps.
 
@@ -242,10 +246,7 @@ def import_row(
       ValueError: if the row exists, or the file is damaged or does not fit the run;
         names what differs.
     """
-    row, base = "emdm", task.base
-    place = folder / row / "checkpoints"
-    if checkpoint.latest_step(place) is not None:
-        raise ValueError(f"{folder}: row {row!r} exists; use another folder")
+    base = task.base
     config, params = emdm_published.load(
         weights, frames=base.frames, num_steps=num_steps, heads=heads
     )
@@ -253,46 +254,31 @@ def import_row(
         expected, found = getattr(base, field), getattr(config, field)
         if expected != found:
             raise ValueError(
-                f"{weights} does not fit {folder}: field {field!r} is {found!r}, the "
-                f"run's {expected!r}"
+                f"{weights} does not fit {task.run.folder}: field {field!r} is "
+                f"{found!r}, the run's {expected!r}"
             )
-    checkpoint.save(
-        place,
-        0,
-        {"generator": {"ema_params": params["generator"]}},
-        {"system": "emdm", "stage": row, "weights": weights.name}
-        | _config_json(config)
-        | task.describe,
-    )
+    state = {"generator": {"ema_params": params["generator"]}}
+    runs.store(task.run, "emdm", state, model=dataclasses.asdict(config))
     return config
 
 
-def load_row(folder: Path, row: str) -> tuple[Params, Config]:
+def load_row(run: runs.Run, row: str) -> tuple[Params, Config]:
     """Averaged parameters of a row's generator, and its configuration.
 
     Args:
-      folder: The run folder.
+      run: The run folder.
       row: Its name, or a sampler's.
-
-    Returns:
-      Both.
 
     Raises:
       CheckpointError: if the row was not trained here.
       ValueError: if its configuration has other fields than this version's.
     """
-    check_rows((row,))
-    trained = SAMPLERS[row][0] if row in SAMPLERS else row
-    value = runs.check_stage(folder / trained, trained, system="emdm")
-    try:
-        config = runs.config_from_json(Config, value.get("config"))
-    except ValueError as error:
-        raise ValueError(f"{folder / trained}: field 'config': {error}") from error
+    stage = _stage(row)
+    config = runs.stage_config(run, stage, Config)
     params = runs.load_params(
-        folder / trained,
-        trained,
+        run,
+        stage,
         lambda: emdm_model.init(jax.random.key(0), config)["generator"],
-        system="emdm",
         adversarial=bool(config.latent),
     )
     return params, config
@@ -351,38 +337,3 @@ def sample_many(
         return jax.lax.map(one, (keys, conditions), batch_size=min(chunk, number))
 
     return jax.jit(run)
-
-
-def write_config(folder: Path, value: dict[str, Any]) -> None:
-    """Writes how a run folder's data were made.
-
-    Args:
-      folder: The run folder.
-      value: A JSON object.
-    """
-    whole = {"system": "emdm"} | value
-    files.write_text(folder / "config.json", json.dumps(whole, indent=1))
-
-
-def read_config(folder: Path) -> dict[str, Any]:
-    """Reads what `write_config` wrote.
-
-    Args:
-      folder: The run folder.
-
-    Returns:
-      The JSON object.
-
-    Raises:
-      OSError: if it cannot be read.
-      ValueError: if it is no run folder of EMDM; names the file and the field.
-    """
-    path = folder / "config.json"
-    what = "expected a run folder of `experiments/emdm.py train`"
-    found = (value := files.read_object(path, what=what)).get("system")
-    if found != "emdm":
-        raise ValueError(f"{path}: field 'system' is {found!r}, expected 'emdm'")
-    if value.get("task") == "text":
-        # Folders from before there was a choice.
-        value.setdefault("text_form", "unit")
-    return value

@@ -380,7 +380,7 @@ def step_table(run: Run, setting: Setting, *, chunk: int) -> tuple[Rows, Places]
     rows, places = real_rows(run, setting), {}
     trained = sorted(
         int(folder.name.removeprefix("motion_"))
-        for folder in run.folder.glob("motion_*")
+        for folder in run.record.folder.glob("motion_*")
         if folder.name.removeprefix("motion_").isdecimal()
     )
     for number in trained:

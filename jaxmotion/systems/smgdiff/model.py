@@ -298,16 +298,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         "speeds": lambda x: tuple(_numbers("speed", x, least=0.0)),
         "source": lambda x: runs.names_from_json([x])[0],
     }
-    made = {}
-    for field, make in parts.items():
-        if field not in value:
-            raise ValueError(f"{where}: field {field!r} is missing")
-        try:
-            made[field] = make(value[field])
-        except KeyError as error:
-            raise ValueError(f"{where}: field {field!r}: {error} is missing") from error
-        except (TypeError, ValueError, IndexError) as error:
-            raise ValueError(f"{where}: field {field!r}: {error}") from error
+    made = runs.decode(value, where, parts)
     model = Model(**made)
     labels, size = len(model.labels), model.representation.normalizer.mean.size
     for name, found, expected in (

@@ -233,7 +233,7 @@ def straight(model: Model) -> SamplePath:
 def _generators(run: Run) -> dict[str, SamplePath]:
     """Trained trajectory generators by name."""
     found = {}
-    for folder in sorted(run.folder.glob("paths_*")):
+    for folder in sorted(run.record.folder.glob("paths_*")):
         model, params = smgdiff_training.load_stage(run, folder.name)
         found[f"generator, T = {model.paths.num_steps}"] = smgdiff_trajectory.sampler(
             params, config=model.paths

@@ -1,16 +1,18 @@
-"""Training of SMGDiff's two stages."""
+"""How SMGDiff is trained: a stage for each kind and number of steps.
+
+motion_<T>   the motion model of T steps, after a draft of its own
+paths_<T>    the trajectory generator
+"""
 
 import dataclasses
 import functools
-import json
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from jaxmotion import files
 from jaxmotion.data.ball_clips import BallClips, load_ball_clips, save_ball_clips
-from jaxmotion.learning import checkpoint, runs, training
+from jaxmotion.learning import runs
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
 from jaxmotion.systems.smgdiff import model as smgdiff_model
@@ -19,21 +21,19 @@ from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.model import SYSTEM, Model
 from jaxmotion.typing import Key, Params
 
-_WHAT = "expected a run folder of `experiments/smgdiff.py train`"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """What a run folder holds besides the parameters.
+    """A run folder, its model and its data.
 
     Attributes:
-      folder: Where it is.
+      record: What the folder is.
       model: The model.
       train: Clips that it was trained on.
       held_out: Clips that it never saw.
     """
 
-    folder: Path
+    record: runs.Run
     model: Model
     train: BallClips
     held_out: BallClips
@@ -116,79 +116,81 @@ def with_steps(model: Model, stage: str) -> Model:
     return dataclasses.replace(model, **{field: changed})
 
 
-def write_run(run: Run) -> None:
-    """Writes all of a run but its stages; one that is there must be the same.
+def prepare(
+    folder: Path,
+    data: Path,
+    *,
+    held_out: float,
+    sizes: dict[str, Any],
+    paths: dict[str, Any] | None = None,
+) -> Run:
+    """Makes model and clips of a run folder, or loads those it has.
 
     Args:
-      run: The run.
+      folder: The run folder.
+      data: Clips with a ball.
+      held_out: Part of the recordings to hold out.
+      sizes: As `make_model` takes them.
+      paths: As `make_model` takes them.
 
     Raises:
-      OSError: if a file cannot be written.
-      ValueError: if the folder holds another model; names what differs.
+      OSError: if the clips cannot be read.
+      ValueError: if the folder was made otherwise, or the clips do not fit.
     """
-    where = run.folder / "config.json"
-    value = smgdiff_model.to_json(run.model)
-    if where.exists():
-        differ = runs.differences(files.read_object(where, what=_WHAT), value)
-        if differ:
-            raise ValueError(
-                f"{where}: another model: {differ}; choose another folder, or train "
-                "with the same data and sizes"
-            )
-        return
-    save_ball_clips(run.folder / "train.npz", run.train)
-    save_ball_clips(run.folder / "held_out.npz", run.held_out)
-    files.write_text(where, json.dumps(value, indent=1))
+
+    def make() -> runs.Content:
+        parts = smgdiff_data.split(load_ball_clips(data), fraction=held_out)
+        model = make_model(parts[0], sizes=sizes, paths=paths)
+        return runs.Content(
+            model=smgdiff_model.to_json(model),
+            source=model.source,
+            split={
+                name: list(part.clips.clip_names)
+                for name, part in zip(("train", "held_out"), parts, strict=True)
+            },
+            files={
+                name: functools.partial(save_ball_clips, data=part)
+                for name, part in zip(_FILES, parts, strict=True)
+            },
+        )
+
+    record = runs.begin(
+        folder,
+        system=SYSTEM,
+        data=[data],
+        settings={"held_out": held_out, "sizes": sizes, "paths": paths or {}},
+        make=make,
+    )
+    return _decode(record)
+
+
+_FILES = ("train.npz", "held_out.npz")
 
 
 def load_run(folder: Path) -> Run:
     """Reads a run folder.
 
-    Args:
-      folder: Of `experiments/smgdiff.py train`.
-
-    Returns:
-      The run.
-
     Raises:
       OSError: if a file is missing.
       ValueError: if one is damaged or foreign; names it and the field.
     """
-    where = folder / "config.json"
-    value = files.read_object(where, what=_WHAT)
-    return Run(
-        folder=folder,
-        model=smgdiff_model.from_json(value, where=str(where)),
-        train=load_ball_clips(folder / "train.npz"),
-        held_out=load_ball_clips(folder / "held_out.npz"),
-    )
+    return _decode(runs.load(folder, system=SYSTEM))
 
 
-def stage_config(model: Model, stage: str) -> tuple[str, dict[str, Any]]:
-    """What a stage's checkpoint says of it.
+def _decode(record: runs.Run) -> Run:
+    train, held_out = (load_ball_clips(record.file(name)) for name in _FILES)
+    model = smgdiff_model.from_json(record.model, where=str(record.config))
+    return Run(record=record, model=model, train=train, held_out=held_out)
 
-    Args:
-      model: The model, with the stage's number of steps.
-      stage: "motion_8", "paths_1", ...
 
-    Returns:
-      Name of the model's field, and that configuration as JSON.
-    """
-    field = "config" if stage.startswith("motion") else "paths"
-    return field, dataclasses.asdict(getattr(model, field))
+def stage_json(model: Model, stage: str) -> dict[str, Any]:
+    """JSON of the networks of a stage of the model with that number of steps."""
+    is_motion = stage.startswith("motion")
+    return dataclasses.asdict(model.config if is_motion else model.paths)
 
 
 def init_stage(key: Key, model: Model, stage: str) -> Params:
-    """Initial parameters of a stage.
-
-    Args:
-      key: Consumed.
-      model: The model, with the stage's number of steps.
-      stage: "motion_8", "paths_1", ...
-
-    Returns:
-      The parameters.
-    """
+    """Initial parameters of a stage of the model with that number of steps."""
     if stage.startswith("motion"):
         return smgdiff_model.init(key, model.config)
     return smgdiff_trajectory.init(key, model.paths)
@@ -209,15 +211,9 @@ def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
       ValueError: if there is no such stage.
     """
     model = with_steps(run.model, stage)
-    folder = run.folder / stage
-    value = runs.check_stage(folder, stage, system=SYSTEM)
-    field, expected = stage_config(model, stage)
-    if value.get(field) != expected:
-        raise checkpoint.CheckpointError(
-            f"{folder}: field {field!r} is not that of {run.folder}/config.json"
-        )
+    runs.check_model(run.record, stage, stage_json(model, stage))
     init = lambda: init_stage(jax.random.key(0), model, stage)  # noqa: E731
-    return model, runs.load_params(folder, stage, init, system=SYSTEM)
+    return model, runs.load_params(run.record, stage, init)
 
 
 # Sizes and weights of `smgdiff.Config`, by name.
@@ -266,43 +262,33 @@ def train_stage(
     """
     model = with_steps(run.model, stage)
     arrays = smgdiff_data.scene_arrays(run.train, model.config.window)
-    folder, key = run.folder / stage, jax.random.key(budget.seed)
-    params = jax.jit(lambda key: init_stage(key, model, stage))(key)
-    source = run.folder / "train.npz"
-    draft = {"draft_steps": draft_steps} if stage.startswith("motion") else None
-    if draft_steps and draft:
-        params = _fit(
-            folder / "draft",
-            dataclasses.replace(
-                model, config=dataclasses.replace(model.config, **DRAFT)
-            ),
-            stage,
-            params,
-            arrays,
-            budget=dataclasses.replace(budget, steps=draft_steps),
-            source=source,
-        )
-    _fit(
-        folder,
-        model,
-        stage,
-        params,
-        arrays,
-        budget=budget,
-        source=source,
-        settings=draft,
+    params = jax.jit(lambda key: init_stage(key, model, stage))(
+        jax.random.key(budget.seed)
     )
+    settings = None
+    if stage.startswith("motion"):
+        settings = {"draft_steps": draft_steps}
+        if draft_steps:
+            draft = dataclasses.replace(model.config, **DRAFT)
+            params = _fit(
+                run,
+                f"{stage}/draft",
+                dataclasses.replace(model, config=draft),
+                params,
+                arrays,
+                budget=dataclasses.replace(budget, steps=draft_steps),
+            )
+    _fit(run, stage, model, params, arrays, budget=budget, settings=settings)
 
 
 def _fit(
-    folder: Path,
-    model: Model,
+    run: Run,
     stage: str,
+    model: Model,
     params: Params,
     arrays: smgdiff_data.SceneArrays,
     *,
     budget: runs.Budget,
-    source: Path,
     settings: dict[str, Any] | None = None,
 ) -> Params:
     """Trains a stage's parameters; returns their average."""
@@ -322,18 +308,15 @@ def _fit(
         scenes, labels = smgdiff_data.sample_scenes(key, arrays, batch=budget.batch)
         return (scenes if is_motion else scenes.motion), labels
 
-    optimizer = runs.make_optimizer(budget)
-    state = runs.fit(
-        folder,
-        training.init_train_state(params, optimizer),
-        training.make_update(loss, optimizer, ema_decay=budget.ema),
+    state = runs.minimize(
+        run.record,
+        stage,
+        loss,
+        params,
         sample_batch,
         arrays,
-        system=SYSTEM,
-        stage=stage,
         budget=budget,
-        config=dict([stage_config(model, stage)]),
-        source=source,
+        model=stage_json(model, stage),
         settings=settings,
         show=("loss", "foot") if is_motion else ("loss",),
     )

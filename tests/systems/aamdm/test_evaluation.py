@@ -12,9 +12,10 @@ import pytest
 from jaxmotion.control.frame import Frame
 from jaxmotion.evaluation import table
 from jaxmotion.systems.aamdm import data as aamdm_data
+from jaxmotion.systems.aamdm import embedding as aamdm_embedding
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
-from tests import person
+from tests import person, tiny
 from tests.reference import pose as reference
 
 FPS = 60.0
@@ -25,12 +26,11 @@ def run():
     """One clip of four hundred frames in which everything moves."""
     data, _ = aamdm_data.pose_data(person.clips((400,)), fps=FPS)
     return aamdm_training.Run(
-        folder=Path("none"),
+        record=tiny.run_folder(Path("none"), "aamdm"),
         skeleton=person.skeleton(),
+        embedding=aamdm_embedding.Config(num_joints=6, fps=FPS),
         train=data,
         held_out=data,
-        source="made in the tests",
-        config={},
     )
 
 

@@ -1,17 +1,18 @@
-"""Stages of AAMDM's training: resumed, told apart, and read back."""
+"""Folders of AAMDM: prepared once, loaded or refused, and the chains in them."""
 
 import dataclasses
-import json
+import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
-from jaxmotion.learning import adversarial, checkpoint, training
+from jaxmotion.data import clips_io
+from jaxmotion.learning import checkpoint, runs
 from jaxmotion.systems.aamdm import data as aamdm_data
 from jaxmotion.systems.aamdm import embedding as aamdm_embedding
+from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
 from jaxmotion.systems.aamdm import training as aamdm_training
 from tests import person, tiny
@@ -21,13 +22,240 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
-BUDGET = aamdm_training.Budget(
-    steps=4, batch=4, learning_rate=0.1, ema=0.5, chunk=2, save_every=2
+LENGTHS = (160, 90, 160, 30)
+MADE = dict(field="theme", labels=("walk",), fps=60.0, held_out=0.2, mirrored=True)
+BUDGET = runs.Budget(steps=2, batch=4, chunk=1, save_every=2, optimizer="adamw")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "clips.npz"
+    clips_io.save_clips(path, person.clips(LENGTHS))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(data, tmp_path_factory):
+    """The walks, clips 0 and 2, and their mirror images."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    return aamdm_training.prepare(folder, data, **MADE)
+
+
+# --- data of a folder --------------------------------------------------------------
+
+
+def test_clips_are_chosen_mirrored_described_and_split(run, data):
+    assert run.train.offsets.tolist() == [0, 68, 136, 204, 272]
+    assert run.held_out.offsets.tolist() == [0, 32, 64, 96, 128]
+    assert run.skeleton.names == person.NAMES and run.source == "made in the tests"
+    assert run.embedding.num_joints == 6 and run.embedding.fps == 60.0
+    record = run.record
+    assert record.settings["mirrored"] is True and record.settings["labels"] == ["walk"]
+    assert len(record.split["train"]) == len(record.split["held_out"]) == 4
+    # Sideways and turning velocities of the mirror images are the opposite ones.
+    own, image = run.train.poses[:136], run.train.poses[136:]
+    for channel, sign in ((-8, -1.0), (-6, 1.0), (-4, -1.0)):
+        np.testing.assert_allclose(
+            image[:, channel], sign * own[:, channel], rtol=1e-3, atol=1e-3
+        )
+
+
+def test_what_is_prepared_is_not_prepared_again(run, data, monkeypatch):
+    monkeypatch.setattr(clips_io, "load_clips", lambda path: pytest.fail("read"))
+    again = aamdm_training.prepare(run.record.folder, data, **MADE)
+    pairs = zip(jax.tree.leaves(again.train), jax.tree.leaves(run.train), strict=True)
+    for a, b in pairs:
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    "change", [dict(fps=120.0), dict(labels=()), dict(held_out=0.3), dict(mirrored=0)]
 )
-CONFIG = {"config": {"width": 3}, "source": "tests"}
+def test_a_folder_keeps_to_how_it_was_made(run, data, change):
+    change = {k: bool(v) if k == "mirrored" else v for k, v in change.items()}
+    before = (run.record.folder / "config.json").read_text()
+    with pytest.raises(ValueError, match=f"{run.record.folder}.*another folder"):
+        aamdm_training.prepare(run.record.folder, data, **MADE | change)
+    assert (run.record.folder / "config.json").read_text() == before
 
 
-def data():
+def test_data_that_do_not_fit_are_named(data, tmp_path):
+    with pytest.raises(OSError, match="gone.npz"):
+        aamdm_training.prepare(tmp_path, tmp_path / "gone.npz", **MADE)
+    for change, message in (
+        (dict(labels=("fly",)), "unknown theme 'fly'"),
+        (dict(field="mood"), "unknown label field 'mood'"),
+        (dict(fps=24.0), "cannot be resampled to 24"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            aamdm_training.prepare(tmp_path, data, **MADE | change)
+    assert not (tmp_path / "config.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "message"),
+    [
+        ("skeleton", None, "field 'skeleton': a JSON NoneType"),
+        ("config", {"num_joints": 6, "fps": 1e9}, "field 'config': fps is 1000000000"),
+        ("config", {"num_joints": 7}, "field 'skeleton' has 6 joints, the config 7"),
+    ],
+)
+def test_a_config_of_other_networks_is_named(run, monkeypatch, field, change, message):
+    model = run.record.model | {field: change}
+    record = dataclasses.replace(run.record, model=model)
+    monkeypatch.setattr(runs, "load", lambda folder, system: record)
+    with pytest.raises(ValueError, match=f"^{record.config}: {message}"):
+        aamdm_training.load_run(record.folder)
+
+
+BAD_FRAMES = {
+    "not a frame file": dict(content=b"hello"),
+    "'poses' has shape": dict(poses=np.zeros((3, 5))),
+    "'offsets' should ascend": dict(offsets=np.array([0, 0])),
+    "not within": dict(paths=np.full((272, 12), 1e30)),
+}
+
+
+@pytest.mark.parametrize("message", BAD_FRAMES)
+def test_frames_that_do_not_fit_are_named(run, tmp_path, monkeypatch, message):
+    """Of a folder that agrees with itself; one that does not is refused before."""
+    content, path = BAD_FRAMES[message], tmp_path / "data" / "train.npz"
+    path.parent.mkdir()
+    with np.load(run.record.file("train.npz")) as file:
+        np.savez(path, **dict(file) | {k: content[k] for k in content if k in file})
+    if "content" in content:
+        path.write_bytes(content["content"])
+    record = dataclasses.replace(run.record, folder=tmp_path)
+    monkeypatch.setattr(runs, "load", lambda folder, system: record)
+    with pytest.raises(ValueError, match=f"^{path}: .*{message}"):
+        aamdm_training.load_run(tmp_path)
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(OSError, match="gone.*expected a run folder .*aamdm.py train"):
+        aamdm_training.load_run(tmp_path / "gone")
+
+
+# --- spaces and chains -------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def space(run):
+    return aamdm_training.make_space(run, None)
+
+
+CONFIG = aamdm_model.Config(features=110, latent=2, width=16, depth=1, window=2)
+
+
+@pytest.fixture(scope="module")
+def chain(run, space):
+    """Parameters of both stages, of chains of five steps."""
+    given, init = (run, "full_pose", space, CONFIG, BUDGET), aamdm_model.init
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(aamdm_model, "init", lambda k, c: tiny.random_params(init, c))
+        return {
+            "polisher": aamdm_training.train_polisher(*given),
+            "generator": aamdm_training.train_generator(*given),
+        }
+
+
+def test_a_space_of_a_run_is_read_back(run, space):
+    found = aamdm_training.load_space(run, "full_pose")
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(space), strict=True):
+        np.testing.assert_array_equal(a, b)
+    frames = aamdm_space.to_frames(found, run.train.poses, run.train.paths)
+    np.testing.assert_allclose(jnp.mean(frames, axis=0), 0.0, atol=1e-3)
+    with pytest.raises(
+        checkpoint.CheckpointError, match=str(run.record.folder / "embedded")
+    ):
+        aamdm_training.load_space(run, "embedded")
+
+
+def test_a_space_that_is_there_is_loaded(run, space, monkeypatch):
+    monkeypatch.setattr(checkpoint, "save", lambda *a, **k: pytest.fail("saved"))
+    again = aamdm_training.make_space(run, None)
+    for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(space), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_an_embedded_space_is_read_back(run, tmp_path):
+    config, data = run.embedding, run.train
+    statistics = aamdm_embedding.fit_statistics(data.poses, data.paths, config=config)
+    autoencoder = aamdm_space.Autoencoder(
+        params=tiny.random_params(aamdm_embedding.init, config),
+        statistics=statistics,
+        config=config,
+    )
+    record = dataclasses.replace(run.record, folder=tmp_path)
+    other = dataclasses.replace(run, record=record)
+    made = aamdm_training.make_space(other, autoencoder)
+    found = aamdm_training.load_space(other, "embedded")
+    assert jax.tree.structure(found) == jax.tree.structure(made)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(made), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(("drafts", "polishes"), [(3, 2), (4, 1), (5, 0), (0, 5)])
+def test_chains_of_one_length_share_their_networks(run, space, chain, drafts, polishes):
+    params, config = aamdm_training.load_networks(
+        run, "full_pose", space, drafts=drafts, polishes=polishes
+    )
+    assert config == dataclasses.replace(CONFIG, drafts=drafts, polishes=polishes)
+    used = {"generator": drafts, "polisher": polishes}
+    assert set(params) == {name for name, steps in used.items() if steps}
+    for name, found in params.items():
+        pairs = zip(jax.tree.leaves(found), jax.tree.leaves(chain[name]), strict=True)
+        for a, b in pairs:
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_stored_chain_makes_frames(run, space, chain):
+    step = aamdm_training.load_chain(run, "full_pose", space, drafts=3, polishes=2)
+    previous = aamdm_space.to_frames(space, run.train.poses[0], run.train.paths[0])
+    found = jax.jit(step)(jax.random.key(0), previous)
+    made = aamdm_model.sampler(chain, config=CONFIG)
+    expected = jax.jit(made)(jax.random.key(0), previous)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_chain_that_was_not_trained_is_named(run, space, chain):
+    for missing, options in (
+        ("T6", dict(drafts=4, polishes=2)),
+        ("T5_change", dict(drafts=3, polishes=2, target="change")),
+    ):
+        folder = str(run.record.folder / "full_pose" / missing)
+        with pytest.raises(checkpoint.CheckpointError, match=folder):
+            aamdm_training.load_chain(run, "full_pose", space, **options)
+
+
+def test_a_chain_of_another_space_is_named(run, space, chain):
+    narrow = jax.tree.map(lambda x: x[:-1], space)
+    with pytest.raises(ValueError, match="110 channels, expected the 109"):
+        aamdm_training.load_chain(run, "full_pose", narrow, drafts=3, polishes=2)
+
+
+def test_a_chain_is_not_trained_over_another(run, space, chain):
+    wide = dataclasses.replace(CONFIG, window=3)
+    with pytest.raises(
+        ValueError, match="polisher: of another model: window is 2, given 3"
+    ):
+        aamdm_training.train_polisher(run, "full_pose", space, wide, BUDGET)
+
+
+def test_a_chain_in_a_folder_of_another_length_is_named(run, space, chain):
+    folder = run.record.folder / "full_pose"
+    shutil.copytree(folder / "T5", folder / "T7")
+    with pytest.raises(
+        checkpoint.CheckpointError,
+        match="T7/polisher: field 'stage' is 'full_pose/T5/pol",
+    ):
+        aamdm_training.load_chain(run, "full_pose", space, drafts=5, polishes=2)
+
+
+# --- windows -----------------------------------------------------------------------
+
+
+def numbered():
     """Frames that hold their clip and their number."""
     clip, number = np.repeat([0, 1], [7, 5]), np.arange(12)
     return aamdm_data.PoseData(
@@ -38,205 +266,10 @@ def data():
     )
 
 
-def init(size=3):
-    return {"w": jnp.arange(2.0 * size).reshape(size, 2), "b": jnp.ones(2)}
-
-
-def loss(params, key, batch):
-    noise = jax.random.normal(key, params["b"].shape)
-    bias = (params["b"] + noise).reshape(1, 1, 2)
-    gap = batch - params["w"][:1].reshape(1, 1, 2) - bias
-    return jnp.mean(gap**2), {}
-
-
-def fit(folder, *, steps=4, stage="polisher", config=CONFIG, frames=b"1", **changes):
-    """A stage up to some of the steps of the whole budget."""
-    source = folder.with_name(f"{folder.name}.frames")
-    source.parent.mkdir(parents=True, exist_ok=True)
-    source.write_bytes(frames)
-    optimizer = aamdm_training.make_optimizer(BUDGET)
-    sample, arrays = aamdm_training.frame_windows(
-        data().poses, data(), 2, batch=BUDGET.batch
-    )
-    return aamdm_training.fit(
-        folder,
-        training.init_train_state(init(), optimizer),
-        training.make_update(loss, optimizer, ema_decay=BUDGET.ema),
-        sample,
-        arrays,
-        stage=stage,
-        budget=dataclasses.replace(BUDGET, steps=steps, **changes),
-        config=config,
-        source=source,
-    )
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A stage of four updates, and the state that it returned."""
-    folder = tmp_path_factory.mktemp("run") / "polisher"
-    return folder, fit(folder)
-
-
-def assert_same(found, expected):
-    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True)
-    for a, b in pairs:
-        np.testing.assert_array_equal(a, b)
-
-
-def contents(folder):
-    return {x: x.read_bytes() for x in folder.rglob("*") if x.is_file()}
-
-
-# --- training ----------------------------------------------------------------------
-
-
-def test_a_resumed_stage_ends_as_one_without_a_break(trained, tmp_path):
-    half = fit(tmp_path, steps=2)
-    assert int(half.step) == 2
-    whole = fit(tmp_path, override=True)
-    assert_same(whole, trained[1])
-    assert np.abs(whole.params["w"] - init()["w"]).max() > 0
-    rows = [json.loads(x) for x in (tmp_path / "losses.jsonl").read_text().splitlines()]
-    assert [row["step"] for row in rows] == [2, 4]
-
-
-def test_any_number_of_updates_can_be_made_and_gone_on_from(trained, tmp_path):
-    """Three are not a multiple of the chunk of two."""
-    assert int(fit(tmp_path, steps=3).step) == 3
-    assert checkpoint.latest_step(tmp_path / "checkpoints") == 3
-    assert_same(fit(tmp_path, override=True), trained[1])
-
-
-def test_a_finished_stage_is_not_trained_again(trained):
-    folder, state = trained
-    before = (folder / "losses.jsonl").read_text()
-    again = fit(folder)
-    assert_same(again, state)
-    assert (folder / "losses.jsonl").read_text() == before
-    assert checkpoint.latest_step(folder / "checkpoints") == 4
-
-
-def test_other_settings_are_refused_and_named(trained):
-    folder, state = trained
-    other = CONFIG | {"config": {"width": 5}}
-    before = contents(folder)
-    changes = {
-        "of another model: config.width is 3, given 5": dict(config=other),
-        "at step 4, .*: batch is 4, given 5; seed is .*--override": dict(
-            batch=5, seed=8
-        ),
-        "learning_rate is .*, given 0.5": dict(learning_rate=0.5),
-        "ema is 0.5, given 0.25": dict(ema=0.25),
-        "optimizer is .*, given 'radam'": dict(optimizer="radam"),
-        "steps is 4, given 6": dict(steps=6),
-        "data is '[0-9a-f]{12}', .* .other data.;": dict(frames=b"2"),
-        "has 4 steps, expected at most the 3 to train": dict(steps=3),
-    }
-    for message, change in changes.items():
-        with pytest.raises(ValueError, match=f"^{folder}: .*{message}"):
-            fit(folder, **change)
-        assert contents(folder) == before
-    with pytest.raises(ValueError, match="has 4 steps"):
-        fit(folder, steps=3, override=True)
-    # How often it is saved changes nothing that is trained.
-    assert_same(fit(folder, chunk=1, save_every=1), state)
-    assert contents(folder) == before
-
-
-def test_a_stage_is_not_trained_in_the_folder_of_another(trained):
-    folder, _ = trained
-    with pytest.raises(checkpoint.CheckpointError) as error:
-        fit(folder, stage="generator")
-    for word in (str(folder), "'polisher'", "'generator'"):
-        assert word in str(error.value)
-
-
-@pytest.mark.parametrize("name", ["muon", "adamw", "radam"])
-def test_every_optimizer_lowers_a_bowl(name):
-    budget = dataclasses.replace(BUDGET, optimizer=name, steps=40, learning_rate=0.1)
-    optimizer = aamdm_training.make_optimizer(budget)
-    params = {"w": jnp.full((2, 2), 3.0), "b": jnp.full(2, 3.0)}
-    bowl = lambda p: sum(jnp.sum(x**2) for x in jax.tree.leaves(p))  # noqa: E731
-
-    def one(carry, _):
-        params, state = carry
-        changes, state = optimizer.update(jax.grad(bowl)(params), state, params)
-        return (optax.apply_updates(params, changes), state), bowl(params)
-
-    start = params, optimizer.init(params)
-    values = jax.jit(lambda c: jax.lax.scan(one, c, None, 40)[1])(start)
-    assert np.all(np.isfinite(values)) and values[-1] < 0.7 * values[0]
-
-
-# --- what it leaves behind ---------------------------------------------------------
-
-
-def test_averaged_parameters_are_read_back(trained):
-    folder, state = trained
-    assert aamdm_training.check_stage(folder, "polisher")["source"] == "tests"
-    found = aamdm_training.load_params(folder, "polisher", init)
-    assert_same(found, state.ema_params)
-    assert np.abs(state.ema_params["w"] - state.params["w"]).max() > 0
-
-
-def test_one_stage_is_not_taken_for_another(trained):
-    folder, _ = trained
-    for read in (
-        lambda: aamdm_training.check_stage(folder, "generator"),
-        lambda: aamdm_training.load_params(folder, "generator", init, adversarial=True),
-        lambda: aamdm_training.restore_space(folder, lambda: space(None)),
-    ):
-        with pytest.raises(checkpoint.CheckpointError, match=str(folder)) as error:
-            read()
-        assert "'polisher'" in str(error.value)
-        assert "'generator'" in str(error.value) or "'space'" in str(error.value)
-
-
-def test_a_checkpoint_of_another_system_is_named(tmp_path):
-    state = {"ema_params": init()}
-    checkpoint.save(tmp_path / "checkpoints", 1, state, {"system": "camdm"})
-    with pytest.raises(checkpoint.CheckpointError, match=f"{tmp_path}.*'camdm'.*aamdm"):
-        aamdm_training.check_stage(tmp_path, "polisher")
-
-
-def test_a_folder_without_checkpoints_is_named(tmp_path):
-    for read in (
-        lambda: aamdm_training.check_stage(tmp_path, "polisher"),
-        lambda: aamdm_training.load_params(tmp_path, "polisher", init),
-        lambda: aamdm_training.restore_space(tmp_path, lambda: space(None)),
-    ):
-        with pytest.raises(checkpoint.CheckpointError, match=str(tmp_path)):
-            read()
-
-
-def test_parameters_of_another_size_are_refused(trained):
-    folder, _ = trained
-    with pytest.raises(checkpoint.CheckpointError, match=f"{folder}.*another model"):
-        aamdm_training.load_params(folder, "polisher", lambda: init(size=4))
-    with pytest.raises(checkpoint.CheckpointError, match=f"{folder}.*another model"):
-        aamdm_training.load_params(folder, "polisher", init, adversarial=True)
-
-
-def test_of_two_players_the_generator_is_read(tmp_path):
-    optimizer = aamdm_training.make_optimizer(BUDGET)
-
-    def player(factor):
-        params = jax.tree.map(lambda x: factor * x, init())
-        return training.init_train_state(params, optimizer)
-
-    players = adversarial.GanState(generator=player(2.0), discriminator=player(3.0))
-    config = {"system": "aamdm", "stage": "generator"}
-    checkpoint.save(tmp_path / "checkpoints", 1, players, config)
-    found = aamdm_training.load_params(tmp_path, "generator", init, adversarial=True)
-    assert_same(found, jax.tree.map(lambda x: 2.0 * x, init()))
-
-
-# --- windows -----------------------------------------------------------------------
-
-
 def test_windows_of_frames_lie_within_clips():
-    sample, arrays = aamdm_training.frame_windows(data().poses, data(), 4, batch=200)
+    sample, arrays = aamdm_training.frame_windows(
+        numbered().poses, numbered(), 4, batch=200
+    )
     found = np.asarray(jax.jit(sample)(jax.random.key(0), arrays))
     assert found.shape == (200, 4, 2)
     assert np.all(found[..., 0] == found[:, :1, 0])
@@ -244,35 +277,4 @@ def test_windows_of_frames_lie_within_clips():
     # Four starts in the first clip and two in the second, all of them drawn.
     assert set(found[:, 0, 1].astype(int)) == {0, 1, 2, 3, 7, 8}
     with pytest.raises(ValueError, match="8 frames.*longest has 7"):
-        aamdm_training.frame_windows(data().poses, data(), 8, batch=2)
-
-
-# --- spaces ------------------------------------------------------------------------
-
-SIZES = aamdm_embedding.Config(num_joints=6, latent=4, width=8)
-
-
-def space(autoencoder):
-    poses, paths = jnp.ones((4, 98)), jnp.ones((4, 12))
-    poses = poses * jnp.arange(4.0)[:, None]
-    if autoencoder:
-        statistics = aamdm_embedding.fit_statistics(poses, paths, config=SIZES)
-        params = tiny.random_params(aamdm_embedding.init, SIZES)
-        autoencoder = aamdm_space.Autoencoder(
-            params=params, statistics=statistics, config=SIZES
-        )
-    return aamdm_space.fit_space(
-        poses, paths, jnp.arange(3, dtype=jnp.int32), autoencoder=autoencoder or None
-    )
-
-
-@pytest.mark.parametrize("embedded", [False, True])
-def test_a_space_is_read_back(tmp_path, embedded):
-    made = space(embedded)
-    aamdm_training.save_space(tmp_path, made, {"source": "tests"})
-    found = aamdm_training.restore_space(tmp_path, lambda: jax.tree.map(jnp.copy, made))
-    assert jax.tree.structure(found) == jax.tree.structure(made)
-    assert_same(found, made)
-    with pytest.raises(checkpoint.CheckpointError, match=str(tmp_path)):
-        other = space(not embedded)
-        aamdm_training.restore_space(tmp_path, lambda: jax.tree.map(jnp.copy, other))
+        aamdm_training.frame_windows(numbered().poses, numbered(), 8, batch=2)

@@ -1,7 +1,9 @@
 """A model as a value: to JSON and back, from a run folder, and what may be wrong."""
 
 import copy
+import dataclasses
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ import numpy as np
 import optax
 import pytest
 
-from jaxmotion.learning import checkpoint, training
+from jaxmotion.learning import checkpoint, runs, training
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
@@ -164,15 +166,23 @@ def save_run(folder, model, params):
         ema_params=jax.tree.map(lambda x: 2 * x, params),
         opt_state=state.opt_state,
     )
-    value = camdm_model.to_json(model) | {"experiment": {"steps": 4}}
-    checkpoint.save(folder / "checkpoints", 4, state, value)
+    run = runs.begin(
+        folder,
+        system="camdm",
+        data=[],
+        settings={},
+        make=lambda: runs.Content(
+            model=camdm_model.to_json(model), source="", split={}, files={}
+        ),
+    )
+    value = dataclasses.asdict(model.config)
+    runs.store(run, camdm_model.STAGE, state, model=value)
 
 
 def test_a_run_gives_its_averaged_parameters(tmp_path, model, params):
     save_run(tmp_path, model, params)
-    found, found_params, value = camdm_model.load(tmp_path)
+    found, found_params, _ = camdm_model.load(tmp_path)
     assert found.config == model.config
-    assert value["experiment"] == {"steps": 4}
     jax.tree.map(
         lambda a, b: np.testing.assert_array_equal(a, 2 * b), found_params, params
     )
@@ -198,10 +208,24 @@ def test_parameters_of_another_size_are_refused(tmp_path, model, params):
             camdm_model.load(place)
 
 
-def test_a_folder_without_a_model(tmp_path):
+def test_a_folder_without_a_model(tmp_path, model, params):
     for place in (tmp_path, tmp_path / "none"):
-        with pytest.raises(checkpoint.CheckpointError, match=str(place)):
+        with pytest.raises(FileNotFoundError, match=f"{place}.*expected a run folder"):
             camdm_model.load(place)
-    checkpoint.save(tmp_path / "checkpoints", 1, {"a": jnp.ones(2)}, {"system": "else"})
+    save_run(tmp_path, model, params)
+    shutil.rmtree(tmp_path / "motion")
+    with pytest.raises(checkpoint.CheckpointError, match=str(tmp_path)):
+        camdm_model.load(tmp_path)
+    value = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(value | {"system": "else"}))
     with pytest.raises(ValueError, match=f"{tmp_path}.*'system' is 'else'"):
+        camdm_model.load(tmp_path)
+
+
+def test_a_checkpoint_of_another_model_is_named(tmp_path, model, params):
+    save_run(tmp_path, model, params)
+    value = json.loads((tmp_path / "config.json").read_text())
+    value["model"]["config"]["weight_foot"] = 7.0
+    (tmp_path / "config.json").write_text(json.dumps(value))
+    with pytest.raises(ValueError, match="motion: of another model: weight_foot is"):
         camdm_model.load(tmp_path)

@@ -5,7 +5,6 @@ import pytest
 
 from jaxmotion.data import text_motion
 from jaxmotion.systems.emdm import text as emdm_text
-from jaxmotion.systems.emdm import training as emdm_training
 from tests.reference import clip as oracle
 from tests.text import samples
 
@@ -37,12 +36,23 @@ def folder(tmp_path):
         fps=20.0,
         source="made in the tests",
     )
-    text_motion.save_text_motions(tmp_path / "data.npz", motions)
+    data = tmp_path / "motions.npz"
+    text_motion.save_text_motions(data, motions)
 
-    def write(**given):
-        value = {"task": "text", "encoder": str(clip)} | given
-        emdm_training.write_config(tmp_path, value)
-        return tmp_path
+    def write(form):
+        """A run folder with this text form."""
+        emdm_text.prepare(
+            tmp_path / "run",
+            (data,),
+            encoder=str(clip),
+            form=form,
+            unseen=(),
+            least=1,
+            fps=20.0,
+            frames=40,
+            held_out=0.1,
+        )
+        return tmp_path / "run"
 
     return write, weights
 
@@ -63,7 +73,7 @@ def released(text):
 def test_released_texts_are_cut_and_not_scaled(folder):
     write, weights = folder
     assert len(ids(LONG)) > 22
-    run = emdm_text.load_run(write(text_form="released"))
+    run = emdm_text.load_run(write("released"))
     want = vectors(weights, [released(SHORT), released(LONG)])
     whole = vectors(weights, [ids(SHORT), ids(LONG)])
     assert np.abs(want[1] - whole[1]).max() > 1e-2
@@ -75,22 +85,20 @@ def test_released_texts_are_cut_and_not_scaled(folder):
     )
 
 
-@pytest.mark.parametrize("given", [{}, {"text_form": "unit"}])
-def test_unit_texts_are_whole_and_scaled(folder, given):
-    """Also in folders from before there was a choice."""
+def test_unit_texts_are_whole_and_scaled(folder):
     write, weights = folder
-    run = emdm_text.load_run(write(**given))
+    run = emdm_text.load_run(write("unit"))
     whole = vectors(weights, [ids(SHORT), ids(LONG)])
     whole /= np.sqrt((whole**2).mean())
     np.testing.assert_allclose(run.vectors[run.index], whole, atol=1e-5)
     np.testing.assert_allclose(emdm_text.encode(run, (LONG,)), whole[1:], atol=1e-5)
 
 
-def test_the_two_forms_have_caches_of_their_own(folder):
+def test_the_two_forms_have_folders_of_their_own(folder):
     write, _ = folder
-    emdm_text.load_run(write(text_form="released"))
-    with pytest.raises(ValueError, match="texts.npz: field 'encoder'.*22 tokens"):
-        emdm_text.load_run(write(text_form="unit"))
+    write("released")
+    with pytest.raises(ValueError, match="text_form is 'released', given 'unit'; use"):
+        write("unit")
 
 
 def test_the_default_is_the_released_form_with_clip_alone():

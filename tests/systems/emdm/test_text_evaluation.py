@@ -19,6 +19,7 @@ from jaxmotion.evaluators import text_motion as text_motion_evaluator
 from jaxmotion.systems.emdm import text as emdm_text
 from jaxmotion.systems.emdm import text_evaluation as emdm_text_evaluation
 from jaxmotion.text import encoder
+from tests import tiny
 from tests.reference import matching as oracle
 
 SIZES = dict(movement_width=16, motion_width=12, text_width=10, embedding=8)
@@ -94,8 +95,7 @@ def run():
         source="made in the tests",
     )
     return emdm_text.TextRun(
-        folder=Path(),
-        config={},
+        record=tiny.run_folder(Path(), "emdm"),
         motions=motions,
         encoder=encoder.hashed_encoder(dimensions=8),
         vectors=np.zeros((1, 8)),

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import json
 import shutil
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -62,23 +61,30 @@ def batch(key, data, size):
     )
 
 
-def task(config=CONFIG, **describe):
+def run_of(folder, files="1"):
+    return tiny.run_folder(folder, "emdm", files={"data.npz": files})
+
+
+def load(folder, row):
+    return emdm_training.load_row(run_of(folder), row)
+
+
+def task(folder, config=CONFIG, files="1"):
     return emdm_training.Task(
+        run=run_of(folder, files),
         base=config,
         data=DATA,
         batch=batch,
         geometry=GEOMETRY,
-        describe={"source": "tests", "actions": ["a", "b"]} | describe,
-        source=Path(__file__),
     )
 
 
 PROGRAMS = {}
 
 
-def fit(folder, row, *, given=None, steps=4, **changes):
+def fit(folder, row, *, config=CONFIG, files="1", steps=4, **changes):
     """Trains a row; its update is compiled once for all folders, its start never."""
-    given = given or task()
+    given = task(folder, config, files)
     make, start, init = training.train_chunk, training.init_train_state, emdm_model.init
 
     def once(*parts, **options):
@@ -95,9 +101,7 @@ def fit(folder, row, *, given=None, steps=4, **changes):
         )
         patch.setattr(training, "train_chunk", once)
         patch.setattr(training, "init_train_state", placed)
-        emdm_training.train_row(
-            folder, given, row, generator=budget, discriminator=budget
-        )
+        emdm_training.train_row(given, row, generator=budget, discriminator=budget)
 
 
 # --- rows --------------------------------------------------------------------------
@@ -132,7 +136,7 @@ def test_unknown_rows_are_named_with_the_known_ones(tmp_path):
     for call in (
         lambda: emdm_training.check_rows(("emdm", "emdn", "x")),
         lambda: emdm_training.row_config(CONFIG, "emdn"),
-        lambda: emdm_training.load_row(tmp_path, "emdn"),
+        lambda: load(tmp_path, "emdn"),
         lambda: fit(tmp_path, "emdn"),
     ):
         with pytest.raises(ValueError, match="'emdn': expected.*emdm_5.*ddim_10"):
@@ -171,13 +175,13 @@ def test_a_row_leaves_checkpoints_and_losses(trained, row):
     prefix = "generator/" if row == "emdm" else ""
     assert {f"{prefix}{term}" for term in terms} <= set(rows[0])
     assert ("discriminator/r1" in rows[0]) == (row == "emdm")
-    value = runs.check_stage(folder, row, system="emdm")
-    assert value["source"] == "tests" and value["actions"] == ["a", "b"]
+    config = dataclasses.asdict(emdm_training.row_config(CONFIG, row))
+    runs.check_model(run_of(trained), row, config)
 
 
 @pytest.mark.parametrize("row", ["emdm", "ddpm_1000"])
 def test_a_row_is_read_back(trained, row):
-    params, config = emdm_training.load_row(trained, row)
+    params, config = load(trained, row)
     assert config == emdm_training.row_config(CONFIG, row)
     start = tiny.random_params(emdm_model.init, config)["generator"]
     assert jax.tree.structure(params) == jax.tree.structure(start)
@@ -189,8 +193,8 @@ def test_a_row_is_read_back(trained, row):
 
 
 def test_a_sampler_is_another_way_to_use_a_row(trained, monkeypatch):
-    params, config = emdm_training.load_row(trained, "ddim_10")
-    plain, same_config = emdm_training.load_row(trained, "ddpm_1000")
+    params, config = load(trained, "ddim_10")
+    plain, same_config = load(trained, "ddpm_1000")
     assert same(params, plain) and config == same_config
     seen, make = [], emdm_model.sampler
 
@@ -212,8 +216,8 @@ def test_a_resumed_row_ends_as_one_without_a_break(trained, tmp_path, row):
     fit(tmp_path, row, steps=2)
     assert checkpoint.latest_step(tmp_path / row / "checkpoints") == 2
     fit(tmp_path, row, override=True)
-    found, _ = emdm_training.load_row(tmp_path, row)
-    expected, _ = emdm_training.load_row(trained, row)
+    found, _ = load(tmp_path, row)
+    expected, _ = load(trained, row)
     assert same(found, expected)
     # The same numbers in every update, but for how long they took; the third update
     # after the first with a penalty has the next one.
@@ -231,29 +235,22 @@ def test_a_finished_row_is_not_trained_again(trained):
     assert losses(trained / "emdm") == before
 
 
-@pytest.mark.parametrize(
-    ("changes", "describe", "field"),
-    [
-        (dict(heads=1), {}, "config"),
-        (dict(weight_r1=0.5), {}, "config"),
-        ({}, dict(source="others"), "source"),
-    ],
-)
-def test_other_sizes_or_data_are_refused(trained, changes, describe, field):
-    given = task(dataclasses.replace(CONFIG, **changes), **describe)
+@pytest.mark.parametrize("change", [dict(heads=1), dict(weight_r1=0.5)])
+def test_other_sizes_are_refused(trained, change):
     for row in ("emdm", "ddpm_1000"):
-        with pytest.raises(ValueError, match=f"{row}: of another model: {field}"):
-            fit(trained, row, given=given)
+        with pytest.raises(
+            ValueError, match=f"{row}: of another model: {[*change][0]}"
+        ):
+            fit(trained, row, config=dataclasses.replace(CONFIG, **change))
         assert checkpoint.latest_step(trained / row / "checkpoints") == 4
 
 
 def test_other_budgets_are_refused(trained):
-    other = dataclasses.replace(task(), source=Path(emdm_training.__file__))
     for row, message, change in (
         ("emdm", "discriminator_rate is .*, given 0.5", dict(learning_rate=0.5)),
         ("ddpm_1000", "learning_rate is .*, given 0.5", dict(learning_rate=0.5)),
         ("emdm", "seed is 0, given 3", dict(seed=3)),
-        ("emdm", "data is .* .other data.", dict(given=other)),
+        ("emdm", "files.data.npz is '1', given '2'", dict(files="2")),
         ("emdm", "has 4 steps, expected at most the 3", dict(steps=3)),
     ):
         with pytest.raises(ValueError, match=f"{row}: .*{message}"):
@@ -263,10 +260,10 @@ def test_other_budgets_are_refused(trained):
 
 def test_rows_that_are_not_there_or_others_are_named(trained, tmp_path):
     with pytest.raises(checkpoint.CheckpointError, match="emdm_5"):
-        emdm_training.load_row(trained, "emdm_5")
+        load(trained, "emdm_5")
     shutil.copytree(trained / "ddpm_1000", tmp_path / "ddpm_50")
     with pytest.raises(checkpoint.CheckpointError) as error:
-        emdm_training.load_row(tmp_path, "ddpm_50")
+        load(tmp_path, "ddpm_50")
     for word in (str(tmp_path / "ddpm_50"), "'ddpm_1000'", "'ddpm_50'"):
         assert word in str(error.value)
     with pytest.raises(checkpoint.CheckpointError, match="another stage"):
@@ -278,7 +275,7 @@ def test_a_row_of_another_system_is_named(tmp_path):
     folder = tmp_path / "emdm"
     checkpoint.save(folder / "checkpoints", 1, {"ema_params": DATA}, value)
     for call in (
-        lambda: emdm_training.load_row(tmp_path, "emdm"),
+        lambda: load(tmp_path, "emdm"),
         lambda: fit(tmp_path, "emdm"),
     ):
         with pytest.raises(
@@ -352,34 +349,19 @@ def test_a_scale_of_one_is_no_guidance(many):
     np.testing.assert_allclose(guided, plain, rtol=1e-4, atol=1e-4)
 
 
-# --- the folder's own settings -----------------------------------------------------
-
-
-def test_settings_come_back_with_their_system(tmp_path):
-    value = {"field": "content", "frames": 60, "held_out": 0.2, "merge": {"a": "b"}}
-    emdm_training.write_config(tmp_path, value)
-    assert emdm_training.read_config(tmp_path) == {"system": "emdm"} | value
+# --- whose run it is ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("settings", "message"),
     [
-        (None, "config.json: no such file: expected a run folder of"),
-        ("{", "config.json: not JSON"),
-        ("[1]", "config.json: a JSON list, expected an object"),
-        (
-            '{"field": "content"}',
-            "config.json: field 'system' is None, expected 'emdm'",
-        ),
-        (
-            '{"system": "aamdm"}',
-            "config.json: field 'system' is 'aamdm', expected 'emdm'",
-        ),
+        ({}, "'settings.task' is None, expected 'action' or 'none'"),
+        ({"task": "action", "frames": 60}, "'settings.field' is None, expected a text"),
+        ({"task": "action", "field": "a", "frames": "6"}, "expected a whole number"),
+        ({"task": "text", "field": "a", "frames": 6}, "'text', expected 'action' or "),
     ],
 )
-def test_other_folders_are_named(tmp_path, content, message):
-    if content is not None:
-        (tmp_path / "config.json").write_text(content)
-    with pytest.raises((OSError, ValueError), match=message) as error:
-        emdm_training.read_config(tmp_path)
-    assert str(tmp_path) in str(error.value)
+def test_runs_of_another_task_are_named(tmp_path, settings, message):
+    run = tiny.run_folder(tmp_path, "emdm", settings=settings)
+    with pytest.raises(ValueError, match=f"^{run.config}: field .*{message}"):
+        emdm_training.check_task(run, ("action", "none"))

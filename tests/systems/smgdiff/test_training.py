@@ -1,12 +1,12 @@
 """SMGDiff's runs: splits, stages, folders, and what plans and players score."""
 
 import dataclasses
-import json
 
 import jax
 import numpy as np
 import pytest
 
+from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.learning import runs
 from jaxmotion.learning.checkpoint import CheckpointError, latest_step, load_config
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
@@ -30,15 +30,14 @@ BUDGET = runs.Budget(steps=4, batch=4, chunk=2, save_every=2)
 def run(tmp_path_factory):
     """Both stages, trained for four updates."""
     folder = tmp_path_factory.mktemp("run")
-    train, held_out = smgdiff_data.split(ball_walker.clips(60), fraction=0.3)
-    model = smgdiff_training.make_model(train, sizes=SIZES, paths=PATHS)
-    made = smgdiff_training.Run(
-        folder=folder, model=model, train=train, held_out=held_out
+    data = folder / "clips.npz"
+    save_ball_clips(data, ball_walker.clips(60))
+    made = smgdiff_training.prepare(
+        folder / "run", data, held_out=0.3, sizes=SIZES, paths=PATHS
     )
-    smgdiff_training.write_run(made)
     for stage in ("motion_2", "paths_1"):
         smgdiff_training.train_stage(made, stage, budget=BUDGET, draft_steps=2)
-    return smgdiff_training.load_run(folder)
+    return smgdiff_training.load_run(folder / "run")
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +55,13 @@ def setting(run):
 
 def test_a_motion_model_starts_from_a_draft_with_weights_of_its_own(run):
     draft, last = (
-        load_config(run.folder / "motion_2" / where / "checkpoints")
+        load_config(run.record.folder / "motion_2" / where / "checkpoints")
         for where in ("draft", "")
     )
-    assert draft["config"] | smgdiff_training.DRAFT == draft["config"]
-    assert draft["config"] != last["config"] == dataclasses.asdict(run.model.config)
-    assert latest_step(run.folder / "motion_2" / "draft" / "checkpoints") == 2
-    assert not (run.folder / "paths_1" / "draft").exists()
+    assert draft["model"] | smgdiff_training.DRAFT == draft["model"]
+    assert draft["model"] != last["model"] == dataclasses.asdict(run.model.config)
+    assert latest_step(run.record.folder / "motion_2" / "draft" / "checkpoints") == 2
+    assert not (run.record.folder / "paths_1" / "draft").exists()
 
 
 def test_pieces_of_one_recording_stay_together():
@@ -108,12 +107,15 @@ def test_a_run_comes_back_from_its_folder(run):
 
 
 def test_another_model_does_not_go_into_the_same_folder(run):
-    config = dataclasses.replace(run.model.config, width=32)
-    other = dataclasses.replace(
-        run, model=dataclasses.replace(run.model, config=config)
-    )
-    with pytest.raises(ValueError, match="another model: config."):
-        smgdiff_training.write_run(other)
+    data = run.record.folder.parent / "clips.npz"
+    for change, message in (
+        (dict(sizes=SIZES | dict(width=32)), "sizes.width is 16, given 32"),
+        (dict(paths=PATHS | dict(depth=2)), "paths.depth is 1, given 2"),
+        (dict(held_out=0.4), "held_out is 0.3, given 0.4"),
+    ):
+        given = dict(held_out=0.3, sizes=SIZES, paths=PATHS) | change
+        with pytest.raises(ValueError, match=f"made otherwise: {message}"):
+            smgdiff_training.prepare(run.record.folder, data, **given)
 
 
 def test_stages_are_named_by_kind_and_steps(run):
@@ -123,19 +125,6 @@ def test_stages_are_named_by_kind_and_steps(run):
             smgdiff_training.with_steps(run.model, name)
     with pytest.raises(CheckpointError):
         smgdiff_training.load_stage(run, "motion_5")
-
-
-def test_bad_folders_are_named(tmp_path):
-    with pytest.raises(
-        FileNotFoundError, match="config.json: no such file: expected a run folder"
-    ):
-        smgdiff_training.load_run(tmp_path)
-    (tmp_path / "config.json").write_text("{")
-    with pytest.raises(ValueError, match="not JSON"):
-        smgdiff_training.load_run(tmp_path)
-    (tmp_path / "config.json").write_text(json.dumps({"system": "emdm"}))
-    with pytest.raises(ValueError, match="field 'system' is 'emdm'"):
-        smgdiff_training.load_run(tmp_path)
 
 
 def test_situations_hold_what_was_and_what_came(run):
