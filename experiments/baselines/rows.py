@@ -141,10 +141,10 @@ def train_baseline(
         return found.at[:, given].add(noise)
 
     runs.minimize(
+        _BASELINES[name].init(jax.random.key(budget.seed), config),
         run.record,
         _stage(name),
         loss,
-        _BASELINES[name].init(jax.random.key(budget.seed), config),
         sample,
         arrays,
         budget=budget,

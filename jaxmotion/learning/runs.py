@@ -534,10 +534,10 @@ def fit(
 
 
 def minimize(
+    params: Params,
     run: Run,
     stage: str,
     loss: training.Loss,
-    params: Params,
     sample_batch: Callable[[Key, Any], Any],
     data: Any,
     *,
@@ -547,10 +547,10 @@ def minimize(
     """Trains a stage of one network by a loss, with the budget's optimizer.
 
     Args:
+      params: Initial parameters.
       run: The run.
       stage: Name of the stage.
       loss: `(params, key, batch) -> (loss, info)`.
-      params: Initial parameters.
       sample_batch: `(key, data) -> batch`.
       data: Arrays.
       budget: How long.

@@ -243,10 +243,10 @@ def train_autoencoder(run: Run, budget: Budget) -> Autoencoder:
         return found[..., :size], found[..., size:]
 
     state = runs.minimize(
+        aamdm_embedding.init(jax.random.key(budget.seed), config),
         run.record,
         "autoencoder",
         loss,
-        aamdm_embedding.init(jax.random.key(budget.seed), config),
         sample,
         arrays,
         budget=budget,
@@ -352,10 +352,10 @@ def train_polisher(
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     change = space.change if config.target == "change" else None
     state = runs.minimize(
+        aamdm_model.init(jax.random.key(budget.seed), config)["polisher"],
         run.record,
         _stage(name, config, "polisher"),
         functools.partial(aamdm_loss.polisher_loss, config=config, change=change),
-        aamdm_model.init(jax.random.key(budget.seed), config)["polisher"],
         *frame_windows(frames, run.train, config.window + 1, batch=budget.batch),
         budget=budget,
         model=_shared(config),

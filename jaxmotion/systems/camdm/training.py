@@ -371,10 +371,10 @@ def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> No
     else:
         _, params = continued(model, init)
     runs.minimize(
+        params,
         run,
         STAGE,
         functools.partial(camdm_loss.loss, skeleton=model.skeleton, config=config),
-        params,
         window_sampler(field=field, batch=budget.batch),
         jax.tree.map(jnp.asarray, (clips, index)),
         budget=budget,

@@ -209,7 +209,7 @@ def train_row(
             emdm_loss.diffusion_loss, config=config, geometry=geometry
         )
         runs.minimize(
-            task.run, stage, loss, params["generator"], sample, task.data, **common
+            params["generator"], task.run, stage, loss, sample, task.data, **common
         )
         return
     optimizers = runs.make_optimizer(generator), runs.make_optimizer(discriminator)

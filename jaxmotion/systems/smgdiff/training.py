@@ -309,10 +309,10 @@ def _fit(
         return (scenes if is_motion else scenes.motion), labels
 
     state = runs.minimize(
+        params,
         run.record,
         stage,
         loss,
-        params,
         sample_batch,
         arrays,
         budget=budget,
