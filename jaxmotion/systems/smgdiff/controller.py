@@ -347,7 +347,7 @@ class Method:
         """The controller."""
         motion, paths, representation = params
         return controller(
-            smgdiff_trajectory.generator(paths, config=self.paths),
+            smgdiff_trajectory.sampler(paths, config=self.paths),
             smgdiff_guidance.sampler(
                 motion,
                 config=self.config,
