@@ -73,11 +73,6 @@ def _known(flags, cache):
     return known
 
 
-@pytest.fixture(scope="module")
-def quick_compile():
-    """Nothing any more: goes with its last use."""
-
-
 @pytest.fixture(scope="session")
 def _modules():
     """Names of the modules that ran since compiled programs were last forgotten."""

@@ -13,8 +13,6 @@ from jaxmotion.data import bvh, bvh_text
 from jaxmotion.motion.skeleton import joint_positions
 from tests import samples
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 @pytest.fixture(scope="module")
 def model():

@@ -277,7 +277,7 @@ from pathlib import Path
 import jax, jax.numpy as jnp, optax
 from jaxmotion.learning import training
 from jaxmotion.learning.loop import Loop, train
-from jaxmotion.protocols import script
+from jaxmotion import cli
 def main():
     def run(state, key, data, count):
         if int(state.step) == 2:
@@ -292,7 +292,7 @@ def main():
         return state, info
     settings = Loop(num_steps=6, chunk=2, save_every=2, folder=folder, config={{}})
     train(counted, state, None, None, loop=settings)
-script.start(main)
+cli.start(main)
 """
 
 
