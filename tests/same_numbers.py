@@ -24,6 +24,7 @@ ROOT = Path(__file__).parents[1]
 RECORD = Path(__file__).with_suffix(".json")
 # Cells that are times, and what says when, where and by what it was made.
 TIMES = (
+    "ms a frame",
     "steps_per_second",
     "p50 ms",
     "p95 ms",
