@@ -31,6 +31,8 @@ MODULES_REMEMBERED = 4
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config):
     """Workers for the whole suite; files that are named run in one process."""
+    if hasattr(config, "workerinput"):
+        return  # a worker makes no workers
     given = getattr(config.option, "numprocesses", 0)
     if given is None and config.args_source is not config.ArgsSource.ARGS:
         config.option.numprocesses = "auto"
