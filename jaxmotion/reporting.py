@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmotion import files
 from jaxmotion.data import bvh
-from jaxmotion.evaluation import bench, table
+from jaxmotion.evaluation import bench, columns, table
 from jaxmotion.learning import runs
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
@@ -146,7 +146,8 @@ def write_sweep(
     title, notes = report["title"], [*report["notes"]]
     left_out = _draw(folder / "pareto.png", rows, points, quality, sample, title)
     if left_out:
-        notes.append(f"not in the plot, for want of a finite {quality}: {left_out}")
+        missing = f"for want of a finite {columns.header(quality)}"
+        notes.append(f"not in the plot, {missing}: {left_out}")
     whole = report | {"notes": notes, "rows": table.to_json(rows)}
     files.write_text(folder / "table.json", json.dumps(whole, indent=1))
     text = table.to_markdown(rows)
@@ -184,7 +185,7 @@ def _draw(
             tuple(point.name for point in shown),
             *(
                 np.array([_ends(rows[point.row][column]) for point in shown])
-                for column in ("p50 ms", quality)
+                for column in ("p50", quality)
             ),
             references={
                 name: np.array(_ends(rows[name][quality]))
@@ -192,7 +193,7 @@ def _draw(
                 if is_finite(name)
             },
             xlabel=f"{sample}, batch 1: p50, ms",
-            ylabel=f"{quality} (lower is better)",
+            ylabel=f"{columns.header(quality)} (lower is better)",
             title=title,
             broken=tuple(
                 point.name for point in shown if bench.has_failed(rows[point.row])

@@ -26,8 +26,8 @@ RECORD = Path(__file__).with_suffix(".json")
 TIMES = (
     "ms a frame",
     "steps_per_second",
-    "p50 ms",
-    "p95 ms",
+    "p50",
+    "p95",
     "ms",
     "first_ms",
     "seconds",

@@ -16,9 +16,7 @@ from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
 
 # Columns of steered rollouts that neither the paper's tables nor ours have.
-_LEFT_OUT = tuple(
-    f"{name}_uc" for name in ("div", "speed_m/s", "acceleration_m/s2", "jerk_m/s3")
-)
+_LEFT_OUT = tuple(f"{name}_uc" for name in ("div", "speed", "acceleration", "jerk"))
 
 
 def trained_rows(

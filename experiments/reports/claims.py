@@ -6,8 +6,9 @@ The data lie in experiments/papers, a file a system.
 import dataclasses
 import tomllib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+from jaxmotion.evaluation import columns
 from jaxmotion.systems import registry
 
 FOLDER = Path(__file__).parents[1] / "papers"
@@ -33,26 +34,31 @@ class Source:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Column:
-    """A metric of a table.
+    """A metric of a table; what is not said here is as `columns.COLUMNS` declares it.
 
     Attributes:
       name: As the paper names it.
-      here: As metrics.json names it.
-      better: Where good values lie; "real" is near those of recorded motion.
-      kind: "mean" has an interval of 95 %, or none; "time" has the middle half of the
-        calls, or none; "count" is a number of the samples.
-      judged: A recognizer's: values of two recognizers do not compare.
+      here: Id of the column here.
+      better: Where good values lie.
+      kind: What its intervals are.
+      evaluated: It is an evaluator's: values of two evaluators do not compare.
       scale: Factor from the unit here to the paper's.
       note: What differs from the paper's metric.
     """
 
     name: str
     here: str
-    better: Literal["lower", "higher", "real"]
-    kind: Literal["mean", "time", "count"] = "mean"
-    judged: bool = False
+    better: columns.Direction
+    kind: columns.Kind = "mean"
+    evaluated: bool = False
     scale: float = 1.0
     note: str = ""
+
+
+def _column(value: dict[str, Any]) -> Column:
+    declared = columns.COLUMNS[value["here"]]
+    names = ("better", "kind", "evaluated")
+    return Column(**{name: getattr(declared, name) for name in names} | value)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -222,7 +228,7 @@ def read_paper(system: registry.System) -> Paper:
             name: Source(**value | {"commands": tuple(value["commands"])})
             for name, value in whole.pop("source").items()
         }
-        columns = {k: Column(**value) for k, value in whole.pop("column").items()}
+        known = {k: _column(value) for k, value in whole.pop("column").items()}
         tables = []
         for value in whole.pop("table"):
             names, claims = value.pop("columns"), value.pop("claims", [])
@@ -230,7 +236,7 @@ def read_paper(system: registry.System) -> Paper:
             table = Table(
                 paper=system.title,
                 source=sources[value.pop("source")],
-                columns=tuple(columns[name] for name in names),
+                columns=tuple(known[name] for name in names),
                 rows=tuple(rows),
                 claims=tuple(Claim(pairs=_pairs(x), **x) for x in claims),
                 **value,

@@ -3,12 +3,12 @@
 import math
 from collections.abc import Iterable
 
+from jaxmotion.evaluation import columns
 from jaxmotion.evaluation.table import Cell
 from reports import verdicts
 from reports.claims import Absent, Claim, Column, Row, Source, Stated, Table
 from reports.results import Found, provenance
 
-ARROWS = {"lower": "↓", "higher": "↑", "real": "→"}
 # Command lines that leave a source behind.
 Commands = dict[Source, tuple[str, ...]]
 Decided = list[tuple[Table, Claim, verdicts.Decision]]
@@ -178,7 +178,7 @@ def section(
     Returns:
       The lines.
     """
-    header = [f"{x.name} {ARROWS[x.better]}" for x in table.columns]
+    header = [f"{x.name} {columns.ARROWS[x.better]}" for x in table.columns]
     notes = [f"{x.name}: {x.note}" for x in table.columns if x.note]
     lines = [f"### {table.name}: {table.title}", "", table.note, ""]
     lines += table_lines(
@@ -223,12 +223,12 @@ def absent_lines(absent: Iterable[Absent]) -> list[str]:
     return [*table_lines(("paper", "what", "why not"), rows), ""]
 
 
-def source_lines(found: Found, judged: set[Source]) -> list[str]:
+def source_lines(found: Found, evaluated: set[Source]) -> list[str]:
     """Lines of where every file came from.
 
     Args:
       found: All that was measured.
-      judged: Sources with values of a recognizer.
+      evaluated: Sources with values of an evaluator.
 
     Returns:
       The lines.
@@ -239,6 +239,6 @@ def source_lines(found: Found, judged: set[Source]) -> list[str]:
             lines += [f"- {source.run}, {source.file}: not run"]
             continue
         lines += [f"- `{there.path}`"]
-        told = provenance(there, judged=source in judged)
+        told = provenance(there, evaluated=source in evaluated)
         lines += [f"  - {name}: {text}" for name, text in told.items()]
     return [*lines, ""]

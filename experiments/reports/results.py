@@ -27,8 +27,8 @@ class Measured:
     about: dict[str, Any]
 
     @property
-    def judge(self) -> tuple[str, str] | None:
-        """Fingerprints of the recognizer and of the clips that distances refer to."""
+    def evaluator(self) -> tuple[str, str] | None:
+        """Fingerprints of the evaluator and of the clips that distances refer to."""
         found = self.about.get("evaluator")
         names = ("fingerprint", "reference_clips")
         if not isinstance(found, dict) or not all(name in found for name in names):
@@ -131,7 +131,7 @@ def _data(about: dict[str, Any], evaluator: Any) -> str:
         return str(about["source"])
     run = about.get("run")
     files = run.get("data", []) if isinstance(run, dict) else []
-    # Data and license of whom the recognizer was trained on, where nothing else says.
+    # Data and license of what the evaluator was trained on, where nothing else says.
     told = evaluator.get("recognizer") if isinstance(evaluator, dict) else None
     parts = [", ".join(str(x) for x in files), f"recognizer: {told}" if told else ""]
     return "; ".join(filter(None, parts)) or NOT_RECORDED
@@ -144,12 +144,12 @@ def _evaluator(evaluator: Any) -> str:
     return _joined(evaluator, names).removeprefix("fingerprint ")
 
 
-def provenance(measured: Measured, *, judged: bool) -> dict[str, str]:
+def provenance(measured: Measured, *, evaluated: bool) -> dict[str, str]:
     """What a file says about how its rows came about.
 
     Args:
       measured: Of the file.
-      judged: Whether a recognizer had a part in it.
+      evaluated: Whether an evaluator had a part in it.
 
     Returns:
       Texts by heading; "not recorded" for what it does not say.
@@ -164,6 +164,6 @@ def provenance(measured: Measured, *, judged: bool) -> dict[str, str]:
         "versions": _joined(about, ("python", "jax", "jaxlib", "flax", "numpy")),
         "hardware": _joined(about, ("cpu", "machine", "cores", "devices")),
         "git commit": str(about.get("git_commit") or NOT_RECORDED),
-        "evaluator": _evaluator(evaluator) if judged else "none needed",
+        "evaluator": _evaluator(evaluator) if evaluated else "none needed",
         "arguments": json.dumps(arguments) if arguments else NOT_RECORDED,
     }

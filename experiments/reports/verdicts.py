@@ -30,8 +30,8 @@ RULE = (
     "Intervals are those of the file, of 95 %. Counts have Wilson's. Times have what "
     "their column says, and those without spread a factor of "
     f"{TIME_FACTOR:g} either way; others without an interval decide nothing.",
-    "Rows of several files that a recognizer judged are compared only if the files "
-    "name the same recognizer and reference clips.",
+    "Rows of several files that an evaluator scored are compared only if the files "
+    "name the same evaluator and reference clips.",
     "Intervals run over replications, clips or rollouts with one training of each "
     "row: what another seed of training would change is not in them.",
 )
@@ -177,12 +177,16 @@ def printed(value: Stated) -> float | None:
     return value[0] if isinstance(value, tuple) else value
 
 
-def _judges_differ(table: Table, column: Column, rows: list[Row], found: Found) -> bool:
+def _evaluators_differ(
+    table: Table, column: Column, rows: list[Row], found: Found
+) -> bool:
     sources = {table.source_of(row) for row in rows}
-    if not column.judged or len(sources) <= 1:
+    if not column.evaluated or len(sources) <= 1:
         return False
-    judges = {measured.judge for source in sources if (measured := found.get(source))}
-    return len(judges) > 1 or None in judges
+    evaluators = {
+        measured.evaluator for source in sources if (measured := found.get(source))
+    }
+    return len(evaluators) > 1 or None in evaluators
 
 
 def decide(table: Table, claim: Claim, found: Found) -> Decision:
@@ -201,8 +205,8 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     cells = {row.name: cell_of(table, row, column, found) for row in rows}
     absent = [name for name, cell in cells.items() if cell is None]
     present = {name: cell for name, cell in cells.items() if cell is not None}
-    if _judges_differ(table, column, [table.row(name) for name in present], found):
-        reason = "rows were judged by different or unrecorded evaluators"
+    if _evaluators_differ(table, column, [table.row(name) for name in present], found):
+        reason = "rows were scored by different or unrecorded evaluators"
         return Decision(verdict="not decided", reason=reason)
     finite = {
         name: ends(cell, column)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxmotion import files
+from jaxmotion.evaluation import columns
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.systems import registry
 from jaxmotion.viz import plots
@@ -24,11 +25,11 @@ SOURCES = tuple(
     dict.fromkeys(table.source_of(row) for table in TABLES for row in table.rows)
 )
 # Those with values of an evaluator.
-JUDGED = {
+EVALUATED = {
     table.source_of(row)
     for table in TABLES
     for row in table.rows
-    if any(column.judged for column in table.columns)
+    if any(column.evaluated for column in table.columns)
 }
 
 
@@ -60,7 +61,7 @@ def draw(path: Path, table: Table, found: Found) -> None:
         target = 0 if column.better == "real" else None
         panels.append(
             plots.Panel(
-                title=f"{column.name} {markdown.ARROWS[column.better]}",
+                title=f"{column.name} {columns.ARROWS[column.better]}",
                 left=np.array([_printed(row.paper[place]) for row in table.rows]),
                 right=np.array([_ends(cell, column) for cell in cells]),
                 target=target,
@@ -151,7 +152,11 @@ def _json(
         "sources": [
             {"run": source.run, "file": source.file, "command": commands[source]}
             | {"found": None if there is None else str(there.path)}
-            | ({} if there is None else provenance(there, judged=source in JUDGED))
+            | (
+                {}
+                if there is None
+                else provenance(there, evaluated=source in EVALUATED)
+            )
             for source, there in found.items()
         ],
     }
@@ -185,7 +190,7 @@ def _lines(
             lines += markdown.section(table, decided, found, commands, picture)
     lines += ["## What cannot be run here", "", *markdown.absent_lines(ABSENT)]
     lines += ["## Where the values come from", ""]
-    lines += markdown.source_lines(found, JUDGED)
+    lines += markdown.source_lines(found, EVALUATED)
     shown = "; ".join(f"{name} {text}" for name, text in made.items())
     return [*lines, f"This report was written with: {shown}."]
 

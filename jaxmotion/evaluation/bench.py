@@ -298,10 +298,10 @@ def time_cells(times: np.ndarray, *, seed: int) -> Row:
     """
     found = statistics.bootstrap_interval(times, np.median, seed=seed)
     return {
-        "p50 ms": Cell(
+        "p50": Cell(
             value=found.estimate, low=found.low, high=found.high, samples=times.size
         ),
-        "p95 ms": Cell(value=float(np.percentile(times, 95)), samples=times.size),
+        "p95": Cell(value=float(np.percentile(times, 95)), samples=times.size),
     }
 
 

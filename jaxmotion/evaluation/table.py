@@ -8,13 +8,14 @@ import csv
 import dataclasses
 import io
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmotion.evaluation import statistics
+from jaxmotion.evaluation import columns, statistics
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,6 +90,26 @@ def cell(
     return Cell(value=scale * estimate, low=low, high=high, samples=count)
 
 
+def row(scores: Sequence[dict[str, Array]], *, order: Sequence[str] = ()) -> Row:
+    """Means over replications with 95 % intervals, within the columns' bounds.
+
+    Args:
+      scores: One dictionary a replication, of the same names.
+      order: Names in the order of the table's columns; others follow. Compiled
+        programs return dictionaries in alphabetical order.
+    """
+    places = {name: i for i, name in enumerate(order)}
+    names = sorted(scores[0], key=lambda name: places.get(name, len(places)))
+    unknown = columns.Column(id="", title="")
+    return {
+        name: cell(
+            jnp.stack([one[name] for one in scores]),
+            bounds=columns.COLUMNS.get(name, unknown).bounds,
+        )
+        for name in names
+    }
+
+
 def to_json(rows: Rows) -> dict[str, Any]:
     """Rows as a JSON object.
 
@@ -130,10 +151,11 @@ def to_markdown(rows: Rows) -> str:
     Returns:
       The table, intervals in brackets, sample counts in parentheses.
     """
-    columns = list(dict.fromkeys(c for row in rows.values() for c in row))
-    lines = ["| row | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
-    for name, row in rows.items():
-        cells = " | ".join(_text(row.get(column)) for column in columns)
+    names = list(dict.fromkeys(name for row in rows.values() for name in row))
+    titles = " | ".join(columns.header(name) for name in names)
+    lines = [f"| row | {titles} |", "|---" * (len(names) + 1) + "|"]
+    for name, cells_of in rows.items():
+        cells = " | ".join(_text(cells_of.get(column)) for column in names)
         lines.append(f"| {name} | {cells} |")
     return "\n".join(lines)
 

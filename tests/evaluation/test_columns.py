@@ -1,17 +1,19 @@
 """Cells of a table."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
 
-from jaxmotion.evaluation import columns
+from jaxmotion.evaluation import columns, table
 
 
 def test_a_row_holds_means_and_students_intervals_in_the_asked_order():
     values = np.array([1.0, 2.0, 4.0, 5.0])
     scores = [{"a": jnp.float32(v), "b": jnp.float32(2 * v), "c": v} for v in values]
-    found = columns.row(scores, order=("b", "unknown", "c"))
+    found = table.row(scores, order=("b", "unknown", "c"))
     assert list(found) == ["b", "c", "a"]
     half = scipy.stats.t.ppf(0.975, 3) * values.std(ddof=1) / 2
     assert found["a"].value == pytest.approx(3.0)
@@ -20,8 +22,17 @@ def test_a_row_holds_means_and_students_intervals_in_the_asked_order():
 
 
 def test_intervals_of_proportions_stay_within_them():
-    scores = [{"skill accuracy": jnp.float32(x), "fid": x} for x in (0.9, 1.0, 1.0)]
+    scores = [{"skill_accuracy": jnp.float32(x), "fid": x} for x in (0.9, 1.0, 1.0)]
     scores = [{k: jnp.float32(v) for k, v in one.items()} for one in scores]
-    row = columns.row(scores)
-    assert row["skill accuracy"].high == 1.0
+    row = table.row(scores)
+    assert row["skill_accuracy"].high == 1.0
     assert row["fid"].high == pytest.approx(1.11, abs=1e-2)
+
+
+def test_columns_are_declared_once_and_named_apart():
+    headers = [column.header for column in columns.COLUMNS.values()]
+    assert len(set(headers)) == len(headers)
+    for name, column in columns.COLUMNS.items():
+        assert column.id == name and re.fullmatch("[a-z0-9_]+", name)
+    assert columns.header("foot_slide") == "foot slide, m/s"
+    assert columns.header("not declared") == "not declared"

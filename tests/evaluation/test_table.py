@@ -88,7 +88,7 @@ def test_json_is_strict_json_and_holds_the_numbers():
 def test_markdown_has_a_column_for_each_metric_and_dashes_for_gaps():
     lines = table.to_markdown(ROWS).splitlines()
     grid = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
-    assert grid[0] == ["row", "error", "fid", "extra"]
+    assert grid[0] == ["row", "error", "FID", "extra"]
     assert set(lines[1]) == {"|", "-"} and lines[1].count("|") == 5
     assert grid[2] == ["truth", "1.25 [1, 1.5] (n=9)", "0.5 (n=1)", "–"]
     assert grid[3] == ["made", "– (n=0)", "–", "3 [2, 4] (n=2)"]

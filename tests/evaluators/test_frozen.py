@@ -289,7 +289,7 @@ def test_the_same_evaluator_gives_the_same_numbers(ball, tmp_path):
         same(found.judge.params, ball[-1].params)
     first, second = (smgdiff_evaluation.score_real(x) for x in settings)
     for one, other in zip(first, second, strict=True):
-        assert {"FID", "skill accuracy"} < set(one) == set(other)
+        assert {"fid", "skill_accuracy"} < set(one) == set(other)
         assert [float(v) for v in one.values()] == [float(v) for v in other.values()]
 
 

@@ -101,8 +101,8 @@ def test_what_is_trained_is_not_trained_again(call, trained, data):
 
 # --- evaluation --------------------------------------------------------------------
 
-FREE = {"diverged", "div", "fid", "ffr_mann", "ffr_gmd", "speed_m/s"}
-STEERED = {"diverged_uc", "te_promised", "te_realized", "trajectory_error_deg"}
+FREE = {"diverged", "div", "fid", "ffr_mann", "ffr_gmd", "speed"}
+STEERED = {"diverged_uc", "te_promised", "te_realized", "trajectory_error"}
 
 
 @pytest.mark.slow
@@ -122,7 +122,7 @@ def test_an_evaluation_has_the_data_and_the_trained_rows(evaluated):
         free = FREE & set(rows[name])
         assert free in (FREE, {"diverged"})
         assert free == FREE or rows[name]["diverged"]["value"] > 0
-    assert 0.0 < rows["data (trained on)"]["speed_m/s"]["value"] < 2.0
+    assert 0.0 < rows["data (trained on)"]["speed"]["value"] < 2.0
     assert "procedural" in found["source"]
 
 

@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from jaxmotion.data import bvh, bvh_text, clips_io, windows
+from jaxmotion.evaluation import columns
 from jaxmotion.learning import checkpoint
 from jaxmotion.motion import trajectory
 from jaxmotion.systems.camdm import model as camdm_model
@@ -164,7 +165,7 @@ def check_evaluation(folder, rollouts):
     every = {column for column, _ in camdm_release.COLUMNS.values()}
     assert released["rollouts"] == every
     # Of clips that nobody steered there is no error of direction or facing.
-    steered = {name for name in every if name.endswith("_deg")}
+    steered = {name for name in every if columns.COLUMNS[name].unit == "°"}
     assert released["held-out (ground truth)"] == every - steered
     for name in every:
         assert found["rows"]["rollouts"][name]["samples"] == rollouts
@@ -221,7 +222,7 @@ def test_speeds_are_measured_beside_data_and_by_frame_of_the_plan(call, trained)
     assert found["rows"]["told 0 m/s"]["creep_cm"]["samples"] == 2
     data = found["rows"]["training, about 1 m/s"]
     assert data["windows"]["value"] > 0
-    assert 0.8 < data["speed_m/s"]["value"] < 1.2
+    assert 0.8 < data["speed"]["value"] < 1.2
     places = found["by_frame_of_the_plan"]["told 1 m/s"]
     assert len(places["jerk"]) == 15 and min(places["frames"]) > 0
     text = (trained / "speeds" / "table.md").read_text()

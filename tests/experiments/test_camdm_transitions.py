@@ -62,7 +62,7 @@ def test_a_tiny_run_twice_gives_the_same_table(invoke, tmp_path):
     assert found[0]["rows"] == found[1]["rows"]
     assert len(found[0]["rows"]) == 4
     for row in found[0]["rows"].values():
-        assert 0 <= row["success_%"]["value"] <= 100
-        assert row["transition_s"]["samples"] == 2
+        assert 0 <= row["success"]["value"] <= 100
+        assert row["transition_time"]["samples"] == 2
     assert found[0]["rollouts"] == 4 and found[0]["jax"] and found[0]["git_commit"]
     assert "4 rollouts a row" in (tmp_path / "a" / "table.md").read_text()

@@ -83,12 +83,12 @@ def test_actions_are_scored_beside_real_motions(call, actions):
         "ddpm_50",
     }
     for name, row in rows.items():
-        assert {"FID", "accuracy", "diversity", "multimodality"} <= set(row), name
-        assert 0 <= row["accuracy"]["value"] <= 1 and row["FID"]["value"] >= 0
-        assert row["FID"]["samples"] == 2 and row["FID"]["low"] is not None
-    assert rows["emdm"]["network calls"]["value"] == 10
-    assert rows["ddpm_50"]["network calls"]["value"] == 50
-    assert rows["emdm"]["ms a frame"]["value"] > 0
+        assert {"fid", "accuracy", "diversity", "multimodality"} <= set(row), name
+        assert 0 <= row["accuracy"]["value"] <= 1 and row["fid"]["value"] >= 0
+        assert row["fid"]["samples"] == 2 and row["fid"]["low"] is not None
+    assert rows["emdm"]["network_calls"]["value"] == 10
+    assert rows["ddpm_50"]["network_calls"]["value"] == 50
+    assert rows["emdm"]["frame_time"]["value"] > 0
     assert report["evaluator"]["recognizer"].startswith("GRU") and report["jax"]
     assert "procedural" in report["evaluator"]["recognizer"].lower()
 
@@ -102,7 +102,7 @@ def test_the_same_seed_gives_the_same_scores(call, actions, tmp_path):
         )
     first, second = (rows_of(tmp_path / name)["rows"] for name in "ab")
     for row in ("real (held-out clips)", "emdm"):
-        for column in ("FID", "accuracy", "diversity", "multimodality"):
+        for column in ("fid", "accuracy", "diversity", "multimodality"):
             assert first[row][column] == second[row][column]
 
 
@@ -126,7 +126,7 @@ def test_motions_from_nothing(call, data, tmp_path):
     )
     call(f"evaluate --run {folder} --samples 20 --replications 2 --evaluator-steps 20")
     row = rows_of(folder / "evaluation")["rows"]["emdm"]
-    assert "accuracy" not in row and row["FID"]["value"] >= 0
+    assert "accuracy" not in row and row["fid"]["value"] >= 0
     call(f"sample --run {folder} --out {tmp_path / 'out'}")
     assert (tmp_path / "out" / "motion.bvh").exists()
 
@@ -139,10 +139,10 @@ def test_texts_are_scored_and_sampled(call, texts, tmp_path):
         set(rows)
     )
     row = rows["emdm"]
-    for column in ("R-precision 1", "R-precision 3", "R-precision 3, unseen pairs"):
+    for column in ("r_precision_1", "r_precision_3", "r_precision_3_unseen"):
         assert 0 <= row[column]["value"] <= 1
-    assert row["R-precision 1"]["value"] <= row["R-precision 3"]["value"]
-    assert {"FID", "MM-Dist", "diversity", "multimodality"} <= set(row)
+    assert row["r_precision_1"]["value"] <= row["r_precision_3"]["value"]
+    assert {"fid", "mm_dist", "diversity", "multimodality"} <= set(row)
     report = rows_of(texts / "evaluation")
     assert "hashed" in report["evaluator"]["texts"]
     assert "unit" in report["evaluator"]["texts"]
@@ -154,7 +154,7 @@ def test_texts_are_scored_and_sampled(call, texts, tmp_path):
     )
     kept = rows_of(tmp_path / "kept")["rows"]
     assert kept["real (held-out clips)"] == rows["real (held-out clips)"]
-    for column in ("FID", "MM-Dist", "multimodality"):
+    for column in ("fid", "mm_dist", "multimodality"):
         assert kept["emdm"][column]["value"] != row[column]["value"]
     table = (tmp_path / "kept" / "table.md").read_text()
     assert f"{note}the model's output, as in the released evaluation." in table

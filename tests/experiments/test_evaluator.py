@@ -212,7 +212,7 @@ def test_emdm_is_judged_alike_twice(invoke, data, tmp_path):
     assert not (run / "recognizer").exists()
     report = json.loads((tmp_path / "a" / "metrics.json").read_text())
     assert "trained on tests, 0 updates" in report["evaluator"]["recognizer"]
-    assert np.isfinite(report["rows"]["emdm"]["FID"]["value"])
+    assert np.isfinite(report["rows"]["emdm"]["fid"]["value"])
 
 
 @pytest.mark.slow

@@ -165,7 +165,9 @@ def decide(load, tmp_path):
         number="1",
         title="t",
         source=source,
-        columns=(claims.Column(name="FID", here="fid", better="lower", judged=True),),
+        columns=(
+            claims.Column(name="FID", here="fid", better="lower", evaluated=True),
+        ),
         rows=tuple(
             claims.Row(name=name, here=name.lower(), paper=(1.0,), source=where)
             for name, where in (("A", None), ("B", None), ("C", None), ("D", other))
@@ -255,7 +257,7 @@ def test_beside_the_values_of_camdm_stands_what_its_release_computes(load):
 
 SWEEP = {
     f"T = {steps}": {
-        "p50 ms": near(float(steps)),
+        "p50": near(float(steps)),
         "fid_camdm_release": near(fid),
         "slide_camdm_release": near(0.5),
     }

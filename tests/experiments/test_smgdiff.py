@@ -48,8 +48,8 @@ def test_schedules_stand_beside_real_clips(invoke, trained):
             report["rows"]
         )
         row = report["rows"][wanted]
-        assert row["FID"]["samples"] == 2 and row["ms a plan"]["value"] > 0
-        assert 0 <= row["skill accuracy"]["value"] <= 1
+        assert row["fid"]["samples"] == 2 and row["plan_time"]["value"] > 0
+        assert 0 <= row["skill_accuracy"]["value"] <= 1
         assert report["source"] and report["jax"]
 
 

@@ -324,9 +324,9 @@ def free_row(
             contact.skating_frame_ratio(feet, fps), bounds=(0.0, 1.0)
         ),
         "ffr_gmd": table.cell(contact.skate_ratio(feet, fps), bounds=(0.0, 1.0)),
-        "speed_m/s": table.cell(speed),
-        "acceleration_m/s2": table.cell(smoothness.acceleration(positions, fps)),
-        "jerk_m/s3": table.cell(smoothness.jerk(positions, fps)),
+        "speed": table.cell(speed),
+        "acceleration": table.cell(smoothness.acceleration(positions, fps)),
+        "jerk": table.cell(smoothness.jerk(positions, fps)),
     }
 
 
@@ -351,7 +351,7 @@ def control_row(frames: Frame, *, fps: float) -> Row:
     Returns:
       te_promised: mean absolute difference of the 12 path features of the frame and
       those wanted, meters and components of unit vectors together, as the paper's |x|;
-      te_realized: the same of where the character went; trajectory_error_deg: angle
+      te_realized: the same of where the character went; trajectory_error: angle
       between the commanded and the actual velocity.
     """
     promised = jnp.abs(frames.extra["path"] - frames.extra["wanted_path"]).mean(
@@ -365,7 +365,7 @@ def control_row(frames: Frame, *, fps: float) -> Row:
     return {
         "te_promised": table.cell(promised),
         "te_realized": table.cell(realized),
-        "trajectory_error_deg": table.cell(angle, scale=180.0 / np.pi),
+        "trajectory_error": table.cell(angle, scale=180.0 / np.pi),
     }
 
 
@@ -460,7 +460,7 @@ SCALE, COURSE, SPEED = 10.0, "forward", 1.2
 # Clips that are used, where the data have this field.
 FIELD, LABELS = "theme", ("walk", "run")
 # Columns of a sweep that rollouts under control have.
-_STEERED = ("fid_uc", "te_promised", "te_realized", "trajectory_error_deg")
+_STEERED = ("fid_uc", "te_promised", "te_realized", "trajectory_error")
 _AMOUNTS = {
     "autoencoder_updates": Amount(
         quick=4000,

@@ -190,8 +190,8 @@ def frechet_distances(
 COLUMNS = {
     "slide": ("slide_camdm_release", 1.0),
     "coherence": ("coherence_camdm_release", 1.0),
-    "trajectory": ("trajectory_camdm_release_deg", 180.0 / np.pi),
-    "orientation": ("orientation_camdm_release_deg", 180.0 / np.pi),
+    "trajectory": ("trajectory_camdm_release", 180.0 / np.pi),
+    "orientation": ("orientation_camdm_release", 180.0 / np.pi),
     "fid": ("fid_camdm_release", 1.0),
 }
 

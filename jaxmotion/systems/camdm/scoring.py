@@ -140,12 +140,12 @@ _DEGREES = 180.0 / np.pi
 
 # Column: metric, metric that weights its windows, factor.
 _COLUMNS = {
-    "trajectory_error_deg": ("trajectory_error", "trajectory_used", _DEGREES),
-    "orientation_error_deg": ("orientation_error", None, _DEGREES),
-    "foot_slide_m/s": ("slide_speed", "slide_seconds", 1.0),
+    "trajectory_error": ("trajectory_error", "trajectory_used", _DEGREES),
+    "orientation_error": ("orientation_error", None, _DEGREES),
+    "foot_slide": ("slide_speed", "slide_seconds", 1.0),
     "skate_ratio": ("skate_ratio", None, 1.0),
-    "acceleration_m/s2": ("acceleration", None, 1.0),
-    "jerk_m/s3": ("jerk", None, 1.0),
+    "acceleration": ("acceleration", None, 1.0),
+    "jerk": ("jerk", None, 1.0),
 }
 
 
@@ -181,7 +181,7 @@ def metric_row(
     row = {}
     if hits is not None:
         means = table.group_means(hits, found.group)
-        row["style_accuracy_%"] = table.cell(means, scale=100.0, bounds=(0.0, 1.0))
+        row["style_accuracy"] = table.cell(means, scale=100.0, bounds=(0.0, 1.0))
     for column, (name, weights, scale) in _COLUMNS.items():
         weight = None if weights is None else values[weights]
         means = table.group_means(values[name], found.group, weight)
@@ -393,7 +393,7 @@ def made_row(
         row["fid"] = table.cell(jnp.asarray(values, jnp.float32))
     row |= metric_row(reference.skeleton, grouped, hits, height=reference.height)
     if repeats > 1:
-        row["diversity_m2"] = repeat_diversity(
+        row["pose_variance"] = repeat_diversity(
             reference.skeleton, made, repeats=repeats
         )
     return row

@@ -53,11 +53,11 @@ def _row(
 
 def _cells(values: dict[str, np.ndarray], groups: np.ndarray) -> dict[str, table.Cell]:
     columns = {
-        "speed_m/s": ("speed", None, 1.0),
-        "foot_slide_m/s": ("slide_speed", "slide_seconds", 1.0),
+        "speed": ("speed", None, 1.0),
+        "foot_slide": ("slide_speed", "slide_seconds", 1.0),
         "skate_ratio": ("skate_ratio", None, 1.0),
-        "jerk_m/s3": ("jerk", None, 1.0),
-        "lowest_toe_below_rest_cm": ("sink", None, 100.0),
+        "jerk": ("jerk", None, 1.0),
+        "toe_sink": ("sink", None, 100.0),
     }
     if groups.size == 0:
         return {c: table.cell(jnp.zeros(0)) for c in columns} | {

@@ -37,7 +37,7 @@ STRIDE = 3
 HALF = windows.EVAL_WINDOW // 2
 # Seconds behind the command whose motion is measured; the paper's 120 frames.
 MEASURED = 4.0
-MOTION = ("foot_slide_m/s", "jerk_m/s3")
+MOTION = ("foot_slide", "jerk")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,8 +205,8 @@ def transition_row(
         return table.cell(table.group_means(values, changes.replication), **options)
 
     row = {
-        "success_%": cell(1.0 * done.succeeded, scale=100.0, bounds=(0.0, 1.0)),
-        "transition_s": cell(done.seconds),
+        "success": cell(1.0 * done.succeeded, scale=100.0, bounds=(0.0, 1.0)),
+        "transition_time": cell(done.seconds),
         "transition_frames": cell(fps * done.seconds),
     }
     behind = slice(changes.tick, changes.tick + round(MEASURED * fps))

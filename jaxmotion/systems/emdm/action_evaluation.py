@@ -213,21 +213,19 @@ def scorer(
         fps = run.clips.fps
         toes = positions[..., feet, :]
         return {
-            "FID": frechet.frechet_distance(frechet.moments(features), reference),
+            "fid": frechet.frechet_distance(frechet.moments(features), reference),
             "accuracy": jnp.mean(jnp.argmax(logits, -1) == actions),
             "diversity": diversity.diversity(key_pairs, features, num_pairs=200),
             "multimodality": diversity.multimodality(
                 key_modes, by_action, num_pairs=20
             ),
-            "penetration mm": jnp.mean(
-                plausibility.penetration(positions, ground=ground)
-            ),
-            "float mm": jnp.mean(plausibility.floating(positions, ground=ground)),
-            "skate mm": jnp.mean(plausibility.skating(toes, ground=ground)),
-            "skate ratio": jnp.mean(
+            "penetration": jnp.mean(plausibility.penetration(positions, ground=ground)),
+            "floating": jnp.mean(plausibility.floating(positions, ground=ground)),
+            "skate": jnp.mean(plausibility.skating(toes, ground=ground)),
+            "skate_ratio": jnp.mean(
                 contact.skate_ratio(toes, fps, max_height=ground + 0.05)
             ),
-            "jerk m/s^3": jnp.mean(smoothness.jerk(positions, fps)),
+            "jerk": jnp.mean(smoothness.jerk(positions, fps)),
         }
 
     return score

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 from jaxtyping import Array
 
-from jaxmotion.evaluation import bench, by_frame, columns
+from jaxmotion.evaluation import bench, by_frame, table
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Cell, Row, Rows
 from jaxmotion.learning import runs
@@ -49,7 +49,7 @@ def score_row(
     key = jax.random.key(settings.seed + 1)
     keys = jax.random.split(key, settings.replications)
     scores = [scorer.score(key, many) for key in keys[:count]]
-    return columns.row(scores, order=ORDER), keys[0]
+    return table.row(scores, order=ORDER), keys[0]
 
 
 def evaluate_run(
@@ -92,8 +92,8 @@ def evaluate_run(
         one = jax.jit(lambda key: sample(key, scorer.one, scale=scale))  # noqa: B023
         found[row] = cells | {
             # Per frame, as the paper gives it.
-            "ms a frame": bench.call_time(one, parts=config.frames, least=3),
-            "network calls": Cell(value=float(number)),
+            "frame_time": bench.call_time(one, parts=config.frames, least=3),
+            "network_calls": Cell(value=float(number)),
         }
         if scorer.by_frame is not None:
             places[row] = scorer.by_frame(key, many, config.frames_per_token)
@@ -206,7 +206,7 @@ BENCH = bench.Bench(
     train=_train,
     show=_show,
     prepare=_prepare,
-    quality="FID",
+    quality="fid",
     sample="one motion",
     evaluator="action",
 )

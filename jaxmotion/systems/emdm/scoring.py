@@ -8,7 +8,7 @@ from typing import Any
 import jax
 from jaxtyping import Array
 
-from jaxmotion.evaluation import columns
+from jaxmotion.evaluation import table
 from jaxmotion.evaluation.by_frame import ByFrame
 from jaxmotion.evaluation.table import Row, Rows
 from jaxmotion.evaluators.frozen import Evaluator
@@ -18,12 +18,12 @@ from jaxmotion.typing import Key
 
 # Columns in their order; others follow.
 ORDER = (
-    "R-precision 1",
-    "R-precision 2",
-    "R-precision 3",
-    "FID",
+    "r_precision_1",
+    "r_precision_2",
+    "r_precision_3",
+    "fid",
     "accuracy",
-    "MM-Dist",
+    "mm_dist",
     "diversity",
     "multimodality",
 )
@@ -88,6 +88,4 @@ class RowScorer:
 
 def replicated_row(key: Key, score: Callable[[Key], Scores], *, number: int) -> Row:
     """Means and intervals of a score over replications with keys of their own."""
-    return columns.row(
-        [score(key) for key in jax.random.split(key, number)], order=ORDER
-    )
+    return table.row([score(key) for key in jax.random.split(key, number)], order=ORDER)

@@ -370,11 +370,11 @@ def make_scorer(
         motion = embed(run, evaluator, x, frames, padding=padding)
         precision = matching.r_precision(text, motion)
         return {
-            "R-precision 1": precision[0],
-            "R-precision 2": precision[1],
-            "R-precision 3": precision[2],
-            "FID": frechet.frechet_distance(frechet.moments(motion), reference),
-            "MM-Dist": matching.matching_distance(text, motion),
+            "r_precision_1": precision[0],
+            "r_precision_2": precision[1],
+            "r_precision_3": precision[2],
+            "fid": frechet.frechet_distance(frechet.moments(motion), reference),
+            "mm_dist": matching.matching_distance(text, motion),
             "diversity": diversity.diversity(key, motion, num_pairs=300),
         }
 
@@ -474,7 +474,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
         )
         if "val" in arrays:
             unseen = score_split(key_unseen, many, "val")
-            found["R-precision 3, unseen pairs"] = unseen["R-precision 3"]
+            found["r_precision_3_unseen"] = unseen["r_precision_3"]
         return found
 
     names = {

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.ball_clips import BallClips
-from jaxmotion.evaluation import bench, by_frame, columns
+from jaxmotion.evaluation import bench, by_frame, table
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Row, Rows
 from jaxmotion.evaluators import frozen as evaluators
@@ -272,22 +272,22 @@ def train_ball(
 
 
 _ORDER = (
-    "FID",
-    "foot slide m/s",
-    "acceleration m/s2",
-    "diversity m2",
-    "trajectory error deg",
-    "orientation error deg",
-    "skill accuracy",
-    "touches /min",
-    "missed /min",
-    "missed part",
-    "touch distance cm",
-    "ball in ground mm",
-    "foot in ball mm",
-    "free acceleration m/s2",
-    "skate ratio",
-    "jerk m/s3",
+    "fid",
+    "foot_slide",
+    "acceleration",
+    "pose_variance",
+    "trajectory_error",
+    "orientation_error",
+    "skill_accuracy",
+    "touches",
+    "missed",
+    "missed_part",
+    "touch_distance",
+    "ball_in_ground",
+    "foot_in_ball",
+    "free_acceleration",
+    "skate_ratio",
+    "jerk",
 )
 
 
@@ -296,7 +296,7 @@ Places = dict[str, by_frame.ByFrame]
 
 def scores_row(scores: list[dict[str, Array]]) -> Row:
     """A row of the scores of replications."""
-    return columns.row(scores, order=_ORDER)
+    return table.row(scores, order=_ORDER)
 
 
 def real_rows(run: Run, setting: Setting) -> Rows:
@@ -342,7 +342,7 @@ def _plan_row(
         num_places=model.config.frames_per_token,
         contact_height=smgdiff_scoring.limits(run.train, model).foot_height,
     )
-    return found | {"ms a plan": bench.call_time(_timed(plan, setting))}, places
+    return found | {"plan_time": bench.call_time(_timed(plan, setting))}, places
 
 
 def schedule_table(
@@ -508,7 +508,7 @@ BENCH = bench.Bench(
     train=_train,
     show=_show,
     prepare=_prepare,
-    quality="FID",
+    quality="fid",
     sample="one plan of 45 frames",
     evaluator="ball",
 )

@@ -149,7 +149,7 @@ def score_players(
       starts: Starts of a replication.
 
     Returns:
-      One dictionary a replication; "diversity m2" is the variance of joints over
+      One dictionary a replication; "pose_variance" is the variance of joints over
       players of one start, in the world.
     """
     key, future = jax.random.key(setting.seed + 3), model.config.future
@@ -165,7 +165,7 @@ def score_players(
         labels = jnp.repeat(known.label, repeats)
         wanted = _commanded(velocity, future=future, fps=model.config.fps)
         scores = setting.score(last, wanted, labels)
-        found.append(scores | {"diversity m2": spread(last)})
+        found.append(scores | {"pose_variance": spread(last)})
     return found
 
 

@@ -166,15 +166,15 @@ def scorer(evaluator: SkillEvaluator, limits: Thresholds) -> Score:
             contact_height=limits.foot_height,
         )
         return {
-            "FID": frechet.frechet_distance(moments, evaluator.reference),
-            "foot slide m/s": _weighted(body["slide_speed"], body["slide_seconds"]),
-            "skate ratio": jnp.mean(body["skate_ratio"]),
-            "acceleration m/s2": jnp.mean(body["acceleration"]),
-            "jerk m/s3": jnp.mean(body["jerk"]),
-            "trajectory error deg": _DEGREES
+            "fid": frechet.frechet_distance(moments, evaluator.reference),
+            "foot_slide": _weighted(body["slide_speed"], body["slide_seconds"]),
+            "skate_ratio": jnp.mean(body["skate_ratio"]),
+            "acceleration": jnp.mean(body["acceleration"]),
+            "jerk": jnp.mean(body["jerk"]),
+            "trajectory_error": _DEGREES
             * _weighted(body["trajectory_error"], body["trajectory_used"]),
-            "orientation error deg": _DEGREES * jnp.mean(body["orientation_error"]),
-            "skill accuracy": jnp.mean(jnp.argmax(logits, axis=-1) == labels),
+            "orientation_error": _DEGREES * jnp.mean(body["orientation_error"]),
+            "skill_accuracy": jnp.mean(jnp.argmax(logits, axis=-1) == labels),
         } | contact_scores(scenes, representation, limits)
 
     return score
@@ -216,13 +216,13 @@ def contact_scores(
     inside = ball.joint_penetration(scenes.ball, places, radius=representation.radius)
     ratio = lambda a, b: jnp.sum(a) / jnp.maximum(jnp.sum(b), 1.0)  # noqa: E731
     return {
-        "touches /min": touches / minutes,
-        "missed /min": jnp.sum(count.missed) / minutes,
-        "missed part": ratio(count.missed, count.touches),
-        "touch distance cm": 100.0 * ratio(near.total, near.count),
-        "ball in ground mm": jnp.mean(sunk.mean),
-        "foot in ball mm": jnp.mean(inside.mean),
-        "free acceleration m/s2": ratio(free.total, free.count),
+        "touches": touches / minutes,
+        "missed": jnp.sum(count.missed) / minutes,
+        "missed_part": ratio(count.missed, count.touches),
+        "touch_distance": 100.0 * ratio(near.total, near.count),
+        "ball_in_ground": jnp.mean(sunk.mean),
+        "foot_in_ball": jnp.mean(inside.mean),
+        "free_acceleration": ratio(free.total, free.count),
     }
 
 

@@ -181,7 +181,7 @@ def test_the_scorer_reads_the_evaluators_words(run, published):
         score = emdm_text_evaluation.make_scorer(run, judge)
         key = jax.random.key(0)
         scores = score(key, jnp.asarray(x), frames, caption, reference)
-        found[name] = float(scores["MM-Dist"])
+        found[name] = float(scores["mm_dist"])
     np.testing.assert_allclose(found["glove"], want, rtol=1e-5)
     assert abs(found["hashed"] / want - 1) > 1e-2
 

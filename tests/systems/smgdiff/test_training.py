@@ -147,9 +147,9 @@ def test_what_really_happened_scores_well(setting):
     scores = smgdiff_evaluation.score_real(setting)
     assert len(scores) == 3
     for one in scores:
-        assert float(one["ball in ground mm"]) == pytest.approx(0.0, abs=1e-3)
-        assert float(one["trajectory error deg"]) < 20
-        assert float(one["skill accuracy"]) > 0.9  # a ball at hand, or far away
+        assert float(one["ball_in_ground"]) == pytest.approx(0.0, abs=1e-3)
+        assert float(one["trajectory_error"]) < 20
+        assert float(one["skill_accuracy"]) > 0.9  # a ball at hand, or far away
 
 
 def test_planted_errors_are_measured(setting):
@@ -162,11 +162,11 @@ def test_planted_errors_are_measured(setting):
     known = setting.known
     wanted = known.condition.trajectory
     found = score(sunk(known.future), wanted, known.label)
-    assert float(found["ball in ground mm"]) == pytest.approx(13.0, abs=1e-3)
+    assert float(found["ball_in_ground"]) == pytest.approx(13.0, abs=1e-3)
     plain = score(known.future, wanted, known.label)
-    assert float(found["foot slide m/s"]) == float(plain["foot slide m/s"])
+    assert float(found["foot_slide"]) == float(plain["foot_slide"])
     wrong = score(known.future, wanted, 1 - known.label)
-    total = float(wrong["skill accuracy"]) + float(plain["skill accuracy"])
+    total = float(wrong["skill_accuracy"]) + float(plain["skill_accuracy"])
     assert total == pytest.approx(1.0, abs=1e-5)
 
 
@@ -186,7 +186,7 @@ def test_plans_are_scored_alike_whatever_the_chunk(run, setting):
         for chunk in (1, 3)
     ]
     for a, b in zip(*found, strict=True):
-        assert float(a["FID"]) == pytest.approx(float(b["FID"]), rel=1e-3)
+        assert float(a["fid"]) == pytest.approx(float(b["fid"]), rel=1e-3)
     assert all(np.isfinite(float(v)) for v in found[0][0].values())
 
 
@@ -209,7 +209,7 @@ def test_players_are_scored_with_their_spread(run, setting):
         control=smgdiff_controller.Control(apply=5, reuse=4),
     )
     scores = smgdiff_players.score_players(setting, model, play, repeats=2, starts=2)
-    assert len(scores) == 3 and float(scores[0]["diversity m2"]) > 0
+    assert len(scores) == 3 and float(scores[0]["pose_variance"]) > 0
 
 
 def test_a_straight_path_owes_nothing_to_noise(run, setting):
