@@ -1,4 +1,4 @@
-"""Frozen evaluators: train a recognizer once, and judge everybody's motions by it.
+"""Frozen evaluators: train one, and score everybody's motions with it.
 
 Examples:
   python experiments/evaluator.py train --kind style --data data/bandai2.npz --out evaluators/bandai2_style.npz
@@ -34,7 +34,7 @@ from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Train a recognizer on the training part of clips, and write it to a file.
+    """Train an evaluator on the training part of clips, and write it to a file.
 
     The defaults split clips as the systems' own `train` do, so that what a run held out
     its evaluator never saw; give the options that the run was trained with.

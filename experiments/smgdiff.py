@@ -14,14 +14,15 @@ import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
-from smgdiff_tasks import playing
 
 from jaxmotion import cli, reporting
 from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluation.table import Rows
 from jaxmotion.evaluators import frozen
 from jaxmotion.learning import loop, runs
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import players as smgdiff_players
@@ -271,13 +272,45 @@ def evaluate(args: Evaluate) -> None:
 
 
 def rollout(args: Rollout) -> None:
-    """Writes the rollout."""
+    """Writes the rollout, and prints what is worth knowing before one looks."""
     run = smgdiff_training.load_run(args.run)
     out = args.out or args.run / "rollout"
     loop.check_writable(out)
     cli.announce("compiling the rollout", 40)
-    guided = smgdiff_guidance.on_schedule(guidance_of(args), args.schedule)
-    playing.play(args, run, guided, out)
+    features = run.model.representation
+    skills = args.skills or run.model.labels
+    commands = smgdiff_players.skill_commands(run.model, skills, seconds=args.seconds)
+    scene = smgdiff_players.play_one(
+        run,
+        commands,
+        steps=args.steps,
+        paths=args.paths,
+        guided=smgdiff_guidance.on_schedule(guidance_of(args), args.schedule),
+        seed=args.seed,
+    )
+    touch = np.asarray(scene.touch) > 0.5
+    reporting.write_rollout(
+        out,
+        features.skeleton,
+        scene.motion,
+        commands.velocity,
+        title=", ".join(skills),
+        caption=run.model.source,
+        ball=reporting.Ball(
+            position=np.asarray(scene.ball),
+            touch=touch,
+            joints=features.joints,
+            radius=features.radius,
+        ),
+    )
+    places = joint_positions(features.skeleton, scene.motion)[:, list(features.joints)]
+    nearest = np.linalg.norm(places - scene.ball[:, None], axis=-1).min()
+    away = np.linalg.norm((scene.ball - scene.motion.root_position)[:, ::2], axis=-1)
+    print(
+        f"ball {np.median(away):.2f} m from the root (median), nearest foot "
+        f"{nearest:.2f} m from its center, {np.any(touch, axis=1).sum()} frames with a "
+        "touch"
+    )
 
 
 Command = (

@@ -132,8 +132,8 @@ def _data(about: dict[str, Any], evaluator: Any) -> str:
     run = about.get("run")
     files = run.get("data", []) if isinstance(run, dict) else []
     # Data and license of what the evaluator was trained on, where nothing else says.
-    told = evaluator.get("recognizer") if isinstance(evaluator, dict) else None
-    parts = [", ".join(str(x) for x in files), f"recognizer: {told}" if told else ""]
+    told = evaluator.get("network") if isinstance(evaluator, dict) else None
+    parts = [", ".join(str(x) for x in files), f"evaluator: {told}" if told else ""]
     return "; ".join(filter(None, parts)) or NOT_RECORDED
 
 

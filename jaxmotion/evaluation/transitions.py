@@ -1,6 +1,6 @@
 """How long a change of style takes, and whether it comes at all.
 
-A recognizer decides on windows of a rollout in which another style was commanded. A
+An evaluator decides on windows of a rollout in which another style was commanded. A
 window that starts s seconds behind the command holds no frame from before, so the
 change is done at the latest at the start of the first window that shows the new style.
 
@@ -33,7 +33,7 @@ def transition(
     limit: Scalar = 4.0,
     hold: int = 1,
 ) -> Transition:
-    """Duration and success of changes of style, by a recognizer's decisions.
+    """Duration and success of changes of style, by an evaluator's decisions.
 
     A change is done with the first of `hold` neighboring windows that are all
     recognized. One that is not done by the limit has failed, and lasts the limit: means
@@ -52,7 +52,7 @@ def transition(
     Raises:
       ValueError: if `hold` is not in 1..windows.
 
-    Source: Chen et al. 2024 (CAMDM), tables 2 and 4, with a recognizer for a judge.
+    Source: Chen et al. 2024 (CAMDM), tables 2 and 4, where people judged.
     """
     windows = recognized.shape[-1]
     if not 1 <= hold <= windows:

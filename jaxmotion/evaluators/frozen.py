@@ -1,6 +1,6 @@
-"""Frozen evaluators: a trained recognizer in one file, with all that its use needs.
+"""Frozen evaluators: each in one file, with all that its use needs.
 
-Fréchet distances and accuracies compare only where the same recognizer looked at the
+Fréchet distances and accuracies compare only where the same evaluator looked at the
 motions. One that is trained anew for each table is another one on another machine, so
 tables print its fingerprint, and whoever wants to compare uses one file.
 """
@@ -45,13 +45,13 @@ _FIELDS = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Evaluator:
-    """A recognizer, what it looks at, and how it came about.
+    """An evaluator, what it looks at, and how it came about.
 
     Attributes:
-      kind: "style" (CAMDM's recognizer, of windows of a label), "action" (EMDM's GRU),
+      kind: "style" (CAMDM's evaluator, of windows of a label), "action" (EMDM's GRU),
         "ball" (SMGDiff's, of skills with a ball), or "style_release" (the classifier
         released with CAMDM).
-      params: Of the recognizer.
+      params: Of the evaluator.
       field: Label field of the clips that the classes are from.
       labels: Names of the classes, in their order.
       joints: Names of the skeleton's joints, in their order.
@@ -81,7 +81,7 @@ class Evaluator:
 
     @property
     def config(self) -> Config:
-        """Size of the recognizer."""
+        """Size of the evaluator."""
         classes, joints = len(self.labels), len(self.joints)
         if self.kind == "action":
             return action_evaluator.ActionRecognizerConfig(
@@ -285,10 +285,10 @@ def clips_fingerprint(data: Clips | BallClips, field: str) -> str:
 def describe(
     params: Params, evaluator: Evaluator | None = None, *, reference: str
 ) -> dict[str, Any]:
-    """Who judged a table, for what stands beside it.
+    """Who scored a table, for what stands beside it.
 
     Args:
-      params: Of the recognizer that judged.
+      params: Of the evaluator.
       evaluator: The frozen evaluator that they are of; None if they were trained for
         this table.
       reference: Fingerprint of the clips that Fréchet distances refer to.
@@ -308,7 +308,7 @@ def describe(
 
 
 def note(description: dict[str, Any]) -> str:
-    """A line below a table that says who judged.
+    """A line below a table that says who scored.
 
     Args:
       description: From `describe`; at least a fingerprint and an origin.
@@ -316,7 +316,7 @@ def note(description: dict[str, Any]) -> str:
     Returns:
       The line.
     """
-    line = f"Recognizer {description['fingerprint']} ({description['origin']})"
+    line = f"Evaluator {description['fingerprint']} ({description['origin']})"
     if "reference_clips" in description:
         line += f"; Fréchet distances to clips {description['reference_clips']}"
     return f"{line}."

@@ -232,7 +232,7 @@ def test_an_evaluator_of_actions_is_the_recognizer_a_run_trains(actions, tmp_pat
     evaluators.save(tmp_path / "e.npz", made)
     loaded = evaluators.load(tmp_path / "e.npz")
     call = dict(num_steps=3, seed=0)
-    load = emdm_action_evaluation.load_recognizer
+    load = emdm_action_evaluation.load_evaluator
     same(load(actions, evaluator=loaded, **call), made.params)
     assert not (actions.record.folder / "recognizer").exists()
     same(load(actions, **call), made.params)

@@ -149,7 +149,7 @@ def check_same(folders, made, path):
         assert report["evaluator"]["origin"] == path.name
         assert report["arguments"]["evaluator"] == str(path)
         notes = (folder / "table.md").read_text().splitlines()[-1]
-        assert notes.startswith(f"Recognizer {name} ({path.name})")
+        assert notes.startswith(f"Evaluator {name} ({path.name})")
     first, second = (report["rows"] for report in reports)
     for row in first:
         for column, cell in first[row].items():

@@ -372,16 +372,16 @@ def describe_evaluator(
 def load_evaluator(
     key: Key, run: Run, evaluator: evaluators.Evaluator | None, *, num_steps: int
 ) -> style_evaluator.Recognized:
-    """The frozen recognizer if there is one, else one trained on the run's clips.
+    """The frozen evaluator if there is one, else one trained on the run's clips.
 
     Args:
       key: Consumed.
       run: The run.
-      evaluator: A frozen style recognizer; None to train one.
+      evaluator: A frozen evaluator of styles; None to train one.
       num_steps: Updates of a training.
 
     Returns:
-      The recognizer.
+      The evaluator.
 
     Raises:
       ValueError: if the evaluator does not fit the run; names the field.
@@ -407,7 +407,7 @@ def load_evaluator(
         return style_evaluator.Recognized(
             params=frozen, config=evaluator.config, classes=classes
         )
-    print(f"training the style recognizer for {num_steps} steps", flush=True)
+    print(f"training the evaluator of styles for {num_steps} steps", flush=True)
     return style_evaluator.fit_recognizer(
         key, run.train, field=run.field, num_steps=num_steps
     )
@@ -436,7 +436,7 @@ def _timed_rollouts(
 def train_style(
     train: Clips, held_out: Clips, *, field: str, num_steps: int, seed: int
 ) -> Evaluator:
-    """CAMDM's recognizer, of windows of 60 frames.
+    """CAMDM's evaluator, of windows of 60 frames.
 
     Args:
       train: Training clips.

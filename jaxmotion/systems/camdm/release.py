@@ -253,11 +253,11 @@ def of_rollouts(frames: Frame, commands: trajectory.Command) -> Recordings:
 
 
 def style_features(
-    skeleton: Skeleton, clips: Clips, recognizer: Recognized, *, field: str
+    skeleton: Skeleton, clips: Clips, evaluator: Recognized, *, field: str
 ) -> Groups:
     """Features of the training clips by style: what Fréchet distances are taken to."""
     found = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field=field)
-    features, _ = recognized(skeleton, found, recognizer)
+    features, _ = recognized(skeleton, found, evaluator)
     number = len(clips.names(field))
     return in_groups(features, np.asarray(found.label), number)
 
@@ -276,11 +276,11 @@ def metrics(skeleton: Skeleton, found: Recordings) -> dict[str, np.ndarray]:
 def distances(
     skeleton: Skeleton,
     found: Recordings,
-    recognizer: Recognized,
+    evaluator: Recognized,
     styles: Groups,
 ) -> np.ndarray:
     """Fréchet distance of each recording to its style; NaN for a single window."""
-    features, _ = recognized(skeleton, found.windows, recognizer)
+    features, _ = recognized(skeleton, found.windows, evaluator)
     groups = in_groups(features, np.asarray(found.windows.group), found.label.size)
     return np.asarray(frechet_distances(groups, styles, found.label))
 

@@ -1,7 +1,7 @@
 """Changes of style: how often they come, how soon, and what the motion is meanwhile.
 
 Every ordered pair of styles is one change. A replication has one rollout of each, with
-noise and start poses of its own; all rows have the same. A recognizer decides in
+noise and start poses of its own; all rows have the same. An evaluator decides in
 windows of two seconds whether the new style is there, and the change is dated to the
 center of the first window that shows it: up to half of that window may be from before.
 
@@ -145,7 +145,7 @@ def find_changes(
     skeleton: Skeleton,
     frames: Frame,
     changes: Changes,
-    recognizer: Recognized,
+    evaluator: Recognized,
     *,
     fps: float,
 ) -> tuple[Bool[np.ndarray, "characters windows"], np.ndarray]:
@@ -155,7 +155,7 @@ def find_changes(
       skeleton: The skeleton.
       frames: Displayed frames [characters, ticks, ...].
       changes: That they were made for.
-      recognizer: Of styles.
+      evaluator: Of styles.
       fps: Ticks per second.
 
     Returns:
@@ -169,7 +169,7 @@ def find_changes(
         cut = jax.tree.map(lambda x: x[:, first:last], frames)  # noqa: B023
         label = jnp.asarray(changes.new)
         made = windows.rollout_windows(cut, label, skip=0)
-        found.append(style_evaluator.recognized(skeleton, made, recognizer)[1] > 0.5)
+        found.append(style_evaluator.recognized(skeleton, made, evaluator)[1] > 0.5)
     return np.stack(found, axis=1), centers / fps
 
 
@@ -177,7 +177,7 @@ def transition_row(
     run: Run,
     frames: Frame,
     changes: Changes,
-    recognizer: Recognized,
+    evaluator: Recognized,
     *,
     height: float,
 ) -> dict[str, table.Cell]:
@@ -187,7 +187,7 @@ def transition_row(
       run: The run.
       frames: Of all characters.
       changes: That they were made for.
-      recognizer: Of styles.
+      evaluator: Of styles.
       height: Below it a foot joint should not move, meters.
 
     Returns:
@@ -196,7 +196,7 @@ def transition_row(
       the whole rollout slide and coherence of CAMDM's release.
     """
     skeleton, fps = run.model.skeleton, run.model.config.fps
-    found, centers = find_changes(skeleton, frames, changes, recognizer, fps=fps)
+    found, centers = find_changes(skeleton, frames, changes, evaluator, fps=fps)
     done = transition(
         jnp.asarray(found), jnp.asarray(centers, jnp.float32), limit=changes.limit
     )
@@ -226,7 +226,7 @@ def evaluate_transitions(
     run: Run,
     changes: Changes,
     controls: dict[str, camdm_controller.Control],
-    recognizer: Recognized,
+    evaluator: Recognized,
     *,
     chunk: int | None = None,
     seed: int = 0,
@@ -239,7 +239,7 @@ def evaluate_transitions(
       changes: What characters are told.
       controls: Constants of the run-time, by row; the last row's serve for those who
         keep their style.
-      recognizer: Of styles.
+      evaluator: Of styles.
       chunk: Characters to run at a time, at most.
       seed: Of the noise, the same for all rows.
       report: Called with each row's name when it is measured.
@@ -260,7 +260,7 @@ def evaluate_transitions(
             own.commands,
             chunk=chunk,
         )
-        return transition_row(run, frames, own, recognizer, height=height)
+        return transition_row(run, frames, own, evaluator, height=height)
 
     rows = {}
     for name, control in controls.items():
@@ -270,18 +270,18 @@ def evaluate_transitions(
     return rows
 
 
-def clip_accuracy(run: Run, recognizer: Recognized) -> table.Cell:
-    """How often the recognizer is right on held-out clips: a bound on success.
+def clip_accuracy(run: Run, evaluator: Recognized) -> table.Cell:
+    """How often the evaluator is right on held-out clips: a bound on success.
 
     Args:
       run: The run.
-      recognizer: Of styles.
+      evaluator: Of styles.
 
     Returns:
       Per cent, over clips.
     """
     real = windows.eval_windows(run.held_out, stride=STRIDE, field=run.field)
-    _, hits = style_evaluator.recognized(run.model.skeleton, real, recognizer)
+    _, hits = style_evaluator.recognized(run.model.skeleton, real, evaluator)
     return table.cell(
         table.group_means(hits, real.group), scale=100.0, bounds=(0.0, 1.0)
     )

@@ -1,7 +1,7 @@
 """What EMDM's motions from actions, or from nothing, are scored with.
 
 Every set that is scored, real or generated, has the same number of motions with actions
-drawn uniformly, and goes through one recognizer that was trained on real motions only.
+drawn uniformly, and goes through one evaluator that was trained on real motions only.
 
 Source: Zhou et al. 2024 (EMDM), section 4.3; the evaluation of Guo et al. 2020
 (Action2Motion) with uniform actions.
@@ -43,12 +43,12 @@ from jaxmotion.systems.emdm.scoring import (
 )
 from jaxmotion.typing import Key, Params
 
-# Motions that the recognizer is trained on: most windows of the clips.
+# Motions that the evaluator is trained on: most windows of the clips.
 _RECOGNIZED = 12288
 
 
-def recognizer_config(run: ActionRun) -> action_evaluator.ActionRecognizerConfig:
-    """Size of a run's recognizer.
+def evaluator_config(run: ActionRun) -> action_evaluator.ActionRecognizerConfig:
+    """Size of a run's evaluator.
 
     Args:
       run: The run.
@@ -61,10 +61,10 @@ def recognizer_config(run: ActionRun) -> action_evaluator.ActionRecognizerConfig
     )
 
 
-def fit_recognizer(
+def fit_evaluator(
     train: ActionArrays, *, num_steps: int, seed: int
 ) -> tuple[action_evaluator.ActionRecognizerConfig, Params]:
-    """Trains a recognizer on motions with actions drawn uniformly.
+    """Trains an evaluator on motions with actions drawn uniformly.
 
     Args:
       train: Training clips.
@@ -86,20 +86,20 @@ def fit_recognizer(
     return config, params
 
 
-def load_recognizer(
+def load_evaluator(
     run: ActionRun,
     *,
     num_steps: int,
     seed: int,
     evaluator: evaluators.Evaluator | None = None,
 ) -> Params:
-    """The run's recognizer, trained on its training clips if it is not there yet.
+    """The run's evaluator, trained on its training clips if it is not there yet.
 
     Args:
       run: The run.
       num_steps: Updates.
       seed: Of parameters and batches.
-      evaluator: A frozen recognizer to use in its place; None for none.
+      evaluator: A frozen evaluator to use in its place; None for none.
 
     Returns:
       Its parameters.
@@ -119,7 +119,7 @@ def load_recognizer(
     if frozen is not None:
         return frozen
     folder = run.record.folder / "recognizer"
-    config = recognizer_config(run)
+    config = evaluator_config(run)
     value = {
         "system": "emdm",
         "stage": "recognizer",
@@ -129,7 +129,7 @@ def load_recognizer(
         "source": run.clips.source,
     }
     if checkpoint.latest_step(folder) is None:
-        _, params = fit_recognizer(run.train, num_steps=num_steps, seed=seed)
+        _, params = fit_evaluator(run.train, num_steps=num_steps, seed=seed)
         checkpoint.save(folder, num_steps, {"params": params}, value)
     return runs.restore_evaluator(
         folder,
@@ -139,7 +139,7 @@ def load_recognizer(
 
 
 def _flat(positions: Array) -> Array:
-    """What the recognizer sees of motions that start at the origin facing +z."""
+    """What the evaluator sees of motions that start at the origin facing +z."""
     return positions.reshape(*positions.shape[:-2], -1)
 
 
@@ -162,16 +162,16 @@ def real_positions(
 
 
 def moments(params: Params, run: ActionRun) -> Callable[[Key, Array], frechet.Moments]:
-    """Moments of the recognizer's features of a set of motions.
+    """Moments of the evaluator's features of a set of motions.
 
     Args:
-      params: The recognizer's.
+      params: The evaluator's.
       run: The run.
 
     Returns:
       `(key, positions) -> moments`, jitted.
     """
-    config = recognizer_config(run)
+    config = evaluator_config(run)
 
     @jax.jit
     def of(key: Key, positions: Array) -> frechet.Moments:
@@ -189,7 +189,7 @@ def scorer(
     """Scores of a set of motions, as one compiled program.
 
     Args:
-      params: The recognizer's.
+      params: The evaluator's.
       run: The run.
       reference: Moments of the real features.
       ground: Height of the lowest joint of a person who stands, meters.
@@ -198,7 +198,7 @@ def scorer(
       `score(key, positions, actions) -> scores`. The actions are in ascending order,
       each as often as the others.
     """
-    config, skeleton = recognizer_config(run), run.clips.skeleton
+    config, skeleton = evaluator_config(run), run.clips.skeleton
     feet = jnp.asarray(skeleton.feet)
 
     @jax.jit
@@ -282,7 +282,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
         )
     frozen = settings.evaluator
     steps = 1500 if settings.evaluator_steps is None else settings.evaluator_steps
-    recognizer = load_recognizer(run, num_steps=steps, seed=0, evaluator=frozen)
+    evaluator = load_evaluator(run, num_steps=steps, seed=0, evaluator=frozen)
     trained = (run.clips.source, steps, 0)
     if frozen is not None:
         trained = (frozen.source, frozen.updates, frozen.seed)
@@ -291,9 +291,9 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
         jax.random.key(settings.seed), 4
     )
     truth = real_positions(key_motion, wanted, run.train)
-    reference = moments(recognizer, run)(key_state, truth)
+    reference = moments(evaluator, run)(key_state, truth)
     ground = ground_height(run)
-    score = scorer(recognizer, run, reference, ground=ground)
+    score = scorer(evaluator, run, reference, ground=ground)
 
     def score_real(key: Key, part: ActionArrays) -> Row:
         def once(key: Key) -> Scores:
@@ -349,14 +349,14 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
         one=jax.tree.map(lambda x: x[0], conditions),
         samples=each * number,
         describe={
-            "recognizer": "GRU 2 x 128, tanh 30, joint positions; trained on "
+            "network": "GRU 2 x 128, tanh 30, joint positions; trained on "
             "{}, {} updates, seed {}".format(*trained),
             "reference": f"{each * number} real motions of training clips, actions "
             "uniform",
             "ground height m": ground,
         }
         | evaluators.describe(
-            recognizer,
+            evaluator,
             frozen,
             reference=evaluators.clips_fingerprint(run.train.clips, run.field),
         ),
@@ -375,7 +375,7 @@ def train_action(
     num_steps: int,
     seed: int,
 ) -> Evaluator:
-    """EMDM's recognizer, of motions with actions drawn uniformly.
+    """EMDM's evaluator, of motions with actions drawn uniformly.
 
     Args:
       train: Training clips.
@@ -388,7 +388,7 @@ def train_action(
       The evaluator.
     """
     clips = train.clips
-    config, params = fit_recognizer(train, num_steps=num_steps, seed=seed)
+    config, params = fit_evaluator(train, num_steps=num_steps, seed=seed)
     wanted = jnp.repeat(jnp.arange(config.num_classes), _HELD_OUT)
     key_motion, key_state = jax.random.split(jax.random.key(seed + 1))
     positions = real_positions(key_motion, wanted, held_out)

@@ -8,11 +8,12 @@ Source: SMGDiff, section 5.2 and table 2.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmotion.control import rollout
@@ -25,6 +26,7 @@ from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import scoring as smgdiff_scoring
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.evaluation import Setting
@@ -298,3 +300,89 @@ def path_table(
             rows[f"{name}, guidance {schedule}"] = row
             print(f"{name}, guidance {schedule}: done", flush=True)
     return rows, {"noise of the paths": shares}
+
+
+# The direction of the command turns by so much, every so many seconds.
+_TURN, _SECONDS = np.pi / 3, 4.0
+
+
+def skill_commands(
+    model: Model, skills: Sequence[str], *, seconds: float
+) -> trajectory.Command:
+    """Each skill at its own speed, for an equal time, with turns to either side.
+
+    Args:
+      model: The model.
+      skills: In this order.
+      seconds: Length.
+
+    Returns:
+      One command a tick.
+
+    Raises:
+      ValueError: if the model has no such skill, or there is less than a tick of each.
+    """
+    ticks = round(seconds * model.config.fps)
+    if ticks < len(skills):
+        raise ValueError(f"{seconds:g} s are too short for {len(skills)} skills")
+    labels = np.array([model.label(skill) for skill in skills])
+    label = labels[np.arange(ticks) * len(skills) // ticks]
+    turn = np.floor(np.arange(ticks) / (_SECONDS * model.config.fps)).astype(int)
+    yaw = _TURN * np.array([0, 1, 0, -1])[turn % 4]
+    facing = np.stack([np.sin(yaw), np.cos(yaw)], axis=-1)
+    speed = np.array(model.speeds)[label]
+    return trajectory.Command(
+        velocity=jnp.asarray(speed[:, None] * facing, jnp.float32),
+        facing=jnp.asarray(facing, jnp.float32),
+        label=jnp.asarray(label, jnp.int32),
+    )
+
+
+def path_sampler(run: Run, stage: str) -> SamplePath:
+    """Paths of a stage such as "paths_1", or "straight" ones."""
+    if stage == "straight":
+        return straight(run.model)
+    model, params = smgdiff_training.load_stage(run, stage)
+    return smgdiff_trajectory.sampler(params, config=model.paths)
+
+
+def play_one(
+    run: Run,
+    commands: trajectory.Command,
+    *,
+    steps: int,
+    paths: str,
+    guided: Guidance,
+    seed: int,
+) -> Scene:
+    """One player that starts with training frames of its first command's skill.
+
+    Args:
+      run: The run.
+      commands: One a tick.
+      steps: Motion model.
+      paths: As in `path_sampler`.
+      guided: Contact guidance.
+      seed: Of the start and the noise.
+    """
+    model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
+    driver = smgdiff_controller.controller(
+        path_sampler(run, paths),
+        smgdiff_guidance.sampler(
+            params,
+            config=model.config,
+            representation=model.representation,
+            guided=guided,
+        ),
+        representation=model.representation,
+        config=model.config,
+    )
+    known = smgdiff_scoring.eval_windows(run.train, model, number=2000, seed=seed)
+    first = int(np.flatnonzero(np.asarray(known.label) == int(commands.label[0]))[0])
+    past = jax.tree.map(lambda x: x[first], known.past)
+    state = smgdiff_controller.init_state(
+        model.representation.skeleton, past, config=model.config
+    )
+    one = lambda tree: jax.tree.map(lambda x: x[None], tree)  # noqa: E731
+    play = jax.jit(lambda *given: rollout.rollout(driver, *given)[1])
+    return to_scene(play(jax.random.key(seed), one(state), one(commands))[0])
