@@ -14,10 +14,14 @@ from jaxmotion.evaluation.table import Cell
 from jaxmotion.systems import registry
 from jaxmotion.viz import plots
 from reports import markdown, verdicts
-from reports.claims import Column, Stated, Table, read_paper
+from reports.claims import FOLDER, Column, Stated, Table, read_paper
 from reports.results import Found, provenance
 
-PAPERS = tuple(read_paper(system) for system in registry.SYSTEMS.values())
+PAPERS = tuple(
+    read_paper(system)
+    for system in registry.SYSTEMS.values()
+    if (FOLDER / f"{system.name}.toml").exists()
+)
 TABLES = tuple(table for paper in PAPERS for table in paper.tables)
 ABSENT = tuple(what for paper in PAPERS for what in paper.absent)
 # Every file that a table needs, in the tables' order.

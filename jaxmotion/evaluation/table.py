@@ -90,24 +90,23 @@ def cell(
     return Cell(value=scale * estimate, low=low, high=high, samples=count)
 
 
-def row(scores: Sequence[dict[str, Array]], *, order: Sequence[str] = ()) -> Row:
+def row(scores: Sequence[dict[str, Array]]) -> Row:
     """Means over replications with 95 % intervals, within the columns' bounds.
 
     Args:
       scores: One dictionary a replication, of the same names.
-      order: Names in the order of the table's columns; others follow. Compiled
-        programs return dictionaries in alphabetical order.
+
+    Returns:
+      Columns in the order of their declaration; others follow. (Compiled programs
+      return dictionaries in alphabetical order.)
     """
-    places = {name: i for i, name in enumerate(order)}
-    names = sorted(scores[0], key=lambda name: places.get(name, len(places)))
-    unknown = columns.Column(id="", title="")
-    return {
-        name: cell(
-            jnp.stack([one[name] for one in scores]),
-            bounds=columns.COLUMNS.get(name, unknown).bounds,
-        )
-        for name in names
-    }
+    known = columns.COLUMNS
+    places = {name: i for i, name in enumerate(known)}
+    found = {}
+    for name in sorted(scores[0], key=lambda name: places.get(name, len(places))):
+        bounds = known[name].bounds if name in known else (-math.inf, math.inf)
+        found[name] = cell(jnp.stack([one[name] for one in scores]), bounds=bounds)
+    return found
 
 
 def to_json(rows: Rows) -> dict[str, Any]:

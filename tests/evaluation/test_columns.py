@@ -10,15 +10,17 @@ import scipy.stats
 from jaxmotion.evaluation import columns, table
 
 
-def test_a_row_holds_means_and_students_intervals_in_the_asked_order():
+def test_a_row_holds_means_and_students_intervals_in_the_declared_order():
     values = np.array([1.0, 2.0, 4.0, 5.0])
-    scores = [{"a": jnp.float32(v), "b": jnp.float32(2 * v), "c": v} for v in values]
-    found = table.row(scores, order=("b", "unknown", "c"))
-    assert list(found) == ["b", "c", "a"]
+    scores = [
+        {"a": jnp.float32(v), "jerk": jnp.float32(2 * v), "fid": v} for v in values
+    ]
+    found = table.row(scores)
+    assert list(found) == ["fid", "jerk", "a"]
     half = scipy.stats.t.ppf(0.975, 3) * values.std(ddof=1) / 2
     assert found["a"].value == pytest.approx(3.0)
     assert found["a"].high - 3.0 == pytest.approx(half, rel=1e-4)
-    assert found["b"].value == pytest.approx(6.0) and found["b"].samples == 4
+    assert found["jerk"].value == pytest.approx(6.0) and found["jerk"].samples == 4
 
 
 def test_intervals_of_proportions_stay_within_them():

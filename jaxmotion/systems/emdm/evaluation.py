@@ -19,7 +19,7 @@ from jaxmotion.systems.emdm import action_evaluation, text_evaluation
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
-from jaxmotion.systems.emdm.scoring import ORDER, Many, RowScorer, Settings
+from jaxmotion.systems.emdm.scoring import Many, RowScorer, Settings
 from jaxmotion.typing import Key
 
 # Rows with so many network calls a motion are replicated less often.
@@ -49,7 +49,7 @@ def score_row(
     key = jax.random.key(settings.seed + 1)
     keys = jax.random.split(key, settings.replications)
     scores = [scorer.score(key, many) for key in keys[:count]]
-    return table.row(scores, order=ORDER), keys[0]
+    return table.row(scores), keys[0]
 
 
 def evaluate_run(

@@ -16,17 +16,6 @@ from jaxmotion.evaluators.text_motion import Padding
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.typing import Key
 
-# Columns in their order; others follow.
-ORDER = (
-    "r_precision_1",
-    "r_precision_2",
-    "r_precision_3",
-    "fid",
-    "accuracy",
-    "mm_dist",
-    "diversity",
-    "multimodality",
-)
 Scores = dict[str, Array]
 # Samples motions: `(key, conditions, scale) -> motions`.
 Many = Callable[..., Array]
@@ -88,4 +77,4 @@ class RowScorer:
 
 def replicated_row(key: Key, score: Callable[[Key], Scores], *, number: int) -> Row:
     """Means and intervals of a score over replications with keys of their own."""
-    return table.row([score(key) for key in jax.random.split(key, number)], order=ORDER)
+    return table.row([score(key) for key in jax.random.split(key, number)])

@@ -271,32 +271,7 @@ def train_ball(
     )
 
 
-_ORDER = (
-    "fid",
-    "foot_slide",
-    "acceleration",
-    "pose_variance",
-    "trajectory_error",
-    "orientation_error",
-    "skill_accuracy",
-    "touches",
-    "missed",
-    "missed_part",
-    "touch_distance",
-    "ball_in_ground",
-    "foot_in_ball",
-    "free_acceleration",
-    "skate_ratio",
-    "jerk",
-)
-
-
 Places = dict[str, by_frame.ByFrame]
-
-
-def scores_row(scores: list[dict[str, Array]]) -> Row:
-    """A row of the scores of replications."""
-    return table.row(scores, order=_ORDER)
 
 
 def real_rows(run: Run, setting: Setting) -> Rows:
@@ -307,8 +282,8 @@ def real_rows(run: Run, setting: Setting) -> Rows:
     )
     floor = dataclasses.replace(setting, known=seen)
     return {
-        "real (held-out clips)": scores_row(score_real(setting)),
-        "real (training clips)": scores_row(score_real(floor)),
+        "real (held-out clips)": table.row(score_real(setting)),
+        "real (training clips)": table.row(score_real(floor)),
     }
 
 
@@ -330,7 +305,7 @@ def _plan_row(
 ) -> tuple[Row, by_frame.ByFrame]:
     model, plan = _sampler(run, f"motion_{steps}", guided)
     many = plan_many(plan, model, chunk=chunk)
-    found = scores_row(score_plans(setting, many))
+    found = table.row(score_plans(setting, many))
     scenes = many(jax.random.key(setting.seed), setting.known.condition)
     positions = joint_positions(model.representation.skeleton, scenes.motion)
     at = jnp.arange(model.config.future) % model.config.frames_per_token
@@ -480,7 +455,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
     def score(point: bench.Point) -> Row:
         _, plan = _sampler(run, _stage(point), UNGUIDED)
         many = plan_many(plan, run.model, chunk=budget["chunk"])
-        found = scores_row(score_plans(setting, many))
+        found = table.row(score_plans(setting, many))
         return {column: found[column] for column in truth}
 
     windows = int(setting.known.label.shape[0])

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxmotion.control import rollout
 from jaxmotion.control.frame import Frame
-from jaxmotion.evaluation import diversity
+from jaxmotion.evaluation import diversity, table
 from jaxmotion.evaluation.table import Rows
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
@@ -296,7 +296,7 @@ def path_table(
                 chunk=chunk,
             )
             scores = score_players(setting, model, play, repeats=repeats, starts=starts)
-            row = smgdiff_evaluation.scores_row(scores)
+            row = table.row(scores)
             rows[f"{name}, guidance {schedule}"] = row
             print(f"{name}, guidance {schedule}: done", flush=True)
     return rows, {"noise of the paths": shares}
