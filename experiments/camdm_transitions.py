@@ -90,19 +90,19 @@ def measure(args: Config) -> None:
         seed=args.seed,
     )
     key_fit, _ = jax.random.split(jax.random.key(args.seed))
-    judge = camdm_evaluation.load_evaluator(
+    chosen = camdm_evaluation.load_evaluator(
         key_fit, run, evaluator, num_steps=args.evaluator_steps
     )
     rows = camdm_transitions.evaluate_transitions(
-        run, changes, CONTROLS, judge, chunk=args.chunk, seed=args.seed
+        run, changes, CONTROLS, chosen, chunk=args.chunk, seed=args.seed
     )
     report = {
         "arguments": reporting.arguments_json(args),
         "source": run.model.source,
         "rollouts": int(changes.old.size),
-        "recognized_in_clips_%": camdm_transitions.clip_accuracy(run, judge).value,
+        "recognized_in_clips_%": camdm_transitions.clip_accuracy(run, chosen).value,
         "evaluator": frozen.describe(
-            judge.params,
+            chosen.params,
             evaluator,
             reference=frozen.clips_fingerprint(run.train, run.field),
         ),

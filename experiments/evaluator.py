@@ -52,7 +52,7 @@ class Train:
         those of emdm.py.
       least: Fewest clips of an action (action); None for 10.
       fps: Frames per second that clips are resampled to (action); None for 15.
-      frames: Frames that are judged at a time (action, ball); None for 60 or 45.
+      frames: Frames that are scored at a time (action, ball); None for 60 or 45.
       held_out: Part of the clips or recordings that accuracy is measured on, in (0, 1).
       updates: Of the training; None for 1500, or 800 (ball).
       overwrite: Replace the file if it exists.
@@ -199,7 +199,7 @@ def show(args: Show) -> None:
 class Import:
     """Write the style classifier released with CAMDM as an evaluator; runs no code of it.
 
-    It judges CAMDM's motions of 100STYLE, of its skeleton or Mixamo's.
+    It scores CAMDM's motions of 100STYLE, of its skeleton or Mixamo's.
 
     Example: python experiments/evaluator.py import --weights 100style_position_classifier.pth --out evaluators/camdm_release.npz
 

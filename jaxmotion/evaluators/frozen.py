@@ -155,7 +155,7 @@ def save(path: Path, evaluator: Evaluator) -> None:
     Raises:
       OSError: if the file cannot be written.
     """
-    # All digits: what is loaded must judge as what was saved.
+    # All digits: what is loaded must score as what was saved.
     checkpoint.export_params(
         path, evaluator.params, to_json(evaluator), dtype=np.float32
     )
@@ -238,7 +238,7 @@ def params_for(
       labels: Classes of the run.
       joints: Joint names of the run's skeleton.
       fps: Frames per second of the run.
-      frames: Frames that are judged at a time.
+      frames: Frames that are scored at a time.
 
     Returns:
       The parameters; None without an evaluator.

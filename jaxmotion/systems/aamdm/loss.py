@@ -127,9 +127,9 @@ def discriminator_loss(
     """
     previous, t, x_prev, x_t, fake = _pairs(generator, key, windows, config, change)
     net = aamdm_model.discriminator(config)
-    judge = lambda x: net.apply({"params": params}, x, x_t, t, previous)  # noqa: E731
-    adversarial = gan.discriminator_loss(judge(x_prev), judge(fake))
-    r1 = gan.r1_penalty(judge, x_prev)
+    score = lambda x: net.apply({"params": params}, x, x_t, t, previous)  # noqa: E731
+    adversarial = gan.discriminator_loss(score(x_prev), score(fake))
+    r1 = gan.r1_penalty(score, x_prev)
     loss = adversarial + 0.5 * config.weight_r1 * r1
     return loss, {"adversarial": adversarial, "r1": r1}
 

@@ -130,11 +130,11 @@ def init(key: Key, config: Config) -> Params:
     x = jnp.zeros(config.features)
     z = jnp.zeros(config.latent)
     t = jnp.ones((), jnp.int32)
-    net, judge = network(config), discriminator(config)
+    net, second = network(config), discriminator(config)
     return {
         "polisher": net.init(key_p, x, t, x)["params"],
         "generator": net.init(key_g, x, t, x, z)["params"],
-        "discriminator": judge.init(key_d, x, x, t, x)["params"],
+        "discriminator": second.init(key_d, x, x, t, x)["params"],
     }
 
 

@@ -173,18 +173,18 @@ def discriminator_loss(
     """
     t, x_prev, x_t, _, fake = _generated(generator, key, batch, config)
     net = emdm_model.discriminator(config)
-    judged = emdm_model.judged_condition(batch.vector, config=config)
+    seen = emdm_model.discriminator_condition(batch.vector, config=config)
 
-    def judge(x: Array) -> Array:
-        return net.apply({"params": params}, x, x_t, t, judged)
+    def score(x: Array) -> Array:
+        return net.apply({"params": params}, x, x_t, t, seen)
 
     adversarial = gan.discriminator_loss(
-        judge(x_prev), judge(jax.lax.stop_gradient(fake))
+        score(x_prev), score(jax.lax.stop_gradient(fake))
     )
     r1 = jnp.zeros(())
     if config.weight_r1:
         r1 = jax.lax.cond(
-            penalized, lambda x: gan.r1_penalty(judge, x), lambda x: r1, x_prev
+            penalized, lambda x: gan.r1_penalty(score, x), lambda x: r1, x_prev
         )
     loss = adversarial + 0.5 * config.weight_r1 * r1
     return loss, {"adversarial": adversarial, "r1": r1}
@@ -213,9 +213,9 @@ def generator_loss(
       The loss, "adversarial" and the geometric terms.
     """
     t, _, x_t, prediction, fake = _generated(params, key, batch, config)
-    judged = emdm_model.judged_condition(batch.vector, config=config)
+    seen = emdm_model.discriminator_condition(batch.vector, config=config)
     logits = emdm_model.discriminator(config).apply(
-        {"params": discriminator}, fake, x_t, t, judged
+        {"params": discriminator}, fake, x_t, t, seen
     )
     adversarial = gan.generator_loss(logits)
     geometric, terms = geometric_loss(

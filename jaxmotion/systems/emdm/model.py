@@ -222,9 +222,9 @@ def discriminator(config: Config) -> emdm_network.SequenceDiscriminator:
     )
 
 
-def judged_condition(
+def discriminator_condition(
     vector: Float[Array, "*batch condition"], *, config: Config
-) -> Float[Array, "*batch judged"]:
+) -> Float[Array, "*batch seen"]:
     """What of the condition the discriminator sees: never dropped, or nothing.
 
     Args:
@@ -256,9 +256,9 @@ def init(key: Key, config: Config) -> dict[str, Params]:
     make = generator(config).init(key_generator, x, t, vector, keep, mask, latent)
     found = {"generator": make["params"]}
     if config.latent:
-        judged = judged_condition(vector, config=config)
-        judge = discriminator(config).init(key_discriminator, x, x, t, judged)
-        found["discriminator"] = judge["params"]
+        seen = discriminator_condition(vector, config=config)
+        second = discriminator(config).init(key_discriminator, x, x, t, seen)
+        found["discriminator"] = second["params"]
     return found
 
 

@@ -59,8 +59,8 @@ def load(
     config, params = _generator(path, content["netG_dict"], frames, num_steps, heads)
     found = {"generator": params}
     if isinstance(content.get("netD_dict"), dict) and config.latent:
-        config, judge = _discriminator(path, content["netD_dict"], config)
-        found["discriminator"] = judge
+        config, weights = _discriminator(path, content["netD_dict"], config)
+        found["discriminator"] = weights
     return config, found
 
 

@@ -253,10 +253,10 @@ def test_both_networks_are_drawn_from_the_key():
 
 def test_the_discriminator_sees_the_condition_or_nothing():
     vector = jnp.eye(4)[:3]
-    seen = emdm_model.judged_condition(vector, config=CONFIG)
+    seen = emdm_model.discriminator_condition(vector, config=CONFIG)
     np.testing.assert_array_equal(seen, vector)
     blind = dataclasses.replace(CONFIG, discriminator_condition=False)
-    assert emdm_model.judged_condition(vector, config=blind).shape == (3, 0)
+    assert emdm_model.discriminator_condition(vector, config=blind).shape == (3, 0)
 
 
 def test_conditions_have_lengths():
