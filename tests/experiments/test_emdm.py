@@ -89,8 +89,8 @@ def test_actions_are_scored_beside_real_motions(call, actions):
     assert rows["emdm"]["network_calls"]["value"] == 10
     assert rows["ddpm_50"]["network_calls"]["value"] == 50
     assert rows["emdm"]["frame_time"]["value"] > 0
-    assert report["evaluator"]["recognizer"].startswith("GRU") and report["jax"]
-    assert "procedural" in report["evaluator"]["recognizer"].lower()
+    assert report["evaluator"]["network"].startswith("GRU") and report["jax"]
+    assert "procedural" in report["evaluator"]["network"].lower()
 
 
 @pytest.mark.slow

@@ -211,7 +211,7 @@ def test_emdm_is_judged_alike_twice(invoke, data, tmp_path):
     check_same([tmp_path / "a", tmp_path / "b"], made, path)
     assert not (run / "recognizer").exists()
     report = json.loads((tmp_path / "a" / "metrics.json").read_text())
-    assert "trained on tests, 0 updates" in report["evaluator"]["recognizer"]
+    assert "trained on tests, 0 updates" in report["evaluator"]["network"]
     assert np.isfinite(report["rows"]["emdm"]["fid"]["value"])
 
 

@@ -224,9 +224,12 @@ def reference_of_run(run: Run, evaluator: Recognized, *, seed: int) -> Reference
         run.held_out, stride=windows.EVAL_WINDOW, field=run.field
     )
     dense = windows.eval_windows(run.train, stride=10, field=run.field)
-    return camdm_scoring.make_reference(
-        run.model.skeleton, real, dense, evaluator, seed=seed
+    skeleton = run.model.skeleton
+    found = camdm_scoring.make_reference(skeleton, real, dense, evaluator, seed=seed)
+    styles = camdm_release.style_features(
+        skeleton, run.train, evaluator, field=run.field
     )
+    return dataclasses.replace(found, styles=styles)
 
 
 def _release_cells(

@@ -138,12 +138,19 @@ def test_rows_share_everything_but_the_run_time(monkeypatch, changes):
     """Each row gets its control; the last one's serve for those who keep the style."""
     given = []
 
-    def rollouts(params, key, states, commands, *, control, **rest):
-        label = np.asarray(commands.label)
+    made_with = camdm_transitions.camdm_controller.character
+
+    def character(params, model, *, control):
+        given.append(control)
+        return made_with(params, model, control=control)
+
+    def rollouts(character, key, states, commands, **rest):
+        control, label = given.pop(), np.asarray(commands.label)
         given.append((control, key, bool((label[:, 0] == label[:, -1]).all())))
         return planted(changes, [0, 0, 0, 0])
 
-    monkeypatch.setattr(camdm_transitions.protocol, "steered_rollouts", rollouts)
+    monkeypatch.setattr(camdm_transitions.camdm_controller, "character", character)
+    monkeypatch.setattr(camdm_transitions.steering, "steered_rollouts", rollouts)
     monkeypatch.setattr(
         style_evaluator, "recognized", lambda b, w, r: (None, np.ones(len(w.label)))
     )
