@@ -16,6 +16,7 @@ import tyro
 
 from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
+from jaxmotion.control.foot_lock import FootLock
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluators import frozen
@@ -201,11 +202,15 @@ class Evaluate:
 class Speeds:
     """Tell characters to walk straight on at several speeds, and measure each.
 
-    Example: python experiments/camdm.py speeds --run runs/locomotion --style neutral
+    Examples:
+      python experiments/camdm.py speeds --run runs/locomotion --style neutral
+      python experiments/camdm.py speeds --run locomotion --data data/o3de.npz --foot-lock
+        --held-out-clips WalkStopTurn1 RunPivotTurn1 --out runs/speeds
 
     Attributes:
-      run: Run folder of `train`.
+      run: Run folder of `train`; or a shipped model or an exported file, with `data`.
       data: Clips; None for those that the run was trained on.
+      held_out_clips: Clips of `data` that a shipped or exported model never saw.
       out: Folder for metrics.json and table.md; None for <run>/speeds.
       style: Style of all characters; None for the first.
       speeds: Meters per second; 0 to stand.
@@ -213,17 +218,20 @@ class Speeds:
       seconds: Length of each rollout, seconds.
       follow: Half-life in which a character that left its course returns, seconds; 0
         to steer by velocity alone.
+      foot_lock: Measure what is displayed with locked feet.
       seed: Of poses and noise.
     """
 
     run: Path = Path("runs/camdm")
     data: Path | None = None
+    held_out_clips: tuple[str, ...] = ()
     out: Path | None = None
     style: str | None = None
     speeds: tuple[float, ...] = (0.0, 0.8, 1.4, 2.5, 3.5)
     rollouts: int = 16
     seconds: float = 20.0
     follow: float = 0.0
+    foot_lock: bool = False
     seed: int = 0
 
 
@@ -283,7 +291,10 @@ def evaluate(args: Evaluate) -> None:
 
 def speeds(args: Speeds) -> None:
     """Writes the table, and jerk and slide by frame of the plan below it."""
-    run = camdm_training.load_run(args.run, args.data)
+    if args.run.is_dir():
+        run = camdm_training.load_run(args.run, args.data)
+    else:
+        run = camdm_training.exported_run(args.run, args.data, args.held_out_clips)
     out = args.out or args.run / "speeds"
     loop.check_writable(out)
     cli.announce("compiling the rollouts", 40)
@@ -294,6 +305,7 @@ def speeds(args: Speeds) -> None:
         rollouts=args.rollouts,
         seconds=args.seconds,
         control=camdm_controller.Control(follow=args.follow),
+        foot_lock=FootLock() if args.foot_lock else None,
         seed=args.seed,
     )
     report = {"arguments": reporting.arguments_json(args)} | report

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.control import courses, steering
+from jaxmotion.control.foot_lock import FootLock, lock_feet
 from jaxmotion.data import windows
 from jaxmotion.evaluation import by_frame, locomotion, table
 from jaxmotion.evaluators.style import in_batches
@@ -79,6 +80,7 @@ def speed_table(
     rollouts: int = 16,
     seconds: float = 20.0,
     control: camdm_controller.Control | None = None,
+    foot_lock: FootLock | None = None,
     seed: int = 0,
 ) -> tuple[dict[str, dict[str, table.Cell]], dict[str, by_frame.ByFrame], dict]:
     """Rows by speed, the same rollouts by frame of the plan, and what belongs beside.
@@ -90,6 +92,7 @@ def speed_table(
       rollouts: Characters per speed.
       seconds: Of each rollout; the first three are left out.
       control: Constants of the run-time; None for the defaults.
+      foot_lock: Settings of the lock; None for none.
       seed: Of start poses and noise.
 
     Returns:
@@ -116,9 +119,10 @@ def speed_table(
         name: (*_row(run, found, height=height, rest=rest), np.asarray(found.label))
         for name, found in real.items()
     }
-    states = camdm_controller.start_states(
-        run.held_out, model, labels, field=run.field, seed=seed
-    )
+    character = camdm_controller.character(run.params, model, control=control)
+    if foot_lock is not None:
+        character = lock_feet(character, foot_lock)
+    states = character.start(clips=run.held_out, labels=labels, seed=seed)
     rows: dict[str, dict[str, table.Cell]] = {}
     plans: dict[str, by_frame.ByFrame] = {}
     for speed in speeds:
@@ -126,7 +130,7 @@ def speed_table(
             "straight", labels, np.full(len(labels), speed), seconds=seconds, fps=fps
         )
         frames = steering.steered_rollouts(
-            camdm_controller.character(run.params, model, control=control),
+            character,
             jax.random.key(seed),
             states,
             commands,

@@ -417,3 +417,39 @@ def load_run(
     return Run(
         model=model, params=params, train=parts[0], held_out=parts[1], field=field
     )
+
+
+def exported_run(
+    source: Path, data: Path | None, held_out_clips: tuple[str, ...]
+) -> Run:
+    """A shipped or exported model beside clips with its styles.
+
+    Args:
+      source: Name of a shipped model, or file of `camdm.py export`.
+      data: Clips; of other styles than the model's they are left out.
+      held_out_clips: Those of them that the model never saw, by name.
+
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if no clips are given, or they do not fit the model; names what.
+    """
+    model, params, _ = load(source)
+    if data is None or not held_out_clips:
+        raise ValueError(
+            f"{source} has no clips of its own: give --data and --held-out-clips"
+        )
+    clips = clips_io.load_clips(data)
+    field = next(
+        (name for name, names in clips.label_names if {*model.labels} <= {*names}),
+        "style",
+    )
+    train, held_out = split_data(
+        data,
+        (),
+        field,
+        0.5,
+        labels=model.labels,
+        held_out_clips=held_out_clips,
+    )
+    camdm_model.check_clips(model, train, field)
+    return Run(model=model, params=params, train=train, held_out=held_out, field=field)
