@@ -204,8 +204,8 @@ class Speeds:
 
     Examples:
       python experiments/camdm.py speeds --run runs/locomotion --style neutral
-      python experiments/camdm.py speeds --run locomotion --data data/o3de.npz --foot-lock
-        --held-out-clips WalkStopTurn1 RunPivotTurn1 --out runs/speeds
+      python experiments/camdm.py speeds --run locomotion --data data/o3de.npz
+        --held-out-clips WalkStopTurn1 RunPivotTurn1 --foot-lock --out runs/speeds
 
     Attributes:
       run: Run folder of `train`; or a shipped model or an exported file, with `data`.

@@ -25,7 +25,7 @@ QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_co
 # A worker takes up to 3 GB.
 MOST_WORKERS = 8
 # Compiled programs of so many modules are kept: they take memory, and time to forget.
-MODULES_REMEMBERED = 4
+MODULES_REMEMBERED = 2
 
 
 @pytest.hookimpl(tryfirst=True)
