@@ -147,6 +147,7 @@ def test_a_sampler_of_whole_motions_is_traced_once(guided):
     assert np.abs(results[1] - results[0]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_chunk_of_two_players_is_traced_once(monkeypatch):
     """With and without the penalty, for a first and for a returned state."""
     for name in ("generator_loss", "discriminator_loss"):

@@ -286,7 +286,7 @@ def test_the_same_evaluator_gives_the_same_numbers(ball, tmp_path):
     settings = [setting_of(ball, evaluators.load(path)) for _ in range(2)]
     # As a table with the same seed trains it for itself.
     for found in (*settings, setting_of(ball, None)):
-        same(found.judge.params, ball[-1].params)
+        same(found.evaluator.params, ball[-1].params)
     first, second = (smgdiff_evaluation.score_real(x) for x in settings)
     for one, other in zip(first, second, strict=True):
         assert {"fid", "skill_accuracy"} < set(one) == set(other)

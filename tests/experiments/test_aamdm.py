@@ -281,6 +281,7 @@ def test_from_a_shell_train_twice_evaluate_and_roll_out(data, tmp_path):
     assert bvh_text.read_bvh(folder / "rollout" / "rollout.bvh").values.shape[0] == 60
 
 
+@pytest.mark.slow
 def test_a_run_is_steered_by_the_face(trained):
     """Loaded twice, steered with other values: one program."""
     found = []

@@ -121,6 +121,7 @@ def test_bad_input_is_one_clear_error(invoke, trained, data, tmp_path, line):
     assert {x: x.read_bytes() for x in trained.rglob("*") if x.is_file()} == before
 
 
+@pytest.mark.slow
 def test_a_run_is_steered_by_the_face(trained):
     """Loaded twice, steered with other values: one program."""
     found = []

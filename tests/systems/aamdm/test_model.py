@@ -101,6 +101,7 @@ def test_polisher_loss_is_a_loop_over_its_own_predictions():
     )
 
 
+@pytest.mark.slow
 def test_each_player_moves_only_itself():
     params, windows = parameters(), normal(8, 3, 3)
     judge = functools.partial(aamdm_loss.discriminator_loss, config=CONFIG)

@@ -59,6 +59,7 @@ def evaluated(kind):
     return {TRUTH: truth, FLOOR: floor, "rollouts": row}, report
 
 
+@pytest.mark.slow
 def test_the_rows_and_columns_are_there():
     rows, report = evaluated("walking")
     assert list(rows) == [TRUTH, FLOOR, "rollouts"]

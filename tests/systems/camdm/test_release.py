@@ -74,6 +74,7 @@ def test_rollouts_are_measured_whole_against_what_was_told():
             assert row[column].samples == 3
 
 
+@pytest.mark.slow
 def test_clips_are_measured_whole_whatever_their_length():
     clips = samples.clips()
     # Of lengths of their own: the first is cut short.
@@ -97,6 +98,7 @@ def test_clips_are_measured_whole_whatever_their_length():
             assert got == pytest.approx(value, rel=1e-5, abs=1e-6), (i, name)
 
 
+@pytest.mark.slow
 def test_distances_are_of_each_recording_to_its_style(monkeypatch):
     """Windows one behind the other from the first frame on, and no others."""
     rng = np.random.default_rng(0)
@@ -140,6 +142,7 @@ def test_replications_are_averaged_before_the_interval():
     assert np.isnan(empty.value) and empty.samples == 0
 
 
+@pytest.mark.slow
 def test_features_are_512_and_found_by_style():
     run = samples.run()
     recognizer = style_evaluator.fit_recognizer(

@@ -175,6 +175,7 @@ def steered(chunk):
     return states, frames
 
 
+@pytest.mark.slow
 def test_rollouts_show_a_frame_a_tick_from_where_they_start(run):
     _, frames = steered(None)
     assert frames.root_position.shape == (4, 36, 3)

@@ -197,6 +197,7 @@ def test_another_network_is_refused(first):
 # --- presets -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_papers_preset_is_unclipped_adamw_at_its_rate(first, tmp_path, monkeypatch):
     """Two steps of it are optax's AdamW on the gradients, which exceed the norm 1."""
     model = first[0]

@@ -197,6 +197,7 @@ def test_guidance_pulls_foot_and_ball_together(
     assert (guided < plain).sum() >= 5
 
 
+@pytest.mark.slow
 def test_guided_plans_are_finite_and_the_same_alone(
     params, config, representation, condition
 ):

@@ -53,6 +53,7 @@ def setting(run):
     )
 
 
+@pytest.mark.slow
 def test_a_motion_model_starts_from_a_draft_with_weights_of_its_own(run):
     draft, last = (
         load_config(run.record.folder / "motion_2" / where / "checkpoints")
@@ -143,6 +144,7 @@ def test_situations_hold_what_was_and_what_came(run):
         smgdiff_scoring.eval_windows(run.held_out, model, number=2, seed=0)
 
 
+@pytest.mark.slow
 def test_what_really_happened_scores_well(setting):
     scores = smgdiff_evaluation.score_real(setting)
     assert len(scores) == 3
