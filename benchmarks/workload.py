@@ -163,16 +163,17 @@ def of(system: str, part: str) -> Any:
       ValueError: if there is no such system, or no such part of it.
     """
     registry.get(system)
-    parts = {
-        name: getattr(getattr(sys.modules[__name__], name)(), part)
-        for name in registry.SYSTEMS
-    }
-    if parts[system] is None:
-        known = ", ".join(name for name, found in parts.items() if found)
+
+    def found(name: str) -> Any:
+        make = getattr(sys.modules[__name__], name, None)
+        return make and getattr(make(), part)
+
+    if found(system) is None:
+        known = ", ".join(name for name in registry.SYSTEMS if found(name))
         raise ValueError(
             f"--system {system}: no {part} to measure, expected one of {known}"
         )
-    return parts[system]
+    return found(system)
 
 
 @functools.cache

@@ -21,6 +21,7 @@ from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluators import frozen
 from jaxmotion.learning import checkpoint, loop, runs
+from jaxmotion.learning.training import OptimizerName
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import model as camdm_model
@@ -52,7 +53,7 @@ class Train:
       mirror: Add a mirrored copy of every training clip.
       steps: Optimizer steps of the whole run.
       batch: Windows a step (of 55 frames: 10 past, 45 future).
-      optimizer: "muon" or "adamw".
+      optimizer: "muon" or "adamw" (cosine decay), "radam" or "adam" (constant).
       learning_rate: Peak of its rate; cosine to a tenth.
       warmup: Steps of linear rise.
       max_norm: Gradients are clipped to this global norm; 0 for no clipping.
@@ -82,7 +83,7 @@ class Train:
     mirror: bool = True
     steps: int = 11000
     batch: int | None = None
-    optimizer: Literal["muon", "adamw"] | None = None
+    optimizer: OptimizerName | None = None
     learning_rate: float | None = None
     warmup: int | None = None
     max_norm: float | None = None

@@ -208,7 +208,8 @@ def notes(own: bench.Bench, job: bench.Job, report: dict[str, Any]) -> list[str]
 def budgets() -> str:
     """The numbers of all budgets, for the help."""
     lines = []
-    for name, system in registry.SYSTEMS.items():
+    swept = {name: x for name, x in registry.SYSTEMS.items() if x.swept}
+    for name, system in swept.items():
         lines.append(f"Budgets of {name}, quick / full:")
         for key, amount in system.bench.amounts.items():
             numbers = f"{amount.quick:g} / {amount.full:g}"

@@ -1,8 +1,9 @@
 """The systems, a record each: what experiments, benchmarks and serving ask.
 
-A system is a package of this folder with rooms of agreed names. A record imports a room
-when it is asked for something in it, so that this module is cheap to import and knows
-no more than names.
+A system is a package of this folder with rooms of agreed names: "model" always,
+"training" where it is trained here, "controller" where it is steered, "evaluation"
+where numbers of steps are compared. A record imports a room when it is asked for
+something in it, so that this module is cheap to import and knows no more than names.
 """
 
 import dataclasses
@@ -24,12 +25,15 @@ class System:
       paper: Authors, venue and number of the paper.
       steerable: Whether its room "controller" has `load_character(path)`, which makes a
         `control.steering.Character` of a run folder or an exported file.
+      swept: Whether its room "evaluation" has `BENCH`, which a sweep over numbers of
+        steps asks.
     """
 
     name: str
     title: str
     paper: str
     steerable: bool = True
+    swept: bool = True
 
     def room(self, name: str) -> ModuleType:
         """A module of the system's package, such as "training"."""
