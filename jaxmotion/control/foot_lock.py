@@ -9,7 +9,8 @@ bends the leg to reach it.
    a contact does not flicker.
 2. **Lock.** A contact that begins locks the toe at the point of the ground where it is
    displayed. The lock ends with the contact, or when the animated toe is farther than
-   `radius` from the point. Into and out of the lock, the offset between what was
+   `radius` from the point; during one contact it begins again where the toe has caught
+   up. Into and out of the lock, the offset between what was
    displayed and what is wanted now decays as a critically damped spring: no jump. Only
    the two horizontal coordinates are locked: the height stays the model's, since a
    toe that is held down while it lifts would be dragged over the ground.
@@ -68,6 +69,8 @@ class FootLock:
       end_height: or above this height.
       radius: Distance of the animated toe from the locked point that ends a lock,
         meters.
+      caught_up: Distance from the animated toe within which a toe that lost its lock
+        during a contact is locked anew, meters.
       half_life: Half-life of the offset into and out of a lock, seconds.
       softness: Distance from full stretch at which a leg begins to resist, meters.
     """
@@ -79,6 +82,7 @@ class FootLock:
     end_speed: float = 0.6
     end_height: float = 0.10
     radius: float = 0.2
+    caught_up: float = 0.01
     half_life: float = 0.05
     softness: float = 0.015
 
@@ -193,8 +197,11 @@ def step_lock(
     here = target + offset
     moving = jnp.where(state.locked[:, None], 0.0, velocity)
 
-    begins = contact & ~state.contact
     level = jnp.array([[1.0, 0.0, 1.0]])
+    # A foot that was pulled off its point stands again once it has caught up.
+    left = jnp.sqrt(jnp.sum(offset**2 * level, axis=-1) + 1e-12)
+    again = ~state.locked & (left < lock.caught_up) & (speed < lock.begin_speed)
+    begins = contact & (~state.contact | again)
     point = jnp.where(begins[:, None], here, state.point)
     away = jnp.sqrt(jnp.sum((point - toes) ** 2 * level, axis=-1) + 1e-12)
     locked = (state.locked | begins) & contact & (away < lock.radius)
