@@ -12,22 +12,17 @@ knows no system: what a model's JSON means, its systems know.
 import dataclasses
 import importlib.metadata
 import json
-import math
 import platform
 import sys
-import typing
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
 from jaxmotion import files
-from jaxmotion.learning import checkpoint, fingerprint, loop, training
+from jaxmotion.learning import checkpoint, fingerprint, loop, model_json, training
 from jaxmotion.learning.training import OptimizerName
-from jaxmotion.motion.skeleton import Skeleton, check_skeleton
 from jaxmotion.typing import Key, Params
 
 # Of config.json: folders of another number are refused.
@@ -183,7 +178,7 @@ def _check_same(
             f"{path}: field 'data' is {_listed(found.items())}, given "
             f"{_listed(zip(names, given, strict=True))}: other data; use another folder"
         )
-    differ = differences(value["settings"], settings)
+    differ = model_json.differences(value["settings"], settings)
     if differ:
         raise ValueError(f"{path}: made otherwise: {differ}; use another folder")
 
@@ -279,35 +274,6 @@ def load(folder: Path, *, system: str | None = None) -> Run:
     return run
 
 
-def differences(
-    found: dict[str, Any], given: dict[str, Any], *, prefix: str = ""
-) -> str:
-    """Fields of a JSON object that another does not agree with, in one line.
-
-    Args:
-      found: What was stored; fields that `given` lacks do not count.
-      given: What should be the same; fields within fields are compared on their own.
-      prefix: Of the fields' names.
-
-    Returns:
-      As in "seed is 0, given 7; config.width is 64, given 16"; empty for none.
-    """
-    lines = []
-    found, given = json.loads(json.dumps([found, given]))  # tuples to lists
-    for name, value in given.items():
-        old = found.get(name, "not recorded")
-        if isinstance(value, dict) and isinstance(old, dict):
-            lines.append(differences(old, value, prefix=f"{prefix}{name}."))
-        elif old != value:
-            lines.append(f"{prefix}{name} is {_short(old)}, given {_short(value)}")
-    return "; ".join(filter(None, lines))
-
-
-def _short(value: Any) -> str:
-    text = value if value == "not recorded" else repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
 # --- stages ------------------------------------------------------------------------
 
 
@@ -400,7 +366,7 @@ def check_model(run: Run, stage: str, model: dict[str, Any]) -> None:
       CheckpointError: if there is none, or of another stage or system.
       ValueError: if its networks are others; names the fields that differ.
     """
-    differ = differences(check_stage(run, stage).get("model", {}), model)
+    differ = model_json.differences(check_stage(run, stage).get("model", {}), model)
     if differ:
         raise ValueError(f"{run.folder / stage}: of another model: {differ}")
 
@@ -420,7 +386,9 @@ def stage_config(run: Run, stage: str, kind: type, **more: Any) -> Any:
     """
     value = check_stage(run, stage).get("model")
     try:
-        return config_from_json(kind, value | more if isinstance(value, dict) else None)
+        return model_json.config_from_json(
+            kind, value | more if isinstance(value, dict) else None
+        )
     except ValueError as error:
         raise ValueError(f"{run.folder / stage}: field 'model': {error}") from error
 
@@ -459,7 +427,7 @@ def _check_resumed(
         raise ValueError(
             f"{folder}: has {done} steps, expected at most the {budget.steps} to train"
         )
-    differ = differences(found.get("training", {}), how)
+    differ = model_json.differences(found.get("training", {}), how)
     if differ and not budget.override:
         raise ValueError(
             f"{folder}: at step {done}, and trained with other settings: {differ}; "
@@ -624,172 +592,3 @@ def restore_evaluator(
                 f"{expected!r}"
             )
     return checkpoint.restore(folder, {"params": jax.eval_shape(init)})["params"]
-
-
-# --- JSON of what models are made of ------------------------------------------------
-
-
-def decode(
-    value: dict[str, Any], where: str, parts: Mapping[str, Callable[[Any], Any]]
-) -> dict[str, Any]:
-    """Fields of a JSON object, each made into what it stands for.
-
-    Args:
-      value: The JSON object.
-      where: Its file, for messages.
-      parts: What makes each field; other fields are left out.
-
-    Raises:
-      ValueError: names the file and the field that is missing or wrong.
-    """
-    made = {}
-    for field, make in parts.items():
-        if field not in value:
-            raise ValueError(f"{where}: field {field!r} is missing")
-        try:
-            made[field] = make(value[field])
-        except KeyError as error:
-            raise ValueError(f"{where}: field {field!r}: {error} is missing") from error
-        except (TypeError, ValueError, IndexError) as error:
-            raise ValueError(f"{where}: field {field!r}: {error}") from error
-    return made
-
-
-def skeleton_to_json(skeleton: Skeleton) -> dict[str, Any]:
-    """JSON of a skeleton.
-
-    Args:
-      skeleton: The skeleton.
-
-    Returns:
-      A JSON object.
-    """
-    return {
-        "offsets": np.asarray(skeleton.offsets, np.float64).tolist(),
-        "parents": list(skeleton.parents),
-        "names": list(skeleton.names),
-        "feet": list(skeleton.feet),
-    }
-
-
-def skeleton_from_json(value: Any) -> Skeleton:
-    """Inverse of `skeleton_to_json`.
-
-    Args:
-      value: The JSON object.
-
-    Returns:
-      The skeleton.
-
-    Raises:
-      KeyError: if a field is missing.
-      ValueError: if the fields are not those of a skeleton; says what is wrong.
-    """
-    if not isinstance(value, dict):
-        raise ValueError(f"a JSON {type(value).__name__}, expected an object")
-    fields = {name: value[name] for name in ("offsets", "parents", "names", "feet")}
-    for name, found in fields.items():
-        if not isinstance(found, list):
-            raise ValueError(f"{name} should be a list, found {found!r:.100}")
-    check_skeleton(**fields)
-    return Skeleton(
-        offsets=jnp.asarray(np.asarray(fields["offsets"], np.float32)),
-        parents=tuple(fields["parents"]),
-        names=tuple(fields["names"]),
-        feet=tuple(fields["feet"]),
-    )
-
-
-# Least and largest of numbers in configurations, by name, which keep a damaged file
-# from asking for networks that no machine holds. Others: whole ones 1 to 65,536, the
-# rest 0 to 1e6.
-_LIMITS: dict[str, tuple[float | int, float | int]] = {
-    "features": (1, 10**6),
-    "num_features": (1, 10**6),
-    "num_labels": (1, 10**5),
-    "num_steps": (1, 10**4),
-    "depth": (1, 256),
-    **dict.fromkeys(("latent", "condition_size", "token_margin"), (0, 2**16)),
-    **dict.fromkeys(("drafts", "polishes"), (0, 1000)),
-    **dict.fromkeys(("drop_past", "drop_condition", "own_previous"), (0, 1)),
-    "dropout": (0, math.nextafter(1, 0)),
-    "fps": (1e-3, 1000),
-    **dict.fromkeys(("rotation_scale", "meters", "contact_speed"), (1e-6, 1e6)),
-    # In features of any scale.
-    "rotation_mean": (-1e6, 1e6),
-}
-
-
-def _check_field(name: str, kind: Any, value: Any) -> Any:
-    """The value as a configuration has it; raises unless it is of its kind."""
-    choices = typing.get_args(kind)
-    if dataclasses.is_dataclass(kind):
-        return config_from_json(typing.cast(type, kind), value)
-    if typing.get_origin(kind) is typing.Literal:
-        right = isinstance(value, str) and value in choices
-        expected = f"one of {', '.join(map(repr, choices))}"
-    elif kind is bool:
-        right, expected = isinstance(value, bool), "true or false"
-    elif typing.get_origin(kind) is tuple:
-        if not isinstance(value, list | tuple):
-            raise ValueError(f"{name} is {value!r:.60}, expected a list")
-        return tuple(_check_field(name, choices[0], x) for x in value)
-    elif kind in (int, float):
-        low, high = _LIMITS.get(name, (1, 2**16) if kind is int else (0, 1e6))
-        number = (int,) if kind is int else (int, float)
-        right = isinstance(value, number) and not isinstance(value, bool)
-        right = right and low <= value <= high
-        what = "a whole number" if kind is int else "a number"
-        expected = f"{what} from {low:g} to {high:g}"
-    else:
-        raise TypeError(f"{name}: no rule for {kind}")
-    if not right:
-        raise ValueError(f"{name} is {value!r:.60}, expected {expected}")
-    return float(value) if kind is float else value
-
-
-def config_from_json(kind: type, value: Any) -> Any:
-    """A configuration from its JSON, of which every field is checked.
-
-    Args:
-      kind: Its dataclass, of whole numbers, numbers, truth values, choices, lists and
-        such dataclasses.
-      value: What `dataclasses.asdict` gave, read back.
-
-    Returns:
-      The configuration.
-
-    Raises:
-      ValueError: names the field that is missing, unknown, of another kind or out of
-        range.
-    """
-    if not isinstance(value, dict):
-        raise ValueError(f"a JSON {type(value).__name__}, expected an object")
-    kinds = typing.get_type_hints(kind)
-    unknown = sorted(set(value) - set(kinds))
-    if unknown:
-        raise ValueError(f"has unknown {unknown}")
-    needed = {
-        field.name
-        for field in dataclasses.fields(kind)
-        if field.default is dataclasses.MISSING
-    }
-    if needed - set(value):
-        raise ValueError(f"{', '.join(sorted(needed - set(value)))} is missing")
-    config = kind(**{k: _check_field(k, kinds[k], x) for k, x in value.items()})
-    width, heads = (getattr(config, name, 0) for name in ("width", "heads"))
-    if heads and width % heads:
-        raise ValueError(f"width is {width}, expected a multiple of heads ({heads})")
-    return config
-
-
-def names_from_json(value: Any) -> tuple[str, ...]:
-    """A list of different names.
-
-    Raises:
-      ValueError: if it is none.
-    """
-    right = isinstance(value, list) and all(isinstance(x, str) for x in value)
-    if not right or len(set(value)) < len(value):
-        raise ValueError(f"{value!r:.60}, expected a list of different names")
-    return tuple(value)

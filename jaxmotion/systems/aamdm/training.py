@@ -18,7 +18,7 @@ from jaxtyping import Array, Int
 
 from jaxmotion import files
 from jaxmotion.data import clips_io, mirror, selection
-from jaxmotion.learning import adversarial, checkpoint, runs, training
+from jaxmotion.learning import adversarial, checkpoint, model_json, runs, training
 from jaxmotion.learning.runs import Budget
 from jaxmotion.motion import pose
 from jaxmotion.motion.skeleton import MAX_METERS, Skeleton
@@ -127,7 +127,7 @@ def prepare(
         return runs.Content(
             model={
                 "config": dataclasses.asdict(config),
-                "skeleton": runs.skeleton_to_json(clips.skeleton),
+                "skeleton": model_json.skeleton_to_json(clips.skeleton),
             },
             source=clips.source,
             # Of each clip the end is held out.
@@ -166,10 +166,10 @@ def load_run(folder: Path) -> Run:
 
 def _decode(record: runs.Run) -> Run:
     parts = {
-        "config": lambda x: runs.config_from_json(aamdm_embedding.Config, x),
-        "skeleton": runs.skeleton_from_json,
+        "config": lambda x: model_json.config_from_json(aamdm_embedding.Config, x),
+        "skeleton": model_json.skeleton_from_json,
     }
-    found = runs.decode(record.model, str(record.config), parts)
+    found = model_json.decode(record.model, str(record.config), parts)
     config, skeleton = found["config"], found["skeleton"]
     if config.num_joints != skeleton.num_joints:
         raise ValueError(

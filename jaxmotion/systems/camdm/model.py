@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, guidance, schedule
-from jaxmotion.learning import checkpoint, runs
+from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.motion import features, rotation, trajectory
 from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton
 from jaxmotion.networks import transformer
@@ -357,7 +357,7 @@ def to_json(model: Model) -> dict[str, Any]:
     value = {
         "system": SYSTEM,
         "config": dataclasses.asdict(model.config),
-        "skeleton": runs.skeleton_to_json(model.skeleton),
+        "skeleton": model_json.skeleton_to_json(model.skeleton),
         "labels": list(model.labels),
         "source": model.source,
     }
@@ -416,12 +416,12 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
             f"{where}: field 'system' is {value.get('system')!r}, expected {SYSTEM!r}"
         )
     parts = {
-        "config": lambda x: runs.config_from_json(Config, x),
-        "skeleton": runs.skeleton_from_json,
-        "labels": runs.names_from_json,
-        "source": lambda x: runs.names_from_json([x])[0],
+        "config": lambda x: model_json.config_from_json(Config, x),
+        "skeleton": model_json.skeleton_from_json,
+        "labels": model_json.names_from_json,
+        "source": lambda x: model_json.names_from_json([x])[0],
     }
-    made = runs.decode(value, where, parts)
+    made = model_json.decode(value, where, parts)
     model = Model(**made)
     config = model.config
     for name, found, expected in (

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from jaxmotion.data import bvh, bvh_text, clips_io, mirror, selection, windows
 from jaxmotion.data.clips import Clips
-from jaxmotion.learning import checkpoint, runs
+from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.motion import skeleton
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.camdm import loss as camdm_loss
@@ -146,7 +146,7 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
         first, config=dataclasses.replace(first.config, **weights)
     )
     expected = to_json(dataclasses.replace(model, config=wanted, source=first.source))
-    differ = runs.differences(to_json(found), expected)
+    differ = model_json.differences(to_json(found), expected)
     if differ:
         raise ValueError(
             f"{path}: expected a model with the skeleton, labels and config of the one "

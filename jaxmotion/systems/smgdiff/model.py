@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmotion.learning import runs
+from jaxmotion.learning import model_json
 from jaxmotion.motion import rotation
 from jaxmotion.motion.features import Normalizer
 from jaxmotion.motion.trajectory import Trajectory
@@ -218,7 +218,7 @@ def to_json(model: Model) -> dict[str, Any]:
         "config": dataclasses.asdict(model.config),
         "paths": dataclasses.asdict(model.paths),
         "representation": {
-            "skeleton": runs.skeleton_to_json(features.skeleton),
+            "skeleton": model_json.skeleton_to_json(features.skeleton),
             "mean": numbers(features.normalizer.mean),
             "std": numbers(features.normalizer.std),
             "joints": list(features.joints),
@@ -247,7 +247,7 @@ def _numbers(name: str, value: Any, *, least: float) -> list[int | float]:
 def _representation(value: Any) -> Representation:
     if not isinstance(value, dict):
         raise ValueError(f"a JSON {type(value).__name__}, expected an object")
-    skeleton = runs.skeleton_from_json(value["skeleton"])
+    skeleton = model_json.skeleton_from_json(value["skeleton"])
     joints = value["joints"]
     right = isinstance(joints, list) and all(type(x) is int for x in joints)
     if not right or not all(0 <= x < skeleton.num_joints for x in joints):
@@ -291,14 +291,14 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
             f"{where}: field 'system' is {value.get('system')!r}, expected {SYSTEM!r}"
         )
     parts = {
-        "config": lambda x: runs.config_from_json(Config, x),
-        "paths": lambda x: runs.config_from_json(smgdiff_trajectory.Config, x),
+        "config": lambda x: model_json.config_from_json(Config, x),
+        "paths": lambda x: model_json.config_from_json(smgdiff_trajectory.Config, x),
         "representation": _representation,
-        "labels": runs.names_from_json,
+        "labels": model_json.names_from_json,
         "speeds": lambda x: tuple(_numbers("speed", x, least=0.0)),
-        "source": lambda x: runs.names_from_json([x])[0],
+        "source": lambda x: model_json.names_from_json([x])[0],
     }
-    made = runs.decode(value, where, parts)
+    made = model_json.decode(value, where, parts)
     model = Model(**made)
     labels, size = len(model.labels), model.representation.normalizer.mean.size
     for name, found, expected in (
