@@ -11,10 +11,15 @@ means differ where the samples of a batch have different lengths:
 frame: the losses of MDM and CAMDM are written so, with weight 1.
 """
 
+from collections.abc import Callable
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from jaxmotion.diffusion import schedule
+from jaxmotion.typing import Key
 
 Average = Literal["frames", "samples"]
 
@@ -116,3 +121,38 @@ def foot_slide_loss(
     moved = jnp.where(stands, displacement(flat), 0.0)
     pairs = mask[..., 1:] & mask[..., :-1]
     return masked_mse(moved, jnp.zeros_like(moved), pairs, average=average)
+
+
+def predict_clean(
+    encode: Callable[..., object],
+    denoise: Callable[..., Float[Array, "batch *shape"]],
+    key: Key,
+    x_0: Float[Array, "batch *shape"],
+    *,
+    table: schedule.Schedule,
+    levels: int = 1,
+) -> Float[Array, "levels batch *shape"]:
+    """A denoiser's predictions of samples after noise; each condition is encoded once.
+
+    Args:
+      encode: `(key) -> context`, the conditions of the batch.
+      denoise: `(key, context, x_t, t) -> x_0` of the batch.
+      key: Consumed.
+      x_0: Clean samples.
+      table: Schedule.
+      levels: Noise levels of each sample: evenly spread over 1..T after a random
+        first, so that every one of them is uniform by itself.
+    """
+    key_t, key_encode, key_denoise = jax.random.split(key, 3)
+    first = jax.random.randint(key_t, x_0.shape[:1], 0, table.num_steps)
+    apart = jnp.arange(levels) * table.num_steps // levels
+    t = 1 + (first[None] + apart[:, None]) % table.num_steps
+    context = encode(key_encode)
+
+    def predict(key: Key, t: Array) -> Array:
+        key_noise, key_drop = jax.random.split(key)
+        noise = jax.random.normal(key_noise, x_0.shape)
+        x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
+        return denoise(key_drop, context, x_t, t)
+
+    return jax.vmap(predict)(jax.random.split(key_denoise, levels), t)

@@ -199,6 +199,13 @@ class Projections(NamedTuple):
     value: Float[Array, "*batch tokens heads channels"]
 
 
+class Prefix(NamedTuple):
+    """Keys and values of tokens that do not see those that attend to them."""
+
+    key: Float[Array, "*batch tokens heads channels"]
+    value: Float[Array, "*batch tokens heads channels"]
+
+
 class TimeEmbedding(nn.Module):
     """Sinusoid of the step, then Linear, SiLU, Linear.
 
@@ -315,6 +322,7 @@ class EncoderLayer(nn.Module):
         *,
         train: bool,
         mask: Bool[Array, "*batch tokens"] | None = None,
+        prefix: Prefix | None = None,
     ) -> Float[Array, "*batch queries width"]:
         """The rest of the layer for the tokens that the queries came from.
 
@@ -322,7 +330,9 @@ class EncoderLayer(nn.Module):
           x: Tokens of the queries.
           projections: Queries of those tokens, keys and values of all tokens.
           train: Whether to drop.
-          mask: Tokens that may be attended to; None for all.
+          mask: Tokens of `projections` that may be attended to; None for all.
+          prefix: More tokens to attend to. They stay apart, so that `vmap` shares one
+            prefix among many `x` without a copy.
 
         Returns:
           Tokens of the next layer.
@@ -335,8 +345,16 @@ class EncoderLayer(nn.Module):
         if mask is not None:
             seen = jnp.broadcast_to(mask[..., None, None, :], logits.shape)
             logits = jnp.where(seen, logits, jnp.finfo(logits.dtype).min)
-        weights = drop(jax.nn.softmax(logits, axis=-1))
-        mixed = jnp.swapaxes(weights @ value, -2, -3)
+        if prefix is None:
+            mixed = drop(jax.nn.softmax(logits, axis=-1)) @ value
+        else:
+            before, given = (jnp.swapaxes(y, -2, -3) for y in prefix)
+            ahead = query @ jnp.swapaxes(before, -1, -2) / np.sqrt(query.shape[-1])
+            logits = jnp.concatenate([ahead, logits], axis=-1)
+            weights = drop(jax.nn.softmax(logits, axis=-1))
+            number = given.shape[-2]
+            mixed = weights[..., :number] @ given + weights[..., number:] @ value
+        mixed = jnp.swapaxes(mixed, -2, -3)
         x = x + drop(self.out(mixed.reshape(x.shape)))
         act = _ACTIVATIONS[self.activation]
         feed = lambda y: drop(self.contract(drop(act(self.expand(y)))))  # noqa: E731
@@ -352,6 +370,7 @@ class EncoderLayer(nn.Module):
         train: bool,
         last: int | None = None,
         mask: Bool[Array, "*batch tokens"] | None = None,
+        prefix: Prefix | None = None,
     ) -> Float[Array, "*batch out width"]:
         """The whole layer.
 
@@ -360,6 +379,7 @@ class EncoderLayer(nn.Module):
           train: Whether to drop.
           last: Return only the last so many tokens; None for all.
           mask: Tokens that may be attended to; None for all.
+          prefix: As for `attend`.
 
         Returns:
           Tokens of the next layer.
@@ -370,4 +390,5 @@ class EncoderLayer(nn.Module):
             projections,
             train=train,
             mask=mask,
+            prefix=prefix,
         )

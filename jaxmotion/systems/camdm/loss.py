@@ -1,7 +1,9 @@
-"""CAMDM's training: examples from windows of motion, and the five losses.
+"""CAMDM's training: examples from windows of motion, and the losses.
 
 Source: Chen et al. 2024 (CAMDM), eq. 2-4, and the released code.
 """
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -115,35 +117,38 @@ def loss(
       config: The method.
 
     Returns:
-      The weighted sum, and its five terms by name, unweighted.
+      The weighted sum, and its terms by name, unweighted.
 
     Source: Chen et al. 2024 (CAMDM), eq. 2-4, and the released code's fifth term.
     """
     windows, labels = batch
     size = labels.shape[0]
-    key_example, key_t, key_noise, key_drop = jax.random.split(key, 4)
+    key_example, key_noise = jax.random.split(key)
     keys = jax.random.split(key_example, size)
     condition, x_0 = jax.vmap(
         lambda k, w, c: example(k, skeleton, w, c, config=config)
     )(keys, windows, labels)
-    table = schedule.cosine_schedule(config.num_steps)
-    t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
-    noise = jax.random.normal(key_noise, x_0.shape)
-    x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
-    prediction = network(config).apply(
-        {"params": params},
-        x_t,
-        t,
-        *condition.arguments(config),
-        train=config.dropout > 0,
-        rngs={"dropout": key_drop},
+    call = functools.partial(
+        network(config).apply, {"params": params}, train=config.dropout > 0
     )
-    terms = loss_terms(skeleton, prediction, x_0, config=config)
+    predictions = losses.predict_clean(
+        lambda k: call(
+            *condition.arguments(config), method="encode", rngs={"dropout": k}
+        ),
+        lambda k, *x: call(*x, method="denoise", rngs={"dropout": k}),
+        key_noise,
+        x_0,
+        table=schedule.cosine_schedule(config.num_steps),
+        levels=config.noise_levels,
+    )
+    each = jax.vmap(lambda x: loss_terms(skeleton, x, x_0, config=config))(predictions)
+    terms = jax.tree.map(jnp.mean, each)
     weights = {
         "data": config.weight_data,
         "velocity": config.weight_velocity,
         "position": config.weight_position,
         "position_velocity": config.weight_position_velocity,
+        "acceleration": config.weight_acceleration,
         "foot": config.weight_foot,
     }
     return sum(weights[name] * value for name, value in terms.items()), terms
@@ -156,7 +161,7 @@ def loss_terms(
     *,
     config: Config,
 ) -> dict[str, Float[Array, ""]]:
-    """The five losses: data, velocity, position, position_velocity, foot.
+    """The losses: data, velocity, position, position_velocity, acceleration, foot.
 
     Positions and foot displacements are in the world, with the predicted root. A foot
     stands where the target's is slower than `config.contact_speed`, at any height.
@@ -193,5 +198,8 @@ def loss_terms(
         # As in MDM, the mean runs over x, y and z as well.
         "position": losses.masked_mse(flat(predicted), flat(wanted), every),
         "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
+        "acceleration": losses.velocity_loss(
+            *(losses.displacement(flat(x)) for x in (predicted, wanted)), every[..., 1:]
+        ),
         "foot": losses.foot_slide_loss(predicted[..., feet, :], stands, every),
     }

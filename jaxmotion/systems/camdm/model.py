@@ -61,6 +61,11 @@ class Config:
       norm: Layer norms of the transformer behind each sum ("post", the paper's) or
         before each branch ("pre", ours: learns the legs' phase in a tenth of the
         steps).
+      attention: "full" (the paper's), or "prefix": condition tokens attend among
+        themselves only, and are computed once per plan (ours).
+      frame_kernel: Frames of a convolution over time that corrects the output, and
+        starts as zero; odd, ours, 0 for none in the paper.
+      noise_levels: Noise levels of one window in training; ours, 1 in the paper.
       rotation_layout: 6D as two rows (released code) or two columns.
       heading: Frame of a sample. "random": axes turned by a random yaw (released
         code). "facing": +z is where the character faces in the last past pose (ours:
@@ -77,6 +82,8 @@ class Config:
       weight_position: Of the joint positions (eq. 3).
       weight_position_velocity: Of the displacements of joint positions (released
         code; not in the paper's eq. 4).
+      weight_acceleration: Of the second differences of joint positions; ours, 0 in the
+        paper.
       weight_foot: Of foot sliding.
       contact_speed: A foot slower than this stands, meters per second.
     """
@@ -97,6 +104,9 @@ class Config:
     token_margin: int = 0
     token_window: Literal["hann", "trapezoid"] = "hann"
     norm: Literal["post", "pre"] = "post"
+    attention: Literal["full", "prefix"] = "full"
+    frame_kernel: int = 0
+    noise_levels: int = 1
     rotation_layout: Literal["rows", "columns"] = "rows"
     heading: Literal["random", "facing"] = "random"
     rotation_scale: float = 1.0
@@ -106,6 +116,7 @@ class Config:
     weight_velocity: float = 1.0
     weight_position: float = 1.0
     weight_position_velocity: float = 1.0
+    weight_acceleration: float = 0.0
     weight_foot: float = 1.0
     contact_speed: float = 0.3
 

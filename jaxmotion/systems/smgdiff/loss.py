@@ -3,6 +3,8 @@
 Source: SMGDiff, section 3.2, eq. 4-9; what it leaves open is as in CAMDM.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -108,24 +110,26 @@ def loss(
     """
     windows, labels = batch
     size = labels.shape[0]
-    key_example, key_t, key_noise, key_drop = jax.random.split(key, 4)
+    key_example, key_noise = jax.random.split(key)
     keys = jax.random.split(key_example, size)
     condition, x_0 = jax.vmap(
         lambda k, w, c: example(k, w, c, representation=representation, config=config)
     )(keys, windows, labels)
-    table = schedule.cosine_schedule(config.num_steps)
-    t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
-    noise = jax.random.normal(key_noise, x_0.shape)
-    x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
-    prediction = network(config).apply(
-        {"params": params},
-        x_t,
-        t,
-        *condition.arguments(),
-        train=config.dropout > 0,
-        rngs={"dropout": key_drop},
+    call = functools.partial(
+        network(config).apply, {"params": params}, train=config.dropout > 0
     )
-    terms = loss_terms(prediction, x_0, representation=representation)
+    predictions = losses.predict_clean(
+        lambda k: call(*condition.arguments(), method="encode", rngs={"dropout": k}),
+        lambda k, *x: call(*x, method="denoise", rngs={"dropout": k}),
+        key_noise,
+        x_0,
+        table=schedule.cosine_schedule(config.num_steps),
+        levels=config.noise_levels,
+    )
+    each = jax.vmap(lambda x: loss_terms(x, x_0, representation=representation))(
+        predictions
+    )
+    terms = jax.tree.map(jnp.mean, each)
     weights = {
         "data": config.weight_data,
         "velocity": config.weight_velocity,

@@ -51,6 +51,11 @@ class Config:
         and shares with its neighbors; ours, 0 in the paper.
       token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
       norm: Layer norms behind each sum ("post") or before each branch ("pre", ours).
+      attention: "full" (the paper's), or "prefix": condition tokens attend among
+        themselves only, and are computed once per plan (ours).
+      frame_kernel: Frames of a convolution over time that corrects the output, and
+        starts as zero; odd, ours, 0 for none in the paper.
+      noise_levels: Noise levels of one window in training; ours, 1 in the paper.
       weight_data: Weight of the mean squared error of features.
       weight_velocity: Of the displacements of features.
       weight_position: Of the joint positions.
@@ -77,6 +82,9 @@ class Config:
     token_margin: int = 0
     token_window: Literal["hann", "trapezoid"] = "hann"
     norm: Literal["post", "pre"] = "post"
+    attention: Literal["full", "prefix"] = "full"
+    frame_kernel: int = 0
+    noise_levels: int = 1
     weight_data: float = 1.0
     weight_velocity: float = 1.0
     weight_position: float = 1.0
