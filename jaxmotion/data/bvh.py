@@ -154,7 +154,7 @@ def motion_from_bvh(
 ) -> tuple[Skeleton, Motion]:
     """Skeleton and motion of a parsed file.
 
-    World coordinates stay as published (nothing is centerd, turned or put on the
+    World coordinates stay as published (nothing is centered, turned or put on the
     floor). Joints outside the subtree of `root` are dropped; the motion of its
     ancestors is composed into it. A bone that has position channels gets their mean.
 

@@ -51,8 +51,8 @@ def moments(features: Float[Array, "samples features"]) -> Moments:
     if count < 2:
         raise ValueError(f"{count} samples, expected at least 2 to have a covariance")
     mean = jnp.mean(features, axis=0)
-    centerd = features - mean[None]
-    covariance = jnp.matmul(centerd.T, centerd, precision="highest") / (count - 1)
+    centered = features - mean[None]
+    covariance = jnp.matmul(centered.T, centered, precision="highest") / (count - 1)
     return Moments(
         mean=mean, covariance=covariance, count=jnp.asarray(count, features.dtype)
     )
@@ -78,8 +78,8 @@ def masked_moments(
     weight = mask.astype(features.dtype)[:, None]
     count = jnp.sum(weight)
     mean = jnp.sum(features * weight, axis=0) / count
-    centerd = (features - mean[None]) * weight
-    scatter = jnp.matmul(centerd.T, centerd, precision="highest")
+    centered = (features - mean[None]) * weight
+    scatter = jnp.matmul(centered.T, centered, precision="highest")
     covariance = jnp.where(count > 1, scatter / (count - 1), jnp.nan)
     return Moments(mean=mean, covariance=covariance, count=count)
 
@@ -128,7 +128,7 @@ def frechet_distance_of_rows(
 ) -> Float[Array, ""]:
     """Squared Fréchet distance of the Gaussians fitted to two sets of few rows.
 
-    With centerd rows X and Y divided by the root of their number less one, the last
+    With centered rows X and Y divided by the root of their number less one, the last
     trace of (1) is the sum of the singular values of X Y^T: no covariance is formed,
     so that singular ones lose nothing.
 
@@ -143,13 +143,13 @@ def frechet_distance_of_rows(
       two rows count.
     """
 
-    def centerd(x: Array, count: Array) -> tuple[Array, Array]:
+    def centered(x: Array, count: Array) -> tuple[Array, Array]:
         own = (jnp.arange(len(x)) < count)[:, None]
         mean = jnp.mean(x, axis=0, where=own)
         spread = jnp.where(own, x - mean[None], 0.0)
         return mean, spread / jnp.sqrt(jnp.maximum(count - 1, 1).astype(x.dtype))
 
-    (m_a, x), (m_b, y) = centerd(a, count_a), centerd(b, count_b)
+    (m_a, x), (m_b, y) = centered(a, count_a), centered(b, count_b)
     product = jnp.matmul(x, y.T, precision="highest")
     cross = jnp.sum(jnp.linalg.svd(product, compute_uv=False))
     spread = jnp.sum(x * x) + jnp.sum(y * y) - 2.0 * cross

@@ -282,9 +282,9 @@ def word_vectors(words: Sequence[str]) -> Float[np.ndarray, "words 300"]:
     size = 2 * WORD_SIZE
     digests = [hashlib.shake_256(word.encode()).digest(size) for word in words]
     numbers = np.frombuffer(b"".join(digests), "<u2").reshape(-1, WORD_SIZE)
-    centerd = (numbers.astype(np.float64) + 0.5) / 2**16 - 0.5
-    norm = np.linalg.norm(centerd, axis=-1, keepdims=True)
-    return (_NORM * centerd / norm).astype(np.float32)
+    centered = (numbers.astype(np.float64) + 0.5) / 2**16 - 0.5
+    norm = np.linalg.norm(centered, axis=-1, keepdims=True)
+    return (_NORM * centered / norm).astype(np.float32)
 
 
 def word_class(word: str, part_of_speech: str) -> str:

@@ -60,7 +60,7 @@ def test_feet_alternate_at_the_cadence(speed):
     assert found.contact.any(axis=1).all(), "somebody always stands"
 
 
-def test_the_stance_is_centerd_under_the_body():
+def test_the_stance_is_centered_under_the_body():
     speed = 1.0
     path, yaw = straight(speed)
     found = plan(path, yaw)

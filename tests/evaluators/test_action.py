@@ -159,7 +159,7 @@ def test_it_learns_to_tell_two_actions(skeleton):
 def test_the_released_input_is_not_turned_and_begins_at_the_root(skeleton):
     motion = tiny.walk(9, turn=1.0, start=0.5)
     positions = np.asarray(joint_positions(skeleton, motion), np.float64)
-    centerd = positions - positions[:, :1]
+    centered = positions - positions[:, :1]
     path = positions[:, :1] - positions[0, 0]
     found = action_evaluator.released_input(skeleton, motion)
-    np.testing.assert_allclose(found, (centerd + path).reshape(9, -1), atol=1e-6)
+    np.testing.assert_allclose(found, (centered + path).reshape(9, -1), atol=1e-6)

@@ -1,9 +1,11 @@
 """Losses on arrays against loops in float64."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
 from tests.reference import emdm as reference
 
@@ -155,3 +157,47 @@ def test_padding_changes_no_loss(average):
     np.testing.assert_allclose(
         terms(*padded, longer(mask, False)), terms(*given, mask), rtol=1e-6
     )
+
+
+@pytest.mark.parametrize("levels", [1, 3])
+def test_samples_are_noised_at_levels_that_are_uniform_and_apart(levels):
+    table, size = schedule.cosine_schedule(4), 1200
+    x_0 = jnp.full((size, 2), 3.0)
+    encoded = []
+
+    def predict(show):
+        return losses.predict_clean(
+            lambda key: encoded.append(key),
+            lambda key, context, x_t, t: show(x_t, t[:, None] + 0.0 * x_t),
+            jax.random.key(0),
+            x_0,
+            table=table,
+            levels=levels,
+        )
+
+    x_t, t = predict(lambda x, t: x), predict(lambda x, t: t)[..., 0].astype(int)
+    assert len(encoded) == 2  # once a call, whatever the number of levels
+    assert x_t.shape == (levels, size, 2)
+    for row in t:
+        counts = np.bincount(row, minlength=5)
+        assert counts[0] == 0
+        assert np.all(np.abs(counts[1:] - size / 4) / np.sqrt(size * 3 / 16) < 4.0)
+    assert all(len(set(column)) == levels for column in t.T.tolist())
+    for step in range(1, 5):
+        found = np.asarray(x_t, np.float64)[np.asarray(t) == step]
+        mean = np.sqrt(float(table.alpha_bar[step])) * 3.0
+        z = (found - mean) / np.sqrt(float(table.one_minus_alpha_bar[step]))
+        assert abs(z.mean()) * np.sqrt(z.size) < 4.0
+        assert abs(z.var() - 1) * np.sqrt(z.size / 2) < 4.0
+
+
+def test_each_noise_level_has_its_own_noise_and_dropout():
+    keys = losses.predict_clean(
+        lambda key: key,
+        lambda key, context, x_t, t: x_t + jax.random.normal(key, x_t.shape),
+        jax.random.key(0),
+        jnp.zeros((5, 2)),
+        table=schedule.cosine_schedule(4),
+        levels=4,
+    )
+    assert np.unique(np.round(keys, 5)).size == keys.size

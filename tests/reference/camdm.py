@@ -29,7 +29,7 @@ def joint_positions(offsets, parents, frames, layout):
 
 
 def loss_terms(offsets, parents, feet, prediction, target, *, layout, fps, speed):
-    """The five terms of batches [batch, frames, features], as plain means."""
+    """The six terms of batches [batch, frames, features], as plain means."""
     sums = {}
 
     def add(name, value):
@@ -43,6 +43,8 @@ def loss_terms(offsets, parents, feet, prediction, target, *, layout, fps, speed
         add("position", np.mean((found - wanted) ** 2))
         moved = np.diff(found, axis=0) - np.diff(wanted, axis=0)
         add("position_velocity", np.mean(moved**2))
+        twice = np.diff(found, n=2, axis=0) - np.diff(wanted, n=2, axis=0)
+        add("acceleration", np.mean(twice**2))
         for frame in range(len(p) - 1):
             for foot in feet:
                 step = wanted[frame + 1, foot] - wanted[frame, foot]

@@ -8,8 +8,8 @@ import numpy as np
 
 
 def norm(x, weight, bias):
-    centerd = x - x.mean()
-    return centerd / np.sqrt((centerd**2).mean() + 1e-5) * weight + bias
+    centered = x - x.mean()
+    return centered / np.sqrt((centered**2).mean() + 1e-5) * weight + bias
 
 
 def attention(x, weights, stem, heads):

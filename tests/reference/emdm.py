@@ -106,9 +106,9 @@ def group_norm(x, norm, groups, epsilon=1e-5):
     out = np.empty(len(x))
     for first in range(0, len(x), size):
         group = x[first : first + size]
-        centerd = group - np.mean(group)
-        spread = np.sqrt(np.mean(centerd**2) + epsilon)
-        out[first : first + size] = centerd / spread
+        centered = group - np.mean(group)
+        spread = np.sqrt(np.mean(centered**2) + epsilon)
+        out[first : first + size] = centered / spread
     return out * np.asarray(norm["scale"]) + np.asarray(norm["bias"])
 
 

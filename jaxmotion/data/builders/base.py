@@ -3,7 +3,7 @@
 A builder stores whole clips, one example each, as array_record files, which
 `as_data_source` reads without TensorFlow. `clips_from_source` makes `Clips` of them;
 windows are cut later, on the device. World coordinates stay as published: nothing is
-centerd, turned or put on the floor.
+centered, turned or put on the floor.
 """
 
 import os

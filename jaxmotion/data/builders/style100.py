@@ -6,7 +6,7 @@ name, description, stochastic y/n, symmetric y/n and notes.
 
 Source: the preprocessing of CAMDM's released code (every second frame, cut at start//2
 and stop//2, fingers dropped, symmetric styles mirrored under the same label). Differs:
-clips are not turned, centerd or put on the floor; what follows works in any place.
+clips are not turned, centered or put on the floor; what follows works in any place.
 """
 
 import csv

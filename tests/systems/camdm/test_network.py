@@ -32,6 +32,10 @@ KINDS = {
     ),
     "one label": transformer.CamdmTransformer(**SIZES | {"num_labels": 1}),
     "pre-norm": transformer.CamdmTransformer(**SIZES, norm="pre"),
+    "prefix": transformer.CamdmTransformer(**SIZES, attention="prefix"),
+    "prefix, convolution": transformer.CamdmTransformer(
+        **(SIZES | {"depth": 1}), attention="prefix", norm="pre", frame_kernel=3
+    ),
     "mlp": camdm_network.CamdmMlp(**SIZES),
     "single token": camdm_network.SingleTokenTransformer(**SIZES),
 }
@@ -111,7 +115,7 @@ def test_the_papers_network_has_147_tokens_and_3439260_parameters():
 
 
 @pytest.mark.parametrize(
-    "name", mostly_slow(KINDS, ("transformer", "mlp", "single token"))
+    "name", mostly_slow(KINDS, ("transformer", "prefix", "mlp", "single token"))
 )
 def test_a_batch_is_its_samples(name):
     batched = arguments(3)
@@ -165,10 +169,14 @@ def test_a_dropped_past_is_a_past_of_zeros(name):
 
 
 @pytest.mark.parametrize(
-    "name", mostly_slow(TRANSFORMERS, ("transformer", "overlapping tokens"))
+    "name", mostly_slow(TRANSFORMERS, ("transformer", "overlapping tokens", "prefix"))
 )
 def test_encode_and_denoise_are_the_plain_network(name):
-    """Oracle: all tokens in the documented order through all whole layers."""
+    """Oracle: all tokens in the documented order through all whole layers.
+
+    With prefix attention the condition goes through each layer alone, and the others
+    through the same layer with all of it in sight.
+    """
     net, variables = KINDS[name], parameters(name)
 
     def plain(net, x_t, t, past, path, facing, label, keep_past):
@@ -184,14 +192,26 @@ def test_encode_and_denoise_are_the_plain_network(name):
             ]
         )
         tokens = tokens + blocks.sinusoidal_positions(*tokens.shape)
+        given = tokens[1 : -net.num_outputs]
         for layer in net.layers:
-            tokens = layer(tokens, train=False)
+            if net.attention == "prefix":
+                ends = jnp.delete(tokens, slice(1, -net.num_outputs), axis=0)
+                ends = layer(jnp.concatenate([given, ends]), train=False)[len(given) :]
+                given = layer(given, train=False)
+                tokens = jnp.concatenate([ends[:1], given, ends[1:]])
+            else:
+                tokens = layer(tokens, train=False)
         if net.norm == "pre":
             tokens = net.norm_out(tokens)
         out = net.out(tokens[-net.num_outputs :])
         if net.token_margin:
             return overlapped(out, net)
-        return out.reshape(net.future, net.features)
+        frames = out.reshape(net.future, net.features)
+        if net.frame_kernel:
+            kernel = net.smooth.variables["params"]["kernel"]
+            around = jnp.pad(frames, [(1, 1), (0, 0)])
+            frames += sum(around[i : i + net.future] @ kernel[i] for i in range(3))
+        return frames
 
     args = known_arguments(name)
     expected = net.apply(variables, *args, method=plain)
@@ -212,6 +232,26 @@ def test_dropout_only_in_training_and_by_its_key(name):
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-3
     assert np.abs(first - forward(name)(*args)).max() > 1e-3
+
+
+def test_a_convolution_over_frames_starts_as_zero():
+    name = "prefix, convolution"
+    kernel = KINDS[name].init(jax.random.key(0), *arguments())["params"]["smooth"]
+    assert not np.any(kernel["kernel"])
+
+
+def test_many_noisy_samples_share_one_prefix():
+    """Under vmap its keys are read by all, and no operation copies them."""
+    net, variables = KINDS["prefix"], parameters("prefix")
+    x_t, t, *condition = arguments()
+    context = net.apply(variables, *condition, method="encode")
+    many = jnp.stack([x_t, x_t + 1.0, x_t - 1.0])
+    denoise = lambda x: net.apply(variables, context, x, t, method="denoise")  # noqa: E731
+    found = jax.vmap(denoise)(many)
+    for x, out in zip(many, found, strict=True):
+        np.testing.assert_allclose(denoise(x), out, atol=5e-6)
+    shape = f"3,{context.layers[0].key.shape[-3]},"
+    assert f"[{shape}" not in str(jax.make_jaxpr(jax.vmap(denoise))(many))
 
 
 def test_frames_fold_in_order_and_must_divide():

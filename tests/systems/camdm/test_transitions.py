@@ -37,7 +37,7 @@ def test_every_pair_is_commanded_in_every_replication(changes):
     np.testing.assert_array_equal(label[:, :30], changes.old[:, None].repeat(30, 1))
     after = label.shape[1] - 30
     np.testing.assert_array_equal(label[:, 30:], changes.new[:, None].repeat(after, 1))
-    # The last window is whole, centerd 2 s behind; 4 s are measured.
+    # The last window is whole, centered 2 s behind; 4 s are measured.
     assert after == max(60 + 30, 120)
     speed = np.linalg.norm(np.asarray(changes.commands.velocity), axis=-1)
     assert abs(speed[0, 5] - speed[1, 5]) > 0.01
