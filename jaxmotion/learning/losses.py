@@ -124,21 +124,21 @@ def foot_slide_loss(
 
 
 def predict_clean(
-    encode: Callable[..., object],
-    denoise: Callable[..., Float[Array, "batch *shape"]],
     key: Key,
     x_0: Float[Array, "batch *shape"],
     *,
+    encode: Callable[..., object],
+    denoise: Callable[..., Float[Array, "batch *shape"]],
     table: schedule.Schedule,
     levels: int = 1,
 ) -> Float[Array, "levels batch *shape"]:
     """A denoiser's predictions of samples after noise; each condition is encoded once.
 
     Args:
-      encode: `(key) -> context`, the conditions of the batch.
-      denoise: `(key, context, x_t, t) -> x_0` of the batch.
       key: Consumed.
       x_0: Clean samples.
+      encode: `(key) -> context`, the conditions of the batch.
+      denoise: `(key, context, x_t, t) -> x_0` of the batch.
       table: Schedule.
       levels: Noise levels of each sample: evenly spread over 1..T after a random
         first, so that every one of them is uniform by itself.

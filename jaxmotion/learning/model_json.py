@@ -84,7 +84,9 @@ _LIMITS: dict[str, tuple[float | int, float | int]] = {
     "num_labels": (1, 10**5),
     "num_steps": (1, 10**4),
     "depth": (1, 256),
-    **dict.fromkeys(("latent", "condition_size", "token_margin"), (0, 2**16)),
+    **dict.fromkeys(
+        ("latent", "condition_size", "token_margin", "frame_kernel"), (0, 2**16)
+    ),
     **dict.fromkeys(("drafts", "polishes"), (0, 1000)),
     **dict.fromkeys(("drop_past", "drop_condition", "own_previous"), (0, 1)),
     "dropout": (0, math.nextafter(1, 0)),

@@ -167,10 +167,10 @@ def test_samples_are_noised_at_levels_that_are_uniform_and_apart(levels):
 
     def predict(show):
         return losses.predict_clean(
-            lambda key: encoded.append(key),
-            lambda key, context, x_t, t: show(x_t, t[:, None] + 0.0 * x_t),
             jax.random.key(0),
             x_0,
+            encode=encoded.append,
+            denoise=lambda key, context, x_t, t: show(x_t, t[:, None] + 0.0 * x_t),
             table=table,
             levels=levels,
         )
@@ -193,10 +193,10 @@ def test_samples_are_noised_at_levels_that_are_uniform_and_apart(levels):
 
 def test_each_noise_level_has_its_own_noise_and_dropout():
     keys = losses.predict_clean(
-        lambda key: key,
-        lambda key, context, x_t, t: x_t + jax.random.normal(key, x_t.shape),
         jax.random.key(0),
         jnp.zeros((5, 2)),
+        encode=lambda key: key,
+        denoise=lambda key, context, x_t, t: x_t + jax.random.normal(key, x_t.shape),
         table=schedule.cosine_schedule(4),
         levels=4,
     )

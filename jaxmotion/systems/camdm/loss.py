@@ -132,12 +132,12 @@ def loss(
         network(config).apply, {"params": params}, train=config.dropout > 0
     )
     predictions = losses.predict_clean(
-        lambda k: call(
-            *condition.arguments(config), method="encode", rngs={"dropout": k}
-        ),
-        lambda k, *x: call(*x, method="denoise", rngs={"dropout": k}),
         key_noise,
         x_0,
+        encode=lambda k: call(
+            *condition.arguments(config), method="encode", rngs={"dropout": k}
+        ),
+        denoise=lambda k, *x: call(*x, method="denoise", rngs={"dropout": k}),
         table=schedule.cosine_schedule(config.num_steps),
         levels=config.noise_levels,
     )
