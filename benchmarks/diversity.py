@@ -26,7 +26,7 @@ import workload
 from jaxtyping import Array, Float
 
 from jaxmotion import cli, files, reporting
-from jaxmotion.control import courses, rollout
+from jaxmotion.control import courses, rollout, steering
 from jaxmotion.data import selection
 from jaxmotion.evaluation import diversity, table
 from jaxmotion.evaluators import style as style_evaluator
@@ -166,7 +166,7 @@ def make_load(
             found.train,
             found.field,
         )
-    label = np.array([0 if style is None else model.label(style)])
+    label = steering.label_indices(model.labels, style)
     speeds = np.asarray(selection.label_speeds(clips, field=field))[label]
     speeds = speeds if speed is None else np.array([speed])
     commands = courses.course_batch(

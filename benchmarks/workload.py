@@ -257,7 +257,7 @@ def walker_model(
             config=config, skeleton=skeleton, labels=labels, source=clips.source
         )
         return model, camdm_model.init(jax.random.key(0), config)
-    model, params, _ = camdm_model.load(run)
+    model, params = camdm_model.load(run)
     if (model.labels, model.skeleton.names) != (labels, skeleton.names):
         raise ValueError(
             f"{run}: a model of {model.skeleton.num_joints} joints and the styles "

@@ -21,6 +21,7 @@ from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
 from jaxmotion.learning import loop, runs
 from jaxmotion.systems import registry
+from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import training as aamdm_training
 
@@ -95,7 +96,7 @@ class Evaluate:
       course: Commands of the steered rollouts.
       speed: Meters per second that are commanded.
       scale: Strength of AAMDM's guidance, epsilon of eq. 13.
-      amdm_scale: Likewise, of AMDM's.
+      amdm_scale: Strength of AMDM's.
       long_minutes: Length of the long rollouts of the row "aamdm"; 0 for none.
       long_rollouts: Their number.
       seed: Of poses, noise and pairs.
@@ -108,7 +109,7 @@ class Evaluate:
     seconds: float = 1000 / 60
     course: Course = aamdm_evaluation.COURSE
     speed: float = aamdm_evaluation.SPEED
-    scale: float = aamdm_evaluation.SCALE
+    scale: float = aamdm_controller.SCALE
     amdm_scale: float = 1.0
     long_minutes: float = 10.0
     long_rollouts: int = 16
@@ -139,7 +140,7 @@ class Rollout:
     seconds: float = 20.0
     course: Course = aamdm_evaluation.COURSE
     speed: float = aamdm_evaluation.SPEED
-    scale: float = aamdm_evaluation.SCALE
+    scale: float = aamdm_controller.SCALE
     out: Path | None = None
     seed: int = 0
 

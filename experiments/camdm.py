@@ -101,48 +101,19 @@ class Train:
     override: bool = False
 
 
-def with_preset(args: Train) -> Train:
-    """The arguments, with the preset's values of how to train in place of None."""
-    preset = camdm_training.FITTING[args.preset]
-    open_ = {k: v for k, v in preset.items() if getattr(args, k) is None}
-    return dataclasses.replace(args, **open_)
-
-
 def sizes_of(args: Train) -> dict[str, Any]:
     """Sizes and weights of the model that the arguments describe."""
-    sizes = camdm_training.PRESETS[args.preset] | {
-        "num_steps": args.diffusion_steps,
-        "network": args.network,
-        "token_window": args.token_window,
-    }
-    if args.width is not None:
-        sizes |= {"width": args.width, "hidden": 4 * args.width}
-    for name in ("depth", "token_margin"):
-        if (value := getattr(args, name)) is not None:
-            sizes[name] = value
-    return sizes
+    given = cli.given(camdm_model.Config, args) | {"num_steps": args.diffusion_steps}
+    hidden = {} if args.width is None else {"hidden": 4 * args.width}
+    return camdm_training.PRESETS[args.preset] | given | hidden
 
 
 def train(args: Train) -> None:
     """Trains, with checkpoints."""
-    args = with_preset(args)
     loop.check_writable(args.out)
     sizes = sizes_of(args)
-    budget = runs.Budget(
-        steps=args.steps,
-        batch=args.batch,
-        optimizer=args.optimizer,
-        learning_rate=args.learning_rate,
-        warmup=args.warmup,
-        final=0.1,
-        max_norm=args.max_norm,
-        ema=args.ema,
-        devices=args.devices,
-        chunk=args.chunk,
-        save_every=args.save_every,
-        seed=args.seed,
-        override=args.override,
-    )
+    given = camdm_training.FITTING[args.preset] | cli.given(runs.Budget, args)
+    budget = runs.Budget(**given, final=0.1)
 
     def make(clips: Clips) -> camdm_model.Model:
         model = camdm_training.make_model(clips, field=args.label, **sizes)
@@ -355,7 +326,7 @@ class Export:
 
 def export(args: Export) -> None:
     """Writes the file."""
-    model, params, _ = camdm_model.load(args.run)
+    model, params = camdm_model.load(args.run)
     if args.starts is not None:
         run = camdm_training.load_run(args.run)
         starts = camdm_evaluation.own_starts(run, number=args.starts)

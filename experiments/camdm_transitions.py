@@ -1,8 +1,8 @@
 """CAMDM's changes of style: how many succeed, how soon, with and without guidance.
 
 Characters walk in one style, are told another, and an evaluator looks for it in what
-follows: the paper's tables 2 and 4, where people judged. Rows are the run-time's
-constants of the paper, of its release, without guidance on the past, and characters who
+follows: the paper's tables 2 and 4, where people judged. Rows are the default
+guidance on the past (the paper's), that of its release, none, and characters who
 were told nothing, in whom what is found is a mistake of the evaluator's.
 
 Examples:
@@ -26,8 +26,8 @@ from jaxmotion.systems.camdm import transitions as camdm_transitions
 from jaxmotion.systems.camdm.controller import RELEASED, Control
 
 CONTROLS = {
-    "guided once, scale 0.7 (paper)": Control(),
-    "guided twice, scale 0.5 (release)": Control(
+    "guided": Control(),
+    "guided as released": Control(
         guidance_scale=RELEASED.guidance_scale, guided_plans=RELEASED.guided_plans
     ),
     "not guided": Control(guided_plans=0),
@@ -45,9 +45,8 @@ class Config:
       replications: Sets of one rollout for each ordered pair of styles, with start
         poses and noise of their own; intervals run over these.
       before: Seconds in the first style, 1 at least.
-      limit: Seconds behind the command in which the change must have come.
-      course: Commands; each style goes at its own
-        median speed.
+      limit: Seconds after the command in which the change must have come.
+      course: Commands; each style goes at its own median speed.
       contents: Contents of the clips to start from; none: all of the run's.
       chunk: Characters to run at a time, at most.
       evaluator_steps: Updates of the evaluator of styles, if it is trained here.
@@ -71,11 +70,7 @@ class Config:
 
 
 def measure(args: Config) -> None:
-    """Writes the table.
-
-    Args:
-      args: Of the command line.
-    """
+    """Writes the table."""
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = camdm_training.load_run(args.run, args.data, args.contents)
     out = args.out or args.run / "transitions"
@@ -111,6 +106,12 @@ def measure(args: Config) -> None:
     notes = (
         f"{changes.old.size} rollouts a row: every ordered pair of "
         f"{len(run.model.labels)} styles, {args.replications} times.",
+        *(
+            f"{name}: the first {control.guided_plans} after the change, scale "
+            f"{control.guidance_scale:g}."
+            for name, control in CONTROLS.items()
+            if control.guided_plans
+        ),
         # Without the clips of Fréchet distances: there are none.
         frozen.note({k: report["evaluator"][k] for k in ("fingerprint", "origin")}),
         f"It is right in {report['recognized_in_clips_%']:.1f} % of the windows of "

@@ -11,12 +11,12 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
+import re
 import time
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from emdm_tasks import sampling, setup
 
 from jaxmotion import cli, reporting
 from jaxmotion.evaluation import by_frame
@@ -24,6 +24,7 @@ from jaxmotion.evaluators import frozen
 from jaxmotion.evaluators.text_motion import Padding
 from jaxmotion.learning import loop, runs
 from jaxmotion.reporting import arguments_json
+from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import evaluation as emdm_evaluation
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import scoring as emdm_scoring
@@ -83,7 +84,7 @@ class Train:
     out: Path = Path("runs/emdm_action")
     rows: tuple[str, ...] = ("emdm",)
     field: str = "content"
-    merge: tuple[str, ...] = setup.MERGE
+    merge: tuple[str, ...] = emdm_data.MERGE
     least: int = 10
     encoder: str = "wordllama"
     text_form: emdm_text.TextForm | None = None
@@ -129,9 +130,8 @@ class Evaluate:
       out: Folder; None for <run>/evaluation.
       samples: Motions of a replication (actions: rounded down to as many of each).
       replications: Sets of motions of each row.
-      long_replications: Likewise, of rows with 500 network calls and more.
-      scale: Of classifier-free guidance; None for 1 (actions) or 2.5 (texts), the
-        paper's.
+      long_replications: Sets of rows with 500 network calls and more.
+      scale: Of classifier-free guidance; None for the paper's of the task.
       evaluator_steps: Updates of the evaluator; None for 1500 of that of
         actions, 600 of that of texts, whose updates cost ten times as much.
       evaluator: File of a frozen evaluator of actions, from evaluator.py; None trains
@@ -173,7 +173,7 @@ class Sample:
       action: Action, for a run of actions; several make several motions.
       text: Sentence, for a run of texts; several make several motions.
       frames: Length; None for the model's longest.
-      scale: Of classifier-free guidance; None for 1 (actions) or 2.5 (texts).
+      scale: Of classifier-free guidance; None for the paper's.
       out: Folder; None for <run>/samples.
       seed: Of the noise.
     """
@@ -188,6 +188,62 @@ class Sample:
     seed: int = 0
 
 
+# Frames of the shortest clip that gets a caption, as in HumanML3D.
+_SHORTEST = 40
+
+
+def base_config(args: Train, recon: float) -> emdm_model.Config:
+    """Sizes and weights of the row "emdm"; `recon` is R where none is given."""
+    given = cli.given(emdm_model.Config, args) | dict(
+        token_margin=args.token_margin if args.frames_per_token > 1 else 0,
+        num_steps=args.diffusion_steps,
+        weight_recon=recon if args.recon is None else args.recon,
+    )
+    return emdm_model.Config(features=1, heads=4, norm="pre", **given)
+
+
+def prepare(args: Train) -> emdm_training.Task:
+    """Makes a run folder's data, or loads those it has."""
+    options = dict(
+        fps={"text": 20.0}.get(args.task, 15.0) if args.fps is None else args.fps,
+        frames={"text": 120}.get(args.task, 60) if args.frames is None else args.frames,
+        held_out=args.held_out,
+    )
+    if args.task == "text":
+        form = args.text_form or emdm_text.default_form(args.encoder)
+        run = emdm_text.prepare(
+            args.out,
+            args.data,
+            encoder=args.encoder,
+            form=form,
+            unseen=args.unseen,
+            least=_SHORTEST,
+            **options,
+        )
+        counts = {s: run.motions.clips_of(s).size for s in run.motions.split_names}
+        print(
+            f"{run.motions.num_clips} clips {counts}, {len(run.vectors)} distinct "
+            f"captions, encoded by {run.encoder.name}, {form}"
+        )
+        base = base_config(args, 100.0)
+        return emdm_text.make_task(run, base, frames=options["frames"])
+    run = emdm_data.prepare(
+        args.out,
+        args.data,
+        task=args.task,
+        field=args.field,
+        merge=emdm_data.merges(args.merge),
+        least=args.least,
+        **options,
+    )
+    print(
+        f"{run.clips.num_clips} clips of {len(run.actions)} actions: "
+        f"{', '.join(run.actions)}"
+    )
+    conditional = args.task == "action"
+    return emdm_data.make_task(run, base_config(args, 1.0), conditional=conditional)
+
+
 def train(args: Train) -> None:
     """Trains row by row."""
     emdm_training.check_rows(args.rows)
@@ -197,17 +253,15 @@ def train(args: Train) -> None:
                 f"row {row!r} samples {emdm_training.SAMPLERS[row][0]!r}: train that"
             )
     loop.check_writable(args.out)
-    task = setup.prepare(args)
+    task = prepare(args)
     for row in args.rows:
         begun = time.perf_counter()
         latent = emdm_training.row_config(task.base, row).latent
-        budget = runs.Budget(
-            steps=args.steps if latent else args.ddpm_steps,
-            batch=args.batch,
-            learning_rate=args.learning_rate if latent else args.ddpm_rate,
-            seed=args.seed,
-            override=args.override,
-        )
+        budget = runs.Budget(**cli.given(runs.Budget, args))
+        if not latent:
+            budget = dataclasses.replace(
+                budget, steps=args.ddpm_steps, learning_rate=args.ddpm_rate
+            )
         discriminator = dataclasses.replace(
             budget, optimizer="adam", learning_rate=args.discriminator_rate
         )
@@ -224,8 +278,7 @@ def evaluate(args: Evaluate) -> None:
     loop.check_writable(out)
     cli.announce("compiling the evaluator and the sampler of each row", 40)
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
-    names = {field.name for field in dataclasses.fields(emdm_scoring.Settings)}
-    given = {k: v for k, v in vars(args).items() if k in names}
+    given = cli.given(emdm_scoring.Settings, args)
     settings = emdm_scoring.Settings(**given | {"evaluator": evaluator})
     rows, places, scorer = emdm_evaluation.evaluate_run(
         args.run, settings, rows=args.rows, long_replications=args.long_replications
@@ -247,7 +300,25 @@ def sample(args: Sample) -> None:
     out = args.out or args.run / "samples"
     loop.check_writable(out)
     cli.announce("compiling the sampler", 40)
-    sampling.sample(args, out)
+    made, source = emdm_evaluation.make_motions(
+        args.run,
+        actions=args.action,
+        texts=args.text,
+        row=args.row,
+        frames=args.frames,
+        scale=args.scale,
+        seed=args.seed,
+    )
+    for name, (skeleton, motion) in made.items():
+        reporting.write_rollout(
+            out,
+            skeleton,
+            motion,
+            None,
+            title=f"{name}, {args.row}",
+            caption=source,
+            name=re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:60],
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from emdm_tasks import setup
 
 from jaxmotion import cli
 from jaxmotion.data import selection
@@ -115,7 +114,7 @@ def train_action(args: Train) -> Evaluator:
     clips, left_out = emdm_data.prepare_clips(
         args.data,
         field=field,
-        merge=setup.merges(setup.MERGE if args.merge is None else args.merge),
+        merge=emdm_data.merges(emdm_data.MERGE if args.merge is None else args.merge),
         least=10 if args.least is None else args.least,
         fps=15.0 if args.fps is None else args.fps,
     )

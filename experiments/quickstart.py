@@ -102,7 +102,7 @@ def steer_shipped(args: Config):
 
 def start_model():
     """The shipped walker with a style to learn, which begins as the others' mean."""
-    model, params, _ = camdm_model.load("walker")
+    model, params = camdm_model.load("walker")
     config = dataclasses.replace(model.config, num_labels=model.config.num_labels + 1)
     table = params["embed_label"]["embedding"]
     table = jnp.concatenate([table, table.mean(axis=0, keepdims=True)])

@@ -25,6 +25,7 @@ from jaxmotion.learning import loop, runs
 from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import model as smgdiff_model
 from jaxmotion.systems.smgdiff import players as smgdiff_players
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff.guidance import SCHEDULES, TUNED, Guidance
@@ -138,10 +139,7 @@ class Rollout:
       paths: Trajectory generator; "straight" for none.
       steps: Motion model.
       schedule: Of contact guidance.
-      rate: As of `evaluate`.
-      last_sigma: As of `evaluate`.
-      min_acceleration: As of `evaluate`.
-      max_distance: As of `evaluate`.
+      rate: w_r of DSG; this and the next three as in `evaluate`.
       out: Folder; None for <run>/rollout.
       seed: Of the start and the noise.
     """
@@ -162,14 +160,9 @@ class Rollout:
 
 def sizes_of(args: Train) -> dict[str, Any]:
     """Sizes of the motion model that the arguments describe."""
-    sizes = dict(smgdiff_training.PRESETS[args.preset])
-    if args.width is not None:
-        sizes |= {"width": args.width, "hidden": 4 * args.width}
-    if args.depth is not None:
-        sizes |= {"depth": args.depth}
-    if args.token_margin is not None:
-        sizes |= {"token_margin": args.token_margin}
-    return sizes
+    given = cli.given(smgdiff_model.Config, args)
+    hidden = {} if args.width is None else {"hidden": 4 * args.width}
+    return smgdiff_training.PRESETS[args.preset] | given | hidden
 
 
 def train(args: Train) -> None:
@@ -188,28 +181,16 @@ def train(args: Train) -> None:
     for stage in args.stages:
         begun = time.perf_counter()
         number = args.steps if stage.startswith("motion") else args.path_steps
-        budget = runs.Budget(
-            steps=number,
-            batch=args.batch,
-            learning_rate=args.learning_rate,
-            seed=args.seed,
-            override=args.override,
-        )
+        budget = runs.Budget(**cli.given(runs.Budget, args) | {"steps": number})
         smgdiff_training.train_stage(
             run, stage, budget=budget, draft_steps=args.draft_steps
         )
         print(f"{stage}: {time.perf_counter() - begun:.0f} s", flush=True)
 
 
-def guidance_of(args: Evaluate | Rollout) -> Guidance:
-    """Constants of the guidance that the arguments give."""
-    names = ("rate", "last_sigma", "min_acceleration", "max_distance")
-    return Guidance(**{name: getattr(args, name) for name in names})
-
-
 def evaluate(args: Evaluate) -> None:
     """Writes the tables, each into a folder of its own."""
-    guided = guidance_of(args)
+    guided = Guidance(**cli.given(Guidance, args))
     for schedule in args.schedules:
         smgdiff_guidance.on_schedule(guided, schedule)
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
@@ -273,6 +254,7 @@ def evaluate(args: Evaluate) -> None:
 
 def rollout(args: Rollout) -> None:
     """Writes the rollout, and prints what is worth knowing before one looks."""
+    guided = Guidance(**cli.given(Guidance, args))
     run = smgdiff_training.load_run(args.run)
     out = args.out or args.run / "rollout"
     loop.check_writable(out)
@@ -285,7 +267,7 @@ def rollout(args: Rollout) -> None:
         commands,
         steps=args.steps,
         paths=args.paths,
-        guided=smgdiff_guidance.on_schedule(guidance_of(args), args.schedule),
+        guided=smgdiff_guidance.on_schedule(guided, args.schedule),
         seed=args.seed,
     )
     touch = np.asarray(scene.touch) > 0.5

@@ -3,7 +3,7 @@
 import dataclasses
 import sys
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from jax.errors import JaxRuntimeError
 
@@ -105,11 +105,25 @@ def check(args: Arguments) -> Arguments:
     return args
 
 
+def given(kind: type, args: Any) -> dict[str, Any]:
+    """Options that are fields of a settings dataclass too, but for those that are None.
+
+    Args:
+      kind: A dataclass of the library.
+      args: Dataclass of a command line.
+
+    Returns:
+      Values by name, for `kind(**...)`.
+    """
+    names = {field.name for field in dataclasses.fields(kind)}
+    return {k: x for k, x in vars(args).items() if k in names and x is not None}
+
+
 def announce(what: str, seconds: int) -> None:
     """Says what a silence is for.
 
     Args:
-      what: As in "compiling the rollout".
+      what: Such as "compiling the rollout".
       seconds: How long it takes on two CPU cores.
     """
     print(f"{what}, about {seconds} s", file=sys.stderr, flush=True)

@@ -47,7 +47,8 @@ def load(
       foot_lock: Settings of the lock that keeps planted feet in place; True for the
         defaults, False for none. None: on for shipped models, off for runs and files,
         whose frames are then what the network makes.
-      **options: Of the system's `controller.load_character`, such as CAMDM's `control`.
+      **options: Of the system's `controller.load_character`: `step` makes another step
+        of the chain, such as `diffusion.chain.ddim_step`; CAMDM has `control` as well.
 
     Returns:
       The character: its skeleton, labels, rate, source and licence; `start` makes
@@ -86,7 +87,7 @@ def _system(path: Path) -> Any:
     if path.is_file():
         from jaxmotion.learning import checkpoint
 
-        return checkpoint.import_params(path)[1].get("system")
+        return checkpoint.export_config(path).get("system")
     value = files.read_object(path / "config.json", what="expected a run folder")
     return value.get("system")
 
@@ -224,9 +225,9 @@ def _drawing(skeleton: Skeleton, frames: Frame | Motion) -> dict[str, Any]:
 
 
 def _save_bvh(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
-    from jaxmotion.data import bvh
+    from jaxmotion.data import bvh, bvh_text
 
-    bvh.write_bvh(path, bvh.bvh_from_motion(skeleton, _one(frames)))
+    bvh_text.write_bvh(path, bvh.bvh_from_motion(skeleton, _one(frames)))
 
 
 def _save_gif(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
@@ -243,17 +244,16 @@ def _save_html(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
 
 def _save_npz(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     motion = _one(frames)
-    with files.replacing(path) as file:
-        np.savez(
-            file,
-            root_position=np.asarray(motion.root_position),
-            joint_rotation=np.asarray(motion.joint_rotation),
-            joint_position=np.asarray(joint_positions(skeleton, motion)),
-            offsets=np.asarray(skeleton.offsets),
-            parents=np.array(skeleton.parents),
-            names=np.array(skeleton.names),
-            fps=motion.fps,
-        )
+    arrays = dict(
+        root_position=motion.root_position,
+        joint_rotation=motion.joint_rotation,
+        joint_position=joint_positions(skeleton, motion),
+        offsets=skeleton.offsets,
+        parents=skeleton.parents,
+        names=skeleton.names,
+        fps=motion.fps,
+    )
+    files.write_arrays(path, arrays)
 
 
 def _save_csv(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:

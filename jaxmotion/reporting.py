@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxmotion import files
-from jaxmotion.data import bvh
+from jaxmotion.data import bvh, bvh_text
 from jaxmotion.evaluation import bench, columns, table
 from jaxmotion.learning import runs
 from jaxmotion.motion import trajectory
@@ -73,7 +73,7 @@ def write_rollout(
 
     fps = motion.fps
     folder.mkdir(parents=True, exist_ok=True)
-    bvh.write_bvh(folder / f"{name}.bvh", bvh.bvh_from_motion(skeleton, motion))
+    bvh_text.write_bvh(folder / f"{name}.bvh", bvh.bvh_from_motion(skeleton, motion))
     positions = np.asarray(joint_positions(skeleton, motion))
     walked = positions[:, 0, ::2]
     commanded = None

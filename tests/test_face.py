@@ -4,6 +4,7 @@ import csv
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -69,6 +70,10 @@ def test_a_run_starts_from_clips():
     made = controller.character(run.params, run.model)
     states = made.start(clips=run.train, labels=["zombie", "neutral"])
     assert states.past.root_position.shape == (2, run.model.config.past, 3)
+    names = (*run.train.names("style"), "none walks so")
+    more = dataclasses.replace(run.train, label_names=(("style", names),))
+    same = made.start(clips=more, labels=["zombie", "neutral"])
+    assert jnp.array_equal(same.past.root_position, states.past.root_position)
     with pytest.raises(ValueError, match="no poses to start from: give clips"):
         made.start(2)
     other = dataclasses.replace(run.train, label_names=(("style", ("a", "b")),))

@@ -45,12 +45,7 @@ from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character, Method
 from jaxmotion.motion.rotation import rot6d_from_matrix, safe_normalize
 from jaxmotion.motion.rotation_vector import to_matrix
-from jaxmotion.motion.skeleton import (
-    Motion,
-    Skeleton,
-    global_transforms,
-    joint_positions,
-)
+from jaxmotion.motion.skeleton import Motion, Skeleton, global_transforms
 from jaxmotion.motion.spring import spring
 
 _UP = (0.0, 1.0, 0.0)
@@ -272,7 +267,6 @@ def solve_leg(
     """
     hip, knee, ankle, animated = positions
     goal = ankle + toe - animated
-    goal = goal.at[1].set(jnp.maximum(goal[1], jnp.minimum(ankle[1], 0.0)))
     goal = goal.at[1].set(jnp.maximum(goal[1], lock.ankle_height))
     thigh, shank = _length(knee - hip), _length(ankle - knee)
     before, asked = _length(ankle - hip), _length(goal - hip)
@@ -333,6 +327,19 @@ def place_toes(
       Rotations; only hips, knees and ankles differ.
     """
     positions, rotations = global_transforms(skeleton, root_position, joint_rotation)
+    return _place(skeleton, positions, rotations, joint_rotation, toes, lock=lock)
+
+
+def _place(
+    skeleton: Skeleton,
+    positions: Float[Array, "joints 3"],
+    rotations: Float[Array, "joints 3 3"],
+    joint_rotation: Float[Array, "joints 6"],
+    toes: Float[Array, "feet 3"],
+    *,
+    lock: FootLock,
+) -> Float[Array, "joints 6"]:
+    """`place_toes` of a pose whose world positions and rotations are known."""
     chains = legs(skeleton)
     # Knees bend about the line between the hips, so that the shank goes back.
     hips = [chain[0] for chain in chains]
@@ -378,11 +385,10 @@ def lock_frame(
     Returns:
       The state, and the rotations to display.
     """
-    positions, _ = global_transforms(skeleton, root_position, joint_rotation)
-    toes = positions[jnp.array(skeleton.feet)]
+    pose = global_transforms(skeleton, root_position, joint_rotation)
+    toes = pose[0][jnp.array(skeleton.feet)]
     state = step_lock(state, toes, fps=fps, lock=lock)
-    shown = place_toes(skeleton, root_position, joint_rotation, state.shown, lock=lock)
-    return state, shown
+    return state, _place(skeleton, *pose, joint_rotation, state.shown, lock=lock)
 
 
 @functools.partial(jax.jit, static_argnames=("lock",))
@@ -464,11 +470,13 @@ def clean_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motio
     Unlike `lock_motion` it looks ahead: toes begin to move to their places before the
     contact begins, see `toe_offsets`.
     """
-    toes = joint_positions(skeleton, motion)[:, jnp.array(skeleton.feet)]
+    transforms = jax.vmap(functools.partial(global_transforms, skeleton))
+    pose = transforms(motion.root_position, motion.joint_rotation)
+    toes = pose[0][:, jnp.array(skeleton.feet)]
     planted = _planted(toes, fps=motion.fps, lock=lock)
     wanted = toes.at[..., ::2].add(toe_offsets(toes, planted))
-    place = functools.partial(place_toes, skeleton, lock=lock)
-    rotations = jax.vmap(place)(motion.root_position, motion.joint_rotation, wanted)
+    place = jax.vmap(functools.partial(_place, skeleton, lock=lock))
+    rotations = place(*pose, motion.joint_rotation, wanted)
     return dataclasses.replace(motion, joint_rotation=rotations)
 
 

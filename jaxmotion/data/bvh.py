@@ -1,4 +1,4 @@
-"""BVH files and motions: read, write, convert.
+"""Motions from BVH files and back; `bvh_text` reads and writes the files.
 
 A joint's local transform in a frame is a translation and a rotation. Position channels
 replace the OFFSET, component by component (some sets give every joint six channels,
@@ -16,21 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxmotion.data.bvh_text import Bvh, BvhError, parse_bvh, read_bvh, write_bvh
+from jaxmotion.data.bvh_text import Bvh, BvhError
 from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton
-
-__all__ = [
-    "Bvh",
-    "BvhError",
-    "bvh_from_motion",
-    "bvh_transforms",
-    "frame_rate",
-    "motion_from_bvh",
-    "parse_bvh",
-    "read_bvh",
-    "without_joints",
-    "write_bvh",
-]
 
 _CUSTOMARY = (24, 25, 30, 48, 50, 60, 72, 90, 100, 120, 144, 200, 240)
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion import files
 from jaxmotion.data import clips_io
-from jaxmotion.motion.humanml import HUMANML3D, KIT_ML
+from jaxmotion.motion.humanml_layout import HUMANML3D, KIT_ML
 from jaxmotion.typing import Key
 
 SPLITS = ("train", "val", "test")

@@ -243,7 +243,7 @@ def dpm_solver_step(schedule: Schedule, denoise: Denoiser) -> Multistep:
 
     Source: Lu et al. 2022, "DPM-Solver++", alg. 2, with its first-order last step.
     """
-    log_ratio = 0.5 * (schedule.log_alpha_bar - jnp.log(schedule.one_minus_alpha_bar))
+    log_ratio = 0.5 * schedule.log_snr
 
     def step(key: Key, state: SolverState, t: Int[Array, ""], /) -> SolverState:
         x_t, dtype = state.x, state.x.dtype

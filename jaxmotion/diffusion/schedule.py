@@ -52,12 +52,12 @@ class Schedule:
     @property
     def one_minus_alpha_bar(self) -> Float[Array, "*batch entries"]:
         """Variance of the noise at step t; 0 at index 0, exact for small steps."""
-        return jnp.abs(jnp.expm1(self.log_alpha_bar))  # abs: no -0, whose snr is -inf
+        return jnp.abs(jnp.expm1(self.log_alpha_bar))  # abs: no -0
 
     @property
-    def snr(self) -> Float[Array, "*batch entries"]:
-        """Signal-to-noise ratio alpha_bar / (1 - alpha_bar); infinite at index 0."""
-        return self.alpha_bar / self.one_minus_alpha_bar
+    def log_snr(self) -> Float[Array, "*batch entries"]:
+        """Log of alpha_bar / (1 - alpha_bar); infinite at index 0."""
+        return self.log_alpha_bar - jnp.log(self.one_minus_alpha_bar)
 
 
 @functools.partial(jax.jit, static_argnames=("num_steps", "offset", "max_beta"))
@@ -144,7 +144,9 @@ def linear_schedule(
             f"{math.ceil(1000.0 * largest)} steps, or the cosine schedule"
         )
     scale = 1000.0 / num_steps if scaled else 1.0
-    return _from_betas(jnp.linspace(scale * beta_min, scale * beta_max, num_steps))
+    return schedule_from_betas(
+        jnp.linspace(scale * beta_min, scale * beta_max, num_steps)
+    )
 
 
 @functools.partial(

@@ -18,8 +18,6 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.network import ActionRecognizer
-from jaxmotion.motion import features, trajectory
-from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.typing import Key, Params
 
 
@@ -45,48 +43,6 @@ class ActionRecognizerConfig:
     def network(self) -> ActionRecognizer:
         """The module of these sizes."""
         return ActionRecognizer(self.num_classes, self.num_features, self.hidden)
-
-
-def action_recognizer_input(
-    skeleton: Skeleton, motion: Motion
-) -> Float[Array, "*batch frames channels"]:
-    """Joint positions in the ground frame of the first pose.
-
-    The first root lies above the origin and the first hips face +z; the path that the
-    root takes from there is kept.
-
-    Args:
-      skeleton: The skeleton.
-      motion: Frames of it.
-
-    Returns:
-      Meters; three channels a joint.
-    """
-    root = trajectory.root_trajectory(skeleton, motion)
-    frame = trajectory.PlanarFrame(
-        origin=root.position[..., 0, :], facing=root.facing[..., 0, :]
-    )
-    positions = joint_positions(skeleton, features.to_frame(motion, frame))
-    return positions.reshape(*positions.shape[:-2], -1)
-
-
-def released_input(
-    skeleton: Skeleton, motion: Motion
-) -> Float[Array, "*batch frames channels"]:
-    """Joint positions as the published recognizer looks at them: from the first root.
-
-    Nothing is turned. There the joints are those of SMPL with its mean shape.
-
-    Args:
-      skeleton: The skeleton.
-      motion: Frames of it.
-
-    Returns:
-      Meters; three channels a joint.
-    """
-    positions = joint_positions(skeleton, motion)
-    positions = positions - positions[..., :1, :1, :]
-    return positions.reshape(*positions.shape[:-2], -1)
 
 
 def _initial_state(key: Key, batch: int, config: ActionRecognizerConfig) -> Array:
@@ -122,7 +78,7 @@ def recognize_actions(
       params: The recognizer's parameters.
       key: Consumed by the states before the first frame; the same key, batch size and
         motions give the same features.
-      x: Motions, as `action_recognizer_input` makes them.
+      x: Joint positions, meters, of motions that start at the origin facing +z.
       config: Its size.
 
     Returns:
@@ -144,7 +100,7 @@ def action_recognizer_loss(
     Args:
       params: The recognizer's parameters.
       key: Consumed by the states before the first frame.
-      batch: Motions, as `action_recognizer_input` makes them, and their classes.
+      batch: Joint positions as above, and the classes of the motions.
       config: Its size.
 
     Returns:
@@ -169,7 +125,7 @@ def train_action_recognizer(
 
     Args:
       key: Consumed.
-      x: Motions, as `action_recognizer_input` makes them.
+      x: Joint positions, meters, of motions that start at the origin facing +z.
       labels: Their classes.
       config: Its size.
       num_steps: Updates.

@@ -196,9 +196,7 @@ def load(path: Path) -> Evaluator:
     own |= {name: tuple(value[name]) for name in ("labels", "joints")}
     found = Evaluator(params=params, path=Path(path), **own)
     _require(path, "config", value["config"], dataclasses.asdict(found.config))
-    shapes = lambda tree: jax.tree.map(lambda x: tuple(x.shape), tree)  # noqa: E731
-    if shapes(params) != shapes(_like(found)):
-        raise checkpoint.CheckpointError(f"{path}: parameters of another network")
+    checkpoint.check_params(path, params, _like(found))
     _require(path, "fingerprint", value["fingerprint"], fingerprint(params))
     return found
 

@@ -7,7 +7,6 @@ Source: released code and weights of Guo et al. 2022 (T2M), Guo et al. 2020
 import os
 from typing import Any
 
-from jaxmotion.evaluators.action import ActionRecognizerConfig
 from jaxmotion.evaluators.text_motion import TAGS, WORD_SIZE, MatcherConfig
 from jaxmotion.networks.torch_layers import Layers
 from jaxmotion.networks.weight_files import Stored, arrays, read_weights
@@ -87,47 +86,6 @@ def _state(content: dict[str, Any], field: str) -> dict[str, Stored]:
     """Arrays of a state dict, which may be under a field or be the whole file."""
     inner = content.get(field)
     return arrays(inner if isinstance(inner, dict) else content)
-
-
-def load_action_recognizer(
-    path: str | os.PathLike,
-) -> tuple[Params, ActionRecognizerConfig]:
-    """Reads the published action recognizer (humanact12_gru.tar); runs no code.
-
-    What it looks at is in `action_recognition.released_input`.
-
-    Args:
-      path: A file of PyTorch with its state dict, perhaps under "model".
-
-    Returns:
-      Parameters of `ActionRecognizer`, and its size.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if the file is damaged or foreign, or arrays are missing, unknown or
-        of another shape; names them all.
-    """
-    path = os.fspath(path)
-    what = "the action recognizer"
-    layers = Layers(path, _state(read_weights(path), "model"), what=what)
-    gates, channels = layers.shape("recurrent.weight_ih_l0", 2)
-    features, hidden = layers.shape("linear1.weight", 2)
-    classes, _ = layers.shape("linear2.weight", 2)
-    if channels % 3:
-        raise ValueError(f"{path} does not fit {what}; {channels} inputs, not x, y, z")
-    params = {
-        "lower": layers.gru("recurrent", "l0", channels, hidden),
-        "upper": layers.gru("recurrent", "l1", hidden, hidden),
-        "feature": layers.linear("linear1", hidden, features),
-        "out": layers.linear("linear2", features, classes),
-    }
-    config = ActionRecognizerConfig(
-        num_classes=classes,
-        num_joints=channels // 3,
-        num_features=features,
-        hidden=hidden,
-    )
-    return layers.finish(params), config
 
 
 def load_style_classifier(

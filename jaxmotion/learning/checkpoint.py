@@ -345,23 +345,13 @@ def _insert(path: str | Path, params: Params, name: str, array: np.ndarray) -> N
     node[last] = jax.numpy.asarray(values)
 
 
-def import_params(
-    path: str | Path, like: Params | None = None
-) -> tuple[Params, dict[str, Any]]:
-    """Reads what `export_params` wrote.
-
-    Args:
-      path: The file.
-      like: Parameters of the same structure and shapes to check against.
-
-    Returns:
-      Parameters as float32, and the config.
-
-    Raises:
-      CheckpointError: if the file is no such export, or of another model.
-    """
+def _read_export(
+    path: str | Path, only: tuple[str, ...] | None = None
+) -> tuple[dict[str, np.ndarray], str, dict[str, Any]]:
+    """Arrays of an export, and its config as text and as JSON."""
+    name = os.fspath(path)
     try:
-        arrays = files.read_arrays(path, name=os.fspath(path), what="parameter")
+        arrays = files.read_arrays(path, name=name, what="parameter", only=only)
     except (OSError, ValueError) as error:
         raise CheckpointError(
             f"{path}: not an export of parameters: {_first_line(error)}"
@@ -377,17 +367,34 @@ def import_params(
         raise CheckpointError(
             f"{path}: field 'config' is a {type(config).__name__}, expected an object"
         )
+    return arrays, text, config
+
+
+def export_config(path: str | Path) -> dict[str, Any]:
+    """Config of an export, without its parameters; `import_params` checks both.
+
+    Raises:
+      CheckpointError: if the file is no export.
+    """
+    return _read_export(path, ("config",))[2]
+
+
+def import_params(path: str | Path) -> tuple[Params, dict[str, Any]]:
+    """Reads what `export_params` wrote.
+
+    Returns:
+      Parameters as float32, and the config.
+
+    Raises:
+      CheckpointError: if the file is no such export, or damaged.
+    """
+    arrays, text, config = _read_export(path)
     checksum = arrays.pop("checksum", None)
     if checksum is not None and str(checksum) != _export_checksum(text, arrays):
         raise CheckpointError(f"{path}: corrupt: its checksum differs from its content")
     params: dict[str, Any] = {}
     for name, array in arrays.items():
         _insert(path, params, name, array)
-    if like is not None:
-        want = jax.tree.map(lambda x: tuple(x.shape), like)
-        got = jax.tree.map(lambda x: tuple(x.shape), params)
-        if want != got:
-            raise CheckpointError(f"{path}: parameters of another model")
     if checksum is None:
         warnings.warn(
             f"{path}: no checksum (an earlier version wrote it): damage to it would "
@@ -395,3 +402,14 @@ def import_params(
             stacklevel=2,
         )
     return params, config
+
+
+def check_params(path: str | Path, params: Params, like: Params) -> None:
+    """Raises unless parameters that were read have a model's structure and shapes.
+
+    Raises:
+      CheckpointError: names the file.
+    """
+    want, got = (jax.tree.map(lambda x: tuple(x.shape), x) for x in (like, params))
+    if want != got:
+        raise CheckpointError(f"{path}: parameters of another model")

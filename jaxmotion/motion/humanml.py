@@ -40,9 +40,7 @@ from jaxtyping import Array, Float
 
 from jaxmotion.motion import ground, rotation
 from jaxmotion.motion.features import pack, unpack
-from jaxmotion.motion.humanml_layout import HUMANML3D as HUMANML3D
-from jaxmotion.motion.humanml_layout import KIT_ML as KIT_ML
-from jaxmotion.motion.humanml_layout import Layout as Layout
+from jaxmotion.motion.humanml_layout import Layout
 
 FACING_SIGMA = 20.0  # frames; of the filter on the facing
 

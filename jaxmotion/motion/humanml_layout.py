@@ -1,7 +1,4 @@
-"""Joints, chains and channels of the features of HumanML3D and KIT-ML.
-
-Users reach these through `jaxmotion.motion.humanml`.
-"""
+"""Joints, chains and channels of the features of HumanML3D and KIT-ML."""
 
 import dataclasses
 

@@ -20,7 +20,8 @@ from jaxtyping import Array, Float
 
 from jaxmotion.motion import rotation
 from jaxmotion.motion.facing import plain_names
-from jaxmotion.motion.humanml import HUMANML3D, minimal_swing
+from jaxmotion.motion.humanml import minimal_swing
+from jaxmotion.motion.humanml_layout import HUMANML3D
 from jaxmotion.motion.skeleton import Motion, Skeleton
 
 SMPL_JOINTS = (

@@ -258,28 +258,3 @@ def integrate_root(
     moves = (parts["root_velocity"], parts["root_angular_velocity"])
     _, rest = jax.lax.scan(step, frame, moves)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), frame, rest)
-
-
-def motion_from_poses(
-    poses: Float[Array, "frames features"],
-    frame: PlanarFrame,
-    *,
-    num_joints: int,
-    fps: float,
-) -> Motion:
-    """Pose vectors as a motion: the root's velocities are integrated.
-
-    Args:
-      poses: Pose vectors, one a frame.
-      frame: The simulation bone of the first frame.
-      num_joints: J.
-      fps: Frames per second.
-
-    Returns:
-      The motion, world.
-
-    Source: Holden et al. 2020, released code.
-    """
-    bone = integrate_root(poses, frame, num_joints=num_joints, fps=fps)
-    root, rot6d = place(poses, bone, num_joints=num_joints)
-    return Motion(root_position=root, joint_rotation=rot6d, fps=fps)

@@ -239,22 +239,6 @@ def quaternion_from_matrix(
 
 
 @jax.jit
-def matrix_from_yaw(yaw: Float[Array, "*batch"]) -> Float[Array, "*batch 3 3"]:
-    """Rotation about +y; positive yaw turns +z toward +x.
-
-    Args:
-      yaw: Angle in radians.
-
-    Returns:
-      Rotation matrices.
-    """
-    c, s = jnp.cos(yaw), jnp.sin(yaw)
-    zero, one = jnp.zeros_like(c), jnp.ones_like(c)
-    rows = [[c, zero, s], [zero, one, zero], [-s, zero, c]]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-@jax.jit
 def matrix_from_facing(facing: Float[Array, "*batch 2"]) -> Float[Array, "*batch 3 3"]:
     """Rotation about +y that turns +z onto a ground direction.
 
@@ -268,26 +252,3 @@ def matrix_from_facing(facing: Float[Array, "*batch 2"]) -> Float[Array, "*batch
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
     rows = [[z, zero, x], [zero, one, zero], [-x, zero, z]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-@jax.jit
-def geodesic_distance(
-    a: Float[Array, "*batch 3 3"], b: Float[Array, "*batch 3 3"]
-) -> Float[Array, "*batch"]:
-    """Angle of the rotation that turns a into b.
-
-    Exact near zero and near a half turn, where arccos of the trace is not; the
-    gradient is finite (zero) at both.
-
-    Args:
-      a: Rotation matrices.
-      b: Rotation matrices.
-
-    Returns:
-      Angle in [0, pi] radians.
-    """
-    q = quaternion_from_matrix(jnp.swapaxes(a, -1, -2) @ b)
-    square = jnp.sum(q[..., 1:] ** 2, axis=-1)
-    is_zero = square < _TINY
-    sine = jnp.where(is_zero, 0.0, jnp.sqrt(jnp.where(is_zero, 1.0, square)))
-    return 2.0 * jnp.arctan2(sine, q[..., 0])

@@ -255,28 +255,6 @@ def to_local(trajectory: Trajectory, frame: PlanarFrame) -> Trajectory:
     )
 
 
-@jax.jit
-def to_world(trajectory: Trajectory, frame: PlanarFrame) -> Trajectory:
-    """Inverse of `to_local`.
-
-    Args:
-      trajectory: Path in the frame.
-      frame: Frame, one for the whole path.
-
-    Returns:
-      World path.
-
-    Source: own.
-    """
-    shape = trajectory.position.shape
-    facing = jnp.broadcast_to(frame.facing[..., None, :], shape)
-    position = ground.out_of_frame(trajectory.position, facing)
-    return Trajectory(
-        position=position + frame.origin[..., None, :],
-        facing=ground.out_of_frame(trajectory.facing, facing),
-    )
-
-
 def smoothing_matrices(
     frames: int, sigmas: tuple[float, ...]
 ) -> Float[Array, "sigmas {frames} {frames}"]:

@@ -7,7 +7,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from jaxmotion.data import bvh, clips
+from jaxmotion.data import bvh, bvh_text, clips
 from jaxmotion.data.builders import bandai_namco, base, lafan1, o3de, style100
 from jaxmotion.data.bvh_text import format_bvh
 from tests import test_files
@@ -23,7 +23,7 @@ def bandai_text(seed: int, num_frames: int = 4) -> str:
     values[:, 0] = 0.0
     values[:, 2:, :3] = [[1.0, -80.0, 2.0], [1.0, -80.0, -2.0]]
     six = ("Xposition", "Yposition", "Zposition", "Zrotation", "Xrotation", "Yrotation")
-    content = bvh.Bvh(
+    content = bvh_text.Bvh(
         names=names,
         parents=parents,
         # OFFSET is the first frame's position here, so it differs from clip to clip.
@@ -102,7 +102,7 @@ def test_bandai_namco_reads_the_published_layout(tmp_path, archive):
     offsets = [[0, 0, 0], [0.01, -0.8, 0.02], [0.01, -0.8, -0.02]]
     np.testing.assert_allclose(found.skeleton.offsets, offsets, atol=1e-6)
     # Clip 1 is the walk, written with seed 0; its bytes come through unchanged.
-    walk = bvh.motion_from_bvh(bvh.parse_bvh(bandai_text(0)), root="Hips")[1]
+    walk = bvh.motion_from_bvh(bvh_text.parse_bvh(bandai_text(0)), root="Hips")[1]
     np.testing.assert_array_equal(
         clips.clip_motion(found, 1).joint_rotation, walk.joint_rotation
     )

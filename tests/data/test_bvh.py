@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxmotion.data import bvh
+from jaxmotion.data import bvh, bvh_text
 from jaxmotion.data.bvh_text import format_bvh
 from jaxmotion.motion import skeleton as skeletons
 from jaxmotion.motion.skeleton import Motion
@@ -17,7 +17,7 @@ from tests.data import samples
 TURNS = {"X": "Xrotation", "Y": "Yrotation", "Z": "Zrotation"}
 
 
-def reference_world(content: bvh.Bvh) -> tuple[np.ndarray, np.ndarray]:
+def reference_world(content: bvh_text.Bvh) -> tuple[np.ndarray, np.ndarray]:
     """World transforms from SciPy's Euler angles, joint by joint, frame by frame."""
     positions = np.zeros((content.num_frames, content.num_joints, 3))
     turns = np.zeros((content.num_frames, content.num_joints, 3, 3))
@@ -58,7 +58,7 @@ def second_library(path, frames) -> tuple[list[str], np.ndarray]:
 
 def test_fields_of_a_file_with_every_oddity():
     values = samples.bvh_values()
-    content = bvh.parse_bvh(samples.bvh_text(values))
+    content = bvh_text.parse_bvh(samples.bvh_text(values))
     assert content.names == ("Root", "mixamorig:Hips", "Left Leg", "Head", "Prop")
     assert content.parents == (-1, 0, 1, 1, 0)
     assert content.channels[2] == ("Xrotation", "Zrotation", "Yrotation")
@@ -84,8 +84,8 @@ def test_fields_of_a_file_with_every_oddity():
     ],
 )
 def test_spacing_line_ends_and_case_do_not_matter(change):
-    expected = bvh.parse_bvh(samples.bvh_text())
-    found = bvh.parse_bvh(change(samples.bvh_text()))
+    expected = bvh_text.parse_bvh(samples.bvh_text())
+    found = bvh_text.parse_bvh(change(samples.bvh_text()))
     np.testing.assert_array_equal(found.values, expected.values)
     assert found.channels == expected.channels
     assert found.end_sites == expected.end_sites
@@ -97,18 +97,18 @@ def test_paths_bytes_and_open_files_read_alike(tmp_path):
     path = tmp_path / "a.bvh"
     path.write_text(samples.bvh_text())
     sources = [path, str(path), path.read_bytes(), io.BytesIO(path.read_bytes())]
-    found = [bvh.read_bvh(source).values for source in sources]
+    found = [bvh_text.read_bvh(source).values for source in sources]
     for values in found[1:]:
         np.testing.assert_array_equal(values, found[0])
     with pytest.raises(FileNotFoundError, match="none.bvh"):
-        bvh.read_bvh(tmp_path / "none.bvh")
+        bvh_text.read_bvh(tmp_path / "none.bvh")
 
 
 @pytest.mark.parametrize("order", ["".join(p) for p in itertools.permutations("XYZ")])
 def test_every_channel_order_equals_scipy(order):
     channels = " ".join(TURNS[axis] for axis in order)
     text = samples.bvh_text().replace("Xrotation Zrotation Yrotation", channels)
-    content = bvh.parse_bvh(text)
+    content = bvh_text.parse_bvh(text)
     expected = Rotation.from_euler(order, content.values[:, 12:15], degrees=True)
     rotations = bvh.bvh_transforms(content)[1]
     np.testing.assert_allclose(rotations[:, 2], expected.as_matrix(), atol=1e-12)
@@ -116,7 +116,7 @@ def test_every_channel_order_equals_scipy(order):
 
 def test_positions_replace_the_offset_component_by_component():
     text = samples.bvh_text().replace("CHANNELS 1 Yrotation", "CHANNELS 1 Yposition")
-    content = bvh.parse_bvh(text)
+    content = bvh_text.parse_bvh(text)
     positions, rotations = bvh.bvh_transforms(content)
     np.testing.assert_array_equal(positions[:, 0], content.values[:, :3])
     np.testing.assert_array_equal(positions[:, 3, 0], 0.0)
@@ -133,7 +133,7 @@ def constant_bone_values(num_frames: int = 4) -> np.ndarray:
 
 
 def test_motion_has_the_world_positions_of_the_file():
-    content = bvh.parse_bvh(samples.bvh_text(constant_bone_values()))
+    content = bvh_text.parse_bvh(samples.bvh_text(constant_bone_values()))
     skeleton, motion = bvh.motion_from_bvh(content, feet=("Left Leg",))
     assert (skeleton.names, skeleton.feet) == (content.names, (2,))
     assert motion.fps == 60.0
@@ -144,7 +144,7 @@ def test_motion_has_the_world_positions_of_the_file():
 
 def test_ancestors_are_composed_into_the_new_root():
     # The hips move against their parent here; dropping it must not lose that.
-    content = bvh.parse_bvh(samples.bvh_text())
+    content = bvh_text.parse_bvh(samples.bvh_text())
     skeleton, motion = bvh.motion_from_bvh(content, root="mixamorig:Hips", scale=1.0)
     assert skeleton.names == ("mixamorig:Hips", "Left Leg", "Head")
     assert skeleton.parents == (-1, 0, 0)
@@ -156,25 +156,25 @@ def test_ancestors_are_composed_into_the_new_root():
 
 
 def test_a_bone_that_changes_is_an_error():
-    content = bvh.parse_bvh(samples.bvh_text(), name="stretch.bvh")
-    with pytest.raises(bvh.BvhError, match="stretch.bvh.*mixamorig:Hips.*changes"):
+    content = bvh_text.parse_bvh(samples.bvh_text(), name="stretch.bvh")
+    with pytest.raises(bvh_text.BvhError, match="stretch.bvh.*mixamorig:Hips.*changes"):
         bvh.motion_from_bvh(content)
 
 
 @pytest.mark.parametrize("option", [{"root": "Pelvis"}, {"feet": ("Pelvis",)}])
 def test_unknown_joints_are_named_with_the_known_ones(option):
-    content = bvh.parse_bvh(samples.bvh_text(constant_bone_values()))
-    with pytest.raises(bvh.BvhError, match="unknown joint 'Pelvis'.*Left Leg"):
+    content = bvh_text.parse_bvh(samples.bvh_text(constant_bone_values()))
+    with pytest.raises(bvh_text.BvhError, match="unknown joint 'Pelvis'.*Left Leg"):
         bvh.motion_from_bvh(content, **option)
-    with pytest.raises(bvh.BvhError, match="'Prop' is not below"):
+    with pytest.raises(bvh_text.BvhError, match="'Prop' is not below"):
         bvh.motion_from_bvh(content, root="mixamorig:Hips", feet=("Prop",))
 
 
 def test_write_then_read_gives_the_same_content(tmp_path):
-    content = bvh.parse_bvh(samples.bvh_text())
+    content = bvh_text.parse_bvh(samples.bvh_text())
     path = tmp_path / "a.bvh"
-    bvh.write_bvh(path, content)
-    found = bvh.read_bvh(path)
+    bvh_text.write_bvh(path, content)
+    found = bvh_text.read_bvh(path)
     for field in ("names", "parents", "channels", "end_sites", "frame_time"):
         assert getattr(found, field) == getattr(content, field)
     np.testing.assert_array_equal(found.offsets, content.offsets)
@@ -182,7 +182,7 @@ def test_write_then_read_gives_the_same_content(tmp_path):
     assert format_bvh(found) == path.read_text()
     assert os.listdir(tmp_path) == ["a.bvh"]
     with pytest.raises(OSError):
-        bvh.write_bvh(path / "a.bvh", content)
+        bvh_text.write_bvh(path / "a.bvh", content)
 
 
 def test_writing_puts_breadth_first_joints_depth_first(tmp_path):
@@ -195,8 +195,8 @@ def test_writing_puts_breadth_first_joints_depth_first(tmp_path):
         names=tuple(base.names[i] for i in order),
     )
     motion = samples.motion(5, 3)
-    bvh.write_bvh(tmp_path / "a.bvh", bvh.bvh_from_motion(skeleton, motion))
-    found, moved = bvh.motion_from_bvh(bvh.read_bvh(tmp_path / "a.bvh"))
+    bvh_text.write_bvh(tmp_path / "a.bvh", bvh.bvh_from_motion(skeleton, motion))
+    found, moved = bvh.motion_from_bvh(bvh_text.read_bvh(tmp_path / "a.bvh"))
     assert found.names == base.names
     positions = np.asarray(skeletons.joint_positions(skeleton, motion))
     again = np.asarray(skeletons.joint_positions(found, moved))
@@ -212,7 +212,7 @@ def test_motion_to_bvh_and_back_keeps_rotations_also_at_a_locked_gimbal():
         root_position=motion.root_position, joint_rotation=jnp.array(rot6d), fps=24.0
     )
     content = bvh.bvh_from_motion(samples.skeleton(), motion)
-    content = bvh.parse_bvh(format_bvh(content, decimals=9))
+    content = bvh_text.parse_bvh(format_bvh(content, decimals=9))
     skeleton, found = bvh.motion_from_bvh(content, feet=("LeftToe", "RightToe"))
     assert (found.fps, skeleton.feet) == (24.0, (3, 5))
     np.testing.assert_allclose(found.joint_rotation, rot6d, atol=1e-6)
@@ -232,13 +232,13 @@ def test_motion_with_nan_or_other_joints_is_not_written():
 
 
 def test_dropping_joints_drops_what_hangs_below_them():
-    content = bvh.parse_bvh(samples.bvh_text())
+    content = bvh_text.parse_bvh(samples.bvh_text())
     rest = bvh.without_joints(content, ["Left Leg", "Prop"])
     assert rest.names == ("Root", "mixamorig:Hips", "Head")
     assert rest.parents == (-1, 0, 1)
     np.testing.assert_array_equal(rest.values, content.values[:, [*range(12), 15]])
     assert bvh.without_joints(content, ["mixamorig:Hips"]).names == ("Root", "Prop")
-    with pytest.raises(bvh.BvhError, match="root"):
+    with pytest.raises(bvh_text.BvhError, match="root"):
         bvh.without_joints(content, ["Root"])
 
 
@@ -257,7 +257,7 @@ def test_second_library_has_the_same_positions(tmp_path):
     values = constant_bone_values(5)
     text = samples.bvh_text(values).replace("Left Leg", "LeftLeg")
     (tmp_path / "a.bvh").write_text(text)
-    content = bvh.read_bvh(tmp_path / "a.bvh")
+    content = bvh_text.read_bvh(tmp_path / "a.bvh")
     skeleton, motion = bvh.motion_from_bvh(content)
     names, expected = second_library(tmp_path / "a.bvh", range(5))
     found = 100 * np.asarray(skeletons.joint_positions(skeleton, motion))
@@ -267,7 +267,9 @@ def test_second_library_has_the_same_positions(tmp_path):
 
 def test_second_library_reads_what_is_written(tmp_path):
     motion = samples.motion(5, 6)
-    bvh.write_bvh(tmp_path / "a.bvh", bvh.bvh_from_motion(samples.skeleton(), motion))
+    bvh_text.write_bvh(
+        tmp_path / "a.bvh", bvh.bvh_from_motion(samples.skeleton(), motion)
+    )
     names, found = second_library(tmp_path / "a.bvh", range(5))
     expected = 100 * np.asarray(skeletons.joint_positions(samples.skeleton(), motion))
     order = [names.index(name) for name in samples.NAMES]
@@ -283,7 +285,7 @@ def test_ten_recordings_agree_with_the_second_library():
     if not files:
         pytest.skip(f"JAXMOTION_DATA: no BVH files below {folder}")
     for path in files[:: max(1, len(files) // 10)][:10]:
-        content = bvh.read_bvh(path)
+        content = bvh_text.read_bvh(path)
         top = "Hips" if "Hips" in content.names else None
         skeleton, motion = bvh.motion_from_bvh(content, root=top)
         frames = np.linspace(0, content.num_frames - 1, 20).astype(int)
@@ -293,9 +295,9 @@ def test_ten_recordings_agree_with_the_second_library():
         np.testing.assert_allclose(100 * found, expected[:, order], atol=1e-3)
 
 
-def chain(num_joints: int) -> bvh.Bvh:
+def chain(num_joints: int) -> bvh_text.Bvh:
     """Every joint the child of the one before."""
-    return bvh.Bvh(
+    return bvh_text.Bvh(
         names=tuple(f"j{i}" for i in range(num_joints)),
         parents=tuple(range(-1, num_joints - 1)),
         offsets=np.arange(3.0 * num_joints).reshape(num_joints, 3),
@@ -309,7 +311,7 @@ def chain(num_joints: int) -> bvh.Bvh:
 def test_long_chains_are_written_and_read():
     text = format_bvh(chain(5000))
     assert len(text) < 5_000_000
-    found = bvh.parse_bvh(text)
+    found = bvh_text.parse_bvh(text)
     assert found.parents == chain(5000).parents
     np.testing.assert_array_equal(found.offsets, chain(5000).offsets)
 
@@ -351,12 +353,12 @@ def test_rates_that_are_not_whole_stay(frame_time, rate):
 @pytest.mark.parametrize("place", ["OFFSET 0.0 50.0 0.0", "OFFSET 10.0 -5.0 0.5"])
 def test_positions_beyond_float32_are_refused(place):
     text = samples.bvh_text(constant_bone_values()).replace(place, "OFFSET 0 1e39 0")
-    content = bvh.parse_bvh(text, name="far.bvh")
-    with pytest.raises(bvh.BvhError, match=r"far.bvh: '.*' is 1e\+39 .* along y"):
+    content = bvh_text.parse_bvh(text, name="far.bvh")
+    with pytest.raises(bvh_text.BvhError, match=r"far.bvh: '.*' is 1e\+39 .* along y"):
         bvh.motion_from_bvh(content)
 
 
 def test_a_pipe_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe.bvh")
     with pytest.raises(OSError, match="pipe.bvh: expected a regular file"):
-        bvh.read_bvh(tmp_path / "pipe.bvh")
+        bvh_text.read_bvh(tmp_path / "pipe.bvh")

@@ -1,6 +1,6 @@
 import pytest
 
-from jaxmotion.data import bvh
+from jaxmotion.data import bvh_text
 from tests.data import samples
 
 ROW = " ".join(["1.0"] * 16)
@@ -108,15 +108,15 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_malformed_files_are_named_with_the_line(case):
     text, message = BAD[case]
-    with pytest.raises(bvh.BvhError, match="bad.bvh"):
-        bvh.parse_bvh(text, name="bad.bvh")
+    with pytest.raises(bvh_text.BvhError, match="bad.bvh"):
+        bvh_text.parse_bvh(text, name="bad.bvh")
     with pytest.raises(ValueError, match=message):
-        bvh.parse_bvh(text, name="bad.bvh")
+        bvh_text.parse_bvh(text, name="bad.bvh")
 
 
 def test_binary_files_and_wild_frame_counts_are_refused(tmp_path):
     (tmp_path / "a.bvh").write_bytes(b"HIERARCHY\xff\xfe\x00")
-    with pytest.raises(bvh.BvhError, match="a.bvh: not a text file"):
-        bvh.read_bvh(tmp_path / "a.bvh")
-    with pytest.raises(bvh.BvhError, match="999999999999"):
-        bvh.parse_bvh(samples.bvh_text().replace("s: 3", "s: 999999999999"))
+    with pytest.raises(bvh_text.BvhError, match="a.bvh: not a text file"):
+        bvh_text.read_bvh(tmp_path / "a.bvh")
+    with pytest.raises(bvh_text.BvhError, match="999999999999"):
+        bvh_text.parse_bvh(samples.bvh_text().replace("s: 3", "s: 999999999999"))

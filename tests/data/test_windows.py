@@ -5,8 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.data import windows
+from jaxmotion.data import selection, windows
 from jaxmotion.data.clips import clip_motion
+from tests import samples
+
+LABELS = np.array([0, 1, 1, 0])
+
+
+@pytest.fixture(scope="module")
+def run():
+    return samples.run()
 
 
 @pytest.mark.parametrize("stride", [1, 3])
@@ -91,3 +99,71 @@ def test_cut_takes_a_traced_start(walker):
         np.testing.assert_array_equal(
             motion.root_position, walker.root_position[start : start + 20]
         )
+
+
+def test_data_windows_are_the_clips_frames(run):
+    clips = run.train
+    found = windows.eval_windows(clips, stride=30, field="style")
+    # Clips of 120 frames: windows at 0, 30 and 60.
+    count = 3 * clips.num_clips
+    assert found.motion.root_position.shape == (count, 60, 3)
+    assert found.velocity.shape == found.facing.shape == (count, 60, 2)
+    roots = np.asarray(clips.root_position)
+    for window in range(count):
+        clip, start = divmod(window, 3)
+        begin = int(clips.offsets[clip]) + 30 * start
+        np.testing.assert_array_equal(
+            found.motion.root_position[window], roots[begin : begin + 60]
+        )
+        assert found.group[window] == clip
+        assert found.label[window] == clips.labels["style"][clip]
+
+
+def test_what_is_wanted_of_a_clip_is_its_own_path_smoothed(run):
+    found = windows.eval_windows(run.train, stride=60, field="style")
+    path = np.asarray(found.motion.root_position, float)[..., ::2]
+    # Over most of a window the wanted path goes where the walker goes.
+    wanted = np.asarray(found.velocity, float)[:, 10:50].sum(axis=1) / 30.0
+    walked = path[:, 50] - path[:, 10]
+    assert np.abs(wanted - walked).max() < 0.15
+    np.testing.assert_allclose(np.linalg.norm(found.facing, axis=-1), 1.0, atol=1e-5)
+    # It is smoother than the walk itself: no sway, no steps.
+    rough = np.diff(path, 2, axis=1)[:, 15:45] * 30.0
+    smooth = np.diff(np.asarray(found.velocity), axis=1)[:, 15:45]
+    assert np.abs(smooth).mean() < 0.7 * np.abs(rough).mean()
+
+
+def test_rollout_windows_leave_out_the_start_and_keep_their_owner():
+    frames = samples.walking(LABELS, seconds=7.0)
+    found = windows.rollout_windows(frames, jnp.asarray(LABELS), skip=60)
+    assert found.motion.root_position.shape == (8, 60, 3)  # 150 frames hold two
+    for window in range(8):
+        owner, part = divmod(window, 2)
+        begin = 60 + 60 * part
+        assert found.group[window] == owner
+        assert found.label[window] == LABELS[owner]
+        for got, of in (
+            (found.motion.joint_rotation, frames.joint_rotation),
+            (found.velocity, frames.desired_velocity),
+            (found.facing, frames.desired_facing),
+        ):
+            np.testing.assert_array_equal(got[window], of[owner, begin : begin + 60])
+
+
+def test_rollouts_too_short_to_measure_are_named():
+    frames = samples.walking(LABELS[:1], seconds=3.9)
+    with pytest.raises(ValueError, match=r"3\.9 s are too short.*at least 4 s"):
+        windows.rollout_windows(frames, jnp.asarray([0]), skip=60)
+    windows.check_ticks(120, fps=30.0, skip=60)
+
+
+def test_style_speeds_are_medians_within_clips(run):
+    clips = run.train
+    found = selection.label_speeds(clips, field="style")
+    steps = {0: [], 1: []}
+    for clip in range(clips.num_clips):
+        own = slice(int(clips.offsets[clip]), int(clips.offsets[clip + 1]))
+        path = np.asarray(clips.root_position, float)[own, ::2]
+        speed = np.linalg.norm(np.diff(path, axis=0), axis=-1) * 30.0
+        steps[int(clips.labels["style"][clip])] += speed.tolist()
+    np.testing.assert_allclose(found, [np.median(steps[i]) for i in (0, 1)], rtol=1e-4)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from jaxmotion.evaluators import action as action_evaluator
-from jaxmotion.motion import features, trajectory
 from jaxmotion.motion.skeleton import joint_positions
 from tests import tiny
 
@@ -20,48 +19,6 @@ CONFIG = action_evaluator.ActionRecognizerConfig(
 @pytest.fixture(scope="module")
 def params():
     return tiny.random_params(action_evaluator.init_action_recognizer, CONFIG)
-
-
-def test_the_input_against_a_loop(skeleton):
-    motion = tiny.walk(20, turn=1.0, start=0.5)
-    found = action_evaluator.action_recognizer_input(skeleton, motion)
-    positions = np.asarray(joint_positions(skeleton, motion), np.float64)
-    across = positions[0, 1] - positions[0, 3]
-    ahead = np.cross(across, [0, 1, 0])
-    ahead /= np.linalg.norm(ahead)
-    left = np.cross([0, 1, 0], ahead)
-    start = positions[0, 0] * [1, 0, 1]
-    for frame in range(20):
-        expected = [
-            [(p - start) @ left, p[1], (p - start) @ ahead] for p in positions[frame]
-        ]
-        np.testing.assert_allclose(
-            np.asarray(found[frame]).reshape(5, 3), expected, atol=1e-5
-        )
-    assert np.linalg.norm(found[-1, :3:2]) > 0.5  # the root's path is seen
-
-
-def test_neither_place_nor_facing_of_the_start_is_seen(skeleton):
-    motion = tiny.walk(20, turn=1.0)
-    frame = trajectory.PlanarFrame(
-        origin=jnp.array([3.0, -5.0]), facing=jnp.array([0.6, -0.8])
-    )
-    np.testing.assert_allclose(
-        action_evaluator.action_recognizer_input(
-            skeleton, features.from_frame(motion, frame)
-        ),
-        action_evaluator.action_recognizer_input(skeleton, motion),
-        atol=1e-5,
-    )
-
-
-def test_a_batch_is_turned_motion_by_motion(skeleton):
-    walks = [tiny.walk(6, start=start) for start in (0.0, 2.0)]
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *walks)
-    found = action_evaluator.action_recognizer_input(skeleton, both)
-    for one, walk in zip(found, walks, strict=True):
-        expected = action_evaluator.action_recognizer_input(skeleton, walk)
-        np.testing.assert_allclose(one, expected, atol=1e-6)
 
 
 def test_the_key_alone_decides_the_states(params):
@@ -134,7 +91,7 @@ def test_it_learns_to_tell_two_actions(skeleton):
         for turn in (-0.8, 0.8)
     ]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *walks)
-    x = action_evaluator.action_recognizer_input(skeleton, together)
+    x = joint_positions(skeleton, together).reshape(48, 12, 15)
     train, held_out = (
         x.reshape(12, 2, 2, 12, 15)[:, i].reshape(24, 12, 15) for i in range(2)
     )
@@ -154,12 +111,3 @@ def test_it_learns_to_tell_two_actions(skeleton):
         params, jax.random.key(1), held_out, config=CONFIG
     )
     assert np.mean(logits.argmax(-1) == labels) > 0.8
-
-
-def test_the_released_input_is_not_turned_and_begins_at_the_root(skeleton):
-    motion = tiny.walk(9, turn=1.0, start=0.5)
-    positions = np.asarray(joint_positions(skeleton, motion), np.float64)
-    centered = positions - positions[:, :1]
-    path = positions[:, :1] - positions[0, 0]
-    found = action_evaluator.released_input(skeleton, motion)
-    np.testing.assert_allclose(found, (centered + path).reshape(9, -1), atol=1e-6)

@@ -86,7 +86,7 @@ def test_other_parameters_than_were_frozen_are_refused(tmp_path):
         evaluators.load(path)
     wide = samples.evaluator(labels=("calm", "brisk", "limp")).params
     checkpoint.export_params(path, wide, value, dtype=np.float32)
-    with pytest.raises(ValueError, match=f"{path}: parameters of another network"):
+    with pytest.raises(ValueError, match=f"{path}: parameters of another model"):
         evaluators.load(path)
 
 

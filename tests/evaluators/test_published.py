@@ -144,31 +144,6 @@ def test_code_in_a_file_is_not_run(state, tmp_path, capsys):
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize("old_format", [False, True])
-def test_the_action_recognizer_is_pytorchs(tmp_path, old_format):
-    peer = peers.randomize(peers.ActionRecognizer(), 4)
-    path = tmp_path / "humanact12_gru.tar"
-    torch.save(
-        {"model": peer.state_dict(), "epoch": 8},
-        path,
-        _use_new_zipfile_serialization=not old_format,
-    )
-    params, config = published.load_action_recognizer(path)
-    assert (config.num_classes, config.num_joints) == (12, 24)
-    generator = np.random.default_rng(0)
-    x = generator.normal(size=(3, 20, 72)).astype(np.float32)
-    state = generator.normal(size=(3, 2, 128)).astype(np.float32)
-    given = jnp.asarray(x), jnp.asarray(state)
-    ours = config.network.apply({"params": params}, *given)
-    with torch.inference_mode():
-        theirs = peer(
-            torch.from_numpy(x.swapaxes(0, 1)), torch.from_numpy(state.swapaxes(0, 1))
-        )
-    for found, wanted in zip(ours, theirs, strict=True):
-        assert wanted.std() > 0.1
-        np.testing.assert_allclose(found, wanted.numpy(), atol=1e-5)
-
-
 def style_classifier(path, **changes):
     peer = peers.randomize(peers.StyleClassifier(classes=5), 6)
     with torch.inference_mode():  # one step of training, for statistics that fit
@@ -207,8 +182,6 @@ def test_recognizers_that_do_not_fit_are_named(tmp_path):
     style_classifier(path, class_names=["Old"])
     with pytest.raises(ValueError, match="'class_names' should list .* 5 styles"):
         published.load_style_classifier(path)
-    with pytest.raises(ValueError, match="recurrent.weight_ih_l0 should have 2 axes"):
-        published.load_action_recognizer(path)
     state = peers.StyleClassifier(classes=5).state_dict()
     del state["bn3.running_var"]
     style_classifier(path, state_dict=state)

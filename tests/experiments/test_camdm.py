@@ -204,7 +204,7 @@ def test_one_style_trains_with_clips_held_out_by_name(call, data, tmp_path):
         f"train --data {data} --out {tmp_path} {SIZES} --steps 2 --labels neutral "
         f"--held-out-clips {' '.join(held_out)}"
     )
-    model, _, _ = camdm_model.load(tmp_path)
+    model, _ = camdm_model.load(tmp_path)
     assert model.labels == ("neutral",)
     run = camdm_training.load_run(tmp_path)
     assert list(run.held_out.clip_names) == held_out
@@ -232,7 +232,7 @@ def test_speeds_are_measured_beside_data_and_by_frame_of_the_plan(call, trained)
 @pytest.mark.slow
 def test_an_export_has_poses_of_the_models_own(call, trained, tmp_path):
     call(f"export --run {trained} --out {tmp_path / 'model.npz'} --starts 2")
-    model, _, _ = camdm_model.load(tmp_path / "model.npz")
+    model, _ = camdm_model.load(tmp_path / "model.npz")
     lead = (len(model.labels), 2, model.config.past)
     assert model.starts.root_position.shape == (*lead, 3)
     path = trajectory.root_trajectory(
@@ -267,7 +267,7 @@ def released(call, data, tmp_path_factory):
 
 @pytest.mark.slow
 def test_released_weights_become_a_model_that_rolls_out(call, released):
-    model, params, _ = camdm_model.load(released / "released")
+    model, params = camdm_model.load(released / "released")
     assert model.config.num_steps == 4 and model.config.norm == "post"
     assert model.labels == samples.STYLES
     assert model.skeleton.feet == samples.clips().skeleton.feet

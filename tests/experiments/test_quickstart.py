@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.data import bvh
+from jaxmotion.data import bvh, bvh_text
 from jaxmotion.motion.skeleton import joint_positions
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +27,7 @@ def test_a_person_stands_walks_runs_and_crouches(tmp_path):
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert "Open 3D Engine" in found["source"]
-    skeleton, motion = bvh.motion_from_bvh(bvh.read_bvh(tmp_path / "rollout.bvh"))
+    skeleton, motion = bvh.motion_from_bvh(bvh_text.read_bvh(tmp_path / "rollout.bvh"))
     hips = np.asarray(motion.root_position)
     frames = round(30 * sum(part[0] for part in found["course"]))
     assert hips.shape == (frames, 3)

@@ -99,7 +99,7 @@ BAD = {
     ),
     "evaluate --run {none}": "no such file: expected a run folder",
     f"evaluate --run {{run}} {SHORT} --schedules middle": "unknown schedule 'middle'",
-    "rollout --run {run} --skills dive": "unknown skill 'dive'",
+    "rollout --run {run} --skills dive": "unknown label 'dive'",
     "rollout --run {run} --seconds 0.01": "too short",
     "rollout --run {run} --paths paths_7": "no checkpoint",
 }

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies
 
-from jaxmotion.data import bvh
+from jaxmotion.data import bvh, bvh_text
 from jaxmotion.data.bvh_text import format_bvh
 from tests.data import samples, test_builders
 from tests.data.test_bvh import chain
@@ -94,11 +94,11 @@ def test_malformed_files(tmp_path, capsys):
 
     def read(data):
         path.write_bytes(data)
-        content = bvh.read_bvh(path)
+        content = bvh_text.read_bvh(path)
         bvh.frame_rate(content.frame_time)
         try:
             bvh.motion_from_bvh(content)
-        except bvh.BvhError as error:
+        except bvh_text.BvhError as error:
             assert "x.bvh" in str(error) and "\n" not in str(error)
         return content
 
@@ -160,7 +160,7 @@ def test_files_of_all_shapes_come_back_and_agree_with_bvhio(tmp_path, capsys):
     path = tmp_path / "x.bvh"
     target = harness.Target(
         "BVH round trips",
-        lambda content: (bvh.write_bvh(path, content), bvh.read_bvh(path))[1],
+        lambda content: (bvh_text.write_bvh(path, content), bvh_text.read_bvh(path))[1],
         lambda content, found: same(path, content, found, counts=target.found),
     )
 
@@ -175,7 +175,7 @@ def test_files_of_all_shapes_come_back_and_agree_with_bvhio(tmp_path, capsys):
     )
     @hypothesis.given(contents())
     def run(fields):
-        content = bvh.Bvh(**fields)
+        content = bvh_text.Bvh(**fields)
         target.feed(repr(content), content)
 
     run()

@@ -313,7 +313,9 @@ def test_export_and_import(tmp_path):
     params = state_of(3).params
     path = tmp_path / "folder" / "model.npz"
     checkpoint.export_params(path, params, {"a": [1, 2]}, dtype=np.float32)
-    found, config = checkpoint.import_params(path, like=params)
+    found, config = checkpoint.import_params(path)
+    checkpoint.check_params(path, found, params)
+    assert checkpoint.export_config(path) == config
     jax.tree.map(np.testing.assert_array_equal, found, params)
     assert config == {"a": [1, 2]}
     checkpoint.export_params(path, params, {})
@@ -384,7 +386,7 @@ def test_import_of_something_else(tmp_path):
             checkpoint.import_params(path)
     np.savez(path, a=np.zeros(3))
     with pytest.raises(checkpoint.CheckpointError, match="model.npz"):
-        checkpoint.import_params(path)
+        checkpoint.export_config(path)
     np.save(tmp_path / "array.npy", np.zeros(3))
     with pytest.raises(checkpoint.CheckpointError, match="array.npy"):
         checkpoint.import_params(tmp_path / "array.npy")
@@ -396,7 +398,8 @@ def test_import_of_something_else(tmp_path):
         checkpoint.import_params(tmp_path / "none.npz")
     checkpoint.export_params(path, state_of(0).params, {})
     with pytest.raises(checkpoint.CheckpointError, match="model.npz.*another model"):
-        checkpoint.import_params(path, like=state_of(0, width=9).params)
+        found, _ = checkpoint.import_params(path)
+        checkpoint.check_params(path, found, state_of(0, width=9).params)
 
 
 GARBAGE = {

@@ -369,7 +369,7 @@ def test_a_killed_training_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
         subprocess.run(command(folder, steps), cwd=ROOT, env=quick, check=True)
     states = []
     for folder in (killed, whole):
-        model, _, _ = camdm_model.load(folder)
+        model, _ = camdm_model.load(folder)
         stage = folder / "motion" / "checkpoints"
         assert checkpoint.latest_step(stage) == steps
         params = jax.eval_shape(

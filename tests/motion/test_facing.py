@@ -53,7 +53,8 @@ def test_facing_turns_with_the_root():
     skeleton = biped(("Root", "Hips", "LeftUpLeg", "RightUpLeg"))
     yaw = np.array([0.0, 0.5, 3.1, -3.1], np.float32)
     rest = rotation.rot6d_from_matrix(jnp.broadcast_to(jnp.eye(3), (4, 4, 3, 3)))
-    turned = rotation.rot6d_from_matrix(rotation.matrix_from_yaw(jnp.asarray(yaw)))
+    ahead = jnp.stack([jnp.sin(yaw), jnp.cos(yaw)], axis=-1)
+    turned = rotation.rot6d_from_matrix(rotation.matrix_from_facing(ahead))
     got = facing.hip_facing(skeleton, rest.at[:, 0].set(turned))
     np.testing.assert_allclose(got, np.stack([np.sin(yaw), np.cos(yaw)], -1), atol=1e-6)
 

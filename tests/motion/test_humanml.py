@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxmotion.motion import humanml
+from jaxmotion.motion import humanml, humanml_layout
 from jaxmotion.motion.features import unpack
 from tests import person
 from tests.person import float32
 from tests.reference import humanml as reference
 
 FRAMES = 240  # of nearly all clips, so that each layout is compiled once
-HUMANML3D, KIT_ML = humanml.HUMANML3D, humanml.KIT_ML
+HUMANML3D, KIT_ML = humanml_layout.HUMANML3D, humanml_layout.KIT_ML
 PUBLISHED = dataclasses.replace(HUMANML3D, hip_weight=-1.0)
 # Rotations are those of the world: while somebody faces -z, the swings of hips and
 # collars are nearly half turns, which magnify the rounding of the positions.

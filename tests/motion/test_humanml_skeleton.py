@@ -5,13 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.data import bvh, bvh_text
-from jaxmotion.motion import humanml, humanml_skeleton
+from jaxmotion.motion import humanml_layout, humanml_skeleton
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from tests import person
 from tests.person import float32
 
 SMPL = humanml_skeleton.SMPL_JOINTS
-PARENTS = humanml.HUMANML3D.parents
+PARENTS = humanml_layout.HUMANML3D.parents
 LAFAN1 = (
     *("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToe"),
     *("RightUpLeg", "RightLeg", "RightFoot", "RightToe"),

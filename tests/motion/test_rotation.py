@@ -226,45 +226,9 @@ def test_quaternion_gradients_are_finite_at_half_turns_and_the_identity(epsilon)
 
 def test_yaw_turns_z_toward_x():
     yaw = np.linspace(-4.0, 4.0, 33)
-    found = rotation.matrix_from_yaw(float32(yaw))
     expected = Rotation.from_rotvec(np.outer(yaw, [0, 1, 0])).as_matrix()
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    quarter = rotation.matrix_from_yaw(jnp.array(np.pi / 2, jnp.float32))
-    np.testing.assert_allclose(quarter @ jnp.array([0.0, 0, 1]), [1, 0, 0], atol=1e-6)
     facing = float32(np.stack([np.sin(yaw), np.cos(yaw)], axis=-1))
     np.testing.assert_allclose(rotation.matrix_from_facing(facing), expected, atol=1e-6)
-
-
-def test_geodesic_distance_agrees_with_scipy():
-    a, b = (reference.random_rotations(seed, COUNT) for seed in (4, 5))
-    found = rotation.geodesic_distance(float32(a.as_matrix()), float32(b.as_matrix()))
-    np.testing.assert_allclose(found, (a.inv() * b).magnitude(), atol=2e-6)
-
-
-@pytest.mark.parametrize(
-    "angle", [0.0, 1e-4, 1e-2, 1.0, np.pi - 1e-2, np.pi - 1e-3, np.pi]
-)
-def test_geodesic_distance_near_zero_and_near_a_half_turn(angle):
-    for base, axis in zip(reference.random_rotations(6, 6), AXES, strict=True):
-        other = base * Rotation.from_rotvec(angle * axis)
-        a, b = float32(base.as_matrix()), float32(other.as_matrix())
-        # Float32 matrices hold the angle to some 1e-7; arccos would give 3e-4 here.
-        assert abs(float(rotation.geodesic_distance(a, b)) - angle) < 1e-5
-        assert abs(float(rotation.geodesic_distance(b, a)) - angle) < 1e-5
-        gradient = jax.grad(rotation.geodesic_distance)(a, b)
-        assert bool(jnp.all(jnp.isfinite(gradient)))
-
-
-def test_geodesic_gradient_descends():
-    a = float32(reference.random_rotations(7, 1).as_matrix()[0])
-
-    def distance(yaw):
-        return rotation.geodesic_distance(a, a @ rotation.matrix_from_yaw(yaw))
-
-    for yaw in (-2.0, -0.3, 0.3, 2.0):
-        np.testing.assert_allclose(distance(jnp.float32(yaw)), abs(yaw), atol=2e-6)
-        slope = jax.grad(distance)(jnp.float32(yaw))
-        np.testing.assert_allclose(slope, np.sign(yaw), atol=1e-4)
 
 
 def test_safe_normalize():
@@ -282,7 +246,6 @@ FUNCTIONS = {
     "rot6d_rows_to_columns": (6,),
     "matrix_from_quaternion": (4,),
     "quaternion_from_matrix": (3, 3),
-    "matrix_from_yaw": (),
     "matrix_from_facing": (2,),
 }
 

@@ -170,20 +170,6 @@ class EmdmDiscriminator(nn.Module):
         return self.fc7(h)[:, 0]
 
 
-class ActionRecognizer(nn.Module):
-    def __init__(self, channels=72, classes=12):
-        super().__init__()
-        self.recurrent = nn.GRU(channels, 128, 2)
-        self.linear1 = nn.Linear(128, 30)
-        self.linear2 = nn.Linear(30, classes)
-
-    def forward(self, x, state):
-        """x is [frames, batch, channels], the state [2, batch, 128]."""
-        out, _ = self.recurrent(x, state)
-        features = torch.tanh(self.linear1(out[-1]))
-        return features, self.linear2(features)
-
-
 class StyleClassifier(nn.Module):
     def __init__(self, channels=45, classes=100, frames=60):
         super().__init__()

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 import tensorflow_datasets as tfds
 
-from jaxmotion.data import bvh
+from jaxmotion.data import bvh, bvh_text
 from jaxmotion.data.builders import base
 
 _CONTENTS = {
@@ -79,7 +79,7 @@ class BandaiNamco(base.MotionBuilder):
                 continue
             labels = read_labels(path, data, names)
             skeleton, motion = bvh.motion_from_bvh(
-                bvh.read_bvh(
+                bvh_text.read_bvh(
                     motions.pop(clip), name=path.removesuffix(".json") + ".bvh"
                 ),
                 root="Hips",

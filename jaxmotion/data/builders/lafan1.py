@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from jaxmotion.data import bvh
+from jaxmotion.data import bvh, bvh_text
 from jaxmotion.data.builders import base
 
 _NAME = re.compile(
@@ -54,6 +54,6 @@ class Lafan1(base.MotionBuilder):
             except ValueError as error:
                 raise ValueError(f"{path}: {error}") from None
             skeleton, motion = bvh.motion_from_bvh(
-                bvh.read_bvh(data, name=path), feet=("LeftToe", "RightToe")
+                bvh_text.read_bvh(data, name=path), feet=("LeftToe", "RightToe")
             )
             yield base.example(name, skeleton, motion, labels)

@@ -9,7 +9,7 @@ it leads to.
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from jaxmotion.data import bvh
+from jaxmotion.data import bvh, bvh_text
 from jaxmotion.data.builders import base
 from jaxmotion.motion.skeleton import Motion
 
@@ -71,7 +71,7 @@ class O3deMotionMatching(base.MotionBuilder):
         for path, data in base.read_files(folder, (".bvh",)):
             take = PurePosixPath(path.replace("\\", "/")).stem
             skeleton, motion = bvh.motion_from_bvh(
-                bvh.read_bvh(data, name=path), feet=("LeftToe", "RightToe")
+                bvh_text.read_bvh(data, name=path), feet=("LeftToe", "RightToe")
             )
             for name, style, part in parts(take, motion):
                 labels = {"style": style, "take": take}

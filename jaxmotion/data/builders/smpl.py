@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxmotion.motion.humanml import HUMANML3D
+from jaxmotion.motion.humanml_layout import HUMANML3D
 from jaxmotion.motion.humanml_skeleton import SMPL_JOINTS
 
 # HumanML3D's joints are SMPL's without the hands.

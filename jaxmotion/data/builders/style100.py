@@ -18,7 +18,7 @@ from pathlib import Path, PurePosixPath
 
 import tensorflow_datasets as tfds
 
-from jaxmotion.data import bvh, mirror
+from jaxmotion.data import bvh, bvh_text, mirror
 from jaxmotion.data.builders import base
 from jaxmotion.motion.facing import plain_names
 from jaxmotion.motion.skeleton import Skeleton
@@ -88,7 +88,7 @@ class Style100(base.MotionBuilder):
             if (style, action) not in cuts:
                 skipped["no cut"].append(name)
                 continue
-            content = cut_clip(bvh.read_bvh(data, name=path), cuts[style, action])
+            content = cut_clip(bvh_text.read_bvh(data, name=path), cuts[style, action])
             skeleton, motion = bvh.motion_from_bvh(content)
             feet = toes(skeleton, path)
             skeleton = dataclasses.replace(skeleton, feet=feet)
@@ -120,13 +120,13 @@ def toes(skeleton: Skeleton, path: str) -> tuple[int, ...]:
     for pair in _FEET:
         if set(pair) <= set(plain):
             return tuple(plain.index(name) for name in pair)
-    raise bvh.BvhError(
+    raise bvh_text.BvhError(
         f"{path}: no toes: expected Left and RightToe_End, ToeBase or Toe among the "
         f"joints {', '.join(skeleton.names)}"
     )
 
 
-def cut_clip(content: bvh.Bvh, cut: tuple[int, int]) -> bvh.Bvh:
+def cut_clip(content: bvh_text.Bvh, cut: tuple[int, int]) -> bvh_text.Bvh:
     """The cut at 30 frames per second, without fingers and eyes.
 
     Args:
@@ -141,13 +141,13 @@ def cut_clip(content: bvh.Bvh, cut: tuple[int, int]) -> bvh.Bvh:
     """
     fps = bvh.frame_rate(content.frame_time)
     if fps not in (60.0, 30.0):
-        raise bvh.BvhError(
+        raise bvh_text.BvhError(
             f"{content.name}: {fps:g} frames per second, expected 60 (or 30)"
         )
     start, stop = cut[0] // 2, cut[1] // 2
     values = content.values[:: 2 if fps == 60.0 else 1]
     if not 0 <= start < stop <= len(values):
-        raise bvh.BvhError(
+        raise bvh_text.BvhError(
             f"{content.name}: the cut {cut[0]}..{cut[1]} of Frame_Cuts.csv is not "
             f"within the {2 * len(values)} frames of the recording at 60 a second"
         )
@@ -157,7 +157,7 @@ def cut_clip(content: bvh.Bvh, cut: tuple[int, int]) -> bvh.Bvh:
     return without_fingers(content)
 
 
-def without_fingers(content: bvh.Bvh) -> bvh.Bvh:
+def without_fingers(content: bvh_text.Bvh) -> bvh_text.Bvh:
     """The recording without fingers and eyes, as CAMDM's preprocessing leaves it."""
     dropped = [
         name

@@ -32,6 +32,7 @@ from jaxtyping import Array, Float
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character
+from jaxmotion.diffusion import chain
 from jaxmotion.motion import features, ground, path_features, pose, spring
 from jaxmotion.motion.features import unpack
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
@@ -43,6 +44,9 @@ from jaxmotion.systems.aamdm.embedding import PATH
 from jaxmotion.systems.aamdm.model import Sample
 from jaxmotion.systems.aamdm.space import Space
 from jaxmotion.typing import Key, Objective, Params
+
+# Strength of the guidance, epsilon of eq. 13; ours.
+SCALE = 10.0
 
 # `step(key, previous, goal)`; the goal is None where nothing is asked for.
 Stepper = Callable[[Key, Array, Array | None], Array]
@@ -278,19 +282,23 @@ class Method:
       config: The networks and the chain.
       num_joints: Joints of the skeleton.
       fps: Frames per second.
-      scale: Strength of the guidance, epsilon of eq. 13; ours.
+      scale: Strength of the guidance.
+      step: Makes the chain's step from the schedule and a denoiser.
     """
 
     config: aamdm_model.Config
     num_joints: int
     fps: float
-    scale: float = 10.0
+    scale: float = SCALE
+    step: chain.StepFactory = chain.ancestral_step
 
     def __call__(self, params: tuple[Params, Space]) -> Controller:
         """The controller."""
         networks, space = params
         change = space.change if self.config.target == "change" else None
-        sample = aamdm_model.sampler(networks, config=self.config, change=change)
+        sample = aamdm_model.sampler(
+            networks, config=self.config, change=change, step=self.step
+        )
         return controller(
             guided(sample, scale=self.scale),
             space,
@@ -319,10 +327,13 @@ def start_states(
     return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen])
 
 
-def load_character(path: Path) -> Character:
+def load_character(
+    path: Path, *, step: chain.StepFactory = chain.ancestral_step
+) -> Character:
     """The character of a run folder: 3 drafts and 2 polishes in the embedded space.
 
-    It starts in held-out poses. Commands have no labels.
+    It starts in held-out poses. Commands have no labels. `step` makes the chain's step;
+    the default is the paper's.
 
     Raises:
       CheckpointError: if a stage was not trained.
@@ -340,7 +351,9 @@ def load_character(path: Path) -> Character:
         fps=run.train.fps,
         source=run.source,
         params=(networks, space),
-        method=Method(config=config, num_joints=num_joints, fps=run.train.fps),
+        method=Method(
+            config=config, num_joints=num_joints, fps=run.train.fps, step=step
+        ),
         starts=lambda labels, seed: start_states(
             run.held_out, space, len(labels), num_joints=num_joints, seed=seed
         ),

@@ -455,8 +455,8 @@ def score_stepper(
     return row
 
 
-# The guidance's strength, and the commands, of an evaluation that is given no others.
-SCALE, COURSE, SPEED = 10.0, "forward", 1.2
+# Commands of an evaluation that is given no others.
+COURSE, SPEED = "forward", 1.2
 # Clips that are used, where the data have this field.
 FIELD, LABELS = "theme", ("walk", "run")
 # Columns of a sweep that rollouts under control have.
@@ -536,7 +536,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         chain = load_chain(
             run, "embedded", space, drafts=drafts, polishes=polishes, target="frame"
         )
-        return aamdm_controller.guided(chain, scale=SCALE)
+        return aamdm_controller.guided(chain, scale=aamdm_controller.SCALE)
 
     def real(data: PoseData) -> Row:
         frames = data_frames(run, data, rollouts, ticks, seed=seed)

@@ -32,7 +32,7 @@ from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character, check_labels
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
-from jaxmotion.diffusion import schedule
+from jaxmotion.diffusion import chain, schedule
 from jaxmotion.motion import features, spring, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.systems.camdm import model as camdm_model
@@ -402,6 +402,7 @@ def controller(
     config: camdm_model.Config,
     control: Control | None = None,
     table: schedule.Schedule | None = None,
+    step: chain.StepFactory = chain.ancestral_step,
 ) -> Controller:
     """The run-time of one character, for `rollout.tick` and `rollout.rollout`.
 
@@ -411,6 +412,7 @@ def controller(
       config: The method.
       control: Constants; None for the defaults.
       table: Schedule; None for the cosine one of `config.num_steps`.
+      step: Makes the chain's step; the default is the paper's.
 
     Returns:
       A controller whose frames are `Frame`s. Its second planner is the guided one.
@@ -421,7 +423,7 @@ def controller(
     control = Control() if control is None else control
     if not 1 <= control.apply <= config.future:
         raise ValueError(f"apply is {control.apply}, expected 1..{config.future}")
-    sample = camdm_model.sampler(params, config=config, table=table)
+    sample = camdm_model.sampler(params, config=config, table=table, step=step)
 
     def plan(guided: bool) -> Callable:
         return lambda key, state, command: replan(
@@ -448,14 +450,20 @@ class Method:
 
     config: camdm_model.Config
     control: Control | None = None
+    step: chain.StepFactory = chain.ancestral_step
 
     def __call__(self, params: tuple[Params, Skeleton]) -> Controller:
         """The controller."""
-        return controller(*params, config=self.config, control=self.control)
+        options = dict(config=self.config, control=self.control, step=self.step)
+        return controller(*params, **options)
 
 
 def character(
-    params: Params, model: camdm_model.Model, *, control: Control | None = None
+    params: Params,
+    model: camdm_model.Model,
+    *,
+    control: Control | None = None,
+    step: chain.StepFactory = chain.ancestral_step,
 ) -> Character:
     """A model as a character to be steered.
 
@@ -464,25 +472,35 @@ def character(
       model: The model. Without poses of its own (`starts`) it starts from clips alone.
       control: Constants of the run-time; None for `OWN_STARTS` where the model has
         poses of its own, else for the paper's.
+      step: Makes the chain's step, such as `chain.dpm_solver_step`. Another
+        `functools.partial` is another program: make one once.
     """
     if control is None and model.starts is not None:
         control = OWN_STARTS
+
+    def clip_starts(clips: Clips, labels: np.ndarray, seed: int) -> CharacterState:
+        own, field = camdm_model.fitting_clips(model, clips)
+        return start_states(own, model, labels, field=field, seed=seed)
+
     return Character(
         skeleton=model.skeleton,
         labels=model.labels,
         fps=model.config.fps,
         source=model.source,
         params=(params, model.skeleton),
-        method=Method(config=model.config, control=control),
+        method=Method(config=model.config, control=control, step=step),
         starts=lambda labels, seed: own_states(model, labels, seed=seed),
-        clip_starts=lambda clips, labels, seed: start_states(
-            clips, model, labels, field=camdm_model.style_field(model, clips), seed=seed
-        ),
+        clip_starts=clip_starts,
     )
 
 
-def load_character(path: Path, *, control: Control | None = None) -> Character:
-    """The character of a run folder or an exported file.
+def load_character(
+    path: Path,
+    *,
+    control: Control | None = None,
+    step: chain.StepFactory = chain.ancestral_step,
+) -> Character:
+    """The character of a run folder or an exported file; see `character`.
 
     It starts in the model's own poses where it has some, else in the mean pose of its
     data where it knows that, else in poses of the clips that the run was trained on.
@@ -491,8 +509,8 @@ def load_character(path: Path, *, control: Control | None = None) -> Character:
       CheckpointError: if there is no whole checkpoint.
       ValueError: if it is of another system or damaged.
     """
-    model, params, _ = camdm_model.load(path)
-    made = character(params, model, control=control)
+    model, params = camdm_model.load(path)
+    made = character(params, model, control=control, step=step)
     if model.starts is not None:
         return made
 

@@ -98,11 +98,11 @@ def steer_one(
       ValueError: if there is no such course or style; names those there are.
     """
     model = run.model
-    label = np.array([model.label(style)])
-    end = label[0] if to_style is None else model.label(to_style)
+    label = steering.label_indices(model.labels, style)
+    end = label if to_style is None else steering.label_indices(model.labels, to_style)
     _, commands = course_of_run(run, course, label, seconds=seconds, speed=speed)
     half = commands.label.shape[1] // 2
-    changed = commands.label.at[:, half:].set(int(end))
+    changed = commands.label.at[:, half:].set(int(end[0]))
     commands = dataclasses.replace(commands, label=changed)
     states = camdm_controller.start_states(
         run.train, model, label, field=run.field, seed=seed
@@ -529,7 +529,7 @@ def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
 
 def _show(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
     folder = job.models / point.folder
-    model, _, _ = camdm_model.load(folder)
+    model, _ = camdm_model.load(folder)
     seconds = job.budget["rollout_seconds"]
     options = dict(run=folder, style=model.labels[0], seconds=seconds, seed=job.seed)
     return "rollout", options
@@ -571,7 +571,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
     )
 
     def run_of(point: bench.Point) -> Run:
-        model, params, _ = camdm_model.load(job.models / point.folder)
+        model, params = camdm_model.load(job.models / point.folder)
         return dataclasses.replace(run, model=model, params=params)
 
     def score(point: bench.Point) -> Row:

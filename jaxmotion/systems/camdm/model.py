@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmotion.data import selection
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.learning import checkpoint, model_json, runs
@@ -337,24 +338,6 @@ class Model:
     source: str
     starts: Motion | None = None
 
-    def label(self, name: str) -> int:
-        """Number of a style.
-
-        Args:
-          name: Its name.
-
-        Returns:
-          The number.
-
-        Raises:
-          ValueError: if the model has no such style; names those it has.
-        """
-        if name not in self.labels:
-            raise ValueError(
-                f"unknown style {name!r}: the model has {', '.join(self.labels)}"
-            )
-        return self.labels.index(name)
-
 
 def to_json(model: Model) -> dict[str, Any]:
     """JSON of a model.
@@ -479,17 +462,22 @@ def check_clips(model: Model, clips: Clips, field: str) -> None:
             )
 
 
-def style_field(model: Model, clips: Clips) -> str:
-    """The label field of clips that has the model's styles.
+def fitting_clips(model: Model, clips: Clips) -> tuple[Clips, str]:
+    """Those of the clips that have the model's styles, and the label field with them.
 
     Raises:
-      ValueError: if there is none, or the clips are of another skeleton or rate.
+      ValueError: if no field has them all, or the clips are of another skeleton or
+        rate.
     """
     fields = dict(clips.label_names)
-    for field, names in fields.items():
-        if names == model.labels:
+    # A field with these styles alone before one that has others as well.
+    for field in sorted(fields, key=lambda field: fields[field] != model.labels):
+        if {*model.labels} <= {*fields[field]}:
+            if fields[field] != model.labels:
+                clips = selection.select(clips, field, model.labels)
+                clips = selection.relabel(clips, field)
             check_clips(model, clips, field)
-            return field
+            return clips, field
     raise ValueError(
         f"the clips do not fit the model: no label field (of {', '.join(fields)}) has "
         f"the styles {', '.join(model.labels)}"
@@ -503,15 +491,12 @@ SHIPPED = {
 }
 
 
-def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
+def load(folder: str | Path) -> tuple[Model, Params]:
     """Model and averaged parameters (EMA) of a run folder or an exported file.
 
     Args:
       folder: Name of a shipped model ("locomotion"), run folder that
         `experiments/camdm.py train` made, or npz file that `camdm.py export` wrote.
-
-    Returns:
-      The model, its parameters, and the JSON of the model.
 
     Raises:
       OSError: if there is no such file, or no run folder.
@@ -522,11 +507,11 @@ def load(folder: str | Path) -> tuple[Model, Params, dict[str, Any]]:
     if not path.exists():
         path = SHIPPED.get(str(folder), path)
     if path.is_file():
-        _, value = checkpoint.import_params(path)
+        params, value = checkpoint.import_params(path)
         model = from_json(value, where=str(path))
-        params, _ = checkpoint.import_params(path, like=_shapes(model, path))
-        return model, params, value
+        checkpoint.check_params(path, params, _shapes(model, path))
+        return model, params
     run = runs.load(path, system=SYSTEM)
     model = from_json(run.model, where=str(run.config))
     runs.check_model(run, STAGE, dataclasses.asdict(model.config))
-    return model, runs.load_params(run, STAGE, lambda: _shapes(model, path)), run.model
+    return model, runs.load_params(run, STAGE, lambda: _shapes(model, path))

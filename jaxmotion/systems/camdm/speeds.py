@@ -105,8 +105,7 @@ def speed_table(
     """
     model, fps = run.model, run.model.config.fps
     windows.check_ticks(round(seconds * fps), fps=fps, skip=SKIP)
-    label = model.label(style)
-    labels = np.full(rollouts, label)
+    labels = steering.label_indices(model.labels, style, rollouts)
     real = {
         name: windows.eval_windows(
             clips, stride=windows.EVAL_WINDOW // 2, field=run.field
@@ -146,7 +145,7 @@ def speed_table(
         for name, (values, groups, style_of) in measured.items():
             off = np.abs(values["speed"] - speed)
             near = off < (_NEAR * speed if speed else _STILL)
-            near &= style_of == label
+            near &= style_of == labels[0]
             part = {k: v[near] for k, v in values.items()}
             rows[f"{name}, about {speed:g} m/s"] = _cells(part, groups[near])
         motion = frames[:, SKIP:].motion

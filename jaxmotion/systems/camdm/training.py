@@ -133,7 +133,7 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
     Raises:
       ValueError: if skeleton, styles or sizes differ; names which.
     """
-    first, params, _ = load(path)
+    first, params = load(path)
     weights = {
         name: value
         for name, value in dataclasses.asdict(model.config).items()
@@ -405,7 +405,7 @@ def load_run(
         not the model's; names the folder or what differs.
     """
     run = runs.load(folder, system=SYSTEM)
-    model, params, _ = load(folder)
+    model, params = load(folder)
     field = run.settings["label"]
     if data is None:
         parts = tuple(clips_io.load_clips(run.file(name)) for name in _FILES)
@@ -433,23 +433,11 @@ def exported_run(
       OSError: if a file cannot be read.
       ValueError: if no clips are given, or they do not fit the model; names what.
     """
-    model, params, _ = load(source)
+    model, params = load(source)
     if data is None or not held_out_clips:
         raise ValueError(
             f"{source} has no clips of its own: give --data and --held-out-clips"
         )
-    clips = clips_io.load_clips(data)
-    field = next(
-        (name for name, names in clips.label_names if {*model.labels} <= {*names}),
-        "style",
-    )
-    train, held_out = split_data(
-        data,
-        (),
-        field,
-        0.5,
-        labels=model.labels,
-        held_out_clips=held_out_clips,
-    )
-    camdm_model.check_clips(model, train, field)
+    clips, field = camdm_model.fitting_clips(model, clips_io.load_clips(data))
+    train, held_out = selection.split_by_name(clips, held_out_clips)
     return Run(model=model, params=params, train=train, held_out=held_out, field=field)

@@ -33,6 +33,6 @@ here take minutes:
 * feet stand below 0.2 m/s: the same speed at any rate; published: 0.01 m per frame at
   any rate.
 * actions drawn uniformly: rare actions count as much; published: clips drawn uniformly.
-* `hip_weight` of `humanml.Layout`: facing from hips and shoulders; -1 swaps the hips as
-  the published features do; published: -1.
+* `hip_weight` of `humanml_layout.Layout`: facing from hips and shoulders; -1 swaps the
+  hips as the published features do; published: -1.
 """

@@ -337,7 +337,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
             contact_height=ground + 0.05,
         )
 
-    scale = emdm_training.guidance_scale(settings.scale, default=1.0)
+    scale = emdm_training.guidance_scale(settings.scale, task="action")
     return RowScorer(
         by_frame=places,
         real={

@@ -21,13 +21,37 @@ from jaxmotion.data.clips import Clips
 from jaxmotion.data.text_motion import TextMotions
 from jaxmotion.learning import runs
 from jaxmotion.motion import features, humanml, humanml_skeleton, skeleton
-from jaxmotion.motion.humanml import HUMANML3D
+from jaxmotion.motion.humanml_layout import HUMANML3D
 from jaxmotion.systems.emdm import features as emdm_features
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.emdm.features import Representation
 from jaxmotion.typing import Key
+
+# Labels of Bandai-Namco that name the same action as others, for `merges`.
+MERGE = ("bye=wave-right-hand", "byebye=wave-both-hands", "dash=run")
+
+
+def merges(pairs: tuple[str, ...]) -> dict[str, str]:
+    """Labels that name the same action as others.
+
+    Args:
+      pairs: "old=new".
+
+    Returns:
+      The new label of each old one.
+
+    Raises:
+      ValueError: if a pair is not of that form.
+    """
+    merge = {}
+    for pair in pairs:
+        old, equals, new = pair.partition("=")
+        if not (old and equals and new):
+            raise ValueError(f"merge {pair!r}: expected old=new")
+        merge[old] = new
+    return merge
 
 
 @jax.tree_util.register_dataclass

@@ -1,23 +1,29 @@
-"""Rows of a run beside real motions, with intervals over replications.
+"""Rows of a run beside real motions, with intervals over replications; single motions.
 
 One evaluation, for the table of a run and for a sweep over numbers of steps.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.evaluation import bench, by_frame, table
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Cell, Row, Rows
 from jaxmotion.learning import runs
+from jaxmotion.motion import humanml_skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.systems.emdm import action_evaluation, text_evaluation
 from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import features as emdm_features
 from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import text as emdm_text
 from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.emdm.scoring import Many, RowScorer, Settings
 from jaxmotion.typing import Key
@@ -100,6 +106,94 @@ def evaluate_run(
         seconds = time.perf_counter() - begun
         print(f"{row}: {count} x {scorer.samples}, {seconds:.0f} s", flush=True)
     return found, places, scorer
+
+
+def _features(
+    run: runs.Run,
+    vectors: Array,
+    *,
+    row: str,
+    frames: int | None,
+    scale: float | None,
+    seed: int,
+) -> np.ndarray:
+    """Features of one motion for each vector, cut to their length."""
+    params, config = emdm_training.load_row(run, row)
+    length = config.frames if frames is None else frames
+    conditions = emdm_model.make_condition(
+        vectors, (length,) * vectors.shape[0], config=config
+    )
+    sample = emdm_training.row_sampler(params, config, row)
+    scale = emdm_training.guidance_scale(scale, task=config.condition)
+    many = emdm_training.sample_many(sample, chunk=8)
+    return many(jax.random.key(seed), conditions, scale)[:, :length]
+
+
+def make_motions(
+    folder: Path,
+    *,
+    actions: Sequence[str] = (),
+    texts: Sequence[str] = (),
+    row: str = "emdm",
+    frames: int | None = None,
+    scale: float | None = None,
+    seed: int = 0,
+) -> tuple[dict[str, tuple[Skeleton, Motion]], str]:
+    """One motion for each action or sentence; one in all where a run has neither.
+
+    Args:
+      folder: The run folder.
+      actions: Actions, for a run of actions.
+      texts: Sentences, for a run of texts.
+      row: Which model.
+      frames: Length; None for the model's longest.
+      scale: Guidance; None for the paper's.
+      seed: Of the noise.
+
+    Returns:
+      Skeleton and motion by action or sentence, and the data's source.
+
+    Raises:
+      ValueError: if an action is unknown, a text is empty or too long, the length is
+        out of range, or the run has another task.
+    """
+    record = runs.load(folder, system=emdm_training.SYSTEM)
+    task, given = record.settings["task"], {"action": actions, "text": texts}
+    for name, values in given.items():
+        if values and name != task:
+            raise ValueError(f"{folder} makes motions from {task!r}, not from {name!r}")
+    if task in given and not given[task]:
+        raise ValueError(f"expected --{task} for {folder}")
+    options = dict(row=row, frames=frames, scale=scale, seed=seed)
+    if task == "text":
+        run = emdm_text.load_run(folder)
+        if run.motions.num_features != 263:
+            raise ValueError(
+                "only motions of HumanML3D's 22 joints can be written as BVH"
+            )
+        x = _features(record, emdm_text.encode(run, texts), **options)
+        made = (
+            humanml_skeleton.motion_from_joints(joints, run.motions.fps)
+            for joints in emdm_text.joints(run, x)
+        )
+        return dict(zip(texts, made, strict=True)), run.motions.source
+    run = emdm_data.load_run(folder)
+    for action in actions:
+        if action not in run.actions:
+            raise ValueError(
+                f"unknown action {action!r}: expected one of {', '.join(run.actions)}"
+            )
+    numbers = jnp.asarray([run.actions.index(a) for a in actions], jnp.int32)
+    vectors = emdm_model.action_vectors(numbers, len(run.actions))
+    if not actions:
+        vectors = jnp.zeros((1, 0))
+    x = _features(record, vectors, **options)
+    motions = emdm_features.to_motion(x, run.representation)
+    found = {
+        name: (run.clips.skeleton, jax.tree.map(lambda x, i=i: x[i], motions))
+        for i, name in enumerate(actions or ("motion",))
+    }
+    return found, run.clips.source
 
 
 _ROW = "emdm"

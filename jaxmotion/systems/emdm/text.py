@@ -22,7 +22,7 @@ from jaxmotion.data.text_motion import (
 )
 from jaxmotion.learning import runs
 from jaxmotion.motion import humanml
-from jaxmotion.motion.humanml import HUMANML3D, KIT_ML
+from jaxmotion.motion.humanml_layout import HUMANML3D, KIT_ML, Layout
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
@@ -59,7 +59,7 @@ class TextRun:
     scale: float
 
     @property
-    def layout(self) -> humanml.Layout:
+    def layout(self) -> Layout:
         """Which of the two published skeletons the features describe."""
         layouts = {layout.num_features: layout for layout in (HUMANML3D, KIT_ML)}
         return layouts[self.motions.num_features]

@@ -454,7 +454,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
             mask=jnp.arange(frames)[None] < length[:, None],
         )
 
-    scale = emdm_training.guidance_scale(settings.scale, default=2.5)
+    scale = emdm_training.guidance_scale(settings.scale, task="text")
 
     def score_split(key: Key, many: Many, split: str) -> Scores:
         key_draw, key_sample, key_score = jax.random.split(key, 3)

@@ -301,17 +301,21 @@ def row_sampler(params: Params, config: Config, row: str) -> emdm_model.Sample:
     return emdm_model.sampler(params, config=config, step=chain.ddim_step, steps=steps)
 
 
-def guidance_scale(scale: float | None, *, default: float) -> Array | None:
+# The paper's scales of guidance, by what motions are made from.
+GUIDANCE = {"action": 1.0, "text": 2.5, "none": 1.0}
+
+
+def guidance_scale(scale: float | None, *, task: TaskName) -> Array | None:
     """Scale of classifier-free guidance as samplers take it.
 
     Args:
-      scale: What was asked for; None for the default.
-      default: The paper's of the task.
+      scale: What was asked for; None for the paper's of the task.
+      task: What motions are made from.
 
     Returns:
       The scale; None for 1, which needs no second call of the network.
     """
-    scale = default if scale is None else scale
+    scale = GUIDANCE[task] if scale is None else scale
     return None if scale == 1.0 else jnp.float32(scale)
 
 

@@ -34,6 +34,7 @@ from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character, check_labels
 from jaxmotion.data.ball_clips import BallClips
+from jaxmotion.diffusion import chain
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import Skeleton
@@ -336,23 +337,26 @@ class Method:
       paths: The generator of paths.
       guided: Contact guidance; tuned for short trainings.
       control: Constants of the run-time; None for the defaults.
+      step: Makes the step of both chains where they are not guided.
     """
 
     config: Config
     paths: smgdiff_trajectory.Config
     guided: smgdiff_guidance.Guidance = smgdiff_guidance.TUNED
     control: Control | None = None
+    step: chain.StepFactory = chain.ancestral_step
 
     def __call__(self, params: tuple[Params, Params, Representation]) -> Controller:
         """The controller."""
         motion, paths, representation = params
         return controller(
-            smgdiff_trajectory.sampler(paths, config=self.paths),
+            smgdiff_trajectory.sampler(paths, config=self.paths, step=self.step),
             smgdiff_guidance.sampler(
                 motion,
                 config=self.config,
                 representation=representation,
                 guided=self.guided,
+                step=self.step,
             ),
             representation=representation,
             config=self.config,
@@ -403,10 +407,13 @@ def start_states(
     return state(scenes)
 
 
-def load_character(path: Path) -> Character:
+def load_character(
+    path: Path, *, step: chain.StepFactory = chain.ancestral_step
+) -> Character:
     """The player of a run folder: 8 steps of motion, 1 of paths.
 
-    It starts in frames that the run was trained on, and frames show its ball.
+    It starts in frames that the run was trained on, and frames show its ball. `step`
+    makes the step of the unguided parts of the chain; the default is the paper's.
 
     Raises:
       CheckpointError: if a stage was not trained.
@@ -421,6 +428,6 @@ def load_character(path: Path) -> Character:
         fps=model.config.fps,
         source=model.source,
         params=(motion, path_params, model.representation),
-        method=Method(config=model.config, paths=paths.paths),
+        method=Method(config=model.config, paths=paths.paths, step=step),
         starts=lambda labels, seed: start_states(run.train, model, labels, seed=seed),
     )

@@ -191,24 +191,6 @@ class Model:
     speeds: tuple[float, ...]
     source: str
 
-    def label(self, name: str) -> int:
-        """Number of a skill.
-
-        Args:
-          name: Its name.
-
-        Returns:
-          The number.
-
-        Raises:
-          ValueError: if the model has no such skill; names those it has.
-        """
-        if name not in self.labels:
-            raise ValueError(
-                f"unknown skill {name!r}: the model has {', '.join(self.labels)}"
-            )
-        return self.labels.index(name)
-
 
 def to_json(model: Model) -> dict[str, Any]:
     """JSON of a model.

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmotion.control import rollout
+from jaxmotion.control import rollout, steering
 from jaxmotion.control.frame import Frame
 from jaxmotion.evaluation import diversity, table
 from jaxmotion.evaluation.table import Rows
@@ -325,7 +325,7 @@ def skill_commands(
     ticks = round(seconds * model.config.fps)
     if ticks < len(skills):
         raise ValueError(f"{seconds:g} s are too short for {len(skills)} skills")
-    labels = np.array([model.label(skill) for skill in skills])
+    labels = steering.label_indices(model.labels, skills)
     label = labels[np.arange(ticks) * len(skills) // ticks]
     turn = np.floor(np.arange(ticks) / (_SECONDS * model.config.fps)).astype(int)
     yaw = _TURN * np.array([0, 1, 0, -1])[turn % 4]

@@ -37,12 +37,6 @@ def test_json_and_back(model):
     np.testing.assert_array_equal(found.skeleton.offsets, model.skeleton.offsets)
 
 
-def test_labels_by_name(model):
-    assert [model.label(name) for name in tiny.STYLES] == [0, 1]
-    with pytest.raises(ValueError, match="unknown style 'sad'.*calm, brisk"):
-        model.label("sad")
-
-
 BAD = {
     "system": (lambda v: v.update(system="emdm"), "'system' is 'emdm'"),
     "no system": (lambda v: v.pop("system"), "'system' is None"),
@@ -181,7 +175,7 @@ def save_run(folder, model, params):
 
 def test_a_run_gives_its_averaged_parameters(tmp_path, model, params):
     save_run(tmp_path, model, params)
-    found, found_params, _ = camdm_model.load(tmp_path)
+    found, found_params = camdm_model.load(tmp_path)
     assert found.config == model.config
     jax.tree.map(
         lambda a, b: np.testing.assert_array_equal(a, 2 * b), found_params, params
@@ -191,7 +185,7 @@ def test_a_run_gives_its_averaged_parameters(tmp_path, model, params):
 def test_an_exported_file(tmp_path, model, params):
     path = tmp_path / "model.npz"
     checkpoint.export_params(path, params, camdm_model.to_json(model), dtype=np.float32)
-    found, found_params, _ = camdm_model.load(path)
+    found, found_params = camdm_model.load(path)
     assert found.labels == model.labels
     jax.tree.map(np.testing.assert_array_equal, found_params, params)
 

@@ -150,9 +150,9 @@ def test_what_is_wrong_is_found_before_any_training():
     ):
         with pytest.raises(ValueError, match=message):
             camdm_evaluation.evaluate_run(run, **(options | change))
-    with pytest.raises(ValueError, match="unknown style 'sad': the model has neutral"):
+    with pytest.raises(ValueError, match="unknown label 'sad': the model has neutral"):
         camdm_evaluation.steer_one(run, "sad", course="forward", seconds=1.0)
-    with pytest.raises(ValueError, match="unknown style 'glad'"):
+    with pytest.raises(ValueError, match="unknown label 'glad'"):
         camdm_evaluation.steer_one(
             run, "zombie", to_style="glad", course="forward", seconds=1.0
         )

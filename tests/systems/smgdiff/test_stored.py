@@ -47,12 +47,6 @@ def test_a_model_comes_back(model):
     assert found.representation.skeleton.names == tiny.NAMES
 
 
-def test_skills_have_numbers(model):
-    assert model.label("stand") == 1
-    with pytest.raises(ValueError, match="unknown skill 'dive': .* dribble, stand"):
-        model.label("dive")
-
-
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [

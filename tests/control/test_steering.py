@@ -1,3 +1,5 @@
+"""Characters of CAMDM, started and steered, and how labels are named."""
+
 import copy
 import dataclasses
 import functools
@@ -10,6 +12,7 @@ import pytest
 
 from jaxmotion.control import courses, steering
 from jaxmotion.data import selection, windows
+from jaxmotion.diffusion import chain
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
@@ -21,74 +24,6 @@ LABELS = np.array([0, 1, 1, 0])
 @pytest.fixture(scope="module")
 def run():
     return samples.run()
-
-
-def test_data_windows_are_the_clips_frames(run):
-    clips = run.train
-    found = windows.eval_windows(clips, stride=30, field="style")
-    # Clips of 120 frames: windows at 0, 30 and 60.
-    count = 3 * clips.num_clips
-    assert found.motion.root_position.shape == (count, 60, 3)
-    assert found.velocity.shape == found.facing.shape == (count, 60, 2)
-    roots = np.asarray(clips.root_position)
-    for window in range(count):
-        clip, start = divmod(window, 3)
-        begin = int(clips.offsets[clip]) + 30 * start
-        np.testing.assert_array_equal(
-            found.motion.root_position[window], roots[begin : begin + 60]
-        )
-        assert found.group[window] == clip
-        assert found.label[window] == clips.labels["style"][clip]
-
-
-def test_what_is_wanted_of_a_clip_is_its_own_path_smoothed(run):
-    found = windows.eval_windows(run.train, stride=60, field="style")
-    path = np.asarray(found.motion.root_position, float)[..., ::2]
-    # Over most of a window the wanted path goes where the walker goes.
-    wanted = np.asarray(found.velocity, float)[:, 10:50].sum(axis=1) / 30.0
-    walked = path[:, 50] - path[:, 10]
-    assert np.abs(wanted - walked).max() < 0.15
-    np.testing.assert_allclose(np.linalg.norm(found.facing, axis=-1), 1.0, atol=1e-5)
-    # It is smoother than the walk itself: no sway, no steps.
-    rough = np.diff(path, 2, axis=1)[:, 15:45] * 30.0
-    smooth = np.diff(np.asarray(found.velocity), axis=1)[:, 15:45]
-    assert np.abs(smooth).mean() < 0.7 * np.abs(rough).mean()
-
-
-def test_rollout_windows_leave_out_the_start_and_keep_their_owner():
-    frames = samples.walking(LABELS, seconds=7.0)
-    found = windows.rollout_windows(frames, jnp.asarray(LABELS), skip=60)
-    assert found.motion.root_position.shape == (8, 60, 3)  # 150 frames hold two
-    for window in range(8):
-        owner, part = divmod(window, 2)
-        begin = 60 + 60 * part
-        assert found.group[window] == owner
-        assert found.label[window] == LABELS[owner]
-        for got, of in (
-            (found.motion.joint_rotation, frames.joint_rotation),
-            (found.velocity, frames.desired_velocity),
-            (found.facing, frames.desired_facing),
-        ):
-            np.testing.assert_array_equal(got[window], of[owner, begin : begin + 60])
-
-
-def test_rollouts_too_short_to_measure_are_named():
-    frames = samples.walking(LABELS[:1], seconds=3.9)
-    with pytest.raises(ValueError, match=r"3\.9 s are too short.*at least 4 s"):
-        windows.rollout_windows(frames, jnp.asarray([0]), skip=60)
-    windows.check_ticks(120, fps=30.0, skip=60)
-
-
-def test_style_speeds_are_medians_within_clips(run):
-    clips = run.train
-    found = selection.label_speeds(clips, field="style")
-    steps = {0: [], 1: []}
-    for clip in range(clips.num_clips):
-        own = slice(int(clips.offsets[clip]), int(clips.offsets[clip + 1]))
-        path = np.asarray(clips.root_position, float)[own, ::2]
-        speed = np.linalg.norm(np.diff(path, axis=0), axis=-1) * 30.0
-        steps[int(clips.labels["style"][clip])] += speed.tolist()
-    np.testing.assert_allclose(found, [np.median(steps[i]) for i in (0, 1)], rtol=1e-4)
 
 
 def test_a_style_without_clips_has_no_speed_and_no_start(run):
@@ -156,6 +91,23 @@ def test_characters_start_in_poses_of_the_models_own(run):
             camdm_model.from_json(bad, where="here")
 
 
+def test_labels_by_name_and_by_index():
+    names = ("calm", "brisk")
+    find = functools.partial(steering.label_indices, names)
+    assert find().tolist() == [0] and find("brisk", 3).tolist() == [1, 1, 1]
+    assert find(["brisk", 0]).tolist() == find(np.array([1, 0])).tolist() == [1, 0]
+    assert steering.label_indices((), None, 2).tolist() == [0, 0]
+    for args, message in (
+        (("sad",), "unknown label 'sad': the model has calm, brisk"),
+        ((2,), r"labels are in 2..2, expected 0..1 \(calm, brisk\)"),
+        ((["calm"], 2), "1 labels for 2 characters"),
+        ((0.5,), "label is 0.5, expected a name or an index"),
+        (("calm", 0), "number of characters is 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            find(*args)
+
+
 @functools.cache
 def steered(chunk):
     run = samples.run()
@@ -186,6 +138,32 @@ def test_rollouts_show_a_frame_a_tick_from_where_they_start(run):
     gap = np.asarray(frames.desired_velocity) - np.array([0.0, 1.0])
     gap = np.linalg.norm(gap, axis=-1)
     assert gap[:, -1].max() < 0.1 < 0.5 < gap[:, 0].min()
+
+
+def test_the_step_of_the_chain_is_the_users_choice(run):
+    """DDIM of full noise is the default; of two steps DPM-Solver++ is DDIM without."""
+    start = camdm_controller.start_states
+    states = start(run.held_out, run.model, LABELS[:2], field="style", seed=2)
+    commands = courses.course_batch(
+        "forward", LABELS[:2], np.ones(2), seconds=0.1, fps=30.0
+    )
+
+    def rotations(**step):
+        made = camdm_controller.character(run.params, run.model, **step)
+        key = jax.random.key(5)
+        found = steering.steered_rollouts(made, key, states, commands)
+        assert np.isfinite(found.joint_rotation).all()
+        return found.joint_rotation
+
+    default = rotations()
+    counted = steering._rollouts._cache_size()
+    np.testing.assert_array_equal(rotations(step=chain.ancestral_step), default)
+    assert steering._rollouts._cache_size() == counted
+    noisy = rotations(step=functools.partial(chain.ddim_step, eta=1.0))
+    np.testing.assert_allclose(noisy, default, atol=1e-4)
+    ddim = rotations(step=chain.ddim_step)
+    assert np.abs(ddim - default).max() > 0.01
+    np.testing.assert_allclose(rotations(step=chain.dpm_solver_step), ddim, atol=1e-4)
 
 
 def test_a_second_call_compiles_nothing(run):
