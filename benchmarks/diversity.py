@@ -247,7 +247,7 @@ def one_rollout(
     root, rotation = jax.tree.map(lambda x: x[(ticks - 1) % every :: every], shown)
     motion = Motion(root_position=root, joint_rotation=rotation, fps=config.fps / every)
     world = joint_positions(skeleton, motion)
-    pose = style_evaluator.recognizer_input(skeleton, motion).reshape(world.shape)
+    pose = style_evaluator.window_input(skeleton, motion).reshape(world.shape)
     return Motions(world=world, pose=pose)
 
 

@@ -53,10 +53,10 @@ class Config(suite.Settings):
     lets PyTorch use its fused inference kernels), and through torch.compile.
 
     A ratio is the median over the rounds of ours / eager in the same round; its spread
-    is from the 25th to the 75th percentile. It is judged by wall clock, and only on an
-    idle machine: two threads that wait for each other suffer out of proportion when
+    is from the 25th to the 75th percentile. It is compared by wall clock, on an idle
+    machine: two threads that wait for each other suffer out of proportion when
     another process takes a core, PyTorch's much more than ours. With one thread it is
-    judged by processor time, which hardly depends on the neighbors.
+    compared by processor time, which hardly depends on the neighbors.
 
     Attributes:
       steps: Diffusion steps.
@@ -65,7 +65,7 @@ class Config(suite.Settings):
       limit: Seconds of rounds, at most, but five rounds.
       compile_limit: Seconds that torch.compile may take; 0 to leave it out.
       target: Greatest ratio of "ours, constants" that passes; exit status 1 beyond
-        it, and 2 where the machine was too busy to judge. 0 for no target.
+        it, and 2 where the machine was too busy to tell. 0 for no target.
     """
 
     steps: int = 8
@@ -176,7 +176,7 @@ def rows_of(times: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     return rows
 
 
-def judge(
+def check_target(
     row: dict[str, Any], target: float, *, threads: int, load: float | None
 ) -> None:
     """Says whether the target is reached.
@@ -184,7 +184,7 @@ def judge(
     Args:
       row: Of `rows_of`.
       target: Greatest ratio that passes.
-      threads: Of both sides; one is judged by processor time.
+      threads: Of both sides; one is compared by processor time.
       load: Cores that other processes kept busy meanwhile; None if unknown.
 
     Raises:
@@ -192,8 +192,8 @@ def judge(
     """
     if threads > 1 and (load or 0.0) > IDLE:
         print(
-            f"Not judged: other processes used {load} cores during the rounds. Run it "
-            "on an idle machine, or with --threads 1."
+            f"Not compared: other processes used {load} cores during the rounds. Run "
+            "it on an idle machine, or with --threads 1."
         )
         raise SystemExit(2)
     ratio = row["ratio"] if threads > 1 else row["cpu_ratio"]
@@ -260,7 +260,7 @@ def main() -> None:
     )
     if args.target:
         ours = next(row for row in rows if row["name"] == OURS)
-        judge(ours, args.target, threads=threads, load=load)
+        check_target(ours, args.target, threads=threads, load=load)
 
 
 if __name__ == "__main__":

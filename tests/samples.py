@@ -110,8 +110,8 @@ def evaluator(kind="action", **changes):
         accuracy=0.75,
     )
     made = frozen.Evaluator(params={}, **value | changes)
-    init = style_evaluator.init_recognizer
+    init = style_evaluator.init
     if kind == "action":
-        init = action_evaluator.init_action_recognizer
+        init = action_evaluator.init
     params = tiny.random_params(init, made.config)
     return dataclasses.replace(made, params=params)

@@ -1,4 +1,4 @@
-"""Training of the action recognizer on whole motions, and its use on others.
+"""Training of the action evaluator on whole motions, and its use on others.
 
 The published one draws the recurrent states before the first frame from N(0, 1) at each
 call, so that even real motions get other features each time. Here the draw is made from
@@ -17,13 +17,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.evaluators.network import ActionRecognizer
+from jaxmotion.evaluators.network import ActionClassifier
 from jaxmotion.typing import Key, Params
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ActionRecognizerConfig:
-    """Size of the recognizer.
+class Config:
+    """Size of the evaluator.
 
     Attributes:
       num_classes: Classes.
@@ -40,17 +40,17 @@ class ActionRecognizerConfig:
     state_scale: float = 1.0
 
     @property
-    def network(self) -> ActionRecognizer:
+    def network(self) -> ActionClassifier:
         """The module of these sizes."""
-        return ActionRecognizer(self.num_classes, self.num_features, self.hidden)
+        return ActionClassifier(self.num_classes, self.num_features, self.hidden)
 
 
-def _initial_state(key: Key, batch: int, config: ActionRecognizerConfig) -> Array:
+def _initial_state(key: Key, batch: int, config: Config) -> Array:
     return config.state_scale * jax.random.normal(key, (batch, 2, config.hidden))
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def init_action_recognizer(key: Key, config: ActionRecognizerConfig) -> Params:
+def init(key: Key, config: Config) -> Params:
     """Initial parameters.
 
     Args:
@@ -58,24 +58,24 @@ def init_action_recognizer(key: Key, config: ActionRecognizerConfig) -> Params:
       config: Its size.
 
     Returns:
-      Parameters of `ActionRecognizer`.
+      Parameters of `ActionClassifier`.
     """
     x = jnp.zeros((1, 1, 3 * config.num_joints))
     state = jnp.zeros((1, 2, config.hidden))
     return config.network.init(key, x, state)["params"]
 
 
-def recognize_actions(
+def classify(
     params: Params,
     key: Key,
     x: Float[Array, "batch frames channels"],
     *,
-    config: ActionRecognizerConfig,
+    config: Config,
 ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
     """Features and logits of motions.
 
     Args:
-      params: The recognizer's parameters.
+      params: The evaluator's parameters.
       key: Consumed by the states before the first frame; the same key, batch size and
         motions give the same features.
       x: Joint positions, meters, of motions that start at the origin facing +z.
@@ -88,17 +88,17 @@ def recognize_actions(
     return config.network.apply({"params": params}, x, state)
 
 
-def action_recognizer_loss(
+def loss(
     params: Params,
     key: Key,
     batch: tuple[Float[Array, "batch frames channels"], Int[Array, " batch"]],
     *,
-    config: ActionRecognizerConfig,
+    config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """Cross entropy of a batch.
 
     Args:
-      params: The recognizer's parameters.
+      params: The evaluator's parameters.
       key: Consumed by the states before the first frame.
       batch: Joint positions as above, and the classes of the motions.
       config: Its size.
@@ -107,21 +107,21 @@ def action_recognizer_loss(
       The loss, and the accuracy.
     """
     x, labels = batch
-    _, logits = recognize_actions(params, key, x, config=config)
+    _, logits = classify(params, key, x, config=config)
     return style_evaluator.cross_entropy(logits, labels)
 
 
-def train_action_recognizer(
+def train(
     key: Key,
     x: Float[Array, "motions frames channels"],
     labels: Int[Array, " motions"],
     *,
-    config: ActionRecognizerConfig,
+    config: Config,
     num_steps: int = 1500,
     batch: int = 32,
     learning_rate: float = 3e-3,
 ) -> tuple[Params, dict[str, Array]]:
-    """Trains a recognizer as one compiled program.
+    """Trains an evaluator as one compiled program.
 
     Args:
       key: Consumed.
@@ -137,8 +137,8 @@ def train_action_recognizer(
     """
     return style_evaluator.train_classifier(
         key,
-        lambda key: init_action_recognizer(key, config),
-        functools.partial(action_recognizer_loss, config=config),
+        lambda key: init(key, config),
+        functools.partial(loss, config=config),
         (x, labels),
         num_steps=num_steps,
         batch=batch,

@@ -22,7 +22,7 @@ from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.typing import Params
 
 Kind = Literal["style", "action", "ball", "style_release"]
-Config = style_evaluator.RecognizerConfig | action_evaluator.ActionRecognizerConfig
+Config = style_evaluator.Config | action_evaluator.Config
 
 _FORMAT = "jaxmotion-evaluator"
 _VERSION = 1
@@ -84,12 +84,10 @@ class Evaluator:
         """Size of the evaluator."""
         classes, joints = len(self.labels), len(self.joints)
         if self.kind == "action":
-            return action_evaluator.ActionRecognizerConfig(
-                num_classes=classes, num_joints=joints
-            )
+            return action_evaluator.Config(num_classes=classes, num_joints=joints)
         if self.kind == "style_release":
             return style_evaluator.ReleasedConfig(num_classes=classes)
-        return style_evaluator.RecognizerConfig(
+        return style_evaluator.Config(
             num_classes=classes,
             num_joints=joints + (self.kind == "ball"),
             frames=self.frames,
@@ -211,11 +209,7 @@ def _require(path: Path, field: str, found: Any, expected: Any) -> None:
 def _like(evaluator: Evaluator) -> Params:
     """Shapes of its parameters."""
     is_action = evaluator.kind == "action"
-    init = (
-        action_evaluator.init_action_recognizer
-        if is_action
-        else style_evaluator.init_recognizer
-    )
+    init = action_evaluator.init if is_action else style_evaluator.init
     return jax.eval_shape(lambda: init(jax.random.key(0), evaluator.config))
 
 

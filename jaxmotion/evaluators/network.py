@@ -1,4 +1,4 @@
-"""A convolutional recognizer of style, and the features for Fréchet distances.
+"""A convolutional evaluator of style, and the features for Fréchet distances.
 
 Two residual convolutions over time, then three linear layers; the 512 activations
 before the last are the features. Differs from the released one: layer and group norms
@@ -78,7 +78,7 @@ class ResidualConvolution(nn.Module):
         return nn.leaky_relu(self.norm(self.main(x))) + self.side(x)
 
 
-class Recognizer(nn.Module):
+class WindowClassifier(nn.Module):
     """Windows of poses to features and class logits.
 
     Attributes:
@@ -112,7 +112,7 @@ class Recognizer(nn.Module):
     def __call__(
         self, x: Float[Array, "batch frames channels"], *, train: bool = False
     ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
-        """Recognizes windows.
+        """Classifies windows.
 
         Args:
           x: Joint positions, root-relative and facing +z in each frame, meters;
@@ -129,13 +129,13 @@ class Recognizer(nn.Module):
         return features, self.out(features)
 
 
-class StyleClassifier(Recognizer):
-    """The released recognizer; its input is `learning.recognition.released_input`."""
+class StyleClassifier(WindowClassifier):
+    """The released evaluator; its input is `style.released_input`."""
 
     frozen: bool = True
 
 
-class ActionRecognizer(nn.Module):
+class ActionClassifier(nn.Module):
     """Motions to features and class logits.
 
     Attributes:
@@ -160,7 +160,7 @@ class ActionRecognizer(nn.Module):
         x: Float[Array, "batch frames channels"],
         state: Float[Array, "batch 2 hidden"],
     ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
-        """Recognizes motions.
+        """Classifies motions.
 
         Args:
           x: Joint positions in the frame of the first pose, meters; any length.

@@ -98,7 +98,7 @@ def load_style_classifier(
       frames: Frames of a window.
 
     Returns:
-      Parameters of `networks.recognizer.StyleClassifier`, and the names of the styles.
+      Parameters of `network.StyleClassifier`, and the names of the styles.
 
     Raises:
       FileNotFoundError: if there is no such file.

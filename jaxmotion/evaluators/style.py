@@ -1,4 +1,4 @@
-"""Training of the style recognizer on clips, and its use on motions.
+"""Training of the style evaluator on clips, and its use on motions.
 
 Source: released feature extractor of CAMDM (Chen et al. 2024): windows of 60 frames,
 cross entropy, Adam 1e-3.
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.clips import Clips
 from jaxmotion.data.windows import EVAL_WINDOW, EvalWindows, eval_windows
-from jaxmotion.evaluators.network import Recognizer, StyleClassifier
+from jaxmotion.evaluators.network import StyleClassifier, WindowClassifier
 from jaxmotion.learning import training
 from jaxmotion.motion import rotation, trajectory
 from jaxmotion.motion.facing import body_facing, plain_names
@@ -25,8 +25,8 @@ from jaxmotion.typing import Key, Params
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RecognizerConfig:
-    """Size of the recognizer.
+class Config:
+    """Size of the evaluator.
 
     Attributes:
       num_classes: Classes.
@@ -39,19 +39,19 @@ class RecognizerConfig:
     frames: int = 60
 
     @property
-    def network(self) -> Recognizer:
+    def network(self) -> WindowClassifier:
         """The module of this size."""
-        return Recognizer(self.num_classes)
+        return WindowClassifier(self.num_classes)
 
     def read(
         self, skeleton: Skeleton, motion: Motion
     ) -> Float[Array, "*batch frames channels"]:
         """What the network looks at."""
-        return recognizer_input(skeleton, motion)
+        return window_input(skeleton, motion)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ReleasedConfig(RecognizerConfig):
+class ReleasedConfig(Config):
     """Size of the released classifier: 15 joints, and windows of 60 frames."""
 
     num_joints: int = 15
@@ -127,7 +127,7 @@ def released_input(
     return local.reshape(*local.shape[:-2], -1)
 
 
-def recognizer_input(
+def window_input(
     skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames channels"]:
     """Joint positions relative to the root and turned to face +z, in each frame.
@@ -170,7 +170,7 @@ def cross_entropy(
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def init_recognizer(key: Key, config: RecognizerConfig) -> Params:
+def init(key: Key, config: Config) -> Params:
     """Initial parameters.
 
     Args:
@@ -178,25 +178,25 @@ def init_recognizer(key: Key, config: RecognizerConfig) -> Params:
       config: Its size.
 
     Returns:
-      Parameters of `Recognizer`.
+      Parameters of `WindowClassifier`.
     """
     x = jnp.zeros((1, config.frames, 3 * config.num_joints))
     return config.network.init(key, x)["params"]
 
 
-def recognizer_loss(
+def loss(
     params: Params,
     key: Key,
     batch: tuple[Float[Array, "batch frames channels"], Int[Array, " batch"]],
     *,
-    config: RecognizerConfig,
+    config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """Cross entropy of a batch.
 
     Args:
-      params: The recognizer's parameters.
+      params: The evaluator's parameters.
       key: Consumed by dropout.
-      batch: Windows of `recognizer_input`, and their classes.
+      batch: Windows of `window_input`, and their classes.
       config: Its size.
 
     Returns:
@@ -209,17 +209,17 @@ def recognizer_loss(
     return cross_entropy(logits, labels)
 
 
-def recognize(
+def classify(
     params: Params,
     x: Float[Array, "batch frames channels"],
     *,
-    config: RecognizerConfig,
+    config: Config,
 ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
     """Features and logits of windows.
 
     Args:
-      params: The recognizer's parameters.
-      x: Windows of `recognizer_input`.
+      params: The evaluator's parameters.
+      x: Windows of `window_input`.
       config: Its size.
 
     Returns:
@@ -228,21 +228,21 @@ def recognize(
     return config.network.apply({"params": params}, x)
 
 
-def train_recognizer(
+def train(
     key: Key,
     x: Float[Array, "windows frames channels"],
     labels: Int[Array, " windows"],
     *,
-    config: RecognizerConfig,
+    config: Config,
     num_steps: int = 1500,
     batch: int = 128,
     learning_rate: float = 1e-3,
 ) -> tuple[Params, dict[str, Array]]:
-    """Trains a recognizer as one compiled program.
+    """Trains an evaluator as one compiled program.
 
     Args:
       key: Consumed.
-      x: Windows of `recognizer_input`.
+      x: Windows of `window_input`.
       labels: Their classes.
       config: Its size.
       num_steps: Updates.
@@ -254,8 +254,8 @@ def train_recognizer(
     """
     return train_classifier(
         key,
-        lambda key: init_recognizer(key, config),
-        functools.partial(recognizer_loss, config=config),
+        lambda key: init(key, config),
+        functools.partial(loss, config=config),
         (x, labels),
         num_steps=num_steps,
         batch=batch,
@@ -333,8 +333,8 @@ def in_batches(function: Callable[[Any], Any], x: Any, *, size: int = 256) -> An
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Recognized:
-    """A style recognizer and its size.
+class StyleEvaluator:
+    """A style evaluator and its size.
 
     Attributes:
       params: Its parameters.
@@ -343,14 +343,14 @@ class Recognized:
     """
 
     params: Params
-    config: RecognizerConfig
+    config: Config
     classes: tuple[int, ...] = ()
 
 
-def fit_recognizer(
+def fit(
     key: Key, clips: Clips, *, field: str, num_steps: int = 1500, batch: int = 128
-) -> Recognized:
-    """Trains the style recognizer on windows with a stride of 10 frames.
+) -> StyleEvaluator:
+    """Trains the style evaluator on windows with a stride of 10 frames.
 
     Args:
       key: Consumed.
@@ -360,50 +360,50 @@ def fit_recognizer(
       batch: Windows per update.
 
     Returns:
-      The recognizer.
+      The evaluator.
     """
     found = eval_windows(clips, stride=10, field=field)
-    config = RecognizerConfig(
+    config = Config(
         num_classes=len(clips.names(field)),
         num_joints=clips.skeleton.num_joints,
         frames=EVAL_WINDOW,
     )
-    to_input = jax.jit(functools.partial(recognizer_input, clips.skeleton))
+    to_input = jax.jit(functools.partial(window_input, clips.skeleton))
     x = jnp.asarray(in_batches(to_input, found.motion))
-    params, _ = train_recognizer(
+    params, _ = train(
         key, x, found.label, config=config, num_steps=num_steps, batch=batch
     )
-    return Recognized(params=params, config=config)
+    return StyleEvaluator(params=params, config=config)
 
 
-def recognized(
-    skeleton: Skeleton, found: EvalWindows, recognizer: Recognized
+def features_and_hits(
+    skeleton: Skeleton, found: EvalWindows, evaluator: StyleEvaluator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Features of windows, and whether each one's style is recognized.
 
     Args:
       skeleton: The skeleton.
       found: Windows.
-      recognizer: From `fit_recognizer`.
+      evaluator: From `fit`.
 
     Returns:
       Features [windows, 512], and hits [windows] (0 or 1).
     """
-    run = functools.partial(_recognize, recognizer.params, skeleton, recognizer.config)
+    run = functools.partial(_classify, evaluator.params, skeleton, evaluator.config)
     label = found.label
-    if recognizer.classes:
-        label = jnp.asarray(recognizer.classes)[label]
+    if evaluator.classes:
+        label = jnp.asarray(evaluator.classes)[label]
     return in_batches(run, (found.motion, label))
 
 
 @functools.partial(jax.jit, static_argnums=2)
-def _recognize(
+def _classify(
     params: Params,
     skeleton: Skeleton,
-    config: RecognizerConfig,
+    config: Config,
     x: tuple[Motion, Array],
 ) -> tuple[Array, Array]:
     motion, label = x
     given = config.read(skeleton, motion)
-    feature, logits = recognize(params, given, config=config)
+    feature, logits = classify(params, given, config=config)
     return feature, (jnp.argmax(logits, axis=-1) == label).astype(jnp.float32)

@@ -1,4 +1,4 @@
-"""A short name for the exact values of arrays: which weights judged, which clips."""
+"""A short name for the exact values of arrays: which weights, which clips."""
 
 import hashlib
 import json

@@ -1,7 +1,7 @@
 """Convolution over time as one product of matrices.
 
 In a loop (`jax.lax.scan`, so a chunk of training) XLA's compiler for CPUs has no fast
-convolution: an update of the recognizer of styles takes six to seven times as long as
+convolution: an update of the evaluator of styles takes six to seven times as long as
 with the same sums written as a product. Outside of loops both are equally fast.
 """
 

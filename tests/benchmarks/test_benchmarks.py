@@ -219,7 +219,7 @@ def test_ratios_are_of_the_same_round(load):
 
     def status(**given):
         try:
-            peers.judge(ours, 0.65, **given)
+            peers.check_target(ours, 0.65, **given)
         except SystemExit as stop:
             return stop.code
         return 0

@@ -104,7 +104,7 @@ def test_r1_is_the_squared_gradient():
     rng = np.random.default_rng(1)
     x, w = rng.normal(size=(6, 3)), rng.normal(size=3)
     weights = jnp.asarray(w, jnp.float32)
-    judge = lambda y: y @ weights + jnp.sum(y * y, axis=-1)  # noqa: E731
+    discriminate = lambda y: y @ weights + jnp.sum(y * y, axis=-1)  # noqa: E731
     expected = np.square(w + 2 * x).sum(axis=-1).mean()
-    found = gan.r1_penalty(judge, jnp.asarray(x, jnp.float32))
+    found = gan.r1_penalty(discriminate, jnp.asarray(x, jnp.float32))
     np.testing.assert_allclose(found, expected, rtol=1e-5)

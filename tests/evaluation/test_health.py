@@ -104,7 +104,7 @@ def test_a_joint_that_flies_has_diverged(alive, speed, expected):
     assert diverged(still) == expected
 
 
-def test_a_batch_is_judged_one_by_one(alive):
+def test_a_batch_is_checked_one_by_one(alive):
     broken = alive.copy()
     broken[7] = np.nan
     batch = jnp.asarray(np.stack([alive, broken, held(alive, 0, 200)]))

@@ -1,4 +1,4 @@
-"""The action recognizer sees the path too, repeats by its key, and learns."""
+"""The action evaluator sees the path too, repeats by its key, and learns."""
 
 import dataclasses
 
@@ -11,14 +11,12 @@ from jaxmotion.evaluators import action as action_evaluator
 from jaxmotion.motion.skeleton import joint_positions
 from tests import tiny
 
-CONFIG = action_evaluator.ActionRecognizerConfig(
-    num_classes=2, num_joints=5, num_features=6, hidden=8
-)
+CONFIG = action_evaluator.Config(num_classes=2, num_joints=5, num_features=6, hidden=8)
 
 
 @pytest.fixture(scope="module")
 def params():
-    return tiny.random_params(action_evaluator.init_action_recognizer, CONFIG)
+    return tiny.random_params(action_evaluator.init, CONFIG)
 
 
 def test_the_key_alone_decides_the_states(params):
@@ -26,9 +24,7 @@ def test_the_key_alone_decides_the_states(params):
 
     def recognize(seed, **changes):
         config = dataclasses.replace(CONFIG, **changes)
-        return action_evaluator.recognize_actions(
-            params, jax.random.key(seed), x, config=config
-        )
+        return action_evaluator.classify(params, jax.random.key(seed), x, config=config)
 
     for first, second in zip(recognize(0), recognize(0), strict=True):
         np.testing.assert_array_equal(first, second)
@@ -51,7 +47,7 @@ def test_states_are_standard_normal(params):
     kept["feature"]["kernel"] += 1e-3 * jnp.eye(CONFIG.hidden)[:, :6]
     x = jnp.ones((count, 3, 15))
     for scale in (1.0, 0.5):
-        found, _ = action_evaluator.recognize_actions(
+        found, _ = action_evaluator.classify(
             kept,
             jax.random.key(2),
             x,
@@ -67,12 +63,10 @@ def test_states_are_standard_normal(params):
 def test_the_loss_is_the_cross_entropy(params):
     x = jnp.asarray(np.random.default_rng(1).normal(size=(6, 4, 15)), jnp.float32)
     labels = np.array([0, 1, 1, 0, 1, 0])
-    loss, info = action_evaluator.action_recognizer_loss(
+    loss, info = action_evaluator.loss(
         params, jax.random.key(1), (x, jnp.asarray(labels)), config=CONFIG
     )
-    _, logits = action_evaluator.recognize_actions(
-        params, jax.random.key(1), x, config=CONFIG
-    )
+    _, logits = action_evaluator.classify(params, jax.random.key(1), x, config=CONFIG)
     logits = np.asarray(logits, np.float64)
     chance = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)
     expected = -np.mean(np.log(chance[np.arange(6), labels]))
@@ -96,7 +90,7 @@ def test_it_learns_to_tell_two_actions(skeleton):
         x.reshape(12, 2, 2, 12, 15)[:, i].reshape(24, 12, 15) for i in range(2)
     )
     labels = jnp.tile(jnp.arange(2), 12)
-    params, info = action_evaluator.train_action_recognizer(
+    params, info = action_evaluator.train(
         jax.random.key(0),
         train,
         labels,
@@ -107,7 +101,7 @@ def test_it_learns_to_tell_two_actions(skeleton):
     )
     assert info["loss"].shape == (40,)
     assert info["loss"][-10:].mean() < info["loss"][:3].mean()
-    _, logits = action_evaluator.recognize_actions(
+    _, logits = action_evaluator.classify(
         params, jax.random.key(1), held_out, config=CONFIG
     )
     assert np.mean(logits.argmax(-1) == labels) > 0.8

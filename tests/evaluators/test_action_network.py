@@ -1,11 +1,11 @@
-"""The recurrent recognizer against its units' equations, and what it depends on."""
+"""The recurrent evaluator against its units' equations, and what it depends on."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.evaluators.network import ActionRecognizer
+from jaxmotion.evaluators.network import ActionClassifier
 from tests import tiny
 
 BATCH, FRAMES, CHANNELS, HIDDEN = 3, 5, 6, 4
@@ -13,7 +13,7 @@ BATCH, FRAMES, CHANNELS, HIDDEN = 3, 5, 6, 4
 
 @pytest.fixture(scope="module")
 def net():
-    return ActionRecognizer(num_classes=3, num_features=2, hidden=HIDDEN)
+    return ActionClassifier(num_classes=3, num_features=2, hidden=HIDDEN)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_the_equations(net, inputs, variables):
 def test_published_sizes():
     """Twelve classes, 24 joints: the parameters of PyTorch's layers less the second
     biases of the reset and update gates, which add to the first."""
-    net = ActionRecognizer(num_classes=12)
+    net = ActionClassifier(num_classes=12)
     x = jax.ShapeDtypeStruct((2, 60, 72), "float32")
     state = jax.ShapeDtypeStruct((2, 2, 128), "float32")
     key = jax.eval_shape(lambda: jax.random.key(0))

@@ -1,4 +1,4 @@
-"""Frozen evaluators: their file, what they fit, and that they judge as when trained."""
+"""Frozen evaluators: their file, what they fit, and that they score as when trained."""
 
 import dataclasses
 
@@ -80,7 +80,7 @@ def test_a_field_that_is_wrong_is_named_with_the_file(tmp_path, field):
 def test_other_parameters_than_were_frozen_are_refused(tmp_path):
     made, path = samples.evaluator(), tmp_path / "e.npz"
     value = evaluators.to_json(made)
-    # Rounded to three digits they would judge otherwise.
+    # Rounded to three digits they would score otherwise.
     checkpoint.export_params(path, made.params, value, dtype=np.float16)
     with pytest.raises(ValueError, match=f"{path}: field 'fingerprint'"):
         evaluators.load(path)
@@ -148,7 +148,7 @@ def test_camdm_refuses_one_that_does_not_fit_before_any_training(capsys):
 # --- what tables say ---------------------------------------------------------------
 
 
-def test_tables_say_who_judged(tmp_path):
+def test_tables_say_who_scored(tmp_path):
     made, path = samples.evaluator(), tmp_path / "e.npz"
     evaluators.save(path, made)
     name = fingerprint(made.params)
@@ -185,7 +185,7 @@ def test_the_fingerprint_of_clips_is_of_what_is_learnt_from():
 
 
 @pytest.mark.slow
-def test_an_evaluator_of_styles_judges_from_its_file_as_when_it_was_trained(tmp_path):
+def test_an_evaluator_of_styles_scores_from_its_file_as_when_it_was_trained(tmp_path):
     clips = tiny.clips(60)
     made = camdm_evaluation.train_style(
         clips, clips, field="style", num_steps=1, seed=0
@@ -198,8 +198,10 @@ def test_an_evaluator_of_styles_judges_from_its_file_as_when_it_was_trained(tmp_
     windows = eval_windows(clips, stride=60, field="style")
     found = []
     for one in (made, *(evaluators.load(tmp_path / "e.npz") for _ in range(2))):
-        judge = style_evaluator.Recognized(params=one.params, config=one.config)
-        found.append(style_evaluator.recognized(clips.skeleton, windows, judge))
+        evaluator = style_evaluator.StyleEvaluator(params=one.params, config=one.config)
+        found.append(
+            style_evaluator.features_and_hits(clips.skeleton, windows, evaluator)
+        )
     assert found[0][0].shape == (4, 512) and np.ptp(found[0][0]) > 0.1
     same(found[1], found[0])
     same(found[2], found[0])
@@ -225,7 +227,7 @@ def actions(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_an_evaluator_of_actions_is_the_recognizer_a_run_trains(actions, tmp_path):
+def test_an_evaluator_of_actions_is_the_one_that_a_run_trains(actions, tmp_path):
     made = emdm_action_evaluation.train_action(
         actions.train, actions.held_out, field="style", num_steps=3, seed=0
     )
@@ -234,7 +236,7 @@ def test_an_evaluator_of_actions_is_the_recognizer_a_run_trains(actions, tmp_pat
     call = dict(num_steps=3, seed=0)
     load = emdm_action_evaluation.load_evaluator
     same(load(actions, evaluator=loaded, **call), made.params)
-    assert not (actions.record.folder / "recognizer").exists()
+    assert not (actions.record.folder / "evaluator").exists()
     same(load(actions, **call), made.params)
     assert 0.0 <= made.accuracy <= 1.0 and made.frames == 8
     # Twice from the file, and once from the run's folder: the same judgment.

@@ -177,7 +177,7 @@ def test_the_style_classifier_is_pytorchs(tmp_path):
     assert shapes(params) == shapes(like["params"])
 
 
-def test_recognizers_that_do_not_fit_are_named(tmp_path):
+def test_evaluators_that_do_not_fit_are_named(tmp_path):
     path = tmp_path / "weights.pth"
     style_classifier(path, class_names=["Old"])
     with pytest.raises(ValueError, match="'class_names' should list .* 5 styles"):

@@ -1,4 +1,4 @@
-"""The recognizer sees limbs and nothing else, and learns to tell styles."""
+"""The evaluator sees limbs and nothing else, and learns to tell styles."""
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,12 @@ from jaxmotion.motion import features, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from tests import tiny
 
-CONFIG = style_evaluator.RecognizerConfig(num_classes=2, num_joints=5, frames=12)
+CONFIG = style_evaluator.Config(num_classes=2, num_joints=5, frames=12)
 
 
 def test_the_input_against_a_loop(skeleton):
     motion = tiny.walk(20, turn=1.0, start=0.5)
-    found = style_evaluator.recognizer_input(skeleton, motion)
+    found = style_evaluator.window_input(skeleton, motion)
     positions = np.asarray(joint_positions(skeleton, motion), np.float64)
     for frame in range(20):
         root = positions[frame, 0]
@@ -39,22 +39,22 @@ def test_neither_place_nor_facing_is_seen(skeleton):
         origin=jnp.array([3.0, -5.0]), facing=jnp.array([0.6, -0.8])
     )
     np.testing.assert_allclose(
-        style_evaluator.recognizer_input(skeleton, features.from_frame(motion, frame)),
-        style_evaluator.recognizer_input(skeleton, motion),
+        style_evaluator.window_input(skeleton, features.from_frame(motion, frame)),
+        style_evaluator.window_input(skeleton, motion),
         atol=1e-5,
     )
 
 
 def test_the_loss_is_the_cross_entropy():
-    params = tiny.random_params(style_evaluator.init_recognizer, CONFIG)
+    params = tiny.random_params(style_evaluator.init, CONFIG)
     x = jax.random.normal(jax.random.key(0), (6, 12, 15))
     labels = jnp.array([0, 1, 1, 0, 1, 0])
     loss, info = jax.jit(
-        lambda params, key: style_evaluator.recognizer_loss(
+        lambda params, key: style_evaluator.loss(
             params, key, (x, labels), config=CONFIG
         )
     )(params, jax.random.key(1))
-    _, logits = style_evaluator.Recognizer(2).apply(
+    _, logits = style_evaluator.WindowClassifier(2).apply(
         {"params": params}, x, train=True, rngs={"dropout": jax.random.key(1)}
     )
     logits = np.asarray(logits, np.float64)
@@ -73,7 +73,7 @@ def windows_of_styles(skeleton):
     for label, speed in enumerate((0.7, 1.4)):
         for start in range(8):
             motion = tiny.walk(60, speed=speed, start=float(start))
-            rows = style_evaluator.recognizer_input(skeleton, motion)
+            rows = style_evaluator.window_input(skeleton, motion)
             x += [rows[i : i + 12] for i in range(start, 48, 6)]
             labels += [label] * len(range(start, 48, 6))
     return jnp.stack(x), jnp.asarray(labels, jnp.int32)
@@ -82,12 +82,12 @@ def windows_of_styles(skeleton):
 @pytest.mark.slow
 def test_it_learns_to_tell_two_styles(windows_of_styles):
     x, labels = windows_of_styles
-    params, info = style_evaluator.train_recognizer(
+    params, info = style_evaluator.train(
         jax.random.key(0), x[::2], labels[::2], config=CONFIG, num_steps=50, batch=16
     )
     assert info["loss"].shape == (50,)
     assert info["loss"][-10:].mean() < info["loss"][:3].mean()
-    found, logits = style_evaluator.recognize(params, x[1::2], config=CONFIG)
+    found, logits = style_evaluator.classify(params, x[1::2], config=CONFIG)
     assert found.shape == (x[1::2].shape[0], 512)
     assert np.mean(logits.argmax(-1) == labels[1::2]) > 0.7
 

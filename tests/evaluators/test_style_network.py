@@ -1,14 +1,14 @@
-"""The recognizer's shapes, and that a window's result is its own."""
+"""The evaluator's shapes, and that a window's result is its own."""
 
 import jax
 import numpy as np
 
-from jaxmotion.evaluators.network import Recognizer
+from jaxmotion.evaluators.network import WindowClassifier
 from tests import tiny
 
 
 def test_shapes_and_independence_of_the_batch():
-    net = Recognizer(num_classes=3, num_features=8)
+    net = WindowClassifier(num_classes=3, num_features=8)
     x = jax.random.normal(jax.random.key(0), (4, 6, 15))
     variables = tiny.random_params(net.init, x)
     features, logits = net.apply(variables, x)
@@ -20,7 +20,7 @@ def test_shapes_and_independence_of_the_batch():
 
 
 def test_default_feature_width_is_512():
-    net = Recognizer(num_classes=100)
+    net = WindowClassifier(num_classes=100)
     x = jax.ShapeDtypeStruct((2, 60, 45), "float32")
     key = jax.eval_shape(lambda: jax.random.key(0))
     shapes = jax.eval_shape(net.init_with_output, key, x)
@@ -30,7 +30,7 @@ def test_default_feature_width_is_512():
 
 
 def test_time_matters():
-    net = Recognizer(num_classes=2, num_features=4)
+    net = WindowClassifier(num_classes=2, num_features=4)
     x = jax.random.normal(jax.random.key(0), (1, 6, 15))
     variables = tiny.random_params(net.init, x)
     _, forwards = net.apply(variables, x)
@@ -39,7 +39,7 @@ def test_time_matters():
 
 
 def test_dropout_needs_training():
-    net = Recognizer(num_classes=2, num_features=4)
+    net = WindowClassifier(num_classes=2, num_features=4)
     x = jax.random.normal(jax.random.key(0), (1, 6, 15))
     variables = tiny.random_params(net.init, x)
     draw = lambda seed: net.apply(  # noqa: E731

@@ -149,7 +149,7 @@ def test_long_rollouts_are_counted(evaluated):
 def test_the_table_has_a_line_for_each_row(evaluated):
     found = json.loads((evaluated / "metrics.json").read_text())["rows"]
     *lines, _, note = (evaluated / "table.md").read_text().splitlines()
-    assert "no recognizer" in note
+    assert "no evaluator" in note
     assert [line.split("|")[1].strip() for line in lines[2:]] == list(found)
     assert len({line.count("|") for line in lines}) == 1
 

@@ -39,7 +39,7 @@ def test_a_tiny_run_twice_gives_the_same_table(invoke, tmp_path):
     clips = samples.clips()
     clips_io.save_clips(tmp_path / "clips.npz", clips)
     frozen.save(
-        tmp_path / "judge.npz",
+        tmp_path / "evaluator.npz",
         samples.evaluator(
             "style", labels=samples.STYLES, joints=clips.skeleton.names, frames=60
         ),
@@ -56,7 +56,7 @@ def test_a_tiny_run_twice_gives_the_same_table(invoke, tmp_path):
         invoke(
             "camdm_transitions",
             f"--run {run} --replications 2 --before 1 --limit 1 --contents --chunk 2 "
-            f"--evaluator {tmp_path}/judge.npz --out {tmp_path / name}",
+            f"--evaluator {tmp_path}/evaluator.npz --out {tmp_path / name}",
         )
         found.append(json.loads((tmp_path / name / "metrics.json").read_text()))
     assert found[0]["rows"] == found[1]["rows"]

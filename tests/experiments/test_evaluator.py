@@ -125,7 +125,7 @@ def test_the_help_has_defaults_and_an_example(help_of):
 # --- use ---------------------------------------------------------------------------
 
 
-def judge(path, kind, clips, field, frames):
+def stored_evaluator(path, kind, clips, field, frames):
     """An evaluator that was not trained, for a run of these clips."""
     made = samples.evaluator(
         kind,
@@ -158,7 +158,7 @@ def check_same(folders, made, path):
 
 
 @pytest.mark.slow
-def test_camdm_is_judged_alike_twice(invoke, tmp_path):
+def test_camdm_is_scored_alike_twice(invoke, tmp_path):
     clips = tiny.clips(130)
     clips_io.save_clips(tmp_path / "clips.npz", clips)
     run, path = tmp_path / "run", tmp_path / "style.npz"
@@ -167,7 +167,7 @@ def test_camdm_is_judged_alike_twice(invoke, tmp_path):
         f"train --data {tmp_path}/clips.npz --out {run} --width 16 --depth 1 "
         "--batch 4 --diffusion-steps 2 --held-out 0.5 --warmup 1 --chunk 1 --steps 2",
     )
-    made = judge(path, "style", clips, "style", 60)
+    made = stored_evaluator(path, "style", clips, "style", 60)
     line = f"evaluate --run {run} --rollouts 2 --seconds 4 --chunk 2"
     for name in ("a", "b"):
         invoke("camdm", f"{line} --evaluator {path} --out {tmp_path / name}")
@@ -177,26 +177,26 @@ def test_camdm_is_judged_alike_twice(invoke, tmp_path):
 
 
 @pytest.mark.slow
-def test_smgdiff_is_judged_alike_twice(invoke, data, tmp_path):
+def test_smgdiff_is_scored_alike_twice(invoke, data, tmp_path):
     run, path = tmp_path / "run", tmp_path / "ball.npz"
     invoke(
         "smgdiff",
         f"train --data {data}/ball.npz --out {run} --width 16 --depth 1 --steps 10 "
         "--draft-steps 10 --batch 4 --held-out 0.3 --stages motion_2",
     )
-    made = judge(path, "ball", ball_walker.clips(60).clips, "skill", 45)
+    made = stored_evaluator(path, "ball", ball_walker.clips(60).clips, "skill", 45)
     line = f"evaluate --run {run} --tables steps --steps 2 --windows 8 --replications 2"
     for name in ("a", "b"):
         invoke("smgdiff", f"{line} --evaluator {path} --out {tmp_path / name}")
     check_same([tmp_path / name / "steps" for name in "ab"], made, path)
     wrong = tmp_path / "wrong.npz"
-    judge(wrong, "ball", ball_walker.clips(60).clips, "skill", 12)
+    stored_evaluator(wrong, "ball", ball_walker.clips(60).clips, "skill", 12)
     with pytest.raises(ValueError, match="wrong.npz.*field 'frames' is 12, expected"):
         invoke("smgdiff", f"{line} --evaluator {wrong}")
 
 
 @pytest.mark.slow
-def test_emdm_is_judged_alike_twice(invoke, data, tmp_path):
+def test_emdm_is_scored_alike_twice(invoke, data, tmp_path):
     run, path = tmp_path / "run", tmp_path / "action.npz"
     invoke(
         "emdm",
@@ -204,19 +204,19 @@ def test_emdm_is_judged_alike_twice(invoke, data, tmp_path):
         "--frames 20 --held-out 0.5 --steps 10 --batch 8 --width 16 --hidden 16 "
         "--depth 1 --discriminator-width 64 --merge",
     )
-    made = judge(path, "action", tiny.clips(130), "style", 20)
+    made = stored_evaluator(path, "action", tiny.clips(130), "style", 20)
     line = f"evaluate --run {run} --samples 20 --replications 2"
     for name in ("a", "b"):
         invoke("emdm", f"{line} --evaluator {path} --out {tmp_path / name}")
     check_same([tmp_path / "a", tmp_path / "b"], made, path)
-    assert not (run / "recognizer").exists()
+    assert not (run / "evaluator").exists()
     report = json.loads((tmp_path / "a" / "metrics.json").read_text())
     assert "trained on tests, 0 updates" in report["evaluator"]["network"]
     assert np.isfinite(report["rows"]["emdm"]["fid"]["value"])
 
 
 @pytest.mark.slow
-def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
+def test_the_released_style_classifier_scores(invoke, capsys, tmp_path):
     """Four styles known, two of them the run's; against PyTorch on the same input."""
     torch = pytest.importorskip("torch")
     from tests.reference import published_torch as peers
@@ -233,10 +233,10 @@ def test_the_released_style_classifier_judges(invoke, capsys, tmp_path):
 
     run, evaluator = samples.run(), evaluators.load(out)
     get = functools.partial(camdm_evaluation.load_evaluator, jax.random.key(0))
-    judge = get(run, evaluator, num_steps=1)
+    chosen = get(run, evaluator, num_steps=1)
     found = windows.eval_windows(run.train, stride=60, field="style")
     skeleton = run.model.skeleton
-    features, hits = style_evaluator.recognized(skeleton, found, judge)
+    features, hits = style_evaluator.features_and_hits(skeleton, found, chosen)
     x = np.array(style_evaluator.released_input(skeleton, found.motion))
     with torch.inference_mode():
         wanted, logits = peer(torch.from_numpy(x.swapaxes(1, 2)))

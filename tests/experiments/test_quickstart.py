@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.mark.slow
 def test_a_person_stands_walks_runs_and_crouches(tmp_path):
-    """Judged by the BVH that is written: seconds, paths and heights of the hips."""
+    """Seen in the BVH that is written: seconds, paths and heights of the hips."""
     done = subprocess.run(
         [sys.executable, ROOT / "experiments" / "quickstart.py", "--out", tmp_path],
         env={"PATH": "", "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)},

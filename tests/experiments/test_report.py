@@ -174,13 +174,16 @@ def decide(load, tmp_path):
         ),
     )
 
-    def run(rows, *, pairs=None, judges=(None, None)):
+    def run(rows, *, pairs=None, evaluators=(None, None)):
         pairs = pairs or (("A", "B"), ("B", "C"))
         claim = claims.Claim(words="w", column="FID", pairs=pairs, where="here")
         found = {}
-        for key, names, judge in ((source, "abc", judges[0]), (other, "d", judges[1])):
+        for key, names, evaluator in (
+            (source, "abc", evaluators[0]),
+            (other, "d", evaluators[1]),
+        ):
             own = {k: {"fid": v} for k, v in rows.items() if k in names}
-            about = {"evaluator": judge} if judge else {}
+            about = {"evaluator": evaluator} if evaluator else {}
             found[key] = results.read(put(tmp_path / key.file, own, **about))
         return load("reports.verdicts").decide(table, claim, found)
 
@@ -235,13 +238,13 @@ def test_what_is_not_finite_or_has_no_interval_decides_nothing(decide):
     assert decide(rows | dict(c=cell(9.0, samples=1))).verdict == "not decided"
 
 
-def test_rows_of_two_judges_are_not_compared(decide):
+def test_rows_of_two_evaluators_are_not_compared(decide):
     rows, pairs = dict(a=near(1.0), d=near(2.0)), (("A", "D"),)
     one = {"fingerprint": "aa", "reference_clips": "cc"}
-    for judges in ((None, None), (one, one | {"fingerprint": "bb"}), (one, None)):
-        made = decide(rows, pairs=pairs, judges=judges)
+    for evaluators in ((None, None), (one, one | {"fingerprint": "bb"}), (one, None)):
+        made = decide(rows, pairs=pairs, evaluators=evaluators)
         assert made.verdict == "not decided" and "evaluators" in made.reason
-    assert decide(rows, pairs=pairs, judges=(one, one)).verdict == "reproduced"
+    assert decide(rows, pairs=pairs, evaluators=(one, one)).verdict == "reproduced"
 
 
 def test_beside_the_values_of_camdm_stands_what_its_release_computes(load):

@@ -374,8 +374,8 @@ BAD = {
     "--system camdm --data {data} --out {file}/below": "out: .*plain/below",
     "--system camdm --data {data} --out {new} --models {file}/below": "models: .*plain",
     "--system camdm --data {data} --out {new} --replications 1": "replications: 1",
-    "--system aamdm --evaluator {judge}": "evaluator: aamdm is scored without",
-    "--system camdm --evaluator {judge}": "judge.npz is of kind 'ball', camdm needs",
+    "--system aamdm --evaluator {evaluator}": "evaluator: aamdm is scored without",
+    "--system camdm --evaluator {evaluator}": "is of kind 'ball', camdm needs",
     "--system camdm --evaluator {gone}": "gone.npz",
 }
 
@@ -383,12 +383,12 @@ BAD = {
 @pytest.mark.parametrize("line", BAD)
 def test_what_is_wrong_is_named_before_any_work(call, data, tmp_path, line):
     (tmp_path / "plain").write_text("")
-    frozen.save(tmp_path / "judge.npz", samples.evaluator("ball"))
+    frozen.save(tmp_path / "evaluator.npz", samples.evaluator("ball"))
     places = dict(
         data=data,
         gone=tmp_path / "gone.npz",
         file=tmp_path / "plain",
-        judge=tmp_path / "judge.npz",
+        evaluator=tmp_path / "evaluator.npz",
         new=tmp_path / "new",
     )
     with pytest.raises((OSError, ValueError), match=BAD[line]):

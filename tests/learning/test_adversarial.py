@@ -10,10 +10,10 @@ from jaxmotion.learning import adversarial, training
 
 def players():
     """Discriminator d wants d = g; generator g wants g = 2 d."""
-    judge = lambda d, g, key, batch: (0.5 * (d - g) ** 2, {"gap": d - g})  # noqa: E731
+    discriminate = lambda d, g, key, batch: (0.5 * (d - g) ** 2, {"gap": d - g})  # noqa: E731
     make = lambda g, d, key, batch: (0.5 * (g - 2 * d) ** 2, {})  # noqa: E731
     rates = optax.sgd(0.5), optax.sgd(0.25)
-    update = adversarial.make_gan_update(judge, make, rates, ema_decay=0.9)
+    update = adversarial.make_gan_update(discriminate, make, rates, ema_decay=0.9)
     g, d = jnp.array(1.0), jnp.array(3.0)
     return update, adversarial.GanState(
         generator=training.init_train_state(g, rates[0]),

@@ -98,7 +98,7 @@ def test_restore_part_of_a_part(tmp_path):
             np.testing.assert_array_equal, found["ema_params"], players[name].ema_params
         )
     like = {"ema_params": state_of(0).ema_params}
-    for within in ("discriminator", "judge", None):
+    for within in ("discriminator", "other", None):
         with pytest.raises(checkpoint.CheckpointError, match=f"{folder}.*step 1"):
             checkpoint.restore_part(folder, like, within=within)
 

@@ -13,7 +13,7 @@ from tests import tiny
 NET = mlp.ConditionedMlp(
     features=3, num_steps=4, width=16, depth=3, time_width=8, groups=4
 )
-JUDGE = mlp.PairDiscriminator(num_steps=4, width=16, depth=2, time_width=8)
+DISCRIMINATOR = mlp.PairDiscriminator(num_steps=4, width=16, depth=2, time_width=8)
 
 
 def vectors(number, *batch):
@@ -24,10 +24,10 @@ def vectors(number, *batch):
 
 
 @functools.cache
-def parameters(judge):
+def parameters(adversary):
     x, y, z = vectors(3)
-    given = (x, y, jnp.array(1), z) if judge else (x, jnp.array(1), y, z)
-    return tiny.random_params((JUDGE if judge else NET).init, *given)
+    given = (x, y, jnp.array(1), z) if adversary else (x, jnp.array(1), y, z)
+    return tiny.random_params((DISCRIMINATOR if adversary else NET).init, *given)
 
 
 def dense(layer, x):
@@ -69,16 +69,16 @@ def test_discriminator_is_the_formula():
         h = dense(params[f"Dense_{i}"], h)
         h = np.where(h > 0, h, 0.2 * h)
     expected = dense(params["Dense_2"], h)[0]
-    found = JUDGE.apply(parameters(True), x, y, jnp.array(3), c)
+    found = DISCRIMINATOR.apply(parameters(True), x, y, jnp.array(3), c)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("judge", [False, True])
-def test_a_batch_is_its_samples(judge):
-    net, params = (JUDGE if judge else NET), parameters(judge)
+@pytest.mark.parametrize("adversary", [False, True])
+def test_a_batch_is_its_samples(adversary):
+    net, params = (DISCRIMINATOR if adversary else NET), parameters(adversary)
     x, y, z = vectors(3, 2, 5)
     t = jnp.arange(10).reshape(2, 5) % 4 + 1
-    order = (x, y, t, z) if judge else (x, t, y, z)
+    order = (x, y, t, z) if adversary else (x, t, y, z)
     together = net.apply(params, *order)
     alone = jax.vmap(jax.vmap(lambda *a: net.apply(params, *a)))(*order)
     np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)

@@ -25,7 +25,7 @@ from jaxmotion.evaluation.table import Row, Rows
 from jaxmotion.evaluators import frozen as evaluators
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
-from jaxmotion.evaluators.style import Recognized
+from jaxmotion.evaluators.style import StyleEvaluator
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
@@ -218,7 +218,7 @@ def make_trial(
     )
 
 
-def reference_of_run(run: Run, evaluator: Recognized, *, seed: int) -> Reference:
+def reference_of_run(run: Run, evaluator: StyleEvaluator, *, seed: int) -> Reference:
     """The reference of a run's own clips."""
     real = windows.eval_windows(
         run.held_out, stride=windows.EVAL_WINDOW, field=run.field
@@ -365,7 +365,7 @@ def evaluate_run(
 
 
 def describe_evaluator(
-    run: Run, chosen: Recognized, evaluator: Evaluator | None
+    run: Run, chosen: StyleEvaluator, evaluator: Evaluator | None
 ) -> dict[str, Any]:
     """Who scored a table, for what stands beside it."""
     reference = clips_fingerprint(run.train, run.field)
@@ -374,7 +374,7 @@ def describe_evaluator(
 
 def load_evaluator(
     key: Key, run: Run, evaluator: evaluators.Evaluator | None, *, num_steps: int
-) -> style_evaluator.Recognized:
+) -> style_evaluator.StyleEvaluator:
     """The frozen evaluator if there is one, else one trained on the run's clips.
 
     Args:
@@ -407,13 +407,11 @@ def load_evaluator(
         frames=windows.EVAL_WINDOW,
     )
     if frozen is not None:
-        return style_evaluator.Recognized(
+        return style_evaluator.StyleEvaluator(
             params=frozen, config=evaluator.config, classes=classes
         )
     print(f"training the evaluator of styles for {num_steps} steps", flush=True)
-    return style_evaluator.fit_recognizer(
-        key, run.train, field=run.field, num_steps=num_steps
-    )
+    return style_evaluator.fit(key, run.train, field=run.field, num_steps=num_steps)
 
 
 def _timed_rollouts(
@@ -455,11 +453,9 @@ def train_style(
       ValueError: if a part has no clip as long as a window, or there is no such field.
     """
     key_fit, _ = jax.random.split(jax.random.key(seed))
-    found = style_evaluator.fit_recognizer(
-        key_fit, train, field=field, num_steps=num_steps
-    )
+    found = style_evaluator.fit(key_fit, train, field=field, num_steps=num_steps)
     unseen = windows.eval_windows(held_out, stride=windows.EVAL_WINDOW, field=field)
-    _, hits = style_evaluator.recognized(train.skeleton, unseen, found)
+    _, hits = style_evaluator.features_and_hits(train.skeleton, unseen, found)
     return Evaluator(
         kind="style",
         params=found.params,

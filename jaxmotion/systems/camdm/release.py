@@ -17,7 +17,7 @@ from jaxmotion.control.frame import Frame
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import frechet, table
-from jaxmotion.evaluators.style import Recognized, in_batches, recognized
+from jaxmotion.evaluators.style import StyleEvaluator, features_and_hits, in_batches
 from jaxmotion.motion import facing, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 
@@ -253,11 +253,11 @@ def of_rollouts(frames: Frame, commands: trajectory.Command) -> Recordings:
 
 
 def style_features(
-    skeleton: Skeleton, clips: Clips, evaluator: Recognized, *, field: str
+    skeleton: Skeleton, clips: Clips, evaluator: StyleEvaluator, *, field: str
 ) -> Groups:
     """Features of the training clips by style: what Fréchet distances are taken to."""
     found = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field=field)
-    features, _ = recognized(skeleton, found, evaluator)
+    features, _ = features_and_hits(skeleton, found, evaluator)
     number = len(clips.names(field))
     return in_groups(features, np.asarray(found.label), number)
 
@@ -276,11 +276,11 @@ def metrics(skeleton: Skeleton, found: Recordings) -> dict[str, np.ndarray]:
 def distances(
     skeleton: Skeleton,
     found: Recordings,
-    evaluator: Recognized,
+    evaluator: StyleEvaluator,
     styles: Groups,
 ) -> np.ndarray:
     """Fréchet distance of each recording to its style; NaN for a single window."""
-    features, _ = recognized(skeleton, found.windows, evaluator)
+    features, _ = features_and_hits(skeleton, found.windows, evaluator)
     groups = in_groups(features, np.asarray(found.windows.group), found.label.size)
     return np.asarray(frechet_distances(groups, styles, found.label))
 

@@ -20,7 +20,7 @@ from jaxmotion.evaluation import (
 )
 from jaxmotion.evaluation.table import Row
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.evaluators.style import Recognized, in_batches, recognized
+from jaxmotion.evaluators.style import StyleEvaluator, features_and_hits, in_batches
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.systems.camdm import release as camdm_release
 
@@ -170,7 +170,7 @@ def metric_row(
     Args:
       skeleton: The skeleton.
       found: Windows.
-      hits: From `recognized`; None to leave style accuracy out.
+      hits: From `style.features_and_hits`; None to leave style accuracy out.
       height: Below it a foot joint should not move, meters.
 
     Returns:
@@ -243,7 +243,7 @@ def repeat_diversity(
       Square meters, with an interval over styles.
     """
     local = in_batches(
-        jax.jit(functools.partial(style_evaluator.recognizer_input, skeleton)),
+        jax.jit(functools.partial(style_evaluator.window_input, skeleton)),
         found.motion,
     )
     characters = int(found.group.max()) + 1
@@ -288,7 +288,7 @@ class Reference:
     """
 
     skeleton: Skeleton
-    evaluator: Recognized
+    evaluator: StyleEvaluator
     real: windows.EvalWindows
     real_features: np.ndarray
     hits: np.ndarray
@@ -312,13 +312,13 @@ def make_reference(
     skeleton: Skeleton,
     real: windows.EvalWindows,
     dense: windows.EvalWindows,
-    evaluator: Recognized,
+    evaluator: StyleEvaluator,
     *,
     seed: int,
 ) -> Reference:
     """The reference of held-out windows and of dense windows of training clips."""
-    real_features, hits = recognized(skeleton, real, evaluator)
-    features, _ = recognized(skeleton, dense, evaluator)
+    real_features, hits = features_and_hits(skeleton, real, evaluator)
+    features, _ = features_and_hits(skeleton, dense, evaluator)
     return Reference(
         skeleton=skeleton,
         evaluator=evaluator,
@@ -373,7 +373,7 @@ def made_row(
       replicated: Intervals run over replications, of which every neighbor belongs to
         another, instead of over rollouts and random subsets.
     """
-    features, hits = recognized(reference.skeleton, made, reference.evaluator)
+    features, hits = features_and_hits(reference.skeleton, made, reference.evaluator)
     grouped = made
     row = frechet_cells(features, reference.features, count=count, seed=seed)
     if replicated:

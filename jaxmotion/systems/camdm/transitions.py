@@ -23,7 +23,7 @@ from jaxmotion.data import windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.transitions import transition
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.evaluators.style import Recognized
+from jaxmotion.evaluators.style import StyleEvaluator
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
@@ -133,7 +133,7 @@ def without(changes: Changes) -> Changes:
       changes: The changes.
 
     Returns:
-      Changes whose commands keep label and speed, judged by the same new styles.
+      Changes whose commands keep label and speed, evaluated for the same new styles.
     """
     first = changes.commands.label[:, :1]
     label = jnp.broadcast_to(first, changes.commands.label.shape)
@@ -145,7 +145,7 @@ def find_changes(
     skeleton: Skeleton,
     frames: Frame,
     changes: Changes,
-    evaluator: Recognized,
+    evaluator: StyleEvaluator,
     *,
     fps: float,
 ) -> tuple[Bool[np.ndarray, "characters windows"], np.ndarray]:
@@ -169,7 +169,9 @@ def find_changes(
         cut = jax.tree.map(lambda x: x[:, first:last], frames)  # noqa: B023
         label = jnp.asarray(changes.new)
         made = windows.rollout_windows(cut, label, skip=0)
-        found.append(style_evaluator.recognized(skeleton, made, evaluator)[1] > 0.5)
+        found.append(
+            style_evaluator.features_and_hits(skeleton, made, evaluator)[1] > 0.5
+        )
     return np.stack(found, axis=1), centers / fps
 
 
@@ -177,7 +179,7 @@ def transition_row(
     run: Run,
     frames: Frame,
     changes: Changes,
-    evaluator: Recognized,
+    evaluator: StyleEvaluator,
     *,
     height: float,
 ) -> dict[str, table.Cell]:
@@ -226,7 +228,7 @@ def evaluate_transitions(
     run: Run,
     changes: Changes,
     controls: dict[str, camdm_controller.Control],
-    evaluator: Recognized,
+    evaluator: StyleEvaluator,
     *,
     chunk: int | None = None,
     seed: int = 0,
@@ -270,7 +272,7 @@ def evaluate_transitions(
     return rows
 
 
-def clip_accuracy(run: Run, evaluator: Recognized) -> table.Cell:
+def clip_accuracy(run: Run, evaluator: StyleEvaluator) -> table.Cell:
     """How often the evaluator is right on held-out clips: a bound on success.
 
     Args:
@@ -281,7 +283,7 @@ def clip_accuracy(run: Run, evaluator: Recognized) -> table.Cell:
       Per cent, over clips.
     """
     real = windows.eval_windows(run.held_out, stride=STRIDE, field=run.field)
-    _, hits = style_evaluator.recognized(run.model.skeleton, real, evaluator)
+    _, hits = style_evaluator.features_and_hits(run.model.skeleton, real, evaluator)
     return table.cell(
         table.group_means(hits, real.group), scale=100.0, bounds=(0.0, 1.0)
     )

@@ -47,7 +47,7 @@ from jaxmotion.typing import Key, Params
 _RECOGNIZED = 12288
 
 
-def evaluator_config(run: ActionRun) -> action_evaluator.ActionRecognizerConfig:
+def evaluator_config(run: ActionRun) -> action_evaluator.Config:
     """Size of a run's evaluator.
 
     Args:
@@ -56,14 +56,14 @@ def evaluator_config(run: ActionRun) -> action_evaluator.ActionRecognizerConfig:
     Returns:
       The size.
     """
-    return action_evaluator.ActionRecognizerConfig(
+    return action_evaluator.Config(
         num_classes=len(run.actions), num_joints=run.clips.skeleton.num_joints
     )
 
 
 def fit_evaluator(
     train: ActionArrays, *, num_steps: int, seed: int
-) -> tuple[action_evaluator.ActionRecognizerConfig, Params]:
+) -> tuple[action_evaluator.Config, Params]:
     """Trains an evaluator on motions with actions drawn uniformly.
 
     Args:
@@ -74,13 +74,13 @@ def fit_evaluator(
     Returns:
       Its size, and its parameters.
     """
-    config = action_evaluator.ActionRecognizerConfig(
+    config = action_evaluator.Config(
         num_classes=train.counts.shape[0], num_joints=train.clips.skeleton.num_joints
     )
     key_data, key_train = jax.random.split(jax.random.key(seed))
     actions = jnp.arange(_RECOGNIZED) % config.num_classes
     x = _flat(real_positions(key_data, actions, train))
-    params, _ = action_evaluator.train_action_recognizer(
+    params, _ = action_evaluator.train(
         key_train, x, actions, config=config, num_steps=num_steps
     )
     return config, params
@@ -118,11 +118,11 @@ def load_evaluator(
     )
     if frozen is not None:
         return frozen
-    folder = run.record.folder / "recognizer"
+    folder = run.record.folder / "evaluator"
     config = evaluator_config(run)
     value = {
         "system": "emdm",
-        "stage": "recognizer",
+        "stage": "evaluator",
         "steps": num_steps,
         "seed": seed,
         "actions": list(run.actions),
@@ -134,7 +134,7 @@ def load_evaluator(
     return runs.restore_evaluator(
         folder,
         value,
-        lambda: action_evaluator.init_action_recognizer(jax.random.key(0), config),
+        lambda: action_evaluator.init(jax.random.key(0), config),
     )
 
 
@@ -175,7 +175,7 @@ def moments(params: Params, run: ActionRun) -> Callable[[Key, Array], frechet.Mo
 
     @jax.jit
     def of(key: Key, positions: Array) -> frechet.Moments:
-        features, _ = action_evaluator.recognize_actions(
+        features, _ = action_evaluator.classify(
             params, key, _flat(positions), config=config
         )
         return frechet.moments(features)
@@ -206,7 +206,7 @@ def scorer(
         key: Key, positions: Array, actions: Int[Array, " batch"]
     ) -> dict[str, Array]:
         key_state, key_pairs, key_modes = jax.random.split(key, 3)
-        features, logits = action_evaluator.recognize_actions(
+        features, logits = action_evaluator.classify(
             params, key_state, _flat(positions), config=config
         )
         by_action = features.reshape(config.num_classes, -1, features.shape[-1])
@@ -393,7 +393,7 @@ def train_action(
     key_motion, key_state = jax.random.split(jax.random.key(seed + 1))
     positions = real_positions(key_motion, wanted, held_out)
     x = positions.reshape(*positions.shape[:2], -1)
-    recognize = functools.partial(action_evaluator.recognize_actions, config=config)
+    recognize = functools.partial(action_evaluator.classify, config=config)
     _, logits = jax.jit(recognize)(params, key_state, x)
     return Evaluator(
         kind="action",

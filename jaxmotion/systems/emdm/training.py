@@ -157,13 +157,15 @@ def gan_update(
 
     def update(state: Any, key: Key, batch: emdm_loss.Batch) -> tuple[Any, dict]:
         penalized = state.step % config.r1_every == 0
-        judge = functools.partial(
+        discriminate = functools.partial(
             emdm_loss.discriminator_loss, config=config, penalized=penalized
         )
         make = functools.partial(
             emdm_loss.generator_loss, config=config, geometry=geometry
         )
-        both = adversarial.make_gan_update(judge, make, optimizers, ema_decay=ema)
+        both = adversarial.make_gan_update(
+            discriminate, make, optimizers, ema_decay=ema
+        )
         return both(state, key, batch)
 
     return update

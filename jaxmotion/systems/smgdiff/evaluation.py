@@ -253,7 +253,7 @@ def train_ball(
     )
     unseen = draw(held_out, number=_BALL_WINDOWS, seed=seed + 1)
     x = jax.jit(smgdiff_scoring.evaluator_input)(unseen.future, model.representation)
-    recognize = functools.partial(style_evaluator.recognize, config=chosen.config)
+    recognize = functools.partial(style_evaluator.classify, config=chosen.config)
     _, logits = jax.jit(recognize)(chosen.params, x)
     return Evaluator(
         kind="ball",

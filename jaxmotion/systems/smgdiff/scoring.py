@@ -60,7 +60,7 @@ class SkillEvaluator:
     params: Params
     reference: frechet.Moments
     representation: Representation
-    config: style_evaluator.RecognizerConfig = jax.tree.static()
+    config: style_evaluator.Config = jax.tree.static()
 
 
 def evaluator_input(
@@ -76,7 +76,7 @@ def evaluator_input(
       Meters; three channels a joint, and three of the ball, no longer than the reach.
     """
     skeleton = representation.skeleton
-    joints = style_evaluator.recognizer_input(skeleton, scene.motion)
+    joints = style_evaluator.window_input(skeleton, scene.motion)
     facing = trajectory.root_trajectory(skeleton, scene.motion).facing
     away = scene.ball - scene.motion.root_position
     away = away.at[..., ::2].set(ground.into_frame(away[..., ::2], facing))
@@ -109,7 +109,7 @@ def make_evaluator(
     Returns:
       The evaluator; the same windows are its reference.
     """
-    config = style_evaluator.RecognizerConfig(
+    config = style_evaluator.Config(
         num_classes=num_labels,
         num_joints=representation.skeleton.num_joints + 1,
         frames=scenes.ball.shape[-2],
@@ -117,10 +117,10 @@ def make_evaluator(
     x = jax.jit(evaluator_input)(scenes, representation)
     params = frozen
     if params is None:
-        params, _ = style_evaluator.train_recognizer(
+        params, _ = style_evaluator.train(
             key, x, labels, config=config, num_steps=num_steps
         )
-    features, _ = jax.jit(functools.partial(style_evaluator.recognize, config=config))(
+    features, _ = jax.jit(functools.partial(style_evaluator.classify, config=config))(
         params, x
     )
     return SkillEvaluator(
@@ -153,7 +153,7 @@ def scorer(evaluator: SkillEvaluator, limits: Thresholds) -> Score:
         scenes: Scene, wanted: trajectory.Trajectory, labels: Int[Array, " windows"]
     ) -> dict[str, Array]:
         x = evaluator_input(scenes, representation)
-        features, logits = style_evaluator.recognize(
+        features, logits = style_evaluator.classify(
             evaluator.params, x, config=evaluator.config
         )
         moments = frechet.moments(features)

@@ -104,10 +104,10 @@ def test_polisher_loss_is_a_loop_over_its_own_predictions():
 @pytest.mark.slow
 def test_each_player_moves_only_itself():
     params, windows = parameters(), normal(8, 3, 3)
-    judge = functools.partial(aamdm_loss.discriminator_loss, config=CONFIG)
+    discriminate = functools.partial(aamdm_loss.discriminator_loss, config=CONFIG)
     make = functools.partial(aamdm_loss.generator_loss, config=CONFIG)
     given = params["discriminator"], params["generator"], jax.random.key(0), windows
-    (loss, info), grad = jax.value_and_grad(judge, has_aux=True)(*given)
+    (loss, info), grad = jax.value_and_grad(discriminate, has_aux=True)(*given)
     expected = info["adversarial"] + 0.5 * CONFIG.weight_r1 * info["r1"]
     np.testing.assert_allclose(loss, expected, rtol=1e-6)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(grad))
@@ -259,12 +259,12 @@ def test_given_frames_are_shaken_in_units_of_the_target(monkeypatch, largest):
 def test_players_are_given_shaken_frames(monkeypatch, config, change):
     seen = []
 
-    class Judge:
+    class Discriminator:
         def apply(self, params, x, x_t, t, previous):
             seen.append(previous)
             return jnp.zeros(len(x))
 
-    monkeypatch.setattr(aamdm_model, "discriminator", lambda config: Judge())
+    monkeypatch.setattr(aamdm_model, "discriminator", lambda config: Discriminator())
     monkeypatch.setattr(
         aamdm_model, "network", lambda config: Constant(jnp.zeros((1, 3)))
     )

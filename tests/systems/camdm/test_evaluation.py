@@ -27,24 +27,24 @@ def parts():
     train, held_out = selection.split_clips(
         samples.clips(minutes=0.8), fraction=0.33, seed=0, field="style"
     )
-    recognizer = style_evaluator.fit_recognizer(
+    evaluator = style_evaluator.fit(
         jax.random.key(0), train, field="style", num_steps=40, batch=16
     )
     real = windows.eval_windows(held_out, stride=10, field="style")
     dense = windows.eval_windows(train, stride=10, field="style")
-    return run, recognizer, real, dense
+    return run, evaluator, real, dense
 
 
 @functools.cache
 def evaluated(kind):
     """Characters that walk, two a style; or that stand, each as if alone."""
-    run, recognizer, real, dense = parts()
+    run, evaluator, real, dense = parts()
     frames = samples.walking(LABELS, seconds=14.0)
     frames = samples.standing(frames) if kind == "standing" else frames
     repeats = 1 if kind == "standing" else 2
     made = windows.rollout_windows(frames, jnp.asarray(LABELS), skip=60)
     skeleton = run.model.skeleton
-    reference = camdm_scoring.make_reference(skeleton, real, dense, recognizer, seed=0)
+    reference = camdm_scoring.make_reference(skeleton, real, dense, evaluator, seed=0)
     count = reference.count(len(made.label))
     truth, floor = camdm_scoring.real_rows(reference, count=count, seed=0)
     row = camdm_scoring.made_row(reference, made, repeats=repeats, count=count, seed=0)
@@ -131,7 +131,7 @@ def test_diversity_is_zero_for_characters_that_do_the_same():
     assert evaluated("walking")[0]["rollouts"]["pose_variance"].value > 1e-4
 
 
-def test_a_row_without_recognizer_lacks_style_accuracy_only():
+def test_a_row_without_evaluator_lacks_style_accuracy_only():
     run, _, real, _ = parts()
     row = camdm_scoring.metric_row(run.model.skeleton, real, None, height=0.04)
     expected = dict(evaluated("walking")[0][TRUTH])

@@ -12,7 +12,7 @@ from jaxmotion.control import courses
 from jaxmotion.data import windows
 from jaxmotion.data.clips import clip_motion
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.evaluators.style import RecognizerConfig
+from jaxmotion.evaluators.style import Config
 from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import release as camdm_release
 from tests import samples
@@ -104,18 +104,18 @@ def test_distances_are_of_each_recording_to_its_style(monkeypatch):
     rng = np.random.default_rng(0)
     table = rng.normal(size=(500, 8)).astype(np.float32)
 
-    def recognized(skeleton, found, recognizer):
+    def recognized(skeleton, found, evaluator):
         seen = np.asarray(joints(found.motion))[..., 0, 0].sum(-1)
         chosen = table[np.abs(seen * 1000).astype(int) % 500]
         return chosen + 0.5 * np.asarray(found.label)[:, None], None
 
-    monkeypatch.setattr(camdm_release, "recognized", recognized)
+    monkeypatch.setattr(camdm_release, "features_and_hits", recognized)
     clips, skeleton = samples.clips(), samples.run().model.skeleton
-    judge = style_evaluator.Recognized(
-        params={}, config=RecognizerConfig(num_classes=2, num_joints=22)
+    evaluator = style_evaluator.StyleEvaluator(
+        params={}, config=Config(num_classes=2, num_joints=22)
     )
-    styles = camdm_release.style_features(skeleton, clips, judge, field="style")
-    found = camdm_release.distances(skeleton, recordings(), judge, styles)
+    styles = camdm_release.style_features(skeleton, clips, evaluator, field="style")
+    found = camdm_release.distances(skeleton, recordings(), evaluator, styles)
     dense = windows.eval_windows(clips, stride=windows.EVAL_WINDOW, field="style")
     reference, _ = recognized(skeleton, dense, None)
     frames, commands = rollouts()
@@ -145,18 +145,16 @@ def test_replications_are_averaged_before_the_interval():
 @pytest.mark.slow
 def test_features_are_512_and_found_by_style():
     run = samples.run()
-    recognizer = style_evaluator.fit_recognizer(
+    evaluator = style_evaluator.fit(
         jax.random.key(0), run.train, field="style", num_steps=2, batch=4
     )
     styles = camdm_release.style_features(
-        run.model.skeleton, run.train, recognizer, field="style"
+        run.model.skeleton, run.train, evaluator, field="style"
     )
     assert isinstance(styles, camdm_release.Groups)
     # Four seconds of 30 frames are two windows of 60.
     label = np.asarray(run.train.labels["style"])
     np.testing.assert_array_equal(styles.count, 2 * np.bincount(label))
     assert styles.rows.shape[-1] == 512
-    found = camdm_release.distances(
-        run.model.skeleton, recordings(), recognizer, styles
-    )
+    found = camdm_release.distances(run.model.skeleton, recordings(), evaluator, styles)
     assert found.shape == (3,) and np.isfinite(found).all() and (found > 0).all()

@@ -15,9 +15,9 @@ from tests import samples
 from tests.reference import metrics as oracle
 
 FPS = 30.0
-JUDGE = style_evaluator.Recognized(
+EVALUATOR = style_evaluator.StyleEvaluator(
     params={},
-    config=style_evaluator.RecognizerConfig(num_classes=2, num_joints=22, frames=60),
+    config=style_evaluator.Config(num_classes=2, num_joints=22, frames=60),
 )
 SETTINGS = dict(course="forward", before=1.0, replications=2, seed=0)
 
@@ -66,14 +66,14 @@ def planted(changes, delays):
 
 @pytest.fixture
 def sees_height(monkeypatch):
-    """A recognizer that finds the new style in windows that are high throughout."""
+    """An evaluator that finds the new style in windows that are high throughout."""
 
-    def recognized(skeleton, found, recognizer):
-        del skeleton, recognizer
+    def recognized(skeleton, found, evaluator):
+        del skeleton, evaluator
         high = np.asarray(found.motion.root_position)[..., 1].min(axis=1) > 5
         return np.zeros((len(high), 2)), high.astype(np.float32)
 
-    monkeypatch.setattr(style_evaluator, "recognized", recognized)
+    monkeypatch.setattr(style_evaluator, "features_and_hits", recognized)
 
 
 @pytest.mark.usefixtures("sees_height")
@@ -81,7 +81,7 @@ def test_planted_changes_are_found_at_their_time(changes):
     # All of a window must be high: its center is a second behind the change.
     frames = planted(changes, [-30, 0, 2, np.inf])
     row = camdm_transitions.transition_row(
-        samples.run(), frames, changes, JUDGE, height=0.05
+        samples.run(), frames, changes, EVALUATOR, height=0.05
     )
     # 2 frames are found at the next window, 3; the last one counts as the limit.
     assert row["success"].value == pytest.approx(75.0)
@@ -114,7 +114,7 @@ def test_windows_are_where_they_say(changes):
     run = samples.run()
     frames = planted(changes, [12, 12, 12, 12])
     found, centers = camdm_transitions.find_changes(
-        run.model.skeleton, frames, changes, JUDGE, fps=FPS
+        run.model.skeleton, frames, changes, EVALUATOR, fps=FPS
     )
     np.testing.assert_allclose(centers, np.arange(0, 61, 3) / 30)
     np.testing.assert_array_equal(found, (centers >= 1.4)[None].repeat(4, 0))
@@ -152,11 +152,13 @@ def test_rows_share_everything_but_the_run_time(monkeypatch, changes):
     monkeypatch.setattr(camdm_transitions.camdm_controller, "character", character)
     monkeypatch.setattr(camdm_transitions.steering, "steered_rollouts", rollouts)
     monkeypatch.setattr(
-        style_evaluator, "recognized", lambda b, w, r: (None, np.ones(len(w.label)))
+        style_evaluator,
+        "features_and_hits",
+        lambda b, w, r: (None, np.ones(len(w.label))),
     )
     seen, a, b = [], Control(guided_plans=0), Control(guided_plans=2)
     rows = camdm_transitions.evaluate_transitions(
-        samples.run(), changes, {"a": a, "b": b}, JUDGE, report=seen.append
+        samples.run(), changes, {"a": a, "b": b}, EVALUATOR, report=seen.append
     )
     told = [(control, kept) for control, _, kept in given]
     assert told == [(a, False), (b, False), (b, True)]

@@ -156,12 +156,12 @@ def test_discriminator_loss_is_the_formula(watch):
     expected = reference.discriminator_loss(real, fake)
     x_prev, x_t, t, vector = (np.float64(x) for x in calls[0][0])
 
-    def judge(x, i):
+    def discriminate(x, i):
         return reference.discriminator(
             own, x, x_t[i], int(t[i]) - 1, vector[i], groups=(4, 2)
         )
 
-    penalty = reference.r1(judge, x_prev, gamma=CONFIG.weight_r1)
+    penalty = reference.r1(discriminate, x_prev, gamma=CONFIG.weight_r1)
     np.testing.assert_allclose(info["adversarial"], expected, rtol=1e-4)
     np.testing.assert_allclose(0.25 * info["r1"], penalty, rtol=2e-3)
     np.testing.assert_allclose(loss, expected + penalty, rtol=1e-4)
@@ -189,12 +189,12 @@ def test_a_penalty_is_half_its_weight_of_the_squared_gradient(watch, weight):
 
 def test_generator_loss_is_the_formula(watch):
     params, data = parameters(), batch(6, 6, 6)
-    made, judged = watch("generator"), watch("discriminator")
+    made, discriminated = watch("generator"), watch("discriminator")
 
     @jax.jit
     def run(*given):
         value, info = emdm_loss.generator_loss(*given, config=CONFIG, geometry=GEOMETRY)
-        return value, info, made[-1][2], [(judged[-1][0], None)]
+        return value, info, made[-1][2], [(discriminated[-1][0], None)]
 
     given = params["generator"], params["discriminator"], jax.random.key(0), data
     value, info, prediction, calls = run(*given)
@@ -214,14 +214,14 @@ def test_the_discriminators_gradient_stops_at_the_generator(watch):
     data, key = batch(6, 4), jax.random.key
     config = dataclasses.replace(CONFIG, weight_r1=0.0)
 
-    def judge(scale, params, key, data):
+    def discriminate(scale, params, key, data):
         options = dict(config=config, penalized=jnp.bool_(False))
         return emdm_loss.discriminator_loss(params, scale, key, data, **options)
 
     make = functools.partial(emdm_loss.generator_loss, config=config, geometry=GEOMETRY)
     slopes = [
         jax.grad(loss, has_aux=True)(jnp.float32(0.5), {}, key(0), data)[0]
-        for loss in (judge, make)
+        for loss in (discriminate, make)
     ]
     assert slopes[0] == 0.0 != slopes[1]
 
@@ -308,11 +308,11 @@ def test_the_discriminator_sees_motions_to_their_end(watch, mask_frames, conditi
 def test_the_generator_loses_its_condition_at_a_rate(watch, rate):
     """In both ways to train one; the discriminator keeps it."""
     config = dataclasses.replace(ONE, drop_condition=rate)
-    seen, judged = watch("generator", constant(0.0)), watch("discriminator", SUM)
+    seen, discriminated = watch("generator", constant(0.0)), watch("discriminator", SUM)
     data, options = many(), dict(config=config, geometry=None)
     emdm_loss.generator_loss({}, {}, jax.random.key(0), data, **options)
     emdm_loss.diffusion_loss({}, jax.random.key(1), data, **options)
-    np.testing.assert_array_equal(judged[0][0][3], data.vector)
+    np.testing.assert_array_equal(discriminated[0][0][3], data.vector)
     assert seen[1][0][-1] is None
     latent = np.asarray(seen[0][0][-1])
     assert latent.shape == (MANY, 5) and np.abs(latent.std() - 1.0) < 0.02
@@ -518,7 +518,7 @@ def toy_chunk():
         )
 
     def run(state, key, rates):
-        judge = functools.partial(
+        discriminate = functools.partial(
             emdm_loss.discriminator_loss, config=TOY, penalized=jnp.bool_(False)
         )
         make = functools.partial(emdm_loss.generator_loss, config=TOY, geometry=None)
@@ -528,7 +528,9 @@ def toy_chunk():
             )
             for rate in rates
         )
-        update = adversarial.make_gan_update(judge, make, optimizers, ema_decay=0.9)
+        update = adversarial.make_gan_update(
+            discriminate, make, optimizers, ema_decay=0.9
+        )
 
         def one(state, key):
             key_batch, key_loss = jax.random.split(key)

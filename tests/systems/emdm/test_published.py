@@ -82,7 +82,7 @@ def test_networks_are_pytorchs(task, tmp_path):
     given = [torch.from_numpy(x) for x in (x_t, steps, latent, condition)]
     with torch.inference_mode():
         made = generator(*given).numpy()
-        judged = discriminator(
+        logit = discriminator(
             torch.from_numpy(x_prev), *given[:2], torch.from_numpy(vector)
         ).numpy()
     t = jnp.asarray(steps + 1, jnp.int32)
@@ -96,7 +96,7 @@ def test_networks_are_pytorchs(task, tmp_path):
         mask,
         jnp.asarray(latent),
     )
-    assert made.std() > 0.1 and judged.std() > 0.01
+    assert made.std() > 0.1 and logit.std() > 0.01
     np.testing.assert_allclose(ours, as_ours(made), atol=1e-5)
     logits = emdm_model.discriminator(config).apply(
         {"params": params["discriminator"]},
@@ -105,7 +105,7 @@ def test_networks_are_pytorchs(task, tmp_path):
         t,
         jnp.asarray(vector),
     )
-    np.testing.assert_allclose(logits, judged, atol=1e-5)
+    np.testing.assert_allclose(logits, logit, atol=1e-5)
 
 
 def test_a_checkpoint_has_the_generator_alone(tmp_path):

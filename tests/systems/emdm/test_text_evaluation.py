@@ -174,11 +174,11 @@ def test_the_scorer_reads_the_evaluators_words(run, published):
     motion = released(published, run, x, np.array(frames))
     want = oracle.matching_distance(released_text(published)[np.arange(64) % 3], motion)
     found = {}
-    for name, judge in {
+    for name, evaluator in {
         "glove": published.ours,
         "hashed": dataclasses.replace(published.ours, vocabulary=None),
     }.items():
-        score = emdm_text_evaluation.make_scorer(run, judge)
+        score = emdm_text_evaluation.make_scorer(run, evaluator)
         key = jax.random.key(0)
         scores = score(key, jnp.asarray(x), frames, caption, reference)
         found[name] = float(scores["mm_dist"])

@@ -228,7 +228,7 @@ def test_a_straight_path_owes_nothing_to_noise(run, setting):
     )
 
 
-def test_the_recognizer_sees_the_ball_no_farther_than_the_reach(run):
+def test_the_evaluator_sees_the_ball_no_farther_than_the_reach(run):
     representation = run.model.representation
     scene = ball_walker.scene(12, speed=1.0)
     far = dataclasses.replace(scene, ball=scene.ball.at[..., 0].add(30.0))
