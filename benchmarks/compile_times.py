@@ -45,7 +45,7 @@ class Config(suite.Settings):
       steps: Diffusion steps of the sampler.
       updates: Optimizer steps of the training chunk.
       batch: Windows of an update.
-      characters: Of the rollout.
+      characters: Characters of the rollout.
       seconds: Length of the rollout.
       width: Channels of a token.
     """

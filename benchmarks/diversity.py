@@ -71,7 +71,7 @@ class Config(suite.Settings):
       seconds: Length of a rollout.
       every: Keep every so many frames, from the last one backwards.
       sets: Sets of rollouts, with seeds seed, seed + 1 and so on.
-      seed: Of the first set's noise, and of the start pose.
+      seed: Seeds the first set's noise and the start pose.
       pairs: Random pairs of rollouts for each mean.
       memory_gib: Limit for each program: arguments, results and intermediate values.
       chunk: Rollouts at a time; None for as many as fit, but 16 on a CPU, whose cache
@@ -147,7 +147,7 @@ def make_load(
     seconds: float,
     seed: int,
 ) -> Load:
-    """Model, start state and commands; settings as of `Config`.
+    """Model, start state and commands; settings as in `Config`.
 
     Raises:
       OSError: if the run or its clips cannot be read.

@@ -182,9 +182,9 @@ def check_target(
     """Says whether the target is reached.
 
     Args:
-      row: Of `rows_of`.
+      row: Row of `rows_of`.
       target: Greatest ratio that passes.
-      threads: Of both sides; one is compared by processor time.
+      threads: Threads of both sides; one is compared by processor time.
       load: Cores that other processes kept busy meanwhile; None if unknown.
 
     Raises:

@@ -57,7 +57,7 @@ class Config(suite.Settings):
       arguments: Pass the parameters as arguments; without it they are constants of
         the program, as in deployment.
       frames_per_token: CAMDM, of the network with random parameters; 1 is the paper's.
-      width: Of random networks: channels of a token (CAMDM) or of a hidden layer
+      width: Width of random networks: channels of a token (CAMDM) or of a hidden layer
         (AAMDM); None for 256.
       runs: Timed rollouts of each size.
       limit: Seconds of timed rollouts of each size, at most, but three rollouts.

@@ -122,7 +122,7 @@ class Config:
     """The command line.
 
     Attributes:
-      port: Of a server on this machine that runs already.
+      port: Port of a server on this machine that runs already.
       serve: Run folder: start a server of it, and stop it in the end.
       seconds: How long to steer.
     """
@@ -138,7 +138,7 @@ def timing(
     """How regular frames came.
 
     Args:
-      frames: Of one connection.
+      frames: Frames of one connection.
       fps: The rate they should have.
       until: When they ended, on the clock of their arrivals.
 

@@ -29,7 +29,7 @@ class Metric:
     Attributes:
       name: What was measured, with its settings.
       value: The number.
-      unit: Of the value.
+      unit: Unit of the value.
       direction: Whether a lower or a higher value is better.
       tolerance: Relative change for the worse that the gate still lets pass.
     """
@@ -174,7 +174,7 @@ def report(
     """Writes <out>/<name>.json, and applies the gate.
 
     Args:
-      name: Of the benchmark.
+      name: Name of the benchmark.
       metrics: What was measured.
       args: The settings.
       rows: The table.

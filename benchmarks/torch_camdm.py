@@ -166,7 +166,7 @@ def sample(
         step t (entry 0 unused); `posterior_table` makes it.
       noise: Normal, [T + 1, batch, future, features]: entry 0 is x_T, entry t is
         added in step t.
-      condition: Arguments of the network behind t.
+      condition: Arguments of the network after t.
 
     Returns:
       Clean features.
@@ -210,7 +210,7 @@ def plan_call(
     Args:
       net: The network, or what torch.compile made of it.
       config: The method.
-      condition: Of one character.
+      condition: Condition of one character.
 
     Returns:
       A call without arguments.

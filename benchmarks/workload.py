@@ -71,8 +71,8 @@ class Samples:
     Attributes:
       params: Parameters.
       sampler: Makes `sample(key, condition)` of parameters.
-      conditions: Of a number of characters, batch axis first.
-      frames: Of a sample.
+      conditions: Conditions of a number of characters, batch axis first.
+      frames: Frames of a sample.
     """
 
     params: Params
@@ -145,10 +145,10 @@ class Workload:
     """What of a system there is to time; None for what there is not.
 
     Attributes:
-      samples: Of sizes.
-      rollouts: Of sizes, a run (or None), seconds, and whether characters change
-        commands at different ticks.
-      training: Of sizes and a batch.
+      samples: Samples of these sizes.
+      rollouts: Rollouts of sizes, a run (or None), seconds, and whether characters
+        change commands at different ticks.
+      training: Training of sizes and a batch.
     """
 
     samples: Callable[[Sizes], Samples] | None = None

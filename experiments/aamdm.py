@@ -45,17 +45,17 @@ class Train:
       polisher_steps: Updates of each diffusion model.
       generator_steps: Updates of each denoising-diffusion GAN.
       amdm_steps: Updates of each AMDM.
-      window_steps: Updates of Motion VAE and of Learned Motion Matching, which are
-        dearer since they run through windows.
-      full_pose_steps: Updates of the diffusion model of the full-pose row, which are
-        dearer: in about the same time.
+      window_steps: Updates of Motion VAE and of Learned Motion Matching, which cost
+        more since they run through windows.
+      full_pose_steps: Updates of the diffusion model of the full-pose row, which cost
+        more: in about the same time.
       batch: Windows per update.
       width: Channels of the networks of AAMDM and AMDM (Learned Motion Matching has
         512, Motion VAE 256, as published).
-      schedule: Of the noise.
+      schedule: Schedule of the noise.
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
-      seed: Of everything random.
+      seed: Seeds everything random.
       override: Go on with these settings where a stage began with others.
     """
 
@@ -99,7 +99,7 @@ class Evaluate:
       amdm_scale: Strength of AMDM's.
       long_minutes: Length of the long rollouts of the row "aamdm"; 0 for none.
       long_rollouts: Their number.
-      seed: Of poses, noise and pairs.
+      seed: Seeds poses, noise and pairs.
     """
 
     run: Path = Path("runs/aamdm")
@@ -131,7 +131,7 @@ class Rollout:
       speed: Meters per second that are commanded.
       scale: Strength of the guidance, epsilon of eq. 13.
       out: Folder; None for <run>/rollout.
-      seed: Of the start pose and the noise.
+      seed: Seeds the start pose and the noise.
     """
 
     run: Path = Path("runs/aamdm")

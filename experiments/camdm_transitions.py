@@ -52,7 +52,7 @@ class Config:
       evaluator_steps: Updates of the evaluator of styles, if it is trained here.
       evaluator: File of a frozen evaluator of styles, from evaluator.py; None trains
         one here.
-      seed: Of poses, noise and evaluator.
+      seed: Seeds poses, noise and evaluator.
     """
 
     run: Path = Path("runs/camdm")

@@ -40,10 +40,10 @@ class Config:
       dribble: Labels beside which a ball is dribbled in touches 0.3 to 1.2 s apart.
       sprint: Labels beside which it is kicked ahead, touches 0.5 to 1.6 s apart.
       stand: Labels before whose feet it lies.
-      celebrate: Likewise, under a skill of its own.
+      celebrate: The same, under a skill of its own.
       off_ball: Part of the clips of `dribble` and `sprint` that are used once more,
         with the ball lying out of reach.
-      seed: Of everything random.
+      seed: Seeds everything random.
       overwrite: Replace --out.
     """
 

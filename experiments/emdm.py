@@ -47,7 +47,7 @@ class Train:
       field: Label field that is the action.
       merge: Labels that name the same action as others, "old=new".
       least: Fewest clips of an action.
-      encoder: Of texts: "wordllama", "hashed", or a folder with CLIP's weights.
+      encoder: Encoder of texts: "wordllama", "hashed", or a folder with CLIP's weights.
       text_form: "released": CLIP's vectors as they are, of the first 20 tokens of a
         text; "unit" (ours): vectors of whole texts, scaled to mean square 1. None for
         "released" with CLIP, "unit" with the other encoders, which no release has.
@@ -72,10 +72,10 @@ class Train:
       recon: Weight R of the features' error; None for 1 (actions) or 100 (texts).
       geometry: Joints of the losses relative to the "root" (as released) or in the
         "world" (ours, with which roots keep to their path).
-      learning_rate: Of generators (Muon).
-      ddpm_rate: Of diffusion models (Muon).
-      discriminator_rate: Of the discriminator (Adam, beta 0.5 and 0.9).
-      seed: Of everything random.
+      learning_rate: Rate of generators (Muon).
+      ddpm_rate: Rate of diffusion models (Muon).
+      discriminator_rate: Rate of the discriminator (Adam, beta 0.5 and 0.9).
+      seed: Seeds everything random.
       override: Go on with these settings where a row began with others.
     """
 
@@ -131,7 +131,7 @@ class Evaluate:
       samples: Motions of a replication (actions: rounded down to as many of each).
       replications: Sets of motions of each row.
       long_replications: Sets of rows with 500 network calls and more.
-      scale: Of classifier-free guidance; None for the paper's of the task.
+      scale: Scale of classifier-free guidance; None for the paper's of the task.
       evaluator_steps: Updates of the evaluator; None for 1500 of that of
         actions, 600 of that of texts, whose updates cost ten times as much.
       evaluator: File of a frozen evaluator of actions, from evaluator.py; None trains
@@ -143,7 +143,7 @@ class Evaluate:
       padding: What the text-motion evaluator sees beyond the end of generated motions:
         "zeros" (ours), as beyond that of real ones, or "kept", what the model put there
         (as released).
-      seed: Of noise and pairs.
+      seed: Seeds noise and pairs.
     """
 
     run: Path = Path("runs/emdm_action")
@@ -173,9 +173,9 @@ class Sample:
       action: Action, for a run of actions; several make several motions.
       text: Sentence, for a run of texts; several make several motions.
       frames: Length; None for the model's longest.
-      scale: Of classifier-free guidance; None for the paper's.
+      scale: Scale of classifier-free guidance; None for the paper's.
       out: Folder; None for <run>/samples.
-      seed: Of the noise.
+      seed: Seeds the noise.
     """
 
     run: Path = Path("runs/emdm_action")

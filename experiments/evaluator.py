@@ -53,9 +53,9 @@ class Train:
       fps: Frames per second that clips are resampled to (action); None for 15.
       frames: Frames that are scored at a time (action, ball); None for 60 or 45.
       held_out: Part of the clips or recordings that accuracy is measured on, in (0, 1).
-      updates: Of the training; None for 1500, or 800 (ball).
+      updates: Updates of the training; None for 1500, or 800 (ball).
       overwrite: Replace the file if it exists.
-      seed: Of parameters, batches and windows.
+      seed: Seeds parameters, batches and windows.
     """  # noqa: E501
 
     kind: Literal["style", "action", "ball"] = "style"
@@ -80,7 +80,7 @@ class Show:
     Example: python experiments/evaluator.py show evaluators/bandai2_style.npz
 
     Attributes:
-      file: Of `train`.
+      file: Written by `train`.
     """
 
     file: tyro.conf.Positional[Path]
@@ -96,7 +96,7 @@ def one_file(args: Train) -> Path:
 
 
 def train_style(args: Train) -> Evaluator:
-    """Of windows of a label, for CAMDM."""
+    """Trains on windows of a label, for CAMDM."""
     field = args.label or "style"
     contents = camdm_training.CONTENTS if args.contents is None else args.contents
     train, held_out = camdm_training.split_data(
@@ -109,7 +109,7 @@ def train_style(args: Train) -> Evaluator:
 
 
 def train_action(args: Train) -> Evaluator:
-    """Of whole motions of an action, for EMDM."""
+    """Trains on whole motions of an action, for EMDM."""
     field = args.label or "content"
     clips, left_out = emdm_data.prepare_clips(
         args.data,
@@ -132,7 +132,7 @@ def train_action(args: Train) -> Evaluator:
 
 
 def train_ball(args: Train) -> Evaluator:
-    """Of skills with a ball, for SMGDiff."""
+    """Trains on skills with a ball, for SMGDiff."""
     if args.label not in (None, smgdiff_data.FIELD):
         raise ValueError(
             f"label is {args.label!r}, expected {smgdiff_data.FIELD!r} for kind 'ball'"

@@ -39,7 +39,7 @@ class Config:
       port: Port to listen on; 0 for any that is free.
       max_clients: Connections at a time. Their characters are computed one after the
         other: all of them must fit into a tick (1/30 s).
-      seed: Of the noise of the first character; the next ones count on.
+      seed: Seeds the noise of the first character; the next ones count on.
     """
 
     run: str = "locomotion"

@@ -53,7 +53,7 @@ class Train:
       path_steps: Updates of a trajectory generator.
       batch: Windows per update.
       learning_rate: Peak of Muon's rate; cosine to a twentieth.
-      seed: Of everything random.
+      seed: Seeds everything random.
       override: Go on with these settings where a stage began with others.
     """  # noqa: E501
 
@@ -100,7 +100,7 @@ class Evaluate:
       evaluator: File of a frozen evaluator of skills, from evaluator.py; None trains
         one here.
       chunk: Plans or players at a time.
-      seed: Of windows, noise and evaluator.
+      seed: Seeds windows, noise and evaluator.
     """
 
     run: Path = Path("runs/smgdiff")
@@ -138,10 +138,10 @@ class Rollout:
       skills: In this order; none: all of the model's.
       paths: Trajectory generator; "straight" for none.
       steps: Motion model.
-      schedule: Of contact guidance.
+      schedule: Schedule of contact guidance.
       rate: w_r of DSG; this and the next three as in `evaluate`.
       out: Folder; None for <run>/rollout.
-      seed: Of the start and the noise.
+      seed: Seeds the start and the noise.
     """
 
     run: Path = Path("runs/smgdiff")

@@ -45,7 +45,7 @@ class Config:
       width: Channels of hidden layers.
       sequences: Rollouts of each model.
       length: Steps of a rollout.
-      seed: Of everything random.
+      seed: Seeds everything random.
     """
 
     out: Path = Path("runs/squ9")

@@ -52,7 +52,7 @@ class Config:
         intervals run over these.
       evaluator: File of a frozen evaluator, from evaluator.py; None trains one, with
         the budget's updates. aamdm has none.
-      seed: Of parameters, batches, poses, noise and evaluators.
+      seed: Seeds parameters, batches, poses, noise and evaluators.
     """
 
     system: str

@@ -323,10 +323,10 @@ def show(
 
     Args:
       skeleton: The skeleton.
-      frames: Of one character, such as `frames[0]`.
+      frames: Frames of one character, such as `frames[0]`.
       title: Above the picture.
       caption: Below it, such as the data's source and license.
-      height: Of the view, pixels.
+      height: Height of the view, pixels.
 
     Raises:
       ValueError: if frames are not those of one character, or not finite.

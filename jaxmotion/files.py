@@ -38,7 +38,7 @@ def read_bytes(path: str | os.PathLike) -> bytes:
     """Content of a regular file.
 
     Raises:
-      OSError: as of `open_regular`.
+      OSError: see `open_regular`.
     """
     with open_regular(path) as file:
         return file.read()
@@ -63,7 +63,7 @@ def replacing(path: str | os.PathLike) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        # Of a full disk Python knows the reason but not the file.
+        # Python names the reason, a full disk, but not the file.
         if error.filename is None and error.errno is not None:
             raise OSError(error.errno, error.strerror, path) from error
         raise

@@ -60,9 +60,9 @@ def write_rollout(
       motion: Frames of one character, world.
       desired_velocity: What was commanded, meters per second; its integral is drawn as
         the commanded path. None if nothing was.
-      title: Of the pictures.
+      title: Title of the pictures.
       caption: Below them: the source of the data and its license.
-      name: Of the files, without their ends.
+      name: Name of the files, without their ends.
       ball: What the person plays with; None for nothing.
 
     Raises:
@@ -219,7 +219,7 @@ def git_commit() -> str | None:
     """Commit of this code.
 
     Returns:
-      Its hash, with "+" behind it if files differ from it; None outside a repository.
+      Its hash, with "+" after it if files differ from it; None outside a repository.
     """
 
     def git(*words: str) -> str:

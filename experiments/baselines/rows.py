@@ -33,7 +33,7 @@ TABLE_2 = tuple(
     f"polish{polishes}_draft{drafts}"
     for polishes, drafts in ((0, 3), (1, 3), (10, 3), (2, 2), (2, 4), (2, 10))
 )
-# The dearest last.
+# The most expensive last.
 ALL = (*TABLE_1, *TABLE_2, "full_pose", "amdm200")
 _CHAIN = re.compile(r"polish(\d+)_draft(\d+)$")
 _BASELINES = {"amdm5": amdm, "amdm200": amdm, "lmm": lmm, "mvae": mvae}
@@ -47,7 +47,7 @@ class Sizes:
 
     Attributes:
       width: Channels of the networks of AAMDM and AMDM.
-      schedule: Of AAMDM's chains.
+      schedule: Schedule of AAMDM's chains.
       previous_noise: Noise on given previous frames in training, for all rows alike.
     """
 
@@ -178,7 +178,7 @@ def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
     """The stepper of a trained row.
 
     Args:
-      name: Of the row.
+      name: Name of the row.
       run: The run.
       space: The row's space.
       scale: Strength of the guidance, for those that are guided.

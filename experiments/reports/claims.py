@@ -113,7 +113,7 @@ class Table:
 
     Attributes:
       paper: System.
-      number: Of the table; with a word where it is run in two ways.
+      number: Number of the table; with a word where it is run in two ways.
       title: What it compares.
       columns: Metrics.
       rows: Methods.

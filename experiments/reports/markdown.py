@@ -64,8 +64,8 @@ def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[st
     """Lines of a Markdown table.
 
     Args:
-      header: Of the columns.
-      rows: Of texts.
+      header: Titles of the columns.
+      rows: Texts of each row.
 
     Returns:
       The lines.
@@ -84,7 +84,7 @@ def why_not(table: Table, row: Row, found: Found) -> str:
 
     Args:
       table: The table.
-      row: Of it.
+      row: One of its rows.
       found: All that was measured.
 
     Returns:

@@ -148,7 +148,7 @@ def provenance(measured: Measured, *, evaluated: bool) -> dict[str, str]:
     """What a file says about how its rows came about.
 
     Args:
-      measured: Of the file.
+      measured: What was read of the file.
       evaluated: Whether an evaluator had a part in it.
 
     Returns:

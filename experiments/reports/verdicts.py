@@ -55,8 +55,8 @@ def cell_of(table: Table, row: Row, column: Column, found: Found) -> Cell | None
 
     Args:
       table: The table.
-      row: Of it.
-      column: Of it.
+      row: One of its rows.
+      column: One of its columns.
       found: All that was measured.
 
     Returns:
@@ -108,8 +108,8 @@ def ordered(smaller: Ends, larger: Ends, factor: float = 1.0) -> bool | None:
 
     Args:
       smaller: Interval of what is claimed to be the smaller.
-      larger: Of the larger.
-      factor: By which the larger is larger, at least.
+      larger: That of the larger.
+      factor: The larger is at least so many times the smaller.
 
     Returns:
       True or False if the intervals are apart; None if they overlap.
@@ -130,8 +130,8 @@ def nearer(near: Ends, far: Ends, target: Ends) -> bool | None:
 
     Args:
       near: Interval of what is claimed to be the nearer.
-      far: Of the farther.
-      target: Of the third.
+      far: That of the farther.
+      target: That of the third.
 
     Returns:
       True or False if it is so for every target; None otherwise.
@@ -148,7 +148,7 @@ def compare(claim: Claim, intervals: dict[str, Ends]) -> dict[tuple[str, str], b
 
     Args:
       claim: The claim.
-      intervals: Of rows; those that are not known are missing.
+      intervals: Intervals of rows; those that are not known are missing.
 
     Returns:
       True, False or None for each pair of known rows.

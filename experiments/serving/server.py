@@ -4,7 +4,7 @@ One event loop reads commands and writes frames; the simulation runs in one work
 thread, one character after the other, so that the loop answers while it works. A tick
 of all clients therefore takes the sum of theirs: with more than fits into 1/fps every
 client gets fewer frames. (One batched program would serve many characters faster, but
-every tick of it would cost as much as its dearest character.)
+every tick of it would cost as much as its most expensive character.)
 
 Tick n is due at t0 + n / fps. A tick that takes too long makes the next ones late,
 which then follow at once, until all are on time again; ticks are left out only where
@@ -61,7 +61,7 @@ class _Client:
     Attributes:
       transport: Where frames go.
       command: What it wants.
-      state: Of its character; None until it has one.
+      state: State of its character; None until it has one.
       ticks: Ticks since it has one.
       late: How many of them it got no frame of.
       lines: How many more may be read in this tick.
@@ -88,7 +88,7 @@ class Server:
         Args:
           simulation: What each client gets a character of.
           limits: What clients may use; None for the defaults.
-          seed: Of the first character; the next ones count on.
+          seed: Seeds the first character; the next ones count on.
         """
         self._simulation = simulation
         self._limits = Limits() if limits is None else limits

@@ -93,7 +93,7 @@ class LockState:
       contact: Whether each toe is in contact.
       locked: Whether each toe is locked.
       point: Where it is locked, if so.
-      offset: Of what is displayed from what is wanted.
+      offset: Offset of what is displayed from what is wanted.
       offset_velocity: The rate of that.
       started: Whether there was a frame before.
     """
@@ -487,7 +487,7 @@ class LockedState:
 
     Attributes:
       inner: The controller's own.
-      feet: Of `init_lock` at the start.
+      feet: From `init_lock` at the start.
     """
 
     inner: Any
@@ -548,7 +548,7 @@ def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
     """A character that is displayed with locked feet.
 
     Args:
-      character: Of any system; its skeleton has legs.
+      character: Character of any system; its skeleton has legs.
       lock: Settings; None for the defaults.
 
     Returns:

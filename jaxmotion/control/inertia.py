@@ -46,7 +46,7 @@ def quintic(
 
     Args:
       x: Offset at time zero, in any unit.
-      v: Its velocity, units a second.
+      v: Its velocity, units per second.
       t: Seconds since, not negative.
       duration: Seconds until the offset and its first three derivatives are zero;
         less where it would overshoot. Zero or less: the offset is zero.
@@ -89,9 +89,9 @@ def decay(
 
     Args:
       x: Offsets at time zero.
-      v: Their velocities, units a second.
+      v: Their velocities, units per second.
       t: Seconds since, not negative.
-      duration: Of the quintic, seconds.
+      duration: Duration of the quintic, seconds.
       half_life: If given, seconds: the offset decays as a critically damped spring,
         which never quite ends, and `duration` is not used.
 

@@ -71,7 +71,7 @@ class Character:
           labels: Name or index for all characters, or a sequence with one for each;
             None for the first label.
           clips: Start in poses of these clips instead of the model's own.
-          seed: Of the choice of poses.
+          seed: Seeds the choice of poses.
 
         Returns:
           States, batch axis first.

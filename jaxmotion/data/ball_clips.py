@@ -37,7 +37,7 @@ class BallClips:
       position: World position of the ball's center in every frame, meters, y up.
       touch: Which of `joints` touch the ball in every frame.
       joints: Joints that may touch the ball (feet, or hands).
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
     """
 
     clips: Clips
@@ -63,7 +63,7 @@ def ball_clips(
         [frames, 3], is checked here, since it may come from a file.
       touch: Which of the joints touch the ball in every frame, [frames, touching].
       joints: Joints that may touch the ball.
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
 
     Returns:
       The clips with the ball.

@@ -222,7 +222,7 @@ class Bvh:
 
 
 def _header_number(lines: list[str], at: int, pattern, name: str, what: str):
-    """The number behind 'Frames:' or 'Frame Time:'; returns it and the next index."""
+    """The number after 'Frames:' or 'Frame Time:'; returns it and the next index."""
     while at < len(lines) and not lines[at].strip():
         at += 1
     if at >= len(lines):

@@ -1,6 +1,6 @@
 """Ragged clips of one skeleton as flat arrays.
 
-All frames of all clips lie behind each other; clip c is frames
+The frames of all clips are concatenated; clip c is frames
 `offsets[c]:offsets[c + 1]`. That is one array to put on a device, from which windows
 are gathered inside jit.
 """
@@ -137,7 +137,7 @@ def clips_from_motions(
     source: str = "",
     tolerance: float = 1e-3,
 ) -> Clips:
-    """Puts motions of one skeleton behind each other.
+    """Concatenates motions of one skeleton.
 
     Args:
       motions: One motion a clip, all at the same rate.

@@ -73,7 +73,7 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
 
     Raises:
       OSError: if the file cannot be written.
-      ValueError: if the fields do not agree, as of `load_clips`; nothing is written.
+      ValueError: if the fields do not agree, see `load_clips`; nothing is written.
     """
     fields = to_fields(clips)
     _check_fields(os.fspath(path), fields)

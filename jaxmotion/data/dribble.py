@@ -56,14 +56,15 @@ class Dribble:
     """How a ball is dribbled; meters, seconds.
 
     Attributes:
-      radius: Of the ball.
-      deceleration: Of the rolling ball, meters per second squared.
-      thickness: Of foot and shank about their bones: how high a standing toe joint is
-        above the ground, and how far from it the ball's surface is when they touch.
-      max_height: Of a touching toe above the ground.
-      min_toe_speed: Of a touching toe on the ground plane.
+      radius: Radius of the ball.
+      deceleration: Deceleration of the rolling ball, meters per second squared.
+      thickness: Thickness of foot and shank about their bones: how high a standing toe
+        joint is above the ground, and how far from it the ball's surface is when they
+        touch.
+      max_height: Largest height of a touching toe above the ground.
+      min_toe_speed: Least speed of a touching toe on the ground plane.
       gap: Shortest and longest time between touches.
-      max_speed: Of the ball.
+      max_speed: Largest speed of the ball.
       min_push: Least change of the ball's velocity along that of the toe.
       cone: Largest angle between that change and the toe's velocity, radians.
       restitution: Most that a ball bounces off a foot: the speed at which it leaves the
@@ -72,7 +73,7 @@ class Dribble:
         frames before a touch to two frames after it.
       reach: Largest distance of ball and root on the ground plane.
       wait: Longest time that a ball lies before its first touch.
-      min_frames: Of a segment.
+      min_frames: Fewest frames of a segment.
 
     Raises:
       ValueError: if a value is out of its range; names it.
@@ -111,11 +112,11 @@ class Touches:
     """Possible touches of one clip, in the order of their frames.
 
     Attributes:
-      frame: Of each touch.
+      frame: Frame of each touch.
       foot: Which of the feet touches.
-      place: Of the ball's center on the ground plane, meters.
-      direction: Of the toe's velocity on the ground plane.
-      speed: Of the toe on the ground plane, meters per second.
+      place: Place of the ball's center on the ground plane, meters.
+      direction: Direction of the toe's velocity on the ground plane.
+      speed: Speed of the toe on the ground plane, meters per second.
     """
 
     frame: Int[np.ndarray, "touches"]
@@ -169,8 +170,8 @@ def is_free(
 
     Args:
       body: The clip.
-      place: Of the ball's center on the ground plane, meters.
-      frames: Of the clip.
+      place: Place of the ball's center on the ground plane, meters.
+      frames: Frames of the clip.
       near: Whether a touch is so near in time that a leg may come nearer.
       settings: What is clear and what is near.
 
@@ -279,7 +280,7 @@ def find_chain(
       first: The touch to begin with.
       tried: Touches from which no way led on; those that are tried are added.
       settings: What a ball may do.
-      generator: Of the order in which ways are tried.
+      generator: Draws the order in which ways are tried.
 
     Returns:
       The touches, the first one at least.
@@ -342,7 +343,7 @@ def find_segments(
     Args:
       body: The clip.
       settings: What a ball may do, and how long a stretch is.
-      generator: Of everything.
+      generator: Draws everything.
 
     Returns:
       The segments in their order, perhaps none.
@@ -367,14 +368,14 @@ def dribble_clips(
 ) -> BallClips:
     """Stretches of clips beside which a ball is dribbled.
 
-    Each clip has its own random numbers, so that further clips behind it change
+    Each clip has its own random numbers, so that further clips after it change
     nothing.
 
     Args:
       clips: Locomotion.
       skill: Label of all stretches in a new field "skill".
       settings: What a ball may do.
-      seed: Of the choice among possible touches.
+      seed: Seeds the choice among possible touches.
 
     Returns:
       The stretches, each from the ball's rest (or its first touch) to its last touch,
@@ -492,12 +493,12 @@ def resting_clips(
       distance: Least and largest distance of the ball from where the root comes
         nearest to it on the ground plane, meters. (2.5, 5) is a ball off which the
         person is; (0.4, 0.8) one in front of the feet.
-      seed: Of the places; each clip has its own random numbers.
+      seed: Seeds the places; each clip has its own random numbers.
       angle: Largest angle between the clip's mean facing and the ball's direction,
         radians; pi for anywhere.
       travel: Clips whose root goes farther from its mean place are left out, meters.
-      radius: Of the ball, meters.
-      thickness: Of foot and shank about their bones, meters.
+      radius: Radius of the ball, meters.
+      thickness: Thickness of foot and shank about their bones, meters.
 
     Returns:
       The clips, whole, without any touch.
@@ -558,7 +559,7 @@ def _room(body: Body, ball: Float[np.ndarray, "tries 3"]) -> Float[np.ndarray, "
 
 
 def concatenate_ball_clips(parts: Sequence[BallClips]) -> BallClips:
-    """Puts several sets of clips with a ball behind each other.
+    """Concatenates several sets of clips with a ball.
 
     Args:
       parts: Sets with the same skeleton, label fields and rate, joints and ball; the

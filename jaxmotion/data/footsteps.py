@@ -61,7 +61,7 @@ def _turned(yaw: float, x: float, z: float) -> np.ndarray:
     return np.stack([c * x + s * z, -s * x + c * z], axis=-1)
 
 
-# More steps per second for each meter a second sideways, and each radian a second.
+# More steps per second for each m/s sideways, and each rad/s.
 _ASIDE_PACE, _TURN_PACE = 1.0, 0.3
 
 # A foot on the ground: its toe (x, z), meters, and its direction, radians.
@@ -231,14 +231,14 @@ def plan_footsteps(
       yaw: [F] its facing, radians.
       fps: Frames per second.
       cadence: Steps per second at no speed.
-      cadence_slope: More steps per second for each meter a second.
+      cadence_slope: More steps per second for each meter per second.
       double_support: Part of a step in which both feet stand.
       width: Between the feet, meters.
-      toe_ahead: Of the body when standing, meters.
-      toe_height: Of a standing toe joint, meters.
-      lift: Of a swinging toe, meters.
-      toe_out: Of each foot, radians.
-      generator: Of the small variations.
+      toe_ahead: Distance of the toe ahead of the body when standing, meters.
+      toe_height: Height of a standing toe joint, meters.
+      lift: Height of a swinging toe, meters.
+      toe_out: Outward turn of each foot, radians.
+      generator: Draws the small variations.
       jitter: Standard deviation of the landing points, meters.
 
     Returns:

@@ -10,20 +10,20 @@ class Gait:
     Attributes:
       max_speed: Meters per second.
       cadence: Steps per second at no speed.
-      cadence_slope: More steps per second for each meter a second.
+      cadence_slope: More steps per second for each meter per second.
       double_support: Part of a step with both feet down.
       width: Between the feet.
-      lift: Of a swinging toe.
-      toe_out: Of each foot.
+      lift: Height of a swinging toe.
+      toe_out: Outward turn of each foot.
       crouch: How much lower than upright the pelvis is.
-      lean: Of the trunk, forward.
-      head: Of the head, forward.
-      sway: Of the pelvis to the standing side.
+      lean: Lean of the trunk, forward.
+      head: Tilt of the head, forward.
+      sway: Sway of the pelvis to the standing side.
       bounce: Up and down, twice a stride.
-      twist: Of the pelvis with the leading leg; the chest goes against it.
+      twist: Twist of the pelvis with the leading leg; the chest goes against it.
       arm_swing: Forward and back.
-      arm_forward: Of both upper arms.
-      arm_out: Of both upper arms from hanging.
+      arm_forward: Forward turn of both upper arms.
+      arm_out: Outward turn of both upper arms from hanging.
       elbow: Flexion.
     """
 

@@ -31,7 +31,7 @@ class Walk:
     """A generated walk.
 
     Attributes:
-      motion: Of `walker_skeleton()`.
+      motion: Motion of `walker_skeleton()`.
       contact: Whether each toe (left, right) stands, exact.
     """
 
@@ -49,7 +49,7 @@ def follow_commands(
       commands: One a frame; the body starts at the origin, at rest, facing as the
         first command.
       fps: Frames per second.
-      half_life: Of the springs, seconds.
+      half_life: Half-life of the springs, seconds.
 
     Returns:
       Ground positions (x, z), meters, and facings.
@@ -102,7 +102,7 @@ def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> 
       gait: The manner. Speeds above its max_speed look rushed; far above, legs are too
         short for the steps.
       fps: Frames per second.
-      seed: Of the small variations between steps.
+      seed: Seeds the small variations between steps.
 
     Returns:
       The motion, and which toes stand.
@@ -149,7 +149,7 @@ def random_commands(
     rest strafe sideways or walk backwards.
 
     Args:
-      generator: Of everything.
+      generator: Draws everything.
       frames: Length.
       fps: Frames per second.
       max_speed: Meters per second; sideways and backwards half of it.
@@ -192,8 +192,8 @@ def make_clips(
     """Clips of random walks, the same number in every gait.
 
     Args:
-      seed: Of everything; the same seed gives the same clips.
-      minutes: Of all clips together, rounded up to whole clips of each gait.
+      seed: Seeds everything; the same seed gives the same clips.
+      minutes: Minutes of all clips together, rounded up to whole clips of each gait.
       gaits: Manners by name; None for all of `GAITS`.
       fps: Frames per second.
       clip_seconds: Length of each clip.

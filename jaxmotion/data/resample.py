@@ -50,7 +50,7 @@ def resample(motion: Motion, fps: float) -> Motion:
     The same rate returns the motion itself. Where the rate divides the motion's by a
     whole number n, every nth frame is taken unchanged. Otherwise positions are
     interpolated linearly and rotations by slerp. Nothing is filtered. The last frame is
-    the last one that is not behind the motion's own last frame.
+    the last one that is not after the motion's own last frame.
 
     Args:
       motion: Frames, with any batch axes.
@@ -84,7 +84,7 @@ def resample(motion: Motion, fps: float) -> Motion:
             joint_rotation=motion.joint_rotation[..., ::step, :, :],
             fps=float(fps),
         )
-    # The tolerance keeps a last frame that rounding puts just behind the end.
+    # The tolerance keeps a last frame that rounding puts just after the end.
     count = int(np.floor((num_frames - 1) / ratio + 1e-6)) + 1
     time = np.minimum(np.arange(count) * ratio, num_frames - 1)
     low = np.minimum(np.floor(time).astype(np.int64), max(num_frames - 2, 0))

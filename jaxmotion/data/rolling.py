@@ -40,7 +40,7 @@ def start_speed(
     Args:
       distance: Meters to roll.
       seconds: Time to do so, positive; the ball may be early.
-      deceleration: Of a rolling ball, positive, meters per second squared.
+      deceleration: Deceleration of a rolling ball, positive, meters per second squared.
 
     Returns:
       Meters per second.
@@ -61,7 +61,7 @@ def roll(
     Args:
       displacement: From where it starts to that place, meters on the ground.
       seconds: Time of arrival, positive; the ball may stop there before.
-      deceleration: Of a rolling ball, positive, meters per second squared.
+      deceleration: Deceleration of a rolling ball, positive, meters per second squared.
       times: Between 0 and `seconds`.
 
     Returns:
@@ -85,7 +85,7 @@ def end_velocities(
     Args:
       displacement: From where it starts to where it has to be, meters on the ground.
       seconds: Time of arrival, positive.
-      deceleration: Of a rolling ball, positive, meters per second squared.
+      deceleration: Deceleration of a rolling ball, positive, meters per second squared.
 
     Returns:
       Meters per second; the second is zero where the ball stopped on the way.
@@ -105,7 +105,7 @@ class Body:
       ground: Height of the ground.
       root: On the ground plane (x, z).
       toes: The skeleton's feet.
-      velocity: Of the toes, on the ground plane.
+      velocity: Velocity of the toes, on the ground plane.
       standing: Which of them stand.
       legs: Both ends of the bones from toe to ankle and from ankle to knee.
       fps: Frames per second.
@@ -203,7 +203,7 @@ def ground_height(
     """Height at which toes stand: few of those that stand are lower.
 
     Args:
-      heights: Of the toes, meters.
+      heights: Heights of the toes, meters.
       standing: Which of them stand; where none does, all count.
 
     Returns:

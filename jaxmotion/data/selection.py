@@ -176,7 +176,7 @@ def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
 
 
 def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
-    """Puts several sets of clips of one skeleton behind each other.
+    """Concatenates several sets of clips of one skeleton.
 
     Label names are merged, in the order in which they first occur.
 

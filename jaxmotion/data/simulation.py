@@ -19,7 +19,7 @@ from jaxmotion.motion.facing import hip_facing, plain_names
 from jaxmotion.motion.skeleton import Motion, Skeleton, from_root
 from jaxmotion.motion.trajectory import Trajectory
 
-# Windows of the filters in seconds (31 and 61 frames at 60 a second) and their degree.
+# Windows of the filters, seconds (31 and 61 frames at 60 per second), and their degree.
 _POSITION, _FACING, _DEGREE = 31 / 60, 61 / 60, 3
 # The joint whose ground projection is the bone's position; the first that exists.
 _CHESTS = ("spine2", "chest2", "chest", "spine1")
@@ -34,7 +34,7 @@ def upsample(motion: Motion, fps: float) -> Motion:
 
     Returns:
       The motion; the same one if it has that rate. Its last frame is the last that is
-      not behind the motion's own.
+      not after the motion's own.
 
     Raises:
       ValueError: if the rate is lower than the motion's or more than 16 times as high,
@@ -132,7 +132,7 @@ def simulation_bone(skeleton: Skeleton, motion: Motion) -> Trajectory:
     frames, least = motion.root_position.shape[0], least_frames(motion.fps)
     if frames < least:
         raise ValueError(
-            f"{frames} frames at {motion.fps:g} a second, expected at least {least} "
+            f"{frames} frames at {motion.fps:g} per second, expected at least {least} "
             "for the simulation bone"
         )
     above = from_root(skeleton, motion.joint_rotation, chest)

@@ -49,11 +49,11 @@ class TextMotions:
     """Ragged clips with captions, on the host.
 
     Attributes:
-      features: Feature vectors of all clips behind each other, not normalized.
+      features: Feature vectors of all clips, concatenated, not normalized.
       offsets: First frame of each clip, and the number of frames at the end.
-      mean: Of each feature, over frames.
-      std: Of each feature (or of its group), positive.
-      captions: Sentences, those of one clip behind each other.
+      mean: Mean of each feature, over frames.
+      std: Standard deviation of each feature (or of its group), positive.
+      captions: Sentences, those of one clip next to each other.
       tokens: For each sentence its words as "word/POS word/POS".
       caption_clip: The clip of each caption, ascending.
       split: Number of each clip's split.
@@ -235,7 +235,7 @@ def text_motions(
     fps: float,
     source: str,
 ) -> TextMotions:
-    """Puts clips with captions behind each other.
+    """Concatenates clips with captions.
 
     Args:
       features: Feature vectors of each clip.
@@ -416,11 +416,11 @@ class TextArrays:
     """Clips of one split on the device.
 
     Attributes:
-      features: Z-scored feature vectors of all clips behind each other, then zeros, so
+      features: Z-scored feature vectors of all clips, concatenated, then zeros, so
         that a window from any frame stays inside.
       starts: First frame of each clip.
       lengths: Frames of each clip.
-      captions: Captions of all clips behind each other, as numbers in `TextMotions`.
+      captions: Captions of all clips, concatenated, as numbers in `TextMotions`.
       caption_starts: First entry of each clip in `captions`.
       caption_counts: Captions of each clip.
       max_frames: Frames of a sample, with its padding.
@@ -513,7 +513,7 @@ def sample_text_batch(
       batch: Samples to draw.
 
     Returns:
-      Z-scored features, zero behind their end; lengths in frames; and captions as
+      Z-scored features, zero after their end; lengths in frames; and captions as
       numbers in `TextMotions`.
 
     Source: the data loader released with T2M, unit length 4.

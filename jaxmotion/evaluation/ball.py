@@ -159,7 +159,7 @@ def untouched_acceleration(
     """How much the ball accelerates while no joint is near it.
 
     Over the frames in which, as in the frames before and after, every joint is farther
-    than `max_distance`. A rolling ball is slowed by a few tenths of a meter a second
+    than `max_distance`. A rolling ball is slowed by a few tenths of a meter per second
     squared, a flying one falls with 9.8: compare with real motions.
 
     Args:
@@ -191,7 +191,7 @@ def ground_penetration(
 
     Args:
       ball: Positions, meters.
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
       ground: Height of the ground, meters.
 
     Returns:
@@ -214,7 +214,7 @@ def joint_penetration(
     Args:
       ball: Positions, meters.
       joints: World positions of the joints, meters.
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
 
     Returns:
       Millimeters, not negative: mean over all frames, and largest.

@@ -149,7 +149,7 @@ def resolve(amounts: Amounts, name: str, changes: Sequence[str] = ()) -> Budget:
     """The numbers of a budget, some of them changed.
 
     Args:
-      amounts: Of the system.
+      amounts: Amounts of the system.
       name: "quick" or "full".
       changes: "number=value", for numbers of the budget.
 
@@ -198,8 +198,8 @@ class Job:
       data: Files of clips.
       models: Folder of the trained models.
       budget: Numbers, from `resolve`.
-      replications: Of the evaluation.
-      seed: Of everything random.
+      replications: Replications of the evaluation.
+      seed: Seeds everything random.
       evaluator: A frozen evaluator; None to train one.
     """
 
@@ -270,7 +270,7 @@ def call_time(
 
     Args:
       run: A jitted function of a key.
-      parts: Of the call's time that is given, such as its frames.
+      parts: Parts of the call's time that is given, such as its frames.
       seconds: Calls go on for so long, but for no more than 200 of them.
       least: Number of calls, at least.
 
@@ -291,7 +291,7 @@ def time_cells(times: np.ndarray, *, seed: int) -> Row:
 
     Args:
       times: Milliseconds.
-      seed: Of the resamples.
+      seed: Seeds the resamples.
 
     Returns:
       Two columns.

@@ -51,7 +51,7 @@ def by_frame(
     Args:
       positions: World, meters.
       feet: Joints whose sliding counts.
-      place: Of each frame, in 0..num_places-1; others are left out.
+      place: Place of each frame, in 0..num_places-1; others are left out.
       fps: Frames per second.
       num_places: Length of the result.
       contact_height: A foot joint below this height should not move, meters.

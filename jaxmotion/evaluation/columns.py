@@ -26,7 +26,7 @@ class Column:
       kind: "mean" has an interval of 95 %, or none; "time" has that of the median, the
         middle half of the calls, or none; "count" is a number of the samples.
       evaluated: It is an evaluator's: values of two evaluators do not compare.
-      bounds: Of what the mean can be, in the unit.
+      bounds: Bounds of what the mean can be, in the unit.
     """
 
     id: str

@@ -99,7 +99,7 @@ def skate_ratio(
     Raises:
       ValueError: if there are fewer than two frames.
 
-    Source: Karunratanakul et al. 2023 (GMD), with a threshold a second. Real data do
+    Source: Karunratanakul et al. 2023 (GMD), with a threshold per second. Real data do
       not score zero (about 0.05 there).
     """
     is_fast = foot_steps(foot_positions) * fps > min_speed

@@ -22,7 +22,7 @@ class Moments:
     Leading axes come from `jax.vmap` over sets; the functions here take one set.
 
     Attributes:
-      mean: Of each feature.
+      mean: Mean of each feature.
       covariance: Unbiased (divided by count - 1).
       count: Number of samples.
     """
@@ -134,9 +134,9 @@ def frechet_distance_of_rows(
 
     Args:
       a: Rows from `count_a` on are padding.
-      count_a: Rows that count.
-      b: Likewise.
-      count_b: Likewise.
+      count_a: Rows of it that count.
+      b: The other set.
+      count_b: Rows of it that count.
 
     Returns:
       Distance, in squared units of the features, not negative; NaN where fewer than

@@ -29,7 +29,7 @@ class BiasCheck(NamedTuple):
 
     Attributes:
       sizes: Samples of a subset, N.
-      distances: Of each subset, in squared units of the features.
+      distances: Distances of each subset, in squared units of the features.
       extrapolated: The line at N = infinity; may be negative where the distance is
         about zero.
       slope: c of (1): by how much a distance of N samples is too large, times N.
@@ -83,10 +83,10 @@ def frechet_bias(
 
     Args:
       key: Consumed.
-      features: Of all samples of a model, one row each.
+      features: Features of all samples of a model, one row each.
       reference: Moments of what they are compared with, of as many samples as there
         are.
-      sizes: Of the subsets, see `subset_sizes`.
+      sizes: Sizes of the subsets, see `subset_sizes`.
       repeats: Subsets of each size.
 
     Returns:

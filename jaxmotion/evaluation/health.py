@@ -30,7 +30,7 @@ def diverged_frames(
       fps: Frames per second.
       min_root: Lowest root height, meters.
       max_root: Highest root height, meters.
-      max_speed: Of any joint, meters per second.
+      max_speed: Largest speed of any joint, meters per second.
 
     Returns:
       True where a number is not finite, the root is outside its heights, or a joint
@@ -62,7 +62,7 @@ def has_diverged(
       fps: Frames per second.
       min_root: Lowest root height, meters.
       max_root: Highest root height, meters.
-      max_speed: Of any joint, meters per second.
+      max_speed: Largest speed of any joint, meters per second.
 
     Returns:
       True where a number is not finite, the root is outside its heights, or a joint is
@@ -99,7 +99,7 @@ def frozen_frames(
       commanded: Meters per second.
 
     Returns:
-      True for all frames of frozen windows; never behind the last whole window.
+      True for all frames of frozen windows; never after the last whole window.
 
     Raises:
       ValueError: if a window is shorter than a frame.

@@ -54,7 +54,7 @@ def bootstrap_interval(
     Args:
       samples: Independent ones, [samples].
       statistic: Function of them, with an argument `axis`.
-      seed: Of what is drawn.
+      seed: Seeds what is drawn.
       level: Part of the resampled values that the interval holds, in (0, 1).
       num_resamples: How often to draw.
 

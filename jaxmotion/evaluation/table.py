@@ -49,7 +49,7 @@ def group_means(
     Args:
       values: One a window.
       groups: Its clip.
-      weights: Of the windows; None for equal ones.
+      weights: Weights of the windows; None for equal ones.
 
     Returns:
       One a clip that occurs.
@@ -74,8 +74,8 @@ def cell(
     Args:
       samples: One a clip or rollout.
       scale: Factor for the unit of the table.
-      bounds: Of what the mean can be, before scaling, such as 0 and 1 of a proportion;
-        the interval is cut to them.
+      bounds: Bounds of what the mean can be, before scaling, such as 0 and 1 of a
+        proportion; the interval is cut to them.
 
     Returns:
       The cell; without an interval for a single sample, not a number for none.

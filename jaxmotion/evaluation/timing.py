@@ -54,11 +54,12 @@ def time_in_turn(
     """Times several calls in one run, so that what disturbs one disturbs all.
 
     Every round calls each once; the order moves on by one a round, so that none always
-    runs behind the same other.
+    runs after the same other.
 
     Args:
       calls: By name; what they return is waited for if it is JAX's.
-      arguments: Of the calls of round i, warm-up included; making them is not timed.
+      arguments: Arguments of the calls of round i, warm-up included; making them is not
+        timed.
       rounds: Timed rounds.
       warmup: Rounds before, fewer where they take a quarter of the limit.
       limit_s: Stop after so many seconds, but not before the least number of rounds.
@@ -98,12 +99,12 @@ def time_in_turn(
 
 
 def time_calls(call: Callable[..., Any], **options: Any) -> np.ndarray:
-    """Milliseconds of wall clock of each call; options as of `time_in_turn`."""
+    """Milliseconds of wall clock of each call; options as for `time_in_turn`."""
     return time_in_turn({"": call}, **options)[""][:, 0]
 
 
 def measure(function: Callable, *arguments: Any, **options: Any) -> Timing:
-    """Compiles a jitted function, and times it; options as of `time_in_turn`."""
+    """Compiles a jitted function, and times it; options as for `time_in_turn`."""
     program, seconds = compile_program(function, *arguments)
     times = time_calls(lambda: program(*arguments), **options)
     p50, p95 = np.percentile(times, [50, 95])

@@ -1,7 +1,7 @@
 """How long a change of style takes, and whether it comes at all.
 
 An evaluator decides on windows of a rollout in which another style was commanded. A
-window that starts s seconds behind the command holds no frame from before, so the
+window that starts s seconds after the command holds no frame from before, so the
 change is done at the latest at the start of the first window that shows the new style.
 
 Source: Chen et al. 2024 (CAMDM), section 4.1 and tables 2 and 4, where people judged
@@ -42,7 +42,7 @@ def transition(
 
     Args:
       recognized: Whether each window shows the style that was commanded.
-      starts: Of the windows, seconds since the command, ascending, not negative.
+      starts: Starts of the windows, seconds since the command, ascending, not negative.
       limit: Latest start of the first window that shows it, seconds.
       hold: Windows that must show it without a gap; more than 1 if styles flicker.
 

@@ -130,7 +130,7 @@ def train(
       config: Its size.
       num_steps: Updates.
       batch: Motions an update, drawn with replacement.
-      learning_rate: Of Adam, with cosine decay to a tenth.
+      learning_rate: Rate of Adam, with cosine decay to a tenth.
 
     Returns:
       The moving average of the parameters, and losses and accuracies by step.

@@ -51,7 +51,7 @@ class Evaluator:
       kind: "style" (CAMDM's evaluator, of windows of a label), "action" (EMDM's GRU),
         "ball" (SMGDiff's, of skills with a ball), or "style_release" (the classifier
         released with CAMDM).
-      params: Of the evaluator.
+      params: Parameters of the evaluator.
       field: Label field of the clips that the classes are from.
       labels: Names of the classes, in their order.
       joints: Names of the skeleton's joints, in their order.
@@ -59,8 +59,8 @@ class Evaluator:
       frames: Frames of what it looks at.
       source: Data that it was trained on, and their license.
       clips: Fingerprint of the training clips.
-      seed: Of parameters and batches.
-      updates: Of its training.
+      seed: Seeds parameters and batches.
+      updates: Updates of its training.
       accuracy: On clips that it was not trained on, in [0, 1]; NaN if nobody said.
       path: Its file; None for one that was not loaded.
     """
@@ -102,7 +102,7 @@ def released_style(path: Path) -> Evaluator:
 
     Raises:
       FileNotFoundError: if there is no such file.
-      ValueError: as of `published.load_style_classifier`.
+      ValueError: see `published.load_style_classifier`.
     """
     params, labels = published.load_style_classifier(path)
     return Evaluator(
@@ -280,7 +280,7 @@ def describe(
     """Who scored a table, for what stands beside it.
 
     Args:
-      params: Of the evaluator.
+      params: Parameters of the evaluator.
       evaluator: The frozen evaluator that they are of; None if they were trained for
         this table.
       reference: Fingerprint of the clips that Fréchet distances refer to.

@@ -292,7 +292,7 @@ class TextEncoder(nn.Module):
         Args:
           vectors: Word vectors.
           tags: One-hot parts of speech.
-          words: Of each sentence, with its marks of start and end; in 1..slots.
+          words: Words of each sentence, with its marks of start and end; in 1..slots.
 
         Returns:
           Embeddings.
@@ -341,7 +341,7 @@ class Matcher(nn.Module):
 
         Args:
           features: Normalized to mean 0 and deviation 1, without contact labels.
-          frames: Of each motion, at least `UNIT`.
+          frames: Frames of each motion, at least `UNIT`.
           train: Whether to drop; needs rngs={"dropout": key}.
           padding: What is seen beyond the whole movements: "zeros", or "kept", what is
             there.

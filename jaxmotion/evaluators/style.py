@@ -108,13 +108,13 @@ def released_input(
 
     Args:
       skeleton: The skeleton.
-      motion: Frames of it, at 30 a second.
+      motion: Frames of it, at 30 per second.
 
     Returns:
       Meters; three channels a joint.
 
     Raises:
-      ValueError: as of `released_joints`.
+      ValueError: see `released_joints`.
 
     Source: released feature extractor of CAMDM (Chen et al. 2024).
     """
@@ -247,7 +247,7 @@ def train(
       config: Its size.
       num_steps: Updates.
       batch: Windows per update, drawn with replacement.
-      learning_rate: Of Adam, with cosine decay to a tenth.
+      learning_rate: Rate of Adam, with cosine decay to a tenth.
 
     Returns:
       The moving average of the parameters, and losses and accuracies by step.
@@ -285,7 +285,7 @@ def train_classifier(
       data: Samples, and their classes.
       num_steps: Updates.
       batch: Samples per update, drawn with replacement.
-      learning_rate: Of Adam, with cosine decay to a tenth.
+      learning_rate: Rate of Adam, with cosine decay to a tenth.
       weight_decay: Decoupled.
       max_norm: Clip the gradient to this global norm; None to leave it.
 

@@ -98,10 +98,10 @@ class Pairs:
 
     Attributes:
       features: Normalized features, without contact labels.
-      frames: Of each motion, at least 4.
+      frames: Frames of each motion, at least 4.
       vectors: Word vectors.
       tags: One-hot parts of speech, in the order of `TAGS`.
-      words: Of each sentence, with the marks of start and end.
+      words: Words of each sentence, with the marks of start and end.
     """
 
     features: Float[Array, "*batch frames channels"]
@@ -147,7 +147,8 @@ def embed_motion(
     Args:
       params: The evaluator's parameters.
       features: As in `Pairs`; all padded to the length used in training.
-      frames: Of each motion, at least 4; those beyond a multiple of 4 do not count.
+      frames: Frames of each motion, at least 4; those beyond a multiple of 4 do not
+        count.
       config: Its size.
       padding: What is seen beyond a motion's frames: "zeros", or "kept", what is there.
 

@@ -55,10 +55,10 @@ def make_gan_update(
     """Update of a discriminator, then of a generator against the new discriminator.
 
     Args:
-      discriminator_loss: Of the discriminator's parameters, then the generator's.
-      generator_loss: Of the generator's parameters, then the discriminator's.
+      discriminator_loss: Loss of the discriminator's parameters, then the generator's.
+      generator_loss: Loss of the generator's parameters, then the discriminator's.
       optimizers: The generator's and the discriminator's.
-      ema_decay: Of the generator's average.
+      ema_decay: Decay of the generator's average.
 
     Returns:
       `update(state, key, batch) -> (state, info)`. Names in info begin with

@@ -159,7 +159,7 @@ def read_losses(path: Path) -> list[dict[str, Any]]:
 
 
 def _forget_lost_steps(path: Path, done: int) -> None:
-    """Drops rows behind the checkpoint that a run goes on from, and a torn last row."""
+    """Drops rows after the checkpoint that a run goes on from, and a torn last row."""
     if not path.exists():
         return
     kept = [json.dumps(row) + "\n" for row in read_losses(path) if row["step"] <= done]

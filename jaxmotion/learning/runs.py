@@ -25,7 +25,7 @@ from jaxmotion.learning import checkpoint, fingerprint, loop, model_json, traini
 from jaxmotion.learning.training import OptimizerName
 from jaxmotion.typing import Key, Params
 
-# Of config.json: folders of another number are refused.
+# Format of config.json: folders of another number are refused.
 FORMAT = 1
 _CONFIG = "config.json"
 _PACKAGES = ("jaxmotion", "jax", "jaxlib", "flax", "optax", "numpy")
@@ -286,7 +286,7 @@ class Budget:
       batch: Samples per update (papers: 64).
       optimizer: "muon" or "adamw" with warm-up and cosine decay, or AAMDM's "radam" or
         EMDM's "adam" at a constant rate.
-      learning_rate: Of the optimizer; where it varies, its peak.
+      learning_rate: Rate of the optimizer; where it varies, its peak.
       warmup: Updates of linear rise; None for a tenth of them, 100 at most.
       final: Rate at the end of the decay, as a fraction of the peak.
       max_norm: Gradients are clipped to this global norm; 0 for no clipping.
@@ -294,7 +294,7 @@ class Budget:
       devices: Split each batch over so many.
       chunk: Updates of one compiled call, at most.
       save_every: Updates between checkpoints.
-      seed: Of parameters and batches.
+      seed: Seeds parameters and batches.
       override: Go on even if the checkpoint was trained with another budget or data.
     """
 
@@ -455,13 +455,13 @@ def fit(
       run: The run.
       stage: Name of the stage, which is its folder in the run.
       state: A new one.
-      update: Of the state by a batch.
+      update: Update of the state by a batch.
       sample_batch: `(key, data) -> batch`.
       data: Arrays.
       budget: How long.
       model: JSON of what rebuilds the stage's networks.
       settings: JSON of how the stage is trained besides the budget.
-      key: Of batches and noise; None for one of the budget's seed.
+      key: Key of batches and noise; None for one of the budget's seed.
       show: Names on the progress bar.
 
     Returns:
@@ -573,7 +573,7 @@ def restore_evaluator(
     """Parameters of an evaluator that must have been trained as told.
 
     Args:
-      folder: Of its checkpoint.
+      folder: Folder of its checkpoint.
       value: JSON of how it must have been trained.
       init: Makes parameters of the same shapes; never run.
 

@@ -205,7 +205,7 @@ def train_chunk(
       `run(state, key, data, count=None) -> (state, info)`, jitted; the given state is
       donated (its buffers are gone afterwards). Each value of info has num_steps rows,
       one a step. With a count (traced: no second compilation for another) only so many
-      updates are made, and the rows behind them are zero.
+      updates are made, and the rows after them are zero.
     """
 
     def run(

@@ -136,7 +136,7 @@ def encode_ball(
 
     Args:
       ball: Positions, meters.
-      velocity: Of the ball, meters per second.
+      velocity: Velocity of the ball, meters per second.
       root: Positions of the root, meters.
       reach: Distance on the ground at which control ends, meters.
 
@@ -158,7 +158,7 @@ def place_ball(
     """Where each frame by itself says that the ball is: b of (1).
 
     Args:
-      features: Of the ball, perhaps from a network.
+      features: Features of the ball, perhaps from a network.
       root: Positions of the root, meters.
       least_weight: Weights below are taken to be this.
 
@@ -186,7 +186,7 @@ def decode_ball(
     1 m away. Features of a ball that moves as they say come back exactly.
 
     Args:
-      features: Of the ball, perhaps from a network.
+      features: Features of the ball, perhaps from a network.
       root: Positions of the root, meters.
       start: Where the ball was in the frame before the first, meters.
       fps: Frames per second.

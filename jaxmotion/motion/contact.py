@@ -36,7 +36,7 @@ def foot_contacts(
     Raises:
       ValueError: if there are fewer than two frames.
 
-    Source: Chen et al. 2024 (CAMDM), released code, with thresholds a second.
+    Source: Chen et al. 2024 (CAMDM), released code, with thresholds per second.
     """
     frames = foot_positions.shape[-3]
     if frames < 2:

@@ -50,7 +50,7 @@ class FeatureLayout:
 
 
 def feature_layout(**sizes: int) -> FeatureLayout:
-    """Layout of fields that lie behind each other.
+    """Layout of fields that follow each other.
 
     Args:
       **sizes: For each field, in order, how many numbers it has.
@@ -132,8 +132,8 @@ class Normalizer:
     """An affine map to zero mean and unit deviation.
 
     Attributes:
-      mean: Of each feature.
-      std: Of each feature, never below the floor it was fitted with.
+      mean: Mean of each feature.
+      std: Standard deviation of each feature, never below the floor it was fitted with.
     """
 
     mean: Float[Array, " features"]

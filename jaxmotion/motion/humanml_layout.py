@@ -14,7 +14,7 @@ class Layout:
 
     Attributes:
       chains: Joints of each chain from its start outwards. Every joint but the root is
-        in one chain behind its start.
+        in one chain after its start.
       raw_offsets: Rest direction of the bone from the parent to each joint, a unit
         vector; zero for the root.
       hips: Right and left hip.

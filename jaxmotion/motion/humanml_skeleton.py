@@ -151,7 +151,7 @@ def _fan_rotation(rest: Array, seen: Array) -> Array:
     """
     covariance = jnp.einsum("fni,nj->fij", seen, rest, precision="highest")
     left, _, right = jnp.linalg.svd(covariance)
-    # Of the nearest orthogonal matrices the one that does not mirror.
+    # The nearest orthogonal matrix that does not mirror.
     sign = jnp.where(jnp.linalg.det(_times(left, right)) < 0, -1.0, 1.0)
     last = left[..., :, 2:] * sign[:, None, None]
     return _times(jnp.concatenate([left[..., :, :2], last], axis=-1), right)

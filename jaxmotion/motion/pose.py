@@ -15,7 +15,7 @@ that is 15 J + 8 numbers: 338 for LaFAN1's 22 joints. Joint 0 is local to the bo
 others to their parents, whose translations are the bones of the skeleton and constant.
 
 Source: Li et al. 2024 (AAMDM), section 3.6; the breakdown is that of orangeduck's
-Learned Motion Matching, which it follows. Differs: a rotation's two columns lie behind
+Learned Motion Matching, which it follows. Differs: a rotation's two columns lie after
 each other here, interleaved there.
 """
 
@@ -79,7 +79,7 @@ def _contacts(skeleton: Skeleton, motion: Motion) -> Array:
     stands = jnp.linalg.norm(velocity, axis=-1) < CONTACT_SPEED
     size = max(round(_CONTACT_FILTER * motion.fps / 60.0), 1)
     padded = jnp.pad(stands, ((size // 2, size - 1 - size // 2), (0, 0)), mode="edge")
-    # Of an even number the upper median: half of them standing is enough.
+    # The upper median of an even number: half of them standing is enough.
     count = sum(padded[i : i + len(stands)].astype(jnp.int32) for i in range(size))
     return (2 * count >= size).astype(jnp.float32)
 
@@ -150,7 +150,7 @@ def character_transforms(
     """Joints in the axes of the simulation bone: forward kinematics of a pose vector.
 
     Unlike `skeleton.forward_kinematics` it takes the translations from the pose, so a
-    network that predicts them is told how they move the joints behind.
+    network that predicts them is told how they move the joints after them.
 
     Args:
       parents: Parent of each joint, -1 for joint 0.

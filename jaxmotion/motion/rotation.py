@@ -73,7 +73,7 @@ def _axes_and_lengths(rot6d: Array) -> tuple[Array, Array, Array, Array]:
 
 @jax.custom_vjp
 def columns_from_rot6d(rot6d: Float[Array, "6 *batch"]) -> Float[Array, "3 3 *batch"]:
-    """`matrix_from_rot6d` with the batch behind: for long chains of such products.
+    """`matrix_from_rot6d` with the batch last: for long chains of such products.
 
     The compiler makes loops over the last axis, and three numbers are too short for
     one: with the batch there, kinematics and its gradient are several times as fast.

@@ -56,7 +56,7 @@ def to_matrix(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 def nearest(
     vector: Float[Array, "*batch 3"], reference: Float[Array, "*batch 3"]
 ) -> Float[Array, "*batch 3"]:
-    """Of the vectors of the same rotation, the nearest to another vector.
+    """The nearest to another vector among those of the same rotation.
 
     Without it the difference of two rotation vectors near a half turn jumps by a full
     turn.

@@ -174,7 +174,7 @@ def _chain_forward(
 def _chain_backward(
     parents: tuple[int, ...], kept: tuple[Array, ...], given: tuple[Array, Array]
 ) -> tuple[Array, Array]:
-    """From the leaves to the root: what moves a joint moves all joints behind it."""
+    """From the leaves to the root: what moves a joint moves all joints below it."""
     local, offsets, rotations = kept
     push, twist = list(given[0]), list(given[1])
     of_local, of_offsets = list(local), [jnp.zeros_like(offsets[0])] * len(parents)

@@ -119,9 +119,9 @@ def desired_trajectory(
       command: Wanted velocity and facing.
       num_frames: Length of the path; frame i is (i + 1) / fps seconds ahead.
       fps: Frames per second.
-      half_life: Of both springs, seconds.
+      half_life: Half-life of both springs, seconds.
       acceleration: Meters per second squared, world; zero if not given.
-      turn_rate: Of the facing, radians per second; zero if not given.
+      turn_rate: Turn rate of the facing, radians per second; zero if not given.
 
     Returns:
       The path, world.

@@ -304,7 +304,7 @@ def _read_legacy(path: str) -> Any:
         keys = _Unpickler(file, storage).load()
         place = file.tell()
     for key in keys:
-        places[key] = place + 8, sizes[key]  # behind the number of numbers
+        places[key] = place + 8, sizes[key]  # after the number of numbers
         place += 8 + sizes[key]
     if os.path.getsize(path) < place or set(places) != set(sizes):
         raise ValueError(f"{os.path.getsize(path)} bytes, expected {place}")

@@ -87,7 +87,7 @@ class ClipModel:
     Attributes:
       network: The module.
       params: Its parameters, float32.
-      tokenizer: Of the package `tokenizers`.
+      tokenizer: Tokenizer of the package `tokenizers`.
       fingerprint: Eight hexadecimal digits that change with weights and tokenizer.
     """
 
@@ -295,7 +295,7 @@ def tokenize(
     """Token ids of texts, with the tokens of start and end.
 
     Args:
-      model: Of which the tokenizer and the context are used.
+      model: Its tokenizer and context are used.
       texts: Some sentences.
       max_tokens: Cut longer texts to so many tokens, those of start and end included;
         22 in EMDM and MDM (HumanML3D). None: a text beyond the context is an error.

@@ -31,7 +31,7 @@ class WordLlama:
     """Token embeddings with their tokenizer.
 
     Attributes:
-      tokenizer: Of the package `tokenizers`.
+      tokenizer: Tokenizer of the package `tokenizers`.
       embedding: One row a token.
     """
 

@@ -49,7 +49,7 @@ def fit_text(text: str, width: int, *, size: int, least: int) -> tuple[str, int]
 
     Args:
       width: Pixels.
-      size: Of the font, pixels, where there is room.
+      size: Size of the font, pixels, where there is room.
       least: The smallest size.
 
     Returns:
@@ -336,7 +336,7 @@ def save_gif(
     Args:
       path: File to write.
       positions: [F, J, 3] world positions, meters, y up.
-      fps: Of the motion.
+      fps: Frames per second of the motion.
       names: Joint names, to find the head and color left and right; None for guesses
         and gray.
       commanded: [F, 2] commanded path (x, z), or None.
@@ -344,14 +344,14 @@ def save_gif(
       feet: Joints to mark while they are in contact.
       contact: [F, feet] bool, or None.
       ball: [F, 3] world position of a ball's center, or None.
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
       title: Above the picture, in one line: shrunk, then elided.
       caption: Below it, small: the source of the data and its license.
       every: Draw every so many frames; the speed stays true. None for at most 20
         pictures per second.
-      azimuth: Of the camera, degrees about +y. None for one toward which the
+      azimuth: Azimuth of the camera, degrees about +y. None for one toward which the
         character comes, all in all.
-      elevation: Of the camera, degrees.
+      elevation: Elevation of the camera, degrees.
       size: Width and height, or the side of a square, pixels.
 
     Raises:

@@ -36,7 +36,8 @@ class Camera:
 
         Args:
           points: [..., 3] meters.
-          frame: Of the camera; an array of frames must broadcast against `points`.
+          frame: Frame of the camera; an array of frames must broadcast against
+            `points`.
 
         Returns:
           [..., 2] pixels from the upper left; [...] pixels a meter there; [...] meters

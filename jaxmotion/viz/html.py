@@ -173,7 +173,7 @@ def page(
       walked: [F, 2] walked path, or None.
       ball: [F, 3] world position of a ball's center, or None.
       touch: [F] whether something touches the ball (its rim is red then), or None.
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
       title: Above the picture; escaped, like the caption.
       caption: Below it, small: the source of the data and its license.
 

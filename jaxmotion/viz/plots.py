@@ -32,7 +32,7 @@ class Panel:
     Attributes:
       title: The metric.
       left: Value, lower and upper end of each method; nan for none.
-      right: Likewise, by the second source.
+      right: The same by the second source.
       target: Method whose value is drawn as a line; None for no line.
     """
 
@@ -191,9 +191,9 @@ def write_pareto(
 
     Args:
       path: The picture.
-      names: Of the points; written beside them.
+      names: Names of the points; written beside them.
       x: Value, lower and upper end of each point's first cost.
-      y: Likewise, of its second.
+      y: The same of its second.
       references: Value, lower and upper end of second costs that are lines.
       xlabel: Quantity and unit.
       ylabel: Quantity and unit.
@@ -266,7 +266,7 @@ def write_scatter(
       marks: Points drawn as crosses in every panel.
       title: Over all panels.
       shown: Points drawn of a cloud, at most.
-      seed: Of the choice of these.
+      seed: Seeds the choice of these.
 
     Raises:
       OSError: if the file cannot be written.

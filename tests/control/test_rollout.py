@@ -110,7 +110,7 @@ def test_characters_and_ticks_draw_their_own_numbers():
     assert not np.any(np.isin(other["value"], frames["value"]))
 
 
-def test_a_tick_runs_the_dearest_plan_wanted_and_no_other():
+def test_a_tick_runs_the_most_expensive_plan_wanted_and_no_other():
     wanted = jnp.array([[0, 1, 0, 2, 0], [0, 0, 2, 1, 1]], jnp.int32)
     ran = []
     program = jax.jit(lambda k, s, c: rollout(toy(ran), k, s, c))

@@ -28,7 +28,7 @@ def skeleton(offsets=PLAIN) -> Skeleton:
 
 
 def columns(matrix: np.ndarray) -> np.ndarray:
-    """The first two columns of rotation matrices, behind each other."""
+    """The first two columns of rotation matrices, one after the other."""
     return np.concatenate([matrix[..., 0], matrix[..., 1]], axis=-1)
 
 

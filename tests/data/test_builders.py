@@ -259,7 +259,7 @@ def style_files() -> dict[str, str]:
 
 
 def style_text(seed: int) -> str:
-    """21 frames at 60 a second; the spine is called a thumb."""
+    """21 frames at 60 per second; the spine is called a thumb."""
     content = bvh.bvh_from_motion(samples.skeleton(), samples.motion(21, seed, 60.0))
     return format_bvh(content, decimals=9).replace("Spine", "LeftHandThumb1")
 
@@ -276,7 +276,7 @@ def test_style100_cuts_halves_labels_and_skips(tmp_path, caplog):
     np.testing.assert_array_equal(found.labels["action"], [3, 0, 2])
     assert "1 files skipped, style not in the list: ['Unlisted_BR']" in caplog.text
     assert "1 files skipped, no cut: ['Old_BW']" in caplog.text
-    # 4..13 at 60 a second are frames 2..5 at 30, which are 4, 6, 8, 10 of the file.
+    # 4..13 at 60 per second are frames 2..5 at 30, which are 4, 6, 8, 10 of the file.
     expected = samples.motion(21, 0, 60.0)
     old = clips.clip_motion(found, 1)
     np.testing.assert_allclose(

@@ -86,7 +86,7 @@ def test_kit_ml_has_its_own_width_rate_and_lengths(tmp_path):
     builder = build(tmp_path, "kit_ml")
     found = humanml3d.text_motions_from_source(builder)
     assert found.num_features == 251 and found.fps == 12.5
-    # 000002 has 39 frames; the part of 0.5 s has 10 at the released 20 a second.
+    # 000002 has 39 frames; the part of 0.5 s has 10 at the released 20 per second.
     assert "000002" in found.clip_names and "000003_line1" not in found.clip_names
     lengths = dict(zip(found.clip_names, np.diff(found.offsets), strict=True))
     assert lengths["000001_line2"] == 50

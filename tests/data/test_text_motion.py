@@ -262,7 +262,7 @@ def test_captions_with_times_are_clips_of_their_own():
     expected = [("r", 0, 120, ["a", "c"]), ("r_line2", 39, 51, ["b"])]
     expected += [("r_line5", 20, 40, ["e"])]
     assert cut(120, text) == expected
-    # Times behind the end stop there.
+    # Times after the end stop there.
     assert cut(120, "b#b/X#3#99") == [("r_line1", 60, 60, ["b"])]
     # KIT-ML's own rate.
     assert cut(120, "b#b/X#2#4", cut_fps=12.5, min_frames=24) == [

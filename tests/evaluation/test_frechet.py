@@ -19,7 +19,7 @@ def fit(x):
 
 
 def count_of(x, padding=0):
-    """Rows, with others of no meaning behind them, and how many count."""
+    """Rows, with others of no meaning after them, and how many count."""
     filled = np.pad(x, ((0, padding), (0, 0)), constant_values=7.0)
     return jnp.asarray(filled), jnp.asarray(len(x))
 

@@ -20,7 +20,7 @@ def load():
 
 @pytest.fixture(scope="module")
 def invoke(load):
-    """Runs a script's command line; what has spaces of its own comes behind it."""
+    """Runs a script's command line; what has spaces of its own comes after it."""
     with pytest.MonkeyPatch.context() as patch:
 
         def call(script, line, *more):

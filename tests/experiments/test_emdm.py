@@ -27,7 +27,7 @@ SIZES = (
 
 @pytest.fixture(scope="module")
 def call(invoke):
-    """Runs a command line; sentences come behind it."""
+    """Runs a command line; sentences come after it."""
     return functools.partial(invoke, "emdm")
 
 

@@ -46,8 +46,9 @@ class Target:
 
     Args:
       name: For the report.
-      read: Of an input, a value.
-      confirm: Of an input and its value; raises AssertionError where they differ.
+      read: Makes a value of an input.
+      confirm: Compares an input with its value; raises AssertionError where they
+        differ.
       names: Words of which a message must have one, such as the file's name.
     """
 

@@ -43,7 +43,7 @@ def quaternion(matrix):
 
 
 def plain_rows(data):
-    """Numbers behind the frame time, as Python reads them."""
+    """Numbers after the frame time, as Python reads them."""
     text = data.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     lines = text[text.upper().rindex("TIME") :].split("\n")[1:]
     return [[float(word) for word in line.split()] for line in lines if line.split()]

@@ -249,7 +249,7 @@ def test_a_row_of_the_log_that_is_none_is_named(tmp_path, line):
 
 
 def test_the_log_is_replaced_whole(tmp_path, monkeypatch):
-    """A kill while rows behind the checkpoint are dropped leaves the log as it was."""
+    """A kill while rows after the checkpoint are dropped leaves the log as it was."""
     run, state, key, data = small_parts()
     state = train(run, state, key, data, loop=loop_of(tmp_path, 4))
     path = tmp_path / "losses.jsonl"

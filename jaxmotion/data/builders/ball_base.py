@@ -50,7 +50,7 @@ def ball_example(
       ball: World position of the ball's center in every frame, meters, y up.
       touch: Which of the joints touch the ball in every frame.
       joints: Joints that may touch the ball.
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
 
     Returns:
       What a builder's generator yields.

@@ -174,7 +174,7 @@ def read_sequence(path: str, data: bytes, skeleton: Skeleton) -> tuple[str, dict
     trans, poses, ball = (fields[field][::step].astype(np.float64) for field in _FRAMES)
     if len(trans) < 3:
         raise ValueError(
-            f"{path}: {len(trans)} frames at 30 a second, expected at least 3"
+            f"{path}: {len(trans)} frames at 30 per second, expected at least 3"
         )
     offsets = np.asarray(skeleton.offsets, np.float64)
     # SMPL turns the body about its pelvis, so the way there is not turned.

@@ -25,7 +25,7 @@ from jaxmotion.motion.skeleton import Skeleton
 
 ACTIONS = ("BR", "BW", "FR", "FW", "ID", "SR", "SW", "TR1", "TR2", "TR3")
 _DROPPED = ("eye", "index", "middle", "ring", "pinky", "thumb")
-# As `plain_names` has them: in any case, and behind a rig's prefix such as mixamorig:.
+# As `plain_names` has them: in any case, and after a rig's prefix such as mixamorig:.
 _FEET = (
     ("lefttoeend", "righttoeend"),
     ("lefttoebase", "righttoebase"),
@@ -149,7 +149,7 @@ def cut_clip(content: bvh_text.Bvh, cut: tuple[int, int]) -> bvh_text.Bvh:
     if not 0 <= start < stop <= len(values):
         raise bvh_text.BvhError(
             f"{content.name}: the cut {cut[0]}..{cut[1]} of Frame_Cuts.csv is not "
-            f"within the {2 * len(values)} frames of the recording at 60 a second"
+            f"within the {2 * len(values)} frames of the recording at 60 per second"
         )
     content = dataclasses.replace(
         content, values=values[start:stop], frame_time=1.0 / 30.0
@@ -176,7 +176,7 @@ def read_cuts(path: str, text: str) -> dict[tuple[str, str], tuple[int, int]]:
         order of `ACTIONS`. An empty cell or one with an "n" (NA, nan) means missing.
 
     Returns:
-      Start and stop in frames at 60 a second, by style and action.
+      Start and stop in frames at 60 per second, by style and action.
 
     Raises:
       ValueError: names the file, the line and the cell.

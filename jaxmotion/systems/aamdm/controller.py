@@ -60,8 +60,8 @@ class CharacterState:
     Attributes:
       frame: Its frame, as the space has it.
       bone: Its simulation bone, world.
-      velocity: Of the bone, meters per second, world.
-      turn_rate: Of the bone, radians per second.
+      velocity: Velocity of the bone, meters per second, world.
+      turn_rate: Turn rate of the bone, radians per second.
     """
 
     frame: Float[Array, "*batch channels"]
@@ -106,7 +106,7 @@ def wanted_path(
       state: The character.
       command: What the user wants now.
       fps: Frames per second.
-      half_life: Of the springs, seconds.
+      half_life: Half-life of the springs, seconds.
 
     Returns:
       Path features in the axes of the character's bone.
@@ -238,7 +238,7 @@ def controller(
       fps: Frames per second.
       steered: Whether commands matter; if not, none of the steering is compiled in.
       bounded: Whether frames are kept within the bounds of the data; ours.
-      half_life: Of the springs that turn a command into a path, seconds.
+      half_life: Half-life of the springs that turn a command into a path, seconds.
 
     Returns:
       A controller that makes a frame in every tick.
@@ -317,7 +317,7 @@ def start_states(
       space: The space.
       number: Characters.
       num_joints: Joints of the skeleton.
-      seed: Of the choice of poses.
+      seed: Seeds the choice of poses.
 
     Returns:
       States, batch axis first.

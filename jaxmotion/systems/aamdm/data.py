@@ -1,6 +1,6 @@
 """Pose vectors and path features of clips, ready for AAMDM's training.
 
-The last part of every clip is held out, behind a gap of a second: frames next to each
+The last part of every clip is held out, after a gap of one second: frames next to each
 other are nearly the same.
 """
 
@@ -19,7 +19,7 @@ from jaxmotion.motion import path_features, pose
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class PoseData:
-    """Frames of clips behind each other.
+    """Frames of clips, concatenated.
 
     Attributes:
       poses: Pose vectors.
@@ -67,7 +67,7 @@ def take(data: PoseData, spans: list[tuple[int, int]]) -> PoseData:
 
     Args:
       data: The frames.
-      spans: First frame and the frame behind the last of each part.
+      spans: First frame and the frame after the last of each part.
 
     Returns:
       Those parts.

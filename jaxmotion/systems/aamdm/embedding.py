@@ -5,7 +5,7 @@
 and the autoencoder's loss, which looks at poses in their own channels and, through
 forward kinematics F, in the character's axes:
 
-    L_val = |y' - y| + |F(y') - F(y)|,  L_vel = the same of frame differences a second,
+    L_val = |y' - y| + |F(y') - F(y)|,  L_vel = the same of differences per second,
     L_reg = |z|^2 + |z| + the differences of z.
 
 Source: Li et al. 2024 (AAMDM), section 3.1, eq. 1-4. Norms, weights and normalization
@@ -62,7 +62,7 @@ class Config:
       fps: Frames per second.
       latent: Channels of z (paper: 52, so that xz has 64).
       width: Channels of a hidden layer (ours; the paper gives none).
-      weights: Of the loss.
+      weights: Weights of the loss.
     """
 
     num_joints: int
@@ -179,7 +179,7 @@ def encode(
 
     Args:
       params: The autoencoder's.
-      statistics: Of the training frames.
+      statistics: Statistics of the training frames.
       poses: Pose vectors.
       paths: Path features.
       config: Sizes.
@@ -203,7 +203,7 @@ def decode(
 
     Args:
       params: The autoencoder's.
-      statistics: Of the training frames.
+      statistics: Statistics of the training frames.
       embedded: As `encode` returns them.
       config: Sizes.
 
@@ -241,7 +241,7 @@ def loss(
       params: The autoencoder's.
       key: Not used; losses have one.
       batch: Pose vectors and path features.
-      statistics: Of the training frames.
+      statistics: Statistics of the training frames.
       parents: Parent of each joint.
       config: Sizes and weights.
 

@@ -61,7 +61,7 @@ def commands(
       run: The run.
       number: Characters.
       ticks: Length.
-      course: Of `courses.COURSES`.
+      course: One of `courses.COURSES`.
       speed: Meters per second.
 
     Returns:
@@ -132,7 +132,7 @@ def data_frames(
       data: Where they come from.
       number: Windows.
       ticks: Frames per window.
-      seed: Of their choice.
+      seed: Seeds their choice.
 
     Returns:
       Frames; what they wanted is their own path and velocity.
@@ -210,8 +210,8 @@ class Reference:
     """What rows are compared with.
 
     Attributes:
-      normalizer: Of joint positions in the character's axes.
-      moments: Of the training frames' positions, normalized.
+      normalizer: Normalizer of joint positions in the character's axes.
+      moments: Moments of the training frames' positions, normalized.
       toe_height: Height of the resting toes, meters.
       root_height: Median height of the root, meters.
     """
@@ -429,7 +429,7 @@ def score_stepper(
         still shows.
       course: Commands of the steered rollouts.
       speed: Meters per second that are commanded.
-      seed: Of poses, noise and pairs.
+      seed: Seeds poses, noise and pairs.
       groups: As in `free_row`.
 
     Returns:

@@ -53,7 +53,7 @@ class Config:
       weight_velocity: Weight of the differences of neighboring frames.
       previous_noise: Largest deviation of the noise that is added in training to the
         previous frames of the data, in units of the target's scale; ours, so that a
-        rollout finds back when it has left the data. 0 for none.
+        rollout recovers after leaving the data. 0 for none.
       own_previous: Probability that the GAN's previous frame in training is the
         generator's own prediction of it.
       weight_r1: Weight of the discriminator's gradient penalty, gamma.
@@ -251,8 +251,8 @@ def sampler(
     """The sampler of the next frame.
 
     Args:
-      params: Of the generator and the polisher; the discriminator's are not used, and
-        one that takes no steps may be missing.
+      params: Parameters of the generator and the polisher; the discriminator's are not
+        used, and one that takes no steps may be missing.
       config: The method.
       change: Deviation of each channel's changes; for `target` "change" only.
       step: Makes the chain's step from the schedule and a denoiser; the default is the

@@ -32,7 +32,7 @@ class Autoencoder:
 
     Attributes:
       params: Its parameters.
-      statistics: Of its training frames.
+      statistics: Statistics of its training frames.
       config: Its sizes.
     """
 
@@ -47,12 +47,12 @@ class Space:
     """How frames are made and read.
 
     Attributes:
-      normalizer: Of the channels before they are scaled.
+      normalizer: Normalizer of the channels before they are scaled.
       change: Deviation of each channel's change from frame to frame.
       low: Least value of each channel that a frame is let take: the lowest half per
         cent of the data lie below it.
       high: Greatest value, likewise.
-      autoencoder: Of an embedded space; None for full poses.
+      autoencoder: Autoencoder of an embedded space; None for full poses.
     """
 
     normalizer: features.Normalizer
@@ -96,7 +96,7 @@ def fit_space(
       poses: Pose vectors of all clips.
       paths: Path features.
       neighbors: Frames that are followed by another of the same clip.
-      autoencoder: Of an embedded space; None for full poses.
+      autoencoder: Autoencoder of an embedded space; None for full poses.
 
     Returns:
       The space.

@@ -130,7 +130,7 @@ def prepare(
                 "skeleton": model_json.skeleton_to_json(clips.skeleton),
             },
             source=clips.source,
-            # Of each clip the end is held out.
+            # The end of each clip is held out.
             split={"train": list(names), "held_out": list(names)},
             files={
                 name: functools.partial(_write_frames, part)
@@ -341,7 +341,7 @@ def train_polisher(
 
     Args:
       run: The run.
-      name: Of the space.
+      name: Name of the space.
       space: The space.
       config: The method.
       budget: How long.
@@ -371,7 +371,7 @@ def train_generator(
 
     Args:
       run: The run.
-      name: Of the space.
+      name: Name of the space.
       space: The space.
       config: The method.
       budget: How long; both players have its optimizer.
@@ -419,7 +419,7 @@ def load_networks(
 
     Args:
       run: The run.
-      name: Of the space.
+      name: Name of the space.
       space: The space.
       drafts: Steps of the generator.
       polishes: Steps of the diffusion model.

@@ -50,12 +50,14 @@ class Control:
         M frames (False).
       extend: Use HFTE; without it the user's path alone is the condition (ablation).
       reuse: K of HFTE, points reflected at a time (paper 15, released code 23).
-      guidance_scale: Of the past after a change of style (paper 0.7, code 0.5).
+      guidance_scale: Scale of the guidance on the past after a change of style (paper
+        0.7, code 0.5).
       guided_plans: Plans that are guided after a change of style (paper: "when the
         style label has just changed", so 1; code 2).
       guide_start: The first plans after the start are guided as those after a change of
         style are (released code: its counter starts full).
-      half_life: Of the springs of velocity and facing, seconds (orangeduck 0.27).
+      half_life: Half-life of the springs of velocity and facing, seconds (orangeduck
+        0.27).
       bias_position: Exponent of the blend of positions (released scene 0.7, code
         0.4).
       bias_facing: Exponent of the blend of facings (released code 2.2).
@@ -91,7 +93,7 @@ RELEASED = Control(
 )
 
 
-# Of models that ship: the walked path is the commanded one.
+# For models that ship: the walked path is the commanded one.
 OWN_STARTS = Control(follow=1.0)
 
 
@@ -104,10 +106,10 @@ class CharacterState:
       past: The last displayed poses.
       plan: The poses being played.
       cursor: Next pose of the plan.
-      velocity: Of the desired motion (the spring), meters per second.
-      acceleration: Of the desired motion, meters per second squared.
+      velocity: Velocity of the desired motion (the spring), meters per second.
+      acceleration: Acceleration of the desired motion, meters per second squared.
       facing: Desired facing (the spring), unit.
-      turn_rate: Of the desired facing, radians per second.
+      turn_rate: Turn rate of the desired facing, radians per second.
       anchor: Where the desired motion is, (x, z) meters: the commanded path's end.
       command: The last command; its label is -1 before the first.
       guided: Plans that are still to be guided.
@@ -538,7 +540,7 @@ def start_states(
       model: The model.
       labels: Style of each character.
       field: Label field that is the style.
-      seed: Of the choice of poses.
+      seed: Seeds the choice of poses.
 
     Returns:
       States, batch axis first.
@@ -570,7 +572,7 @@ def own_states(
     Args:
       model: A model with `starts`.
       labels: Style of each character.
-      seed: Of the choice of poses.
+      seed: Seeds the choice of poses.
 
     Returns:
       States, batch axis first.

@@ -52,7 +52,7 @@ def course_of_run(
 
     Args:
       run: The run.
-      course: Of `courses.COURSES`.
+      course: One of `courses.COURSES`.
       labels: Style of each character.
       seconds: Length.
       speed: Meters per second; None for each style's own median speed.
@@ -85,11 +85,11 @@ def steer_one(
     Args:
       run: The run.
       style: Its style.
-      course: Of `courses.COURSES`.
+      course: One of `courses.COURSES`.
       seconds: Length.
       to_style: Its style from half time on; None for the same.
       speed: Meters per second; None for the first style's own median speed.
-      seed: Of the start pose and the noise.
+      seed: Seeds the start pose and the noise.
 
     Returns:
       The motion, and the velocity asked for in each frame, meters per second.
@@ -125,7 +125,7 @@ def own_starts(run: Run, *, number: int, seed: int = 0) -> Motion:
     Args:
       run: The run.
       number: Starts per style, 1 to 16.
-      seed: Of the recorded poses that the rollouts begin with, and the noise.
+      seed: Seeds the recorded poses that the rollouts begin with, and the noise.
 
     Returns:
       `Model.starts`.
@@ -175,7 +175,7 @@ class Trial:
       labels: Style of each character; `repeats` neighbors have one style.
       repeats: Characters of a style.
       speeds: Meters per second, of each character.
-      commands: Of each character and tick.
+      commands: Commands of each character and tick.
       states: In held-out poses.
     """
 
@@ -279,7 +279,7 @@ def score_run(
       trial: Who is steered, and how.
       count: Windows of each Fréchet distance.
       chunk: Characters to run at a time, at most.
-      seed: Of noise and subsets.
+      seed: Seeds noise and subsets.
       replicated: As in `made_row`.
 
     Returns:
@@ -322,13 +322,13 @@ def evaluate_run(
 
     Args:
       run: The run.
-      course: Of `courses.COURSES`.
+      course: One of `courses.COURSES`.
       rollouts: Characters, spread evenly over the styles; at least one a style.
       seconds: Length of each rollout.
       speed: Meters per second; None for each style's own median speed.
       chunk: Characters to run at a time, at most.
       evaluator_steps: Updates of the evaluator of styles, if it is trained here.
-      seed: Of poses, noise, evaluator and subsets.
+      seed: Seeds poses, noise, evaluator and subsets.
       evaluator: A frozen evaluator of styles; None to train one.
 
     Returns:
@@ -444,7 +444,7 @@ def train_style(
       held_out: Clips for its accuracy.
       field: Label field that it recognizes.
       num_steps: Updates.
-      seed: Of parameters and batches.
+      seed: Seeds parameters and batches.
 
     Returns:
       The evaluator.

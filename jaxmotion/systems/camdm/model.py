@@ -34,7 +34,7 @@ from jaxmotion.systems.camdm import network as camdm_network
 from jaxmotion.typing import Key, Params
 
 SYSTEM = "camdm"
-# Of the one training, in a run folder.
+# The one training of a run folder.
 STAGE = "motion"
 
 
@@ -59,7 +59,7 @@ class Config:
       token_margin: Frames beyond its own, on either side, that an output token predicts
         and shares with its neighbors; ours, 0 in the paper.
       token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
-      norm: Layer norms of the transformer behind each sum ("post", the paper's) or
+      norm: Layer norms of the transformer after each sum ("post", the paper's) or
         before each branch ("pre", ours: learns the legs' phase in a tenth of the
         steps).
       attention: "full" (the paper's), or "prefix": condition tokens attend among
@@ -79,13 +79,13 @@ class Config:
         for none in the paper.
       drop_past: Probability that the past is zeroed in training.
       weight_data: Weight of the mean squared error of features (eq. 2).
-      weight_velocity: Of the displacements of rotations.
-      weight_position: Of the joint positions (eq. 3).
-      weight_position_velocity: Of the displacements of joint positions (released
+      weight_velocity: Weight of the displacements of rotations.
+      weight_position: Weight of the joint positions (eq. 3).
+      weight_position_velocity: Weight of the displacements of joint positions (released
         code; not in the paper's eq. 4).
-      weight_acceleration: Of the second differences of joint positions; ours, 0 in the
-        paper.
-      weight_foot: Of foot sliding.
+      weight_acceleration: Weight of the second differences of joint positions; ours, 0
+        in the paper.
+      weight_foot: Weight of foot sliding.
       contact_speed: A foot slower than this stands, meters per second.
     """
 
@@ -150,7 +150,7 @@ class Condition:
     keep_past: Bool[Array, "*batch"]
 
     def arguments(self, config: Config) -> tuple[Array, ...]:
-        """The network's arguments behind x_t and t.
+        """The network's arguments after x_t and t.
 
         Args:
           config: Says how facings are laid out.

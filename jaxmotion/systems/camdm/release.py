@@ -84,9 +84,9 @@ def trajectory_error(
     position: Float[Array, "frames 2"],
     frames: Count | None = None,
 ) -> Float[Array, ""]:
-    """Of the steps of a root (x, z) against commanded velocities of any length.
+    """Mean turn of a root's steps (x, z) against the commanded velocities.
 
-    Radians; frames at rest count, with the polar angle 0. The last command is not used.
+    Radians, lengths do not matter; frames at rest count, with the polar angle 0. The last command is not used.
     """
     frames = len(told) if frames is None else frames
     step = jnp.diff(position, axis=0)
@@ -104,7 +104,7 @@ def orientation_error(
     facing: Float[Array, "frames 2"],
     frames: Count | None = None,
 ) -> Float[Array, ""]:
-    """Of facings (x, z) of any length against the commanded ones; radians."""
+    """Mean turn of facings (x, z) of any length against the commanded ones; radians."""
     return _mean_turn(told, facing, len(told) if frames is None else frames)
 
 
@@ -206,8 +206,8 @@ class Recordings:
       frames: That are each one's own.
       label: Style of each.
       command: Told in each frame; None where nobody steered.
-      windows: Of 60 frames, one behind the other from the first on; `group` is the
-        recording.
+      windows: Windows of 60 frames, one after the other from the first on; `group` is
+        the recording.
     """
 
     motion: Motion
@@ -293,7 +293,7 @@ def row(
     Args:
       values: From `metrics`, and "fid" from `distances`; those that are not numbers
         are left out, as the scripts do.
-      group: Of each recording, such as its replication; None for each on its own.
+      group: Group of each recording, such as its replication; None for each on its own.
 
     Returns:
       Columns; angles in degrees.

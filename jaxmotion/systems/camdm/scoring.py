@@ -39,7 +39,7 @@ def frechet_cell(
       feature: Features of the windows of a row.
       reference: Features of the reference windows.
       count: Windows of each subset, the same for all rows.
-      seed: Of the subsets.
+      seed: Seeds the subsets.
       repeats: Subsets.
 
     Returns:
@@ -66,8 +66,8 @@ def unbiased_cells(
     Args:
       feature: Features of all windows of a row.
       reference: Features of the reference windows.
-      seed: Of the subsets.
-      sizes: Of the subsets, from as many windows as there are features to all.
+      seed: Seeds the subsets.
+      sizes: Sizes of the subsets, from as many windows as there are features to all.
 
     Returns:
       "fid_unbiased", without an interval; nothing if there are too few windows for
@@ -102,7 +102,7 @@ def frechet_cells(
       feature: Features of the windows of a row.
       reference: Features of the reference windows.
       count: Windows of the subsets of `frechet_cell`.
-      seed: Of all subsets.
+      seed: Seeds all subsets.
       repeats: Subsets of `frechet_cell`.
 
     Returns:
@@ -118,7 +118,7 @@ def random_half(clips: np.ndarray, labels: np.ndarray, seed: int) -> np.ndarray:
     Args:
       clips: Clip of each window.
       labels: Style of each window.
-      seed: Of the choice.
+      seed: Seeds the choice.
 
     Returns:
       True for the windows of that half.
@@ -276,7 +276,7 @@ class Reference:
 
     Attributes:
       skeleton: The skeleton.
-      evaluator: Of styles.
+      evaluator: Evaluator of styles.
       real: Windows of held-out clips, one after the other.
       real_features: Theirs.
       hits: Whether the evaluator recognizes their styles.
@@ -340,7 +340,7 @@ def real_rows(
     Args:
       reference: The reference.
       count: Windows of each Fréchet distance.
-      seed: Of the subsets.
+      seed: Seeds the subsets.
       repeats: Subsets of each Fréchet distance.
     """
     distances = functools.partial(
@@ -369,7 +369,7 @@ def made_row(
       made: Windows of the rollouts.
       repeats: Such neighbors; with one there is no column of diversity.
       count: Windows of each Fréchet distance.
-      seed: Of the subsets.
+      seed: Seeds the subsets.
       replicated: Intervals run over replications, of which every neighbor belongs to
         another, instead of over rollouts and random subsets.
     """
@@ -377,7 +377,7 @@ def made_row(
     grouped = made
     row = frechet_cells(features, reference.features, count=count, seed=seed)
     if replicated:
-        # Of each replication, not of each character: these are what is independent.
+        # One for each replication, not for each character: those are independent.
         owner = np.asarray(made.group) % repeats
         grouped = dataclasses.replace(made, group=jnp.asarray(owner))
         values = [

@@ -35,7 +35,7 @@ from jaxmotion.systems.camdm.training import Run
 # Frames between the windows in which the new style is looked for.
 STRIDE = 3
 HALF = windows.EVAL_WINDOW // 2
-# Seconds behind the command whose motion is measured; the paper's 120 frames.
+# Seconds after the command whose motion is measured; the paper's 120 frames.
 MEASURED = 4.0
 MOTION = ("foot_slide", "jerk")
 
@@ -50,8 +50,8 @@ class Changes:
       old: First style of each character.
       new: Style commanded from `tick` on.
       replication: That each character belongs to.
-      tick: Of the change.
-      limit: Seconds behind it in which it must have come.
+      tick: Tick of the change.
+      limit: Seconds after it in which it must have come.
     """
 
     states: camdm_controller.CharacterState
@@ -76,11 +76,11 @@ def make_changes(
 
     Args:
       run: The run.
-      course: Of `courses.COURSES`.
+      course: One of `courses.COURSES`.
       before: Seconds in the first style, at least half a window.
-      limit: Seconds behind the command in which the change must have come.
-      replications: Of all pairs, with start poses of their own.
-      seed: Of the start poses.
+      limit: Seconds after the command in which the change must have come.
+      replications: Sets of all pairs, each with start poses of its own.
+      seed: Seeds the start poses.
 
     Returns:
       The changes; their rollouts last so long that the last window is whole.
@@ -149,17 +149,17 @@ def find_changes(
     *,
     fps: float,
 ) -> tuple[Bool[np.ndarray, "characters windows"], np.ndarray]:
-    """Whether each window about or behind the command shows the new style.
+    """Whether each window about or after the command shows the new style.
 
     Args:
       skeleton: The skeleton.
       frames: Displayed frames [characters, ticks, ...].
       changes: That they were made for.
-      evaluator: Of styles.
+      evaluator: Evaluator of styles.
       fps: Ticks per second.
 
     Returns:
-      Decisions, and the windows' centers in seconds behind the command, from 0 on.
+      Decisions, and the windows' centers in seconds after the command, from 0 on.
     """
     centers = np.arange(0, round(changes.limit * fps) + 1, STRIDE)
     found = []
@@ -187,14 +187,14 @@ def transition_row(
 
     Args:
       run: The run.
-      frames: Of all characters.
+      frames: Frames of all characters.
       changes: That they were made for.
-      evaluator: Of styles.
+      evaluator: Evaluator of styles.
       height: Below it a foot joint should not move, meters.
 
     Returns:
       Success in per cent; duration in seconds and frames, failures counted as the
-      limit; of the four seconds behind the command what `metric_row` measures; and of
+      limit; of the four seconds after the command what `metric_row` measures; and of
       the whole rollout slide and coherence of CAMDM's release.
     """
     skeleton, fps = run.model.skeleton, run.model.config.fps
@@ -211,14 +211,14 @@ def transition_row(
         "transition_time": cell(done.seconds),
         "transition_frames": cell(fps * done.seconds),
     }
-    behind = slice(changes.tick, changes.tick + round(MEASURED * fps))
-    cut = jax.tree.map(lambda x: x[:, behind], frames)
+    after = slice(changes.tick, changes.tick + round(MEASURED * fps))
+    cut = jax.tree.map(lambda x: x[:, after], frames)
     made = windows.rollout_windows(cut, jnp.asarray(changes.new), skip=0)
     owner = changes.replication[np.asarray(made.group)]
     grouped = dataclasses.replace(made, group=jnp.asarray(owner))
     motion = camdm_scoring.metric_row(skeleton, grouped, None, height=height)
     row |= {name: motion[name] for name in MOTION}
-    # Of its changes of style the release measures neither direction nor facing.
+    # The release measures neither direction nor facing of its changes of style.
     whole = camdm_release.of_rollouts(frames, changes.commands)
     values = camdm_release.metrics(skeleton, dataclasses.replace(whole, command=None))
     return row | camdm_release.row(values, changes.replication)
@@ -241,9 +241,9 @@ def evaluate_transitions(
       changes: What characters are told.
       controls: Constants of the run-time, by row; the last row's serve for those who
         keep their style.
-      evaluator: Of styles.
+      evaluator: Evaluator of styles.
       chunk: Characters to run at a time, at most.
-      seed: Of the noise, the same for all rows.
+      seed: Seeds the noise, the same for all rows.
       report: Called with each row's name when it is measured.
 
     Returns:
@@ -277,7 +277,7 @@ def clip_accuracy(run: Run, evaluator: StyleEvaluator) -> table.Cell:
 
     Args:
       run: The run.
-      evaluator: Of styles.
+      evaluator: Evaluator of styles.
 
     Returns:
       Per cent, over clips.

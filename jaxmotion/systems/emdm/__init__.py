@@ -17,7 +17,7 @@ here take minutes:
   less; published: two passes.
 * `norm="pre"`, `frames_per_token=4`, no dropout, Muon: learn faster; published:
   post-norm, 1, 0.1, Adam.
-* `mask_frames=True`: zeros behind a motion's end are seen by nobody; each frame of a
+* `mask_frames=True`: zeros after a motion's end are seen by nobody; each frame of a
   batch counts the same in the losses; published: `mask_frames=False`
   (`--no-mask-frames`): attention and discriminator see the zeros; losses are of each
   motion's own frames, and each motion counts the same.

@@ -69,7 +69,7 @@ def fit_evaluator(
     Args:
       train: Training clips.
       num_steps: Updates.
-      seed: Of parameters, batches and motions.
+      seed: Seeds parameters, batches and motions.
 
     Returns:
       Its size, and its parameters.
@@ -98,7 +98,7 @@ def load_evaluator(
     Args:
       run: The run.
       num_steps: Updates.
-      seed: Of parameters and batches.
+      seed: Seeds parameters and batches.
       evaluator: A frozen evaluator to use in its place; None for none.
 
     Returns:
@@ -382,7 +382,7 @@ def train_action(
       held_out: Clips for its accuracy.
       field: Label field that is the action.
       num_steps: Updates.
-      seed: Of parameters, batches and motions.
+      seed: Seeds parameters, batches and motions.
 
     Returns:
       The evaluator.

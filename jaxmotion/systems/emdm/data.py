@@ -354,8 +354,8 @@ def clip_features(
     """HumanML3D's features of every clip, and how well they give its joints back.
 
     Args:
-      clips: Of a skeleton that `humanml_skeleton.joint_mapping` knows, at the rate of
-        the features.
+      clips: Clips of a skeleton that `humanml_skeleton.joint_mapping` knows, at the
+        rate of the features.
 
     Returns:
       One array a clip, of one frame less than the clip; and the largest error of joints
@@ -419,7 +419,7 @@ def from_labels(
       held_out: Part of the other clips in "test".
       least: Shortest clip, frames at the new rate.
       fps: Frames per second of the features.
-      seed: Of captions and of the split.
+      seed: Seeds captions and the split.
 
     Returns:
       The text motions, and the largest error of joints to features to joints, meters.

@@ -148,7 +148,7 @@ def make_motions(
       row: Which model.
       frames: Length; None for the model's longest.
       scale: Guidance; None for the paper's.
-      seed: Of the noise.
+      seed: Seeds the noise.
 
     Returns:
       Skeleton and motion by action or sentence, and the data's source.

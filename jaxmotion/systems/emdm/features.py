@@ -63,7 +63,7 @@ def fit(skeleton: Skeleton, motions: Motion, *, floor: float = 0.01) -> Represen
     raw = _raw(motions)
     found = features.fit_normalizer(raw, floor=0.0)
     rotations = jnp.broadcast_to(jnp.mean(found.std[:-6]), (raw.shape[-1] - 6,))
-    # The three zeros behind the root's position stay zeros.
+    # The three zeros after the root's position stay zeros.
     root = jnp.concatenate([found.std[-6:-3], jnp.ones(3)])
     std = jnp.maximum(jnp.concatenate([rotations, root]), floor)
     return Representation(
@@ -80,7 +80,6 @@ def to_features(
 
     Args:
       motion: The motions.
-      representation: Of their skeleton.
 
     Returns:
       Features in the network's units.
@@ -95,7 +94,6 @@ def to_motion(
 
     Args:
       x: Features, perhaps from a network.
-      representation: Of the skeleton.
 
     Returns:
       The motions, in meters.
@@ -111,7 +109,6 @@ def geometry(representation: Representation, *, relative: bool) -> Geometry:
     """What the geometric losses need of a representation.
 
     Args:
-      representation: Of the skeleton.
       relative: Joint positions relative to the root, as released; else in the world.
 
     Returns:

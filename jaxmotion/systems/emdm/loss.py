@@ -36,7 +36,7 @@ class Batch:
     """Motions and what they are made from.
 
     Attributes:
-      x_0: Features in the network's units; zero behind a motion's end.
+      x_0: Features in the network's units; zero after a motion's end.
       vector: One-hot actions or text vectors.
       mask: Frames that a motion has.
     """
@@ -119,7 +119,7 @@ def geometric_loss(
 
 
 def _visible(x: Array, batch: Batch, config: Config) -> Array:
-    """Motion as the discriminator sees it: nothing behind its end."""
+    """Motion as the discriminator sees it: nothing after its end."""
     return x * batch.mask[..., None] if config.mask_frames else x
 
 

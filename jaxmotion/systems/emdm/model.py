@@ -54,7 +54,7 @@ class Config:
       token_margin: Frames beyond its own, on either side, that an output token predicts
         and shares with its neighbors; ours, 0 in the paper.
       token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
-      norm: Layer norms behind each sum ("post", the paper's) or before each branch
+      norm: Layer norms after each sum ("post", the paper's) or before each branch
         ("pre", ours: learns faster in short runs).
       mask_frames: What of the zeros that follow a motion's end is seen. True (ours):
         nothing; every frame of a batch counts the same in the losses. False, as
@@ -64,9 +64,9 @@ class Config:
       discriminator_condition: Whether the discriminator sees the condition.
       drop_condition: Probability that the condition is dropped in training.
       weight_recon: R, of the mean squared error of features (100 for texts).
-      weight_position: Of joint positions (0 for texts).
-      weight_velocity: Of frame differences of features (0 for texts).
-      weight_foot: Of sliding feet (0 for texts).
+      weight_position: Weight of joint positions (0 for texts).
+      weight_velocity: Weight of frame differences of features (0 for texts).
+      weight_foot: Weight of sliding feet (0 for texts).
       geometry: Joint positions of those losses relative to the "root" (released code)
         or in the "world" (ours: else a standing foot seems to slide under a moving
         root).

@@ -28,14 +28,14 @@ class Settings:
     Attributes:
       samples: Motions of a replication (actions: rounded down to as many of each).
       replications: Sets of motions of each row.
-      scale: Of classifier-free guidance; None for the paper's.
+      scale: Scale of classifier-free guidance; None for the paper's.
       evaluator_steps: Updates of an evaluator that is trained here; None for 1500 of
         that of actions, 600 of that of texts.
       evaluator: A frozen evaluator of actions; None to train one.
       matcher: Published weights of the text-motion evaluator; None to train one.
       glove: Folder of the word vectors that they read.
       padding: What the text-motion evaluator sees beyond the end of generated motions.
-      seed: Of noise and pairs.
+      seed: Seeds noise and pairs.
     """
 
     samples: int = 1000
@@ -56,7 +56,7 @@ class RowScorer:
     Attributes:
       real: Rows of real motions.
       score: `(key, many) -> scores` of one replication of what `many` samples.
-      scale: Of the guidance; None for none.
+      scale: Scale of the guidance; None for none.
       one: Condition of one motion, to measure times with.
       samples: Motions of a replication.
       describe: JSON that says what the evaluator is.

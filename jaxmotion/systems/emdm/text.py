@@ -45,8 +45,8 @@ class TextRun:
     Attributes:
       record: What the folder is.
       motions: Clips with captions.
-      encoder: Of sentences.
-      vectors: Of the captions' distinct sentences, as the networks take them.
+      encoder: Encoder of sentences.
+      vectors: Vectors of the captions' distinct sentences, as the networks take them.
       index: Vector of each caption.
       scale: What the encoder's vectors were multiplied with; 1 as released.
     """
@@ -123,10 +123,10 @@ def prepare(
     Args:
       folder: The run folder.
       data: One file of text motions, or files of labeled clips.
-      encoder: Of sentences.
+      encoder: Encoder of sentences.
       form: How much of a text it reads, and how its vectors are scaled.
-      unseen: Of labeled clips, pairs "content/style" to keep for evaluation.
-      least: Of labeled clips, the shortest that gets a caption, frames.
+      unseen: Pairs "content/style" of labeled clips to keep for evaluation.
+      least: Frames of the shortest labeled clip that gets a caption.
       fps: Frames per second of labeled clips' features.
       frames: Longest motion.
       held_out: Part of labeled clips to hold out.

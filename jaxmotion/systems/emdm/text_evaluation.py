@@ -39,7 +39,7 @@ from jaxmotion.systems.emdm.scoring import (
 from jaxmotion.systems.emdm.text import TextRun
 from jaxmotion.typing import Key, Params
 
-# Of the evaluator that is trained here, on a CPU.
+# For the evaluator that is trained here, on a CPU.
 SMALL = dict(movement_width=192, motion_width=192, text_width=128, embedding=128)
 _CONTACTS = 4
 # Statistics of the published evaluators, as their releases name them.
@@ -63,8 +63,8 @@ class Evaluator:
     Attributes:
       params: Its parameters.
       config: Its size.
-      mean: Of the features as it was trained on them.
-      std: Likewise.
+      mean: Mean of the features as it was trained on them.
+      std: Their standard deviation.
       name: What it is, for tables.
       vocabulary: Vectors of the words that it knows; None for hashed ones.
     """
@@ -85,7 +85,7 @@ class Sentences:
     Attributes:
       vectors: Word vectors of the distinct captions.
       tags: One-hot parts of speech.
-      words: Of each, with the marks of start and end.
+      words: Words of each, with the marks of start and end.
       index: Distinct caption of each caption.
     """
 
@@ -119,7 +119,7 @@ def train_evaluator(
       run: The run.
       frames: Longest motion.
       num_steps: Updates.
-      seed: Of parameters and batches.
+      seed: Seeds parameters and batches.
 
     Returns:
       The evaluator.
@@ -243,7 +243,7 @@ def read_statistics(
     Args:
       folder: Has mean.npy and std.npy, as in the evaluator's meta folder, or the same
         under another of the released names.
-      num_features: Of a frame, with the 4 contact labels at its end.
+      num_features: Channels of a frame, with the 4 contact labels at its end.
 
     Raises:
       ValueError: if there are none, they are no statistics of so many features, or not
@@ -281,7 +281,7 @@ def published_evaluator(run: TextRun, path: Path, *, glove: Path) -> Evaluator:
     """An evaluator with published weights; its statistics lie beside them.
 
     Args:
-      run: Of HumanML3D's features, or KIT-ML's for its evaluator.
+      run: Run of HumanML3D's features, or KIT-ML's for its evaluator.
       path: File of the weights (finest.tar or safetensors).
       glove: Folder of its word vectors, for `load_glove`.
 
@@ -317,7 +317,7 @@ def embed(
       run: The run.
       evaluator: The evaluator.
       x: Z-scored features of the run.
-      frames: Of each motion.
+      frames: Frames of each motion.
       padding: What the evaluator sees beyond a motion's end: "zeros", as beyond that
         of real motions, or "kept", what is there, as the release does with generated
         motions.

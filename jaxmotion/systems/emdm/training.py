@@ -62,7 +62,7 @@ def row_config(base: Config, row: str) -> Config:
     """Configuration of a row.
 
     Args:
-      base: Of the row "emdm".
+      base: Configuration of the row "emdm".
       row: Its name, or a sampler's.
 
     Returns:
@@ -148,7 +148,7 @@ def gan_update(
     Args:
       optimizers: The generator's and the discriminator's.
       config: The method.
-      geometry: As of `emdm_loss.generator_loss`.
+      geometry: See `emdm_loss.generator_loss`.
       ema: Decay of the generator's average.
 
     Returns:
@@ -238,7 +238,7 @@ def import_row(task: Task, weights: Path, *, heads: int, num_steps: int) -> Conf
 
     Args:
       task: Its data; only what it is conditioned on and how it looks counts.
-      weights: As of `emdm_published.load`; so are heads and steps.
+      weights: These and the next two: see `emdm_published.load`.
 
     Returns:
       The configuration.
@@ -327,7 +327,7 @@ def sample_many(
     """Samples of many conditions, in chunks that fit the cache, as one program.
 
     Args:
-      sample: Of one condition.
+      sample: Sampler of one condition.
       chunk: Conditions at a time.
 
     Returns:

@@ -375,7 +375,7 @@ def start_states(
       data: Clips with a ball.
       model: The model.
       labels: Skill of each player.
-      seed: Of the choice of frames.
+      seed: Seeds the choice of frames.
 
     Returns:
       States, batch axis first.

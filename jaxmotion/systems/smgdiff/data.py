@@ -42,7 +42,7 @@ def split(
     Args:
       data: The clips; what stands before "@" in a name is its recording.
       fraction: Part of the recordings to hold out, in (0, 1).
-      seed: Of the choice.
+      seed: Seeds the choice.
 
     Returns:
       Both parts.

@@ -75,11 +75,11 @@ class Setting:
     """What all rows of a table share.
 
     Attributes:
-      evaluator: Of skills.
+      evaluator: Evaluator of skills.
       score: From `smgdiff_scores.scorer`.
       known: Held-out moments.
       replications: Sets of windows and noise.
-      seed: Of both.
+      seed: Seeds both.
     """
 
     evaluator: smgdiff_scoring.SkillEvaluator
@@ -119,7 +119,7 @@ def make_setting(
       number: Windows of either part, at most.
       replications: Sets of half of the held-out windows.
       evaluator_steps: Updates of the evaluator.
-      seed: Of everything random.
+      seed: Seeds everything random.
       evaluator: A frozen evaluator; None to train one.
 
     Returns:
@@ -162,7 +162,6 @@ def score_scenes(
     """Scores of each replication.
 
     Args:
-      setting: Of the table.
       scenes_of: `(replication, windows) -> scenes` of those held-out windows.
 
     Returns:
@@ -180,9 +179,6 @@ def score_scenes(
 def score_real(setting: Setting) -> list[dict[str, Float[Array, ""]]]:
     """Scores of what really happened.
 
-    Args:
-      setting: Of the table.
-
     Returns:
       One dictionary a replication.
     """
@@ -198,7 +194,6 @@ def score_plans(
     """Scores of plans.
 
     Args:
-      setting: Of the table.
       run: From `plan_many`.
 
     Returns:
@@ -232,7 +227,7 @@ def train_ball(
       held_out: Clips for its accuracy.
       frames: Frames of a plan.
       num_steps: Updates.
-      seed: Of parameters, batches and windows.
+      seed: Seeds parameters, batches and windows.
 
     Returns:
       The evaluator.
@@ -333,8 +328,7 @@ def schedule_table(
 
     Args:
       run: The run.
-      setting: Of the table.
-      names: Of `SCHEDULES`.
+      names: Names of `SCHEDULES`.
       steps: Motion model.
       guided: Constants of the guidance.
       chunk: Plans at a time.

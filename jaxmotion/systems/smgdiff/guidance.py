@@ -34,8 +34,8 @@ class Guidance:
       rate: w_r of DSG, in 0..1.
       last_sigma: Length of the last step per channel, in deviations of the features;
         None for the released code's (`guidance.dsg_step`).
-      min_acceleration: tau_a: a ball that accelerates more is being touched, meters a
-        second squared.
+      min_acceleration: tau_a: a ball that accelerates more is being touched, meters
+        per second squared.
       max_distance: tau_d: from here on a joint is too far from the ball's center,
         meters.
       grounded_weight: w_d: distances of feet that stand count so much.
@@ -54,7 +54,7 @@ UNGUIDED = Guidance(end=0)
 # For models of a short training, chosen on windows of training clips. Their ball still
 # trembles: the paper's threshold takes every frame for a touch. Joints, unlike skin,
 # keep more than 11 cm from its center. The last step changes the result itself, without
-# a network behind it to smooth that, and is kept short.
+# a network after it to smooth that, and is kept short.
 TUNED = Guidance(rate=0.9, last_sigma=0.0005, min_acceleration=12.0, max_distance=0.18)
 # Table 4 of the paper, beside no guidance at all.
 SCHEDULES = {

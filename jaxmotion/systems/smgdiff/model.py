@@ -50,21 +50,21 @@ class Config:
       token_margin: Frames beyond its own, on either side, that an output token predicts
         and shares with its neighbors; ours, 0 in the paper.
       token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
-      norm: Layer norms behind each sum ("post") or before each branch ("pre", ours).
+      norm: Layer norms after each sum ("post") or before each branch ("pre", ours).
       attention: "full" (the paper's), or "prefix": condition tokens attend among
         themselves only, and are computed once per plan (ours).
       frame_kernel: Frames of a convolution over time that corrects the output, and
         starts as zero; odd, ours, 0 for none in the paper.
       noise_levels: Noise levels of one window in training; ours, 1 in the paper.
       weight_data: Weight of the mean squared error of features.
-      weight_velocity: Of the displacements of features.
-      weight_position: Of the joint positions.
-      weight_position_velocity: Of the displacements of joint positions (CAMDM's; not
-        in the paper).
-      weight_foot: Of feet that slide while they stand.
-      weight_ball: Of the ball's place while it is near (not in the paper).
-      weight_ball_acceleration: Of the second differences of its place, by which contact
-        guidance tells touches (not in the paper).
+      weight_velocity: Weight of the displacements of features.
+      weight_position: Weight of the joint positions.
+      weight_position_velocity: Weight of the displacements of joint positions (CAMDM's;
+        not in the paper).
+      weight_foot: Weight of feet that slide while they stand.
+      weight_ball: Weight of the ball's place while it is near (not in the paper).
+      weight_ball_acceleration: Weight of the second differences of its place, by which
+        contact guidance tells touches (not in the paper).
     """
 
     num_features: int
@@ -117,7 +117,7 @@ class Condition:
     ball: Float[Array, "*batch 3"]
 
     def arguments(self) -> tuple[Array, ...]:
-        """The network's arguments behind x_t and t.
+        """The network's arguments after x_t and t.
 
         Returns:
           past, path, facing (6D), label, and that the past is kept.
@@ -176,8 +176,8 @@ class Model:
     """Everything but the parameters.
 
     Attributes:
-      config: Of the motion model.
-      paths: Of the trajectory generator.
+      config: Config of the motion model.
+      paths: Config of the trajectory generator.
       representation: What features mean.
       labels: Names of the skills.
       speeds: Median speed of the root in each skill, meters per second.

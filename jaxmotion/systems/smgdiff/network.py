@@ -31,7 +31,7 @@ class TrajectoryGenerator(nn.Module):
       hidden: Channels of the feed-forward layers.
       frames_per_token: Frames of one token.
       token_margin: As in `transformer.CamdmTransformer`.
-      token_window: Likewise there.
+      token_window: The same.
     """
 
     past: int

@@ -144,7 +144,6 @@ def score_players(
     """Scores of steered players: their second plan's length on, in windows of a plan.
 
     Args:
-      setting: Of the table.
       model: The model.
       play: From `player`, of two plans' length or more.
       repeats: Players of each start.
@@ -257,7 +256,6 @@ def path_table(
 
     Args:
       run: The run.
-      setting: Of the table.
       steps: Motion model.
       guided: Constants of the guidance.
       starts: Starts of players of a replication.
@@ -363,7 +361,7 @@ def play_one(
       steps: Motion model.
       paths: As in `path_sampler`.
       guided: Contact guidance.
-      seed: Of the start and the noise.
+      seed: Seeds the start and the noise.
     """
     model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
     driver = smgdiff_controller.controller(

@@ -36,7 +36,7 @@ class Representation:
       normalizer: Mean and deviation of the features.
       joints: Joints that may touch the ball.
       fps: Frames per second.
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
       reach: Distance at which the ball fades out of the features, meters (paper 2).
       contact_speed: A foot slower than this stands, meters per second.
     """
@@ -109,7 +109,7 @@ def fit(
       skeleton: The skeleton.
       scenes: Windows of the training data, batch first, seen from `plan_frame`.
       joints: Joints that may touch the ball.
-      radius: Of the ball, meters.
+      radius: Radius of the ball, meters.
       floor: Least deviation, in the features' units.
 
     Returns:
@@ -197,7 +197,6 @@ def to_features(
 
     Args:
       scene: In that frame; at least two frames.
-      representation: Of its skeleton.
 
     Returns:
       Features in the network's units.
@@ -217,7 +216,6 @@ def to_motion(
 
     Args:
       x: Features, perhaps from a network.
-      representation: Of the skeleton.
 
     Returns:
       The motion in the frame of the plan.
@@ -241,7 +239,6 @@ def to_scene(
     Args:
       x: Features, perhaps from a network.
       start: Where the ball was in the frame before the first, meters.
-      representation: Of the skeleton.
 
     Returns:
       The scene in the frame of the plan, and which feet stand; both kinds of contact

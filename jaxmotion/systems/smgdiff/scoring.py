@@ -70,7 +70,6 @@ def evaluator_input(
 
     Args:
       scene: Frames.
-      representation: Of their skeleton.
 
     Returns:
       Meters; three channels a joint, and three of the ball, no longer than the reach.
@@ -101,7 +100,6 @@ def make_evaluator(
       key: Consumed.
       scenes: Windows of training clips, as long as those that are to be scored.
       labels: Their skills.
-      representation: Of their skeleton.
       num_labels: Skills.
       num_steps: Updates.
       frozen: Parameters of one that was trained before; None to train one.
@@ -193,7 +191,6 @@ def contact_scores(
 
     Args:
       scenes: Windows.
-      representation: Of their skeleton.
       limits: Where a touch begins.
 
     Returns:
@@ -232,7 +229,7 @@ class EvalWindows:
     """Moments of recordings: what is known, and what then happened.
 
     Attributes:
-      condition: Of the plans.
+      condition: Condition of the plans.
       future: What then happened, in the frame of the plan.
       past: The frames before, likewise.
       label: Skill.
@@ -253,7 +250,7 @@ def eval_windows(
       data: The clips.
       model: The model; windows have its lengths.
       number: How many, at most.
-      seed: Of the choice.
+      seed: Seeds the choice.
 
     Returns:
       The moments.

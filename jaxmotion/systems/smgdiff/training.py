@@ -46,8 +46,8 @@ def make_model(
 
     Args:
       data: Training clips; their skeleton, rate, skills and source become the model's.
-      sizes: Of `smgdiff.Config`, but for those that the clips decide.
-      paths: Of `smgdiff_trajectory.Config`, likewise.
+      sizes: Sizes of `smgdiff.Config`, but for those that the clips decide.
+      paths: The same of `smgdiff_trajectory.Config`.
 
     Returns:
       The model, its features standardized on the clips.
@@ -238,7 +238,7 @@ PRESETS = {
         weight_ball_acceleration=300.0,
     ),
 }
-# Of a training's first part. Displacements are least for a body that does not move, and
+# For the first part of a training. Displacements are least for a body at rest, and
 # a network that meets them first stays on the mean pose for thousands of updates.
 DRAFT = dict(
     weight_position_velocity=5.0, weight_foot=5.0, weight_ball_acceleration=0.0

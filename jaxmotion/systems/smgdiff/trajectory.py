@@ -45,7 +45,7 @@ class Config:
         and shares with its neighbors; ours, 0 in the paper.
       token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
       meters: Unit of the network's positions.
-      weight_velocity: Of the displacements, beside the data's 1.
+      weight_velocity: Weight of the displacements, beside the data's 1.
     """
 
     num_labels: int

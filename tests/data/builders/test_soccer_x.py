@@ -183,7 +183,7 @@ BAD = {
     ),
     "short": (
         lambda fields: {**fields, **sequence(16, 0)},
-        "2 frames at 30 a second, expected at least 3",
+        "2 frames at 30 per second, expected at least 3",
     ),
 }
 

@@ -100,7 +100,7 @@ def test_clips_are_measured_whole_whatever_their_length():
 
 @pytest.mark.slow
 def test_distances_are_of_each_recording_to_its_style(monkeypatch):
-    """Windows one behind the other from the first frame on, and no others."""
+    """Windows one after the other from the first frame on, and no others."""
     rng = np.random.default_rng(0)
     table = rng.normal(size=(500, 8)).astype(np.float32)
 

@@ -107,7 +107,7 @@ def test_all_columns_are_those_of_the_scripts(names, seed):
 def test_frames_that_pad_a_clip_and_a_rigs_prefix_change_nothing():
     motion, command = clip(7, frames=50), commands(7, frames=50)
     wanted = released(BONES, motion, command)
-    # What is behind the end is another clip, whose toes are lower.
+    # What is after the end is another clip, whose toes are lower.
     rest = clip(8, frames=20)
     low = rest.root_position - jnp.array([[0.0, 0.5, 0.0]])
     rest = dataclasses.replace(rest, root_position=low)

@@ -37,7 +37,7 @@ def test_every_pair_is_commanded_in_every_replication(changes):
     np.testing.assert_array_equal(label[:, :30], changes.old[:, None].repeat(30, 1))
     after = label.shape[1] - 30
     np.testing.assert_array_equal(label[:, 30:], changes.new[:, None].repeat(after, 1))
-    # The last window is whole, centered 2 s behind; 4 s are measured.
+    # The last window is whole, centered 2 s after; 4 s are measured.
     assert after == max(60 + 30, 120)
     speed = np.linalg.norm(np.asarray(changes.commands.velocity), axis=-1)
     assert abs(speed[0, 5] - speed[1, 5]) > 0.01
@@ -55,7 +55,7 @@ def test_those_who_keep_their_style_are_told_nothing(changes):
 
 
 def planted(changes, delays):
-    """The walker, a meter higher from so many frames behind the command on."""
+    """The walker, a meter higher from so many frames after the command on."""
     frames = samples.walking(changes.old, seconds=5.0)
     frames = jax.tree.map(lambda x: x[:, : changes.commands.label.shape[1]], frames)
     ticks = np.arange(frames.root_position.shape[1])
@@ -78,7 +78,7 @@ def sees_height(monkeypatch):
 
 @pytest.mark.usefixtures("sees_height")
 def test_planted_changes_are_found_at_their_time(changes):
-    # All of a window must be high: its center is a second behind the change.
+    # All of a window must be high: its center is a second after the change.
     frames = planted(changes, [-30, 0, 2, np.inf])
     row = camdm_transitions.transition_row(
         samples.run(), frames, changes, EVALUATOR, height=0.05

@@ -393,7 +393,7 @@ def test_geometric_terms_of_a_motion_are_of_its_frames(length):
         }
     for name in ("recon", "position", "velocity"):
         np.testing.assert_allclose(found[name], expected[NAMES[name]], rtol=1e-4)
-    # Whatever lies behind the end has no part in any of them.
+    # Whatever lies after the end has no part in any of them.
     beyond = jnp.where(data.mask[..., None], prediction, 50.0)
     for name, value in terms_of(beyond, data)[1].items():
         np.testing.assert_allclose(value, found[name], rtol=1e-5)
