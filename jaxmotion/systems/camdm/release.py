@@ -86,7 +86,8 @@ def trajectory_error(
 ) -> Float[Array, ""]:
     """Mean turn of a root's steps (x, z) against the commanded velocities.
 
-    Radians, lengths do not matter; frames at rest count, with the polar angle 0. The last command is not used.
+    Radians, lengths do not matter; frames at rest count, with the polar angle 0. The
+    last command is not used.
     """
     frames = len(told) if frames is None else frames
     step = jnp.diff(position, axis=0)
