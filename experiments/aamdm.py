@@ -34,7 +34,6 @@ class Train:
 
     Attributes:
       data: Clips from prepare_data.py.
-      out: Run folder.
       rows: What to train; none: all rows of both tables. "aamdm" alone is the system.
       field: Label field by which clips are chosen.
       labels: Labels of the clips to use; none: all clips.
@@ -52,10 +51,8 @@ class Train:
       batch: Windows per update.
       width: Channels of the networks of AAMDM and AMDM (Learned Motion Matching has
         512, Motion VAE 256, as published).
-      schedule: Schedule of the noise.
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
-      seed: Seeds everything random.
       override: Go on with these settings where a stage began with others.
     """
 
@@ -88,7 +85,6 @@ class Evaluate:
     Example: python experiments/aamdm.py evaluate --run runs/aamdm
 
     Attributes:
-      run: Run folder of `train`.
       rows: Which rows; none: all that were trained.
       out: Folder for metrics.json and table.md; None for <run>/evaluation.
       rollouts: Characters; a multiple of 4.
@@ -123,15 +119,9 @@ class Rollout:
     Example: python experiments/aamdm.py rollout --run runs/aamdm --seconds 20
 
     Attributes:
-      run: Run folder of `train`.
-      row: Which method.
-      steered: Whether it is steered.
-      seconds: Length.
-      course: Commands.
       speed: Meters per second that are commanded.
       scale: Strength of the guidance, epsilon of eq. 13.
       out: Folder; None for <run>/rollout.
-      seed: Seeds the start pose and the noise.
     """
 
     run: Path = Path("runs/aamdm")

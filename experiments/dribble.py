@@ -35,7 +35,6 @@ class Config:
 
     Attributes:
       data: Clips from prepare_data.py.
-      out: File to write.
       field: Label field that says what a clip shows.
       dribble: Labels beside which a ball is dribbled in touches 0.3 to 1.2 s apart.
       sprint: Labels beside which it is kicked ahead, touches 0.5 to 1.6 s apart.
@@ -43,7 +42,6 @@ class Config:
       celebrate: The same, under a skill of its own.
       off_ball: Part of the clips of `dribble` and `sprint` that are used once more,
         with the ball lying out of reach.
-      seed: Seeds everything random.
       overwrite: Replace --out.
     """
 

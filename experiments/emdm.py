@@ -42,7 +42,6 @@ class Train:
       task: What motions are made from.
       data: Clips from prepare_data.py, of one skeleton; for texts also one file of text
         motions (humanml3d, kit_ml).
-      out: Run folder.
       rows: What to train; "emdm" alone is the system.
       field: Label field that is the action.
       merge: Labels that name the same action as others, "old=new".
@@ -59,7 +58,6 @@ class Train:
       ddpm_steps: Updates of each diffusion model, which are cheaper.
       batch: Motions an update.
       width: Channels of a token.
-      depth: Layers.
       hidden: Channels of the feed-forward layers.
       dropout: Rate (paper: 0.1; short trainings do without).
       frames_per_token: Frames of one token (paper: 1).
@@ -75,7 +73,6 @@ class Train:
       learning_rate: Rate of generators (Muon).
       ddpm_rate: Rate of diffusion models (Muon).
       discriminator_rate: Rate of the discriminator (Adam, beta 0.5 and 0.9).
-      seed: Seeds everything random.
       override: Go on with these settings where a row began with others.
     """
 
@@ -125,7 +122,6 @@ class Evaluate:
     Example: python experiments/emdm.py evaluate --run runs/emdm_action
 
     Attributes:
-      run: Run folder of `train`.
       rows: Which rows and samplers (ddim_10); none: all that were trained.
       out: Folder; None for <run>/evaluation.
       samples: Motions of a replication (actions: rounded down to as many of each).
@@ -168,14 +164,11 @@ class Sample:
     Example: python experiments/emdm.py sample --run runs/emdm_action --action bow
 
     Attributes:
-      run: Run folder of `train`.
-      row: Which model.
       action: Action, for a run of actions; several make several motions.
       text: Sentence, for a run of texts; several make several motions.
       frames: Length; None for the model's longest.
       scale: Scale of classifier-free guidance; None for the paper's.
       out: Folder; None for <run>/samples.
-      seed: Seeds the noise.
     """
 
     run: Path = Path("runs/emdm_action")

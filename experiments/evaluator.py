@@ -44,7 +44,6 @@ class Train:
       kind: "style" for camdm.py, "action" for emdm.py, "ball" for smgdiff.py.
       data: Clips from prepare_data.py or dribble.py; one file, but for actions.
       label: Field of the clips that is recognized; None for style, content or skill.
-      out: File to write.
       contents: Contents of the clips to use (style); None for those of camdm.py, none:
         all clips.
       merge: Labels that name the same action as others, "old=new" (action); None for
@@ -78,9 +77,6 @@ class Show:
     """Print what an evaluator is.
 
     Example: python experiments/evaluator.py show evaluators/bandai2_style.npz
-
-    Attributes:
-      file: Written by `train`.
     """
 
     file: tyro.conf.Positional[Path]
@@ -203,8 +199,6 @@ class Import:
     Example: python experiments/evaluator.py import --weights 100style_position_classifier.pth --out evaluators/camdm_release.npz
 
     Attributes:
-      weights: Its file.
-      out: File to write.
       overwrite: Replace the file if it exists.
     """  # noqa: E501
 

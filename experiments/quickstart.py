@@ -56,7 +56,6 @@ class Config:
     Attributes:
       out: Folder for the rollout and metrics.json; of a training also checkpoints.
       characters: Rollouts to measure.
-      seed: Seeds everything random.
       train: Teach the walker a style first; the options below are its own.
       steps: Optimizer steps, rounded down to fifties.
       batch: Windows per step.

@@ -39,7 +39,6 @@ class Train:
 
     Attributes:
       data: Clips with a ball, from dribble.py or prepare_data.py.
-      out: Run folder.
       stages: motion_<T> is the motion model of T steps, paths_<T> the trajectory
         generator (the paper's: T = 1).
       preset: "small" for a CPU or a short run, or "paper".
@@ -53,7 +52,6 @@ class Train:
       path_steps: Updates of a trajectory generator.
       batch: Windows per update.
       learning_rate: Peak of Muon's rate; cosine to a twentieth.
-      seed: Seeds everything random.
       override: Go on with these settings where a stage began with others.
     """  # noqa: E501
 
@@ -81,7 +79,6 @@ class Evaluate:
     Example: python experiments/smgdiff.py evaluate --run runs/smgdiff
 
     Attributes:
-      run: Run folder of `train`.
       tables: "schedules" (the paper's table 4), "steps" (table 3: every motion model
         that was trained), "paths" (table 2).
       out: Folder; None for <run>/evaluation.
@@ -133,15 +130,12 @@ class Rollout:
     Example: python experiments/smgdiff.py rollout --run runs/smgdiff --seconds 60
 
     Attributes:
-      run: Run folder of `train`.
       seconds: Length; every skill gets an equal part.
       skills: In this order; none: all of the model's.
       paths: Trajectory generator; "straight" for none.
-      steps: Motion model.
       schedule: Schedule of contact guidance.
       rate: w_r of DSG; this and the next three as in `evaluate`.
       out: Folder; None for <run>/rollout.
-      seed: Seeds the start and the noise.
     """
 
     run: Path = Path("runs/smgdiff")

@@ -45,7 +45,6 @@ class Config:
       width: Channels of hidden layers.
       sequences: Rollouts of each model.
       length: Steps of a rollout.
-      seed: Seeds everything random.
     """
 
     out: Path = Path("runs/squ9")
