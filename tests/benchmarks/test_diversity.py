@@ -101,7 +101,7 @@ def test_chunks_shrink_to_the_limit(load):
 
 
 def test_the_program_that_fits_is_found(load):
-    """Of a program that holds `chunk` matrices at a time."""
+    """For a program that holds `chunk` matrices at a time."""
     memory = load("diversity")
     tried = []
 

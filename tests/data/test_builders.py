@@ -364,7 +364,7 @@ def test_files_of_one_name_in_two_folders_are_both_named(tmp_path):
             build(lafan1.Lafan1, tmp_path, source)
         words = str(caught.value)
         assert f"a/{name} and {source}" in words and f"b/{name}" in words
-    # Of two zips as well.
+    # In two zips as well.
     put(tmp_path / "two", {name: text}, "lafan1.zip")
     put(tmp_path / "two", {name: text}, "lafan1_cuts.zip")
     with pytest.raises(ValueError, match=f"lafan1.zip/{name} and .*cuts.zip/{name}"):

@@ -44,7 +44,7 @@ def test_all_windows_and_no_other(walker, stride):
     ],
 )
 def test_starts_leave_out_what_is_too_short(length, stride, starts, owners):
-    """Of clips of five, two and four frames."""
+    """Clips of five, two and four frames."""
     offsets = np.array([0, 5, 7, 11])
     found = windows.window_starts(offsets, length, stride=stride)
     assert [x.tolist() for x in found] == [starts, owners]

@@ -88,7 +88,7 @@ def test_distance_maps_over_a_batch_of_styles():
 
 @pytest.mark.parametrize("features", [4, 24])
 def test_distance_is_scipys_to_1e_5(features):
-    """Of given moments, so that only the distance itself is on trial."""
+    """Given moments, so that only the distance itself is on trial."""
     rng = np.random.default_rng(features)
     made = []
     for _ in range(2):

@@ -14,7 +14,7 @@ FEATURES, COUNT = 6, 240
 SIZES = frechet_bias.subset_sizes(COUNT, number=6, least=40)
 DEVIATION = np.linspace(0.5, 2.0, FEATURES).astype(np.float32)
 SHIFT = 0.3
-# Of N(SHIFT, DEVIATION^2) to N(0, 1) in each feature.
+# Distance of N(SHIFT, DEVIATION^2) to N(0, 1) in each feature.
 TRUE = float(np.sum(SHIFT**2 + (DEVIATION.astype(float) - 1.0) ** 2))
 STANDARD = frechet.Moments(
     mean=jnp.zeros(FEATURES),
@@ -30,7 +30,7 @@ def draw(key, count=COUNT):
 
 @functools.cache
 def checks():
-    """Of 64 independent sets of samples."""
+    """Estimates from 64 independent sets of samples."""
 
     def one(keys):
         key_data, key_subsets = keys

@@ -49,7 +49,7 @@ run = jax.jit(functools.partial(locomotion.locomotion_metrics, contact_height=0.
 
 
 def measure(motion, velocity=None, facing=None):
-    """Of one window."""
+    """Metrics of one window."""
     wanted = [toward(0.0) if x is None else x for x in (velocity, facing)]
     given = jax.tree.map(lambda x: x[None], (motion, *wanted))
     return {name: float(value[0]) for name, value in run(BONES, *given).items()}
@@ -120,7 +120,7 @@ def test_a_height_in_millimeters(height):
 
 
 def test_rollouts_that_freeze_and_diverge_at_known_times():
-    """Of six minutes, one is a statue from 24 s on, and one sinks at 40 s."""
+    """Six rollouts of a minute: one is a statue from 24 s on, and one sinks at 40 s."""
     frames = 1800
     alive = np.asarray(skeleton.joint_positions(BONES, tiny.walk(frames, turn=0.1)))
     statue, sunk = alive.copy(), alive.copy()

@@ -10,7 +10,7 @@ STARTS = jnp.arange(13) / 3.0  # 0, 1/3 .. 4 seconds
 
 
 def change_of(text, **options):
-    """Of decisions as text, one character a window: 1 is recognized."""
+    """Transition of decisions as text, one character per window: 1 is recognized."""
     recognized = jnp.asarray([x == "1" for x in text])
     return transitions.transition(recognized, STARTS[: len(text)], **options)
 

@@ -129,7 +129,7 @@ def sample_batch(key, data):
 
 @pytest.mark.slow
 def test_it_learns_to_match_new_motions():
-    """Of 16 different sentences; chance is 1/16, 2/16, 3/16."""
+    """With 16 different sentences; chance is 1/16, 2/16, 3/16."""
     steps = 200
     params, info = text_motion_evaluator.train_matcher(
         jax.random.key(0),

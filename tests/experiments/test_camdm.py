@@ -164,7 +164,7 @@ def check_evaluation(folder, rollouts):
     }
     every = {column for column, _ in camdm_release.COLUMNS.values()}
     assert released["rollouts"] == every
-    # Of clips that nobody steered there is no error of direction or facing.
+    # For clips that nobody steered there is no error of direction or facing.
     steered = {name for name in every if columns.COLUMNS[name].unit == "°"}
     assert released["held-out (ground truth)"] == every - steered
     for name in every:

@@ -800,7 +800,7 @@ def test_shipped_models_start_without_clips(script_load, name):
 
 
 def test_characters_start_from_clips(script_load, tmp_path):
-    """Of an exported model, which has no poses of its own."""
+    """An exported model, which has no poses of its own."""
     found = samples.run()
     clips_io.save_clips(tmp_path / "clips.npz", found.train)
     value = camdm_model.to_json(found.model)

@@ -77,7 +77,7 @@ def test_singular_rot6d_gives_a_rotation_and_a_finite_gradient(name):
 
 
 def plain_gram_schmidt(rot6d):
-    """Of one vector of six numbers, left to the compiler's differentiation."""
+    """Matrix of one vector of six numbers, left to the compiler's differentiation."""
     first, second = rot6d[:3], rot6d[3:]
     x = first / jnp.sqrt(jnp.sum(first**2))
     y = second - jnp.sum(x * second) * x

@@ -71,7 +71,7 @@ def test_one_chain(no_screen, little_optimized, capsys):
     found = run("01_one_chain.ipynb")
     steps = list(found["STEPS"])
     expected, variance = found["expected"], found["VARIANCE"]
-    # Of 20,000 normal samples: the standard error of a variance is 1 % of it.
+    # For 20,000 normal samples the standard error of a variance is 1 % of it.
     for name, wanted in (("plain", expected), ("drawn", [variance] * len(steps))):
         for t, got, want in zip(steps, found[name], wanted, strict=True):
             assert abs(got / want - 1.0) < 0.03, (name, t, got, want)

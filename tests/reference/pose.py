@@ -46,13 +46,13 @@ def velocity(positions, fps):
 
 
 def angular_velocity(matrices, fps):
-    """Of matrices [F, 3, 3], in the axes that they turn into."""
+    """Angular velocity of matrices [F, 3, 3], in the axes that they turn into."""
     steps = matrices[1:] @ matrices[:-1].transpose(0, 2, 1)
     return means_of_neighbors(Rotation.from_matrix(steps).as_rotvec() * fps)
 
 
 def contacts(toe, fps, max_speed=0.15, frames=6):
-    """Of one toe [F, 3], at 60 frames per second."""
+    """Contacts of one toe [F, 3], at 60 frames per second."""
     stands = np.linalg.norm(velocity(toe, fps), axis=-1) < max_speed
     return ndimage.median_filter(stands.astype(int), size=frames, mode="nearest")
 

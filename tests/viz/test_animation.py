@@ -53,7 +53,7 @@ def test_the_picture_changes_with_the_motion(tmp_path):
     red = lambda x: (x[..., 0] > x[..., 2] + 80) & (x[..., 1] < 110)  # noqa: E731
 
     def reach(picture):
-        """Of the hand over the foot, in lengths of the leg."""
+        """Height of the hand over the foot, in lengths of the leg."""
         hand, leg = (np.argwhere(mask(picture))[:, 0] for mask in (blue, red))
         return (leg.max() - hand.min()) / np.ptp(leg)
 

@@ -178,7 +178,7 @@ def parts_of(vector):
     return parts
 
 
-# Of the value, and of its change per second.
+# Weights of the value, and of its change per second.
 WEIGHTS = dict(
     position=(75.0, 10.0),
     rotation=(10.0, 1.75),

@@ -118,7 +118,7 @@ BAD_FRAMES = {
 
 @pytest.mark.parametrize("message", BAD_FRAMES)
 def test_frames_that_do_not_fit_are_named(run, tmp_path, monkeypatch, message):
-    """Of a folder that agrees with itself; one that does not is refused before."""
+    """In a folder that agrees with itself; one that does not is refused before."""
     content, path = BAD_FRAMES[message], tmp_path / "data" / "train.npz"
     path.parent.mkdir()
     with np.load(run.record.file("train.npz")) as file:

@@ -200,7 +200,7 @@ def test_the_table_is_written_as_strict_json_and_markdown(tmp_path, capsys):
 
 
 def test_an_unbiased_distance_is_nearer_to_the_true_one():
-    """Of Gaussians a unit apart, from few windows."""
+    """Gaussians a unit apart, few windows."""
     draw = np.random.default_rng(0).normal
     reference = draw(size=(20_000, 16)).astype(np.float32)
     apart = np.eye(16)[0].astype(np.float32)

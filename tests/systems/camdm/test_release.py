@@ -77,7 +77,7 @@ def test_rollouts_are_measured_whole_against_what_was_told():
 @pytest.mark.slow
 def test_clips_are_measured_whole_whatever_their_length():
     clips = samples.clips()
-    # Of lengths of their own: the first is cut short.
+    # Different lengths: the first is cut short.
     cut = np.asarray(clips.offsets).copy()
     cut[1] -= 37
     keep = np.r_[0 : cut[1], cut[1] + 37 : clips.num_frames]

@@ -24,7 +24,7 @@ def motions():
 
 
 def way(motion):
-    """Of the root: steps on the ground, the first from the origin, and heights."""
+    """The root's: steps on the ground, the first from the origin, and heights."""
     root = np.float64(motion.root_position)
     steps = np.diff(root, axis=-2, prepend=np.zeros_like(root[..., :1, :]))
     return np.stack([steps[..., 0], root[..., 1], steps[..., 2]], axis=-1)

@@ -86,7 +86,7 @@ def layer_norm(params, x):
 
 
 def attention(params, x, seen, heads):
-    """Of the tokens x [tokens, width] to those that are seen, head by head."""
+    """From the tokens x [tokens, width] to those that are seen, head by head."""
     q, (k, v) = dense(params["query"], x), np.split(dense(params["key_value"], x), 2, 1)
     size, out = x.shape[1] // heads, []
     for h in range(heads):
@@ -166,7 +166,7 @@ def test_latent_mlp_is_the_formula():
 
 @pytest.mark.parametrize("name", ["action", "text"])
 def test_a_dropped_condition_is_a_zero_vector(name):
-    """Of an action nothing is left, of a text the bias of its layer."""
+    """Nothing is left of an action, and of a text the bias of its layer."""
     net, params = network(name), parameters(name)
     _, _, condition, keep, mask, _ = given(net)
 

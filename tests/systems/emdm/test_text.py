@@ -13,7 +13,7 @@ SHORT, LONG = "a person turns left", "a " * 21 + "left"
 
 
 def ids(text):
-    """Of a whole text, by the tokenizer alone."""
+    """Tokens of a whole text, by the tokenizer alone."""
     made = samples.tokenizer()
     made.no_padding()
     made.no_truncation()
@@ -58,7 +58,7 @@ def folder(tmp_path):
 
 
 def vectors(weights, texts):
-    """Of lists of tokens; the first end is where a text ends."""
+    """Vectors of lists of tokens; the first end is where a text ends."""
     end = samples.tokenizer().token_to_id(samples.END)
     return np.array([oracle.encode(weights, t, end, samples.HEADS) for t in texts])
 

@@ -52,7 +52,7 @@ def statistics(width, seed=0):
 
 
 def evaluators(mean, std):
-    """Of an evaluator: of other clips, root and contacts twice divided by 5."""
+    """An evaluator's: of other clips, root and contacts twice divided by 5."""
     mean, std = mean.copy(), 1.002 * std
     mean[3] -= 0.02
     std[:4] /= 25
