@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from jaxmotion.data.clips import Clips, check_skeletons, take_clips
 
 
-def _label_numbers(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
-    """Numbers of those labels; every name must be known."""
+def _indices(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
+    """Indices of those labels; every name must be known."""
     known = clips.names(field)
     unknown = [name for name in names if name not in known]
     if unknown:
@@ -23,7 +23,7 @@ def _label_numbers(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
 
 
 def select(clips: Clips, field: str, names: Sequence[str]) -> Clips:
-    """Clips whose label is one of those; the numbers of the labels stay as they were.
+    """Clips whose label is one of those; label indices stay as they were.
 
     Args:
       clips: The clips.
@@ -39,7 +39,7 @@ def select(clips: Clips, field: str, names: Sequence[str]) -> Clips:
     """
     if isinstance(names, str):
         raise ValueError(f"names should be a sequence of labels, found {names!r}")
-    numbers = _label_numbers(clips, field, names)
+    numbers = _indices(clips, field, names)
     keep = np.flatnonzero(np.isin(np.asarray(clips.labels[field]), numbers))
     if keep.size == 0:
         raise ValueError(f"no clip has {field} {', '.join(names)}")
@@ -88,7 +88,7 @@ def merge_labels(clips: Clips, field: str, merge: Mapping[str, str]) -> Clips:
     words = clips.names(field)
     numbers = np.arange(len(words))
     for old, new in merge.items():
-        source, target = _label_numbers(clips, field, (old, new))
+        source, target = _indices(clips, field, (old, new))
         numbers[source] = target
     labels = jnp.asarray(numbers[np.asarray(clips.labels[field])], jnp.int32)
     changed = dataclasses.replace(clips, labels=clips.labels | {field: labels})

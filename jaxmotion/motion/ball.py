@@ -182,8 +182,8 @@ def decode_ball(
 
     A weight of 0.3 and more is trusted wholly, one of 0.1 not at all: there the ball
     goes on with its velocity channel from where it was in the frame before, and between
-    it is in between. Likewise a place within 0.5 m of where the velocity leads, and one
-    1 m away. Features of a ball that moves as they say come back exactly.
+    it is in between. A place within 0.5 m of where the velocity leads is trusted too,
+    one 1 m away is not. Features of a ball that moves as they say come back exactly.
 
     Args:
       features: Features of the ball, perhaps from a network.

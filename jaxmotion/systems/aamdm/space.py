@@ -51,7 +51,7 @@ class Space:
       change: Deviation of each channel's change from frame to frame.
       low: Least value of each channel that a frame is let take: the lowest half per
         cent of the data lie below it.
-      high: Greatest value, likewise.
+      high: Greatest such value.
       autoencoder: Autoencoder of an embedded space; None for full poses.
     """
 

@@ -231,7 +231,7 @@ class EvalWindows:
     Attributes:
       condition: Condition of the plans.
       future: What then happened, in the frame of the plan.
-      past: The frames before, likewise.
+      past: The frames before, in the same frame.
       label: Skill.
     """
 
