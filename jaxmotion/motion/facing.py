@@ -22,7 +22,7 @@ _HIPS = (
     ("lefthip", "righthip"),  # 100STYLE, SMPL
     ("lhip", "rhip"),  # BallPlay-M
 )
-# Inner joints of the shoulders in the same way. Where there are collars, these are they.
+# The same of the shoulders: the collars where there are any.
 _SHOULDERS = (
     ("leftcollar", "rightcollar"),  # 100STYLE, SMPL
     ("lthorax", "rthorax"),  # BallPlay-M
