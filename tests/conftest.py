@@ -1,14 +1,15 @@
 """Settings of the whole suite, and a small walker that needs no data.
 
-Keys that are used twice and arrays that broadcast by rank raise. Tests run on the CPU
-unless JAX_PLATFORMS says otherwise, and the whole suite on several workers unless -n
-says how many.
+Arrays that broadcast by rank raise, and keys that are used twice where the library
+draws. Tests run on the CPU unless JAX_PLATFORMS says otherwise, and the whole suite on
+several workers unless -n says how many.
 """
 
 import gc
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Most of the suite's time is compilation: without optimizations it takes a sixth.
@@ -18,12 +19,17 @@ import jax  # noqa: E402
 import jaxlib  # noqa: E402
 import pytest  # noqa: E402
 
-jax.config.update("jax_debug_key_reuse", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
 # A worker takes up to 3 GB.
 MOST_WORKERS = 8
+# Folders whose code draws: there a key that is used twice raises. Elsewhere the check
+# would only make each operation slower, up to seven times.
+DRAWS = ("control", "diffusion", "evaluators", "learning", "networks", "systems")
+# Folders whose modules take longest: they start first, so that no worker waits long for
+# the other's last module.
+FIRST = ("systems", "contracts", "learning", "test_face.py", "evaluators")
 # Compiled programs of so many modules are kept: they take memory, and time to forget.
 MODULES_REMEMBERED = 2
 
@@ -39,6 +45,7 @@ def pytest_cmdline_main(config):
         config.option.maxprocesses = config.option.maxprocesses or MOST_WORKERS
         if config.option.dist == "no":
             config.option.dist = "loadscope"
+            config.option.loadscopereorder = False
 
 
 def pytest_configure(config):
@@ -58,6 +65,16 @@ def pytest_configure(config):
         ):
             os.environ[name] = str(value)
             jax.config.update(name.lower(), value)
+
+
+def _part(path):
+    """A test file's folder in tests/, or its name."""
+    return path.relative_to(Path(__file__).parent).parts[0]
+
+
+def pytest_collection_modifyitems(items):
+    rank = {part: place for place, part in enumerate(FIRST)}
+    items.sort(key=lambda item: rank.get(_part(item.path), len(FIRST)))
 
 
 def _known(flags, cache):
@@ -89,6 +106,12 @@ def _forget_programs(request, _modules):
         _modules.clear()
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _keys_are_used_once(request):
+    with jax.debug_key_reuse(_part(request.node.path) in DRAWS):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -155,6 +155,7 @@ def test_frames_are_indexed_and_never_looped_over(frames):
         iter(frames)
 
 
+@pytest.mark.slow
 def test_shipped_models_lock_their_feet_unless_told_otherwise(model):
     """Told to stand, toes stay where they are on the ground; else they creep."""
     free = jm.load("locomotion", foot_lock=False)

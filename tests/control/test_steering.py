@@ -185,10 +185,14 @@ def test_a_second_call_compiles_nothing(run):
     assert steering._rollouts._cache_size() == counted
 
 
-def test_a_chunk_that_does_not_divide_is_made_smaller(run):
+@pytest.mark.slow
+def test_a_chunk_that_does_not_divide_is_made_smaller():
     _, whole = steered(None)
     _, parts = steered(3)  # of four characters: two at a time
     np.testing.assert_allclose(parts.root_position, whole.root_position, atol=1e-4)
+
+
+def test_chunks_of_nobody_are_refused():
     with pytest.raises(ValueError, match="chunks of 0 characters"):
         steered(0)
 

@@ -147,6 +147,7 @@ def test_it_learns_to_match_new_motions():
     assert measures.matching_distance(text, motion) < 0.7 * shuffled
 
 
+@pytest.mark.slow
 def test_the_default_optimizer_is_adam_at_1e_4():
     """Its first step moves every array by 1e-4 at most, and most by nearly as much."""
     params, _ = text_motion_evaluator.train_matcher(

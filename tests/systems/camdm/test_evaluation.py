@@ -14,32 +14,51 @@ from jaxmotion.data import selection, windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.systems.camdm import scoring as camdm_scoring
-from tests import samples
+from tests import samples, tiny
 
 LABELS = np.repeat([0, 1], 2)
 TRUTH, FLOOR = "held-out (ground truth)", "training half vs half (noise floor)"
 
 
 @functools.cache
-def parts():
-    """Four training clips a style, so that both halves hold two of each."""
+def parts(trained=False):
+    """Four training clips a style, so that both halves hold two of each.
+
+    An evaluator that was not trained has features as good for what moves otherwise.
+    """
     run = samples.run()
     train, held_out = selection.split_clips(
         samples.clips(minutes=0.8), fraction=0.33, seed=0, field="style"
     )
-    evaluator = style_evaluator.fit(
-        jax.random.key(0), train, field="style", num_steps=40, batch=16
+    config = style_evaluator.Config(
+        num_classes=2,
+        num_joints=train.skeleton.num_joints,
+        frames=style_evaluator.EVAL_WINDOW,
     )
+    evaluator = style_evaluator.StyleEvaluator(
+        params=tiny.random_params(style_evaluator.init, config),
+        config=config,
+    )
+    if trained:
+        evaluator = style_evaluator.fit(
+            jax.random.key(0), train, field="style", num_steps=40, batch=16
+        )
     real = windows.eval_windows(held_out, stride=10, field="style")
     dense = windows.eval_windows(train, stride=10, field="style")
     return run, evaluator, real, dense
 
 
 @functools.cache
-def evaluated(kind):
+def walked():
+    """Two a style."""
+    return samples.walking(LABELS, seconds=14.0)
+
+
+@functools.cache
+def evaluated(kind, trained=False):
     """Characters that walk, two a style; or that stand, each as if alone."""
-    run, evaluator, real, dense = parts()
-    frames = samples.walking(LABELS, seconds=14.0)
+    run, evaluator, real, dense = parts(trained)
+    frames = walked()
     frames = samples.standing(frames) if kind == "standing" else frames
     repeats = 1 if kind == "standing" else 2
     made = windows.rollout_windows(frames, jnp.asarray(LABELS), skip=60)
@@ -76,8 +95,9 @@ def test_the_rows_and_columns_are_there():
     assert report["contact_height_m"] == pytest.approx(0.04, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_styles_are_recognized_far_above_chance():
-    rows, _ = evaluated("walking")
+    rows, _ = evaluated("walking", trained=True)
     assert rows[TRUTH]["style_accuracy"].value > 75.0
     assert rows["rollouts"]["style_accuracy"].value > 75.0
 
@@ -98,7 +118,7 @@ def test_health_counts_who_stands_although_told_to_walk():
     assert evaluated("walking")[1]["health"] == dict(diverged=0, frozen=0, rollouts=4)
     assert evaluated("standing")[1]["health"] == dict(diverged=0, frozen=4, rollouts=4)
     run = parts()[0]
-    frames = samples.walking(LABELS[:1])
+    frames = jax.tree.map(lambda x: x[:1], walked())
     broken = frames.root_position.at[0, 50, 1].set(5.0)
     frames = dataclasses.replace(frames, root_position=broken)
     found = camdm_scoring.rollout_health(
@@ -122,9 +142,7 @@ def test_without_repeats_there_is_no_diversity():
 
 def test_diversity_is_zero_for_characters_that_do_the_same():
     run = parts()[0]
-    same = jax.tree.map(
-        lambda x: jnp.repeat(x, 2, axis=0), samples.walking(np.array([0, 1]))
-    )
+    same = jax.tree.map(lambda x: jnp.repeat(x[::2], 2, axis=0), walked())
     found = windows.rollout_windows(same, jnp.asarray(LABELS), skip=60)
     found = camdm_scoring.repeat_diversity(run.model.skeleton, found, repeats=2)
     assert found.value == pytest.approx(0.0, abs=1e-9) and found.samples == 2

@@ -553,6 +553,7 @@ def toy_state():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mover", ["generator", "discriminator"])
 def test_no_player_moves_the_other(mover):
     state = toy_state()

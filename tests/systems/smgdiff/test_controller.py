@@ -64,7 +64,7 @@ def parts_of(representation, config):
         tiny.random_params(smgdiff_model.init, config, seed=3),
         config=config,
         representation=representation,
-        guided=smgdiff_guidance.Guidance(end=1, last_sigma=0.01),
+        guided=smgdiff_guidance.UNGUIDED,
     )
     generate = smgdiff_trajectory.sampler(
         tiny.random_params(smgdiff_trajectory.init, paths, seed=1), config=paths

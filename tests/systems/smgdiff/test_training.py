@@ -28,33 +28,45 @@ BUDGET = runs.Budget(steps=4, batch=4, chunk=2, save_every=2)
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Both stages, trained for four updates."""
+    """As it is read back, before any stage."""
     folder = tmp_path_factory.mktemp("run")
     data = folder / "clips.npz"
     save_ball_clips(data, ball_walker.clips(60))
-    made = smgdiff_training.prepare(
+    smgdiff_training.prepare(
         folder / "run", data, held_out=0.3, sizes=SIZES, paths=PATHS
     )
-    for stage in ("motion_2", "paths_1"):
-        smgdiff_training.train_stage(made, stage, budget=BUDGET, draft_steps=2)
     return smgdiff_training.load_run(folder / "run")
 
 
 @pytest.fixture(scope="module")
-def setting(run):
+def trained(run):
+    """Both stages, trained for four updates."""
+    for stage in ("motion_2", "paths_1"):
+        smgdiff_training.train_stage(run, stage, budget=BUDGET, draft_steps=2)
+    return smgdiff_training.load_run(run.record.folder)
+
+
+def setting_of(run, evaluator_steps):
     return smgdiff_evaluation.make_setting(
         run.train,
         run.held_out,
         run.model,
         number=16,
         replications=3,
-        evaluator_steps=40,
+        evaluator_steps=evaluator_steps,
         seed=0,
     )
 
 
+@pytest.fixture(scope="module")
+def setting(run):
+    """With a recognizer of one update."""
+    return setting_of(run, 1)
+
+
 @pytest.mark.slow
-def test_a_motion_model_starts_from_a_draft_with_weights_of_its_own(run):
+def test_a_motion_model_starts_from_a_draft_with_weights_of_its_own(trained):
+    run = trained
     draft, last = (
         load_config(run.record.folder / "motion_2" / where / "checkpoints")
         for where in ("draft", "")
@@ -102,7 +114,11 @@ def test_a_run_comes_back_from_its_folder(run):
     assert run.model.config.num_features == 30 + 3 + 7 + 2 + 2
     # Two speeds of the walker, as often: the median lies between.
     assert all(0.6 < speed < 1.5 for speed in run.model.speeds)
-    model, params = smgdiff_training.load_stage(run, "motion_2")
+
+
+@pytest.mark.slow
+def test_a_stage_comes_back_from_its_folder(trained):
+    model, params = smgdiff_training.load_stage(trained, "motion_2")
     assert model.config.num_steps == 2
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(params))
 
@@ -145,8 +161,8 @@ def test_situations_hold_what_was_and_what_came(run):
 
 
 @pytest.mark.slow
-def test_what_really_happened_scores_well(setting):
-    scores = smgdiff_evaluation.score_real(setting)
+def test_what_really_happened_scores_well(run):
+    scores = smgdiff_evaluation.score_real(setting_of(run, 40))
     assert len(scores) == 3
     for one in scores:
         assert float(one["ball_in_ground"]) == pytest.approx(0.0, abs=1e-3)
@@ -173,8 +189,8 @@ def test_planted_errors_are_measured(setting):
 
 
 @pytest.mark.slow
-def test_plans_are_scored_alike_whatever_the_chunk(run, setting):
-    model, params = smgdiff_training.load_stage(run, "motion_2")
+def test_plans_are_scored_alike_whatever_the_chunk(trained, setting):
+    model, params = smgdiff_training.load_stage(trained, "motion_2")
     plan = smgdiff_guidance.sampler(
         params,
         config=model.config,
@@ -193,8 +209,8 @@ def test_plans_are_scored_alike_whatever_the_chunk(run, setting):
 
 
 @pytest.mark.slow
-def test_players_are_scored_with_their_spread(run, setting):
-    model, params = smgdiff_training.load_stage(run, "motion_2")
+def test_players_are_scored_with_their_spread(trained, setting):
+    model, params = smgdiff_training.load_stage(trained, "motion_2")
     plan = smgdiff_guidance.sampler(
         params,
         config=model.config,
