@@ -14,7 +14,10 @@ bends the leg to reach it.
    displayed and what is wanted now decays as a critically damped spring: no jump. Only
    the two horizontal coordinates are locked: the height stays the model's, since a
    toe that is held down while it lifts would be dragged over the ground.
-3. **Leg.** The ankle moves by as much as the toe has to, by two-bone inverse
+3. **Body.** While all feet are locked the body follows them: a character that is told
+   to stand and whose plans creep away stays over its feet. The body moves back to its
+   plan when a foot lifts; it strays from it by `body_reach` at most.
+4. **Leg.** The ankle moves by as much as the toe has to, by two-bone inverse
    kinematics: the interior angles follow from the law of cosines,
 
        cos(hip)  = (a^2 + d^2 - b^2) / (2 a d)                                     (1)
@@ -67,6 +70,9 @@ class FootLock:
       caught_up: Distance from the animated toe within which a toe that lost its lock
         during a contact is locked anew, meters.
       half_life: Half-life of the offset into and out of a lock, seconds.
+      body_half_life: Half-life in which the body moves over its locked feet, and back
+        to where the model has it when a foot is free, seconds.
+      body_reach: Most that it is moved, meters; 0 for a body that stays the model's.
       softness: Distance from full stretch at which a leg begins to resist, meters.
     """
 
@@ -79,6 +85,8 @@ class FootLock:
     radius: float = 0.2
     caught_up: float = 0.01
     half_life: float = 0.05
+    body_half_life: float = 0.2
+    body_reach: float = 0.1
     softness: float = 0.015
 
 
@@ -88,13 +96,15 @@ class LockState:
     """Both feet of a character between two frames; world, meters and seconds.
 
     Attributes:
-      animated: Toes of the last frame as the model had them.
+      animated: Toes of the last frame as the model had them, moved with the body.
       shown: The same as they were displayed.
       contact: Whether each toe is in contact.
       locked: Whether each toe is locked.
       point: Where it is locked, if so.
       offset: Offset of what is displayed from what is wanted.
       offset_velocity: The rate of that.
+      body: How far the body (x, z) is displayed from where the model has it.
+      body_velocity: The rate of that.
       started: Whether there was a frame before.
     """
 
@@ -105,6 +115,8 @@ class LockState:
     point: Float[Array, "*batch feet 3"]
     offset: Float[Array, "*batch feet 3"]
     offset_velocity: Float[Array, "*batch feet 3"]
+    body: Float[Array, "*batch 2"]
+    body_velocity: Float[Array, "*batch 2"]
     started: Bool[Array, "*batch"]
 
 
@@ -142,6 +154,8 @@ def init_lock(skeleton: Skeleton) -> LockState:
         point=zeros,
         offset=zeros,
         offset_velocity=zeros,
+        body=jnp.zeros(2),
+        body_velocity=jnp.zeros(2),
         started=jnp.zeros((), bool),
     )
 
@@ -209,7 +223,8 @@ def step_lock(
     offset_velocity = jnp.where(
         changed, moving + offset_velocity - wanted_velocity, offset_velocity
     )
-    return LockState(
+    return dataclasses.replace(
+        state,
         animated=toes,
         shown=jnp.where(level > 0, wanted + offset, toes),
         contact=contact,
@@ -219,6 +234,21 @@ def step_lock(
         offset_velocity=offset_velocity,
         started=jnp.ones((), bool),
     )
+
+
+def _move_body(state: LockState, *, fps: float, lock: FootLock) -> LockState:
+    """The body on its way to where its feet are locked: part 3 of the module's text."""
+    pull = jnp.mean((state.point - state.animated)[:, ::2], axis=0)
+    goal = state.body + pull
+    goal = goal * jnp.minimum(1.0, lock.body_reach / _length(goal))
+    body, velocity = spring(
+        state.body,
+        state.body_velocity,
+        jnp.where(jnp.all(state.locked), goal, 0.0),
+        half_life=lock.body_half_life,
+        dt=1.0 / fps,
+    )
+    return dataclasses.replace(state, body=body, body_velocity=velocity)
 
 
 def _length(x: Array) -> Array:
@@ -314,7 +344,7 @@ def place_toes(
     *,
     lock: FootLock,
 ) -> Float[Array, "joints 6"]:
-    """Rotations of a pose whose toes are moved to other places: part 3.
+    """Rotations of a pose whose toes are moved to other places: part 4.
 
     Args:
       skeleton: The skeleton; its feet are the toes.
@@ -371,7 +401,7 @@ def lock_frame(
     *,
     fps: float,
     lock: FootLock,
-) -> tuple[LockState, Float[Array, "joints 6"]]:
+) -> tuple[LockState, Float[Array, "3"], Float[Array, "joints 6"]]:
     """The next frame with its feet locked.
 
     Args:
@@ -383,12 +413,15 @@ def lock_frame(
       lock: Settings.
 
     Returns:
-      The state, and the rotations to display.
+      The state, and the root's position and the rotations to display.
     """
+    state = _move_body(state, fps=fps, lock=lock)
+    root_position = root_position.at[::2].add(state.body)
     pose = global_transforms(skeleton, root_position, joint_rotation)
     toes = pose[0][jnp.array(skeleton.feet)]
     state = step_lock(state, toes, fps=fps, lock=lock)
-    return state, _place(skeleton, *pose, joint_rotation, state.shown, lock=lock)
+    shown = _place(skeleton, *pose, joint_rotation, state.shown, lock=lock)
+    return state, root_position, shown
 
 
 @functools.partial(jax.jit, static_argnames=("lock",))
@@ -398,12 +431,15 @@ def lock_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motion
     For many characters, `jax.vmap` over the motion.
     """
 
-    def step(state: LockState, frame: tuple[Array, Array]) -> tuple[LockState, Array]:
-        return lock_frame(skeleton, state, *frame, fps=motion.fps, lock=lock)
+    def step(
+        state: LockState, frame: tuple[Array, Array]
+    ) -> tuple[LockState, tuple[Array, Array]]:
+        state, *shown = lock_frame(skeleton, state, *frame, fps=motion.fps, lock=lock)
+        return state, tuple(shown)
 
     frames = (motion.root_position, motion.joint_rotation)
-    _, rotations = jax.lax.scan(step, init_lock(skeleton), frames)
-    return dataclasses.replace(motion, joint_rotation=rotations)
+    _, (root, rotations) = jax.lax.scan(step, init_lock(skeleton), frames)
+    return dataclasses.replace(motion, root_position=root, joint_rotation=rotations)
 
 
 def _planted(
@@ -511,7 +547,7 @@ def locked(
 
     def advance(state: LockedState, command: Any) -> tuple[LockedState, Any]:
         inner, frame = controller.advance(state.inner, command)
-        feet, rotations = lock_frame(
+        feet, root, rotations = lock_frame(
             skeleton,
             state.feet,
             frame.root_position,
@@ -519,7 +555,7 @@ def locked(
             fps=fps,
             lock=lock,
         )
-        frame = dataclasses.replace(frame, joint_rotation=rotations)
+        frame = dataclasses.replace(frame, root_position=root, joint_rotation=rotations)
         return LockedState(inner=inner, feet=feet), frame
 
     return dataclasses.replace(

@@ -165,7 +165,34 @@ def test_feet_that_slide_stand():
     # The first frame has no speed, and the second begins the contact.
     moved = np.linalg.norm(np.asarray(toes)[15:] - np.asarray(toes)[15], axis=-1)
     assert moved.max() < 1e-3
+    still = dataclasses.replace(LOCK, body_reach=0.0)
+    found = foot_lock.lock_motion(SKELETON, motion, lock=still)
     np.testing.assert_array_equal(found.root_position, motion.root_position)
+
+
+def test_a_body_that_creeps_stays_over_its_feet_and_goes_with_a_free_one():
+    motion = drift(0.03, seconds=2.0)
+    lifted = np.asarray(motion.joint_rotation).copy()
+    lifted[45:] = np.asarray(pose(0.9))
+    walks = dataclasses.replace(motion, joint_rotation=jnp.asarray(lifted))
+    root = lambda x: np.asarray(  # noqa: E731
+        foot_lock.lock_motion(SKELETON, x, lock=LOCK).root_position
+    )[:, ::2]
+    own, stands = np.asarray(motion.root_position)[:, ::2], root(motion)
+    strayed = lambda x: np.linalg.norm(x - x[0], axis=-1)  # noqa: E731
+    assert strayed(own).max() > 0.05 and strayed(stands).max() < 0.015
+    free = root(walks)
+    np.testing.assert_array_equal(free[:40], stands[:40])
+    assert np.linalg.norm(free - own, axis=-1)[-1] < 0.01
+    assert np.linalg.norm(np.diff(free, axis=0), axis=-1).max() * FPS < 0.3
+
+
+def test_a_body_strays_from_its_plan_by_its_reach_at_most():
+    motion = drift(0.2, seconds=2.0)
+    lock = dataclasses.replace(LOCK, body_reach=0.04, radius=10.0)
+    found = foot_lock.lock_motion(SKELETON, motion, lock=lock)
+    away = np.linalg.norm(found.root_position - motion.root_position, axis=-1)
+    assert 0.03 < away.max() < 0.04 + 1e-5
 
 
 def test_a_lock_ends_at_its_radius_and_begins_anew():
