@@ -64,7 +64,8 @@ class Control:
       seam: Duration of the inertialized seam, seconds (released code 0.2); 0 for none.
       follow: Half-life, seconds, in which the wanted path returns to the commanded
         one, the integral of the desired velocity; 0 to steer by velocity alone, as
-        the paper does. Ours: without it every rollout drifts off its course.
+        the paper does. Ours: without it every rollout drifts off its course. Whoever
+        stands wants to stand where he came to a stop, not where the command ends.
     """
 
     apply: int = 15
@@ -92,6 +93,9 @@ RELEASED = Control(
     bias_position=0.4,
 )
 
+
+# A desired velocity below this one is a stop, meters per second.
+STILL = 0.02
 
 # For models that ship: the walked path is the commanded one.
 OWN_STARTS = Control(follow=1.0)
@@ -342,6 +346,10 @@ def replan(
     )
 
 
+def _is_still(velocity: Float[Array, "2"]) -> Bool[Array, ""]:
+    return jnp.sum(velocity**2) < STILL**2
+
+
 def advance(
     state: CharacterState,
     command: trajectory.Command,
@@ -373,6 +381,8 @@ def advance(
     facing, turn_rate = spring.facing_spring(
         state.facing, state.turn_rate, command.facing, **times
     )
+    stopped = _is_still(velocity) & ~_is_still(state.velocity)
+    anchor = jnp.where(stopped, pose.root_position[0, ::2], anchor)
     frame = Frame(
         root_position=pose.root_position[0],
         joint_rotation=pose.joint_rotation[0],
