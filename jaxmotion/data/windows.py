@@ -96,6 +96,66 @@ def window_index(
     )
 
 
+# Borders of the classes of `balance`, in m/s and radians.
+SPEED_BORDERS = (0.2, 0.6, 1.1, 1.7, 2.3, 3.0)
+TURN_BORDERS = (-np.pi / 2, -np.pi / 6, np.pi / 6, np.pi / 2)
+
+
+def balance(
+    clips: Clips, index: WindowIndex, *, last: int, power: float = 0.5
+) -> tuple[WindowIndex, Float[np.ndarray, "classes 2"]]:
+    """An index in which what happens rarely stands more often.
+
+    A window's class is its speed at frame `last`, its speed at the end, both over a
+    third of a second, and the turn of the facing between them. Its number of entries
+    grows with n^-power for a class of n windows. Recordings are mostly of steady
+    walking: a model that has seen few stops slides into them.
+
+    Args:
+      clips: The clips.
+      index: Where windows may start.
+      last: Frame that the future begins after.
+      power: 0 leaves the index as it is; 1 gives all classes the same share.
+
+    Returns:
+      The index, about twice as long, and each class's share before and after.
+    """
+    frames = Motion(
+        root_position=clips.root_position,
+        joint_rotation=clips.joint_rotation,
+        fps=clips.fps,
+    )
+    course = jax.jit(trajectory.root_trajectory)(clips.skeleton, frames)
+    position, facing = (np.asarray(x, np.float64) for x in (course.position, course.facing))
+    starts = np.asarray(index.starts)
+    third = max(round(clips.fps / 3), 1)
+
+    def speed(end: np.ndarray) -> np.ndarray:
+        way = np.linalg.norm(position[end] - position[end - third], axis=-1)
+        return np.digitize(way * clips.fps / third, SPEED_BORDERS)
+
+    now, end = starts + last, starts + index.length - 1
+    before = np.maximum(now, starts + third)
+    turned = np.arctan2(
+        np.cross(facing[end], facing[now]), np.sum(facing[end] * facing[now], axis=-1)
+    )
+    width = len(SPEED_BORDERS) + 1
+    kinds = speed(before) * width + speed(end)
+    kinds = kinds * (len(TURN_BORDERS) + 1) + np.digitize(turned, TURN_BORDERS)
+    _, kind, count = np.unique(kinds, return_inverse=True, return_counts=True)
+    weight = count[kind] ** -power
+    times = 2.0 * starts.size * weight / weight.sum()
+    # Rounded so that the sum is right: the n-th entry lies where the sum passes n.
+    edges = np.round(np.concatenate([[0.0], np.cumsum(times)])).astype(int)
+    chosen = np.repeat(np.arange(starts.size), np.diff(edges))
+    shares = np.stack(
+        [count / starts.size, np.bincount(kind[chosen]) / chosen.size], axis=-1
+    )
+    return dataclasses.replace(
+        index, starts=index.starts[chosen], clips=index.clips[chosen]
+    ), shares
+
+
 def cut(clips: Clips, start: Int[Array, ""], length: int) -> Motion:
     """The frames from `start`.
 

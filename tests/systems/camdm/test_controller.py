@@ -26,7 +26,7 @@ CONTROL = camdm_controller.Control(apply=5, reuse=6, seam=0.0)
 def obedient(height):
     """A stand-in of `camdm.sampler`: walks the wanted path at a height of its own."""
 
-    def sampler(params, *, config, table=None):
+    def sampler(params, *, config, **_):
         def plan(key, condition, *, scale=None):
             facing = rotation.matrix_from_facing(condition.trajectory.facing)
             joints = jnp.broadcast_to(
@@ -317,7 +317,7 @@ def test_seams_are_continuous_in_position_and_velocity(skeleton, monkeypatch):
     for fps in (120.0, 240.0):
         config = tiny.config(heading="facing", fps=fps, future=60)
 
-        def sampler(params, *, config, table=None):
+        def sampler(params, *, config, **_):
             def plan(key, condition, *, scale=None):
                 time = jnp.arange(1, config.future + 1) / config.fps
                 root = jnp.stack([0.1 + 0 * time, 0.9 + 0 * time, 0.1 + 1.5 * time], -1)
