@@ -51,6 +51,8 @@ class Train:
       held_out: Fraction of clips kept for evaluation, in (0, 1).
       held_out_clips: Keep these clips for evaluation, by name, instead of a fraction.
       mirror: Add a mirrored copy of every training clip.
+      balance: Draw windows of rare changes of speed and direction more often: a kind
+        that n windows are of has a share that grows with n^(1 - balance).
       steps: Optimizer steps of the whole run.
       batch: Windows a step (of 55 frames: 10 past, 45 future).
       optimizer: "muon" or "adamw" (cosine decay), "radam" or "adam" (constant).
@@ -65,6 +67,10 @@ class Train:
       depth: Layers; None for the preset's.
       token_margin: Frames that neighboring output tokens share; None for the preset's.
       token_window: How they are cross-faded.
+      attention: "full" (the paper's) or "prefix", whose condition tokens do not see the
+        noisy frames and are computed once per plan; None for the preset's.
+      noise_levels: Noise levels of each window in a step; None for the preset's.
+      frame_kernel: Frames of a convolution after the tokens; None for the preset's.
       diffusion_steps: Steps T of the diffusion.
       devices: Split each batch over so many devices; 1 for no mesh.
       seed: Of everything random.
@@ -81,6 +87,7 @@ class Train:
     held_out: float = 0.1
     held_out_clips: tuple[str, ...] = ()
     mirror: bool = True
+    balance: float = 0.0
     steps: int = 11000
     batch: int | None = None
     optimizer: OptimizerName | None = None
@@ -95,6 +102,9 @@ class Train:
     depth: int | None = None
     token_margin: int | None = None
     token_window: Literal["hann", "trapezoid"] = "hann"
+    attention: Literal["full", "prefix"] | None = None
+    noise_levels: int | None = None
+    frame_kernel: int | None = None
     diffusion_steps: int = 8
     devices: int = 1
     seed: int = 0
@@ -128,6 +138,7 @@ def train(args: Train) -> None:
         held_out=args.held_out,
         held_out_clips=args.held_out_clips,
         mirrored=args.mirror,
+        balance=args.balance,
         make=make,
         settings={"sizes": sizes, "init": args.init and str(args.init)},
     )

@@ -126,7 +126,9 @@ def balance(
         fps=clips.fps,
     )
     course = jax.jit(trajectory.root_trajectory)(clips.skeleton, frames)
-    position, facing = (np.asarray(x, np.float64) for x in (course.position, course.facing))
+    position, facing = (
+        np.asarray(x, np.float64) for x in (course.position, course.facing)
+    )
     starts = np.asarray(index.starts)
     third = max(round(clips.fps / 3), 1)
 

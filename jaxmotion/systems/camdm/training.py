@@ -121,7 +121,9 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
 
 
 def continued(model: Model, path: Path) -> tuple[Model, Params]:
-    """Another run's network and averaged parameters, with this model's loss weights.
+    """Another run's network and averaged parameters, to be trained as this model.
+
+    Weights of the losses, attention and noise levels are this model's.
 
     Args:
       model: The model to train.
@@ -134,10 +136,11 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
       ValueError: if skeleton, styles or sizes differ; names which.
     """
     first, params = load(path)
+    # What has no parameters. Attention to a prefix alone is soon learned anew.
     weights = {
         name: value
         for name, value in dataclasses.asdict(model.config).items()
-        if name.startswith("weight_")
+        if name.startswith("weight_") or name in ("attention", "noise_levels")
     }
     # The mean rotation is part of what the network has learned.
     mean = first.config.rotation_mean
@@ -282,6 +285,7 @@ def prepare(
     held_out: float = 0.1,
     held_out_clips: tuple[str, ...] = (),
     mirrored: bool = False,
+    balance: float = 0.0,
     make: Callable[[Clips], Model],
     settings: dict[str, Any],
 ) -> runs.Run:
@@ -297,6 +301,8 @@ def prepare(
       held_out_clips: Clips to hold out.
       mirrored: Whether it is trained on mirrored copies of the clips as well.
       make: The model for the training clips.
+      balance: How much more often rare changes of speed and direction are drawn; see
+        `windows.balance`.
       settings: JSON of what it makes them from.
 
     Raises:
@@ -310,6 +316,7 @@ def prepare(
         held_out=held_out,
         held_out_clips=list(held_out_clips),
         mirror=mirrored,
+        balance=balance,
     )
 
     def content() -> runs.Content:
@@ -360,6 +367,14 @@ def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> No
         clips = with_mirrored(clips)
     config, field = model.config, run.settings["label"]
     index = windows.window_index(clips, config.window, short="skip")
+    if power := run.settings["balance"]:
+        last = config.past - 1
+        index, shares = windows.balance(clips, index, last=last, power=power)
+        lines = [f"{100 * x:.2g} %" for x in (*shares.min(0), *shares.max(0))]
+        print(
+            "rarest of {} kinds of windows: {} instead of {}; most frequent: {} instead "
+            "of {}".format(len(shares), *(lines[i] for i in (1, 0, 3, 2)))
+        )
     short = int(np.sum(np.diff(np.asarray(clips.offsets)) < config.window))
     print(
         f"{clips.num_clips} clips ({short} too short to use), {clips.num_frames} "
