@@ -370,10 +370,10 @@ def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> No
     if power := run.settings["balance"]:
         last = config.past - 1
         index, shares = windows.balance(clips, index, last=last, power=power)
-        lines = [f"{100 * x:.2g} %" for x in (*shares.min(0), *shares.max(0))]
+        (rare, often), (rarely, most) = 100 * shares.min(0), 100 * shares.max(0)
         print(
-            "rarest of {} kinds of windows: {} instead of {}; most frequent: {} instead "
-            "of {}".format(len(shares), *(lines[i] for i in (1, 0, 3, 2)))
+            f"{len(shares)} kinds of windows: the rarest has {often:.2g} % instead of "
+            f"{rare:.2g} %, the most frequent {most:.2g} % instead of {rarely:.2g} %"
         )
     short = int(np.sum(np.diff(np.asarray(clips.offsets)) < config.window))
     print(
