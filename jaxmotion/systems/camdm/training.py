@@ -53,10 +53,12 @@ PRESETS = {
     ),
 }
 # A second, short training of a "small" model: displacements of positions and feet weigh
-# 40 times more against features, so that feet stand still.
+# 40 times more against features, so that feet stand still, and changes of displacements
+# count, so that joints do not shake.
 PRESETS["planted"] = PRESETS["small"] | dict(
     weight_data=1.0,
     weight_position_velocity=20.0,
+    weight_acceleration=20.0,
     weight_foot=20.0,
 )
 # How the presets are trained, as fields of `runs.Budget`.
