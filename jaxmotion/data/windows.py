@@ -138,9 +138,8 @@ def balance(
 
     now, end = starts + last, starts + index.length - 1
     before = np.maximum(now, starts + third)
-    turned = np.arctan2(
-        np.cross(facing[end], facing[now]), np.sum(facing[end] * facing[now], axis=-1)
-    )
+    angle = np.arctan2(facing[:, 0], facing[:, 1])
+    turned = (angle[end] - angle[now] + np.pi) % (2 * np.pi) - np.pi
     width = len(SPEED_BORDERS) + 1
     kinds = speed(before) * width + speed(end)
     kinds = kinds * (len(TURN_BORDERS) + 1) + np.digitize(turned, TURN_BORDERS)

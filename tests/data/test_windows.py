@@ -1,5 +1,7 @@
 """Windows lie within one clip, are drawn uniformly, and short clips are named."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -167,3 +169,39 @@ def test_style_speeds_are_medians_within_clips(run):
         speed = np.linalg.norm(np.diff(path, axis=0), axis=-1) * 30.0
         steps[int(clips.labels["style"][clip])] += speed.tolist()
     np.testing.assert_allclose(found, [np.median(steps[i]) for i in (0, 1)], rtol=1e-4)
+
+
+@pytest.fixture
+def one_stop(walker):
+    """Everyone goes straight on at 1.3 m/s, but for a stop in the last clip."""
+    steps = np.full(walker.num_frames, 1.3 / walker.fps)
+    steps[int(walker.offsets[-1]) - 45 :] = 0.0
+    root = np.asarray(walker.root_position).copy()
+    root[:, 0], root[:, 2] = 0.0, np.cumsum(steps)
+    turned = jnp.broadcast_to(walker.joint_rotation[:1], walker.joint_rotation.shape)
+    return dataclasses.replace(
+        walker, root_position=jnp.asarray(root), joint_rotation=turned
+    )
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0])
+def test_rare_windows_stand_more_often_in_a_balanced_index(one_stop, power):
+    index = windows.window_index(one_stop, 40)
+    balanced, shares = windows.balance(one_stop, index, last=9, power=power)
+    assert abs(balanced.starts.size - 2 * index.starts.size) <= 1
+    # Walking on, stopping, standing; and two between them, at the borders of a speed.
+    assert 3 <= len(shares) <= 8
+    np.testing.assert_allclose(shares.sum(axis=0), 1.0)
+    counts = shares[:, 0] * index.starts.size
+    weights = counts ** (1 - power)
+    np.testing.assert_allclose(shares[:, 1], weights / weights.sum(), atol=0.02)
+    # Within a class all windows stand equally often, each with its own clip.
+    times = np.bincount(balanced.starts, minlength=one_stop.num_frames)
+    start = int(one_stop.offsets[0])
+    walking = times[start : start + 20]
+    assert walking.max() - walking.min() <= 1
+    owner = dict(zip(index.starts.tolist(), index.clips.tolist(), strict=True))
+    found = zip(balanced.starts.tolist(), balanced.clips.tolist(), strict=True)
+    assert all(owner[start] == clip for start, clip in found)
+    still = int(one_stop.offsets[-1]) - 41
+    assert (times[still] > 2) == (power > 0)

@@ -485,3 +485,39 @@ def test_the_mean_pose_stands_on_the_ground():
     feet = joint_positions(model.skeleton, motion)[:, [2, 4], 1]
     np.testing.assert_allclose(feet, 0.0, atol=1e-6)
     np.testing.assert_allclose(motion.root_position[-1], [0, 0.9, 0], atol=1e-6)
+
+
+def test_whoever_comes_to_a_stop_stays_there(skeleton):
+    """The end of the commanded path pulls nobody who stands; a new command does."""
+    state = jax.tree.map(lambda x: x[0], states_of(skeleton, 1))
+    state = dataclasses.replace(
+        state, velocity=jnp.array([0.0, 0.1]), anchor=jnp.array([5.0, 5.0])
+    )
+    step = jax.jit(
+        functools.partial(camdm_controller.advance, config=CONFIG, control=CONTROL)
+    )
+    still, ahead = (
+        trajectory.Command(
+            velocity=jnp.array([0.0, speed]),
+            facing=jnp.array([0.0, 1.0]),
+            label=jnp.zeros((), jnp.int32),
+        )
+        for speed in (0.0, 1.0)
+    )
+    anchors, roots, speeds = [], [], []
+    for _ in range(40):
+        state = dataclasses.replace(state, cursor=jnp.minimum(state.cursor, 5))
+        state, frame = step(state, still)
+        anchors.append(state.anchor)
+        roots.append(frame.root_position[::2])
+        speeds.append(float(jnp.linalg.norm(state.velocity)))
+    stop = next(i for i, x in enumerate(speeds) if x < camdm_controller.STILL)
+    assert 0 < stop < 30
+    assert np.linalg.norm(anchors[stop - 1] - roots[stop - 1]) > 3.0
+    np.testing.assert_array_equal(anchors[stop], roots[stop])
+    for anchor in anchors[stop:]:
+        np.testing.assert_allclose(anchor, roots[stop], atol=0.01)
+    for _ in range(30):
+        state = dataclasses.replace(state, cursor=jnp.minimum(state.cursor, 5))
+        state, _ = step(state, ahead)
+    assert state.anchor[1] - roots[stop][1] > 0.3

@@ -176,12 +176,13 @@ def first(tmp_path):
     return model, params, path
 
 
-def test_only_the_weights_are_new(first):
+def test_only_what_has_no_parameters_is_new(first):
     model, params, path = first
-    config = dataclasses.replace(model.config, weight_foot=7.0, rotation_mean=(1.0,))
+    new = dict(weight_foot=7.0, attention="prefix", noise_levels=2)
+    config = dataclasses.replace(model.config, rotation_mean=(1.0,), **new)
     wanted = dataclasses.replace(model, config=config, source="mine")
     found, loaded = camdm_training.continued(wanted, path)
-    assert found.config == dataclasses.replace(model.config, weight_foot=7.0)
+    assert found.config == dataclasses.replace(model.config, **new)
     assert found.source == "mine"
     for a, b in zip(jax.tree.leaves(loaded), jax.tree.leaves(params), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-3)  # exported as float16
