@@ -26,7 +26,7 @@ from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import published as camdm_published
-from jaxmotion.systems.camdm import speeds as camdm_speeds
+from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm import training as camdm_training
 
 
@@ -182,26 +182,30 @@ class Evaluate:
 
 
 @dataclasses.dataclass(frozen=True)
-class Speeds:
-    """Tell characters to walk straight on at several speeds, and measure each.
+class Steering:
+    """Steer characters straight on at several speeds and along courses; measure each.
 
     Examples:
-      python experiments/camdm.py speeds --run runs/locomotion --style neutral
-      python experiments/camdm.py speeds --run locomotion --data data/o3de.npz
-        --held-out-clips WalkStopTurn1 RunPivotTurn1 --foot-lock --out runs/speeds
+      python experiments/camdm.py steering --run runs/locomotion --style neutral
+      python experiments/camdm.py steering --run locomotion --data data/o3de.npz
+        --held-out-clips WalkStopTurn1 RunPivotTurn1 --out runs/steering
 
     Attributes:
       run: Run folder of `train`; or a shipped model or an exported file, with `data`.
       data: Clips; None for those that the run was trained on.
       held_out_clips: Clips of `data` that a shipped or exported model never saw.
-      out: Folder for metrics.json and table.md; None for <run>/speeds.
+      out: Folder for metrics.json and table.md; None for <run>/steering.
       style: Style of all characters; None for the first.
-      speeds: Meters per second; 0 to stand.
-      rollouts: Characters per speed.
-      seconds: Length of each rollout, seconds.
+      speeds: What characters are told that go straight on, meters per second; 0 to
+        stand.
+      courses: Courses that they follow besides.
+      speed: What they are told there, meters per second.
+      rollouts: Characters per speed and per course.
+      seconds: Length of each rollout, seconds; 13 or more to measure who stands.
       follow: Half-life in which a character that left its course returns, seconds; 0
-        to steer by velocity alone.
-      foot_lock: Measure what is displayed with locked feet.
+        to steer by velocity alone; None for what the model ships with.
+      foot_lock: Measure what is displayed with locked feet, too.
+      chunk: Characters to run at a time, at most.
       seed: Of poses and noise.
     """
 
@@ -211,10 +215,18 @@ class Speeds:
     out: Path | None = None
     style: str | None = None
     speeds: tuple[float, ...] = (0.0, 0.8, 1.4, 2.5, 3.5)
+    courses: tuple[Course, ...] = (
+        "figure_eight",
+        "stop_and_go",
+        "turn_on_the_spot",
+        "turn_around",
+    )
+    speed: float = 1.4
     rollouts: int = 16
     seconds: float = 20.0
-    follow: float = 0.0
-    foot_lock: bool = False
+    follow: float | None = None
+    foot_lock: bool = True
+    chunk: int = 4
     seed: int = 0
 
 
@@ -272,28 +284,40 @@ def evaluate(args: Evaluate) -> None:
     print(report)
 
 
-def speeds(args: Speeds) -> None:
-    """Writes the table, and jerk and slide by frame of the plan below it."""
+def steering(args: Steering) -> None:
+    """Writes the table; below it what is told by frame of the plan and by time."""
     if args.run.is_dir():
         run = camdm_training.load_run(args.run, args.data)
     else:
         run = camdm_training.exported_run(args.run, args.data, args.held_out_clips)
-    out = args.out or args.run / "speeds"
+    model, control = run.model, None
+    out = args.out or args.run / "steering"
     loop.check_writable(out)
+    if args.follow is not None:
+        control = camdm_controller.Control(follow=args.follow)
     cli.announce("compiling the rollouts", 40)
-    rows, plans, report = camdm_speeds.speed_table(
-        run,
-        args.speeds,
-        style=args.style or run.model.labels[0],
+    found = camdm_steering.steering_table(
+        camdm_controller.character(run.params, model, control=control),
+        run.held_out,
+        run.train,
+        field=run.field,
+        label=args.style or model.labels[0],
+        speeds=args.speeds,
+        names=args.courses,
+        course_speed=args.speed,
         rollouts=args.rollouts,
         seconds=args.seconds,
-        control=camdm_controller.Control(follow=args.follow),
         foot_lock=FootLock() if args.foot_lock else None,
+        chunk=args.chunk,
         seed=args.seed,
     )
-    report = {"arguments": reporting.arguments_json(args)} | report
+    report = {"arguments": reporting.arguments_json(args)} | found.report
     report |= reporting.provenance()
-    reporting.write_table(out, rows, report, (by_frame.to_markdown(plans),))
+    notes = [by_frame.to_markdown(found.by_plan, places="by frame of the plan")]
+    if found.by_time:
+        title = "by 0.2 s since a command"
+        notes.append(by_frame.to_markdown(found.by_time, places=title))
+    reporting.write_table(out, found.rows, report, tuple(notes))
 
 
 def rollout(args: Rollout) -> None:
@@ -403,7 +427,7 @@ def import_weights(args: Import) -> None:
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Speeds, tyro.conf.subcommand("speeds")]
+    | Annotated[Steering, tyro.conf.subcommand("steering")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]
@@ -416,7 +440,7 @@ def main() -> None:
     run = {
         Train: train,
         Evaluate: evaluate,
-        Speeds: speeds,
+        Steering: steering,
         Rollout: rollout,
         Export: export,
         Import: import_weights,

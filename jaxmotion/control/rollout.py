@@ -99,6 +99,7 @@ def rollout(
     states: State,
     commands: Commands,
     *,
+    first: int | Int[Array, ""] = 0,
     chunk: int | None = None,
     mesh: Mesh | None = None,
 ) -> tuple[State, Frame]:
@@ -109,6 +110,8 @@ def rollout(
       key: Consumed.
       states: States of the characters, batch axis first.
       commands: Commands [characters, ticks, ...].
+      first: Number c of the first character: a part of a batch draws what it draws in
+        the whole.
       chunk: Run so many characters at a time (it must divide their number), which
         keeps a large batch within a processor's cache; None for all at once.
       mesh: Split the characters over the mesh's first axis. A chunk is then what
@@ -128,7 +131,7 @@ def rollout(
             f"{number} characters on {devices} devices in chunks of {size}: "
             "expected a number that both divide"
         )
-    keys = jax.vmap(lambda c: jax.random.fold_in(key, c))(jnp.arange(number))
+    keys = jax.vmap(lambda c: jax.random.fold_in(key, c))(first + jnp.arange(number))
     run = lambda k, s, c: _scan(controller, k, s, c, size)  # noqa: E731
     if mesh is None:
         return run(keys, states, commands)

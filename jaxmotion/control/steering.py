@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array
@@ -150,6 +151,7 @@ def steered_rollouts(
     states: Any,
     commands: Command,
     *,
+    first: int = 0,
     chunk: int | None = None,
     mesh: Mesh | None = None,
 ) -> Frame:
@@ -160,6 +162,7 @@ def steered_rollouts(
       key: Consumed.
       states: From `character.start`.
       commands: Commands [characters, ticks, ...], as from `courses.course_batch`.
+      first: Number of the first character; see `rollout.rollout`.
       chunk: Characters to run at a time, at most (the largest number that divides
         theirs); see `rollout.rollout`.
       mesh: Devices to split the characters over; see `rollout.rollout`.
@@ -185,6 +188,7 @@ def steered_rollouts(
         key,
         states,
         commands,
+        jnp.int32(first),
         method=character.method,
         chunk=chunk,
         mesh=mesh,
@@ -197,10 +201,12 @@ def _rollouts(
     key: Key,
     states: Any,
     commands: Command,
+    first: Array,
     *,
     method: Method,
     chunk: int | None,
     mesh: Mesh | None,
 ) -> Frame:
     run = rollout.rollout
-    return run(method(params), key, states, commands, chunk=chunk, mesh=mesh)[1]
+    more = dict(first=first, chunk=chunk, mesh=mesh)
+    return run(method(params), key, states, commands, **more)[1]

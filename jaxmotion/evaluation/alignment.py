@@ -1,10 +1,17 @@
-"""How well a motion goes and faces where it was told. Angles are in radians."""
+"""How well a motion goes and faces where it was told. Angles are in radians.
 
+A walker's hips sway with every step. Where that is no fault, paths are compared over
+`reach` frames to either side: a quarter of a second, so that half a second counts.
+"""
+
+import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from jaxmotion.motion import ground
 from jaxmotion.motion.spring import Scalar
@@ -97,3 +104,133 @@ def orientation_error(
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 6; wrapped.
     """
     return jnp.mean(jnp.abs(heading_error(wanted, actual)), axis=-1)
+
+
+@jax.jit
+def commanded_path(
+    velocity: Float[Array, "*batch frames 2"], fps: Scalar
+) -> Float[Array, "*batch frames 2"]:
+    """Where a point is after each frame that starts at the origin and goes as told.
+
+    Args:
+      velocity: Wanted velocity at the end of each frame (after the springs, in systems
+        that have them), meters per second.
+      fps: Frames per second.
+
+    Returns:
+      Positions, meters: the trapezoidal integral, which is within a millimeter of the
+      springs' own for half-lives from a quarter of a second.
+    """
+    ends = jnp.cumsum(velocity, axis=-2)
+    return (ends - 0.5 * (velocity - velocity[..., :1, :])) / fps
+
+
+@functools.partial(jax.jit, static_argnames=("reach",))
+def path_distance(
+    position: Float[Array, "*batch frames 2"],
+    wanted: Float[Array, "*batch frames 2"],
+    *,
+    reach: int,
+) -> Float[Array, "*batch frames"]:
+    """Distance on the ground from where a character is to where it should be by now.
+
+    What lags behind is off its path as what strays to a side.
+
+    Args:
+      position: Root position (x, z) in each frame, meters.
+      wanted: Where it was told to be.
+      reach: Frames to either side over which the difference is averaged; the first and
+        the last one stand for those outside.
+
+    Returns:
+      Meters.
+    """
+    gap = position - wanted
+    frame, last = np.arange(gap.shape[-2]), gap.shape[-2] - 1
+    around = [np.clip(frame + i, 0, last) for i in range(-reach, reach + 1)]
+    mean = sum(gap[..., i, :] for i in around) / len(around)
+    return jnp.linalg.norm(mean, axis=-1)
+
+
+@functools.partial(jax.jit, static_argnames=("reach",))
+def steady_speed(
+    position: Float[Array, "*batch frames 2"], fps: Scalar, *, reach: int
+) -> Float[Array, "*batch frames"]:
+    """Speed of the root without its sway.
+
+    Args:
+      position: Root position (x, z) in each frame, meters.
+      fps: Frames per second.
+      reach: The speed is that from so many frames before to so many after; less at
+        both ends of the path.
+
+    Returns:
+      Meters per second.
+    """
+    frame = np.arange(position.shape[-2])
+    before = np.maximum(frame - reach, 0)
+    after = np.minimum(frame + reach, frame[-1])
+    way = jnp.linalg.norm(position[..., after, :] - position[..., before, :], axis=-1)
+    seconds = np.maximum(after - before, 1) / fps
+    return way / seconds.reshape((1,) * (way.ndim - 1) + (-1,))
+
+
+@functools.partial(jax.jit, static_argnames=("length",))
+def creep(
+    position: Float[Array, "*batch frames 2"], *, length: int
+) -> Float[Array, "*batch"]:
+    """How far a character that should stand goes from its place within some time.
+
+    Args:
+      position: Root position (x, z) in each frame, meters.
+      length: Frames of that time.
+
+    Returns:
+      Largest distance from the first frame of a part of that length, meters; mean
+      over all whole parts.
+
+    Raises:
+      ValueError: if there is no whole part.
+    """
+    parts = position.shape[-2] // length
+    if parts < 1:
+        raise ValueError(
+            f"a path of {position.shape[-2]} frames, expected {length} or more"
+        )
+    lead = position.shape[:-2]
+    part = position[..., : parts * length, :].reshape(*lead, parts, length, 2)
+    away = jnp.linalg.norm(part - part[..., :1, :], axis=-1)
+    return jnp.mean(jnp.max(away, axis=-1), axis=-1)
+
+
+class Reaction(NamedTuple):
+    """Seconds until commands were obeyed, the time they had if not; and whether."""
+
+    seconds: Float[np.ndarray, "*batch commands"]
+    obeyed: Bool[np.ndarray, "*batch commands"]
+
+
+def reaction(
+    reached: Bool[Array | np.ndarray, "*batch frames"],
+    begins: Sequence[int],
+    ends: Sequence[int],
+    fps: float,
+) -> Reaction:
+    """Time from each new command until it is obeyed for the first time.
+
+    Args:
+      reached: Whether a frame does what the command says.
+      begins: First frame of each command.
+      ends: First frame that it no longer holds in.
+      fps: Frames per second.
+    """
+    reached = np.asarray(reached)
+    lead, number = reached.shape[:-1], len(begins)
+    seconds, obeyed = np.zeros((*lead, number)), np.zeros((*lead, number), bool)
+    for i, (begin, end) in enumerate(zip(begins, ends, strict=True)):
+        part = reached[..., begin:end]
+        obeyed[..., i] = part.any(axis=-1)
+        # The first frame shows the character a tick after the command.
+        first = np.where(obeyed[..., i], part.argmax(axis=-1) + 1, end - begin)
+        seconds[..., i] = first / fps
+    return Reaction(seconds=seconds, obeyed=obeyed)

@@ -5,26 +5,22 @@ between two plans, or at a border between two tokens of a network, stands out as
 as the frames at that place are averaged by themselves.
 """
 
-from typing import NamedTuple
+import functools
+import math
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmotion.evaluation import contact
+from jaxmotion.evaluation import columns, contact
 from jaxmotion.motion.spring import Scalar
 
-
-class ByFrame(NamedTuple):
-    """Means over all frames that stand at the same place; NaN where there are none.
-
-    Jerk is in m/s^3 and slide in m/s (of low toes, 0 where none was low).
-    """
-
-    jerk: Float[Array, "places"]
-    slide: Float[Array, "places"]
-    frames: Int[Array, "places"]
+# By column: sums over frames at each place of weighted values, and of their weights.
+# Those of parts of the frames add up.
+Sums = dict[str, Float[Array | np.ndarray, "2 places"]]
+# By column: means over all frames at each place; NaN where there are none.
+ByFrame = dict[str, Float[np.ndarray, "places"]]
 
 
 def frames_since(planned: Bool[Array, "*batch frames"]) -> Int[Array, "*batch frames"]:
@@ -32,6 +28,62 @@ def frames_since(planned: Bool[Array, "*batch frames"]) -> Int[Array, "*batch fr
     place = jnp.broadcast_to(jnp.arange(planned.shape[-1]), planned.shape)
     last = jax.lax.cummax(jnp.where(planned, place, -1), axis=planned.ndim - 1)
     return jnp.where(last < 0, -1, place - last)
+
+
+def place_sums(
+    values: Float[Array, "*batch frames"],
+    place: Int[Array, "*batch frames"],
+    *,
+    num_places: int,
+    weights: Float[Array, "*batch frames"] | None = None,
+) -> Float[Array, "2 places"]:
+    """Sums of values and of weights by place.
+
+    Args:
+      values: One a frame.
+      place: Of each frame, in 0..num_places-1; others are left out.
+      num_places: Length of the result.
+      weights: Of the values; None for equal ones.
+    """
+    at = jax.nn.one_hot(place, num_places)
+    weights = jnp.ones(values.shape) if weights is None else weights
+    total = jnp.einsum("...fp,...f->p", at, values * weights)
+    return jnp.stack([total, jnp.einsum("...fp,...f->p", at, weights)])
+
+
+@functools.partial(jax.jit, static_argnames=("feet", "num_places"))
+def rough_sums(
+    positions: Float[Array, "*batch frames joints 3"],
+    feet: tuple[int, ...],
+    place: Int[Array, "*batch frames"],
+    fps: Scalar,
+    *,
+    num_places: int,
+    contact_height: Scalar,
+) -> Sums:
+    """Sums of jerk and slide; arguments and units as in `by_frame`."""
+    toes = positions[..., jnp.array(feet), :]
+    jerk = jnp.diff(positions, n=3, axis=-3) * fps**3
+    jerk = jnp.mean(jnp.linalg.norm(jerk, axis=-1), axis=-1)
+    low = toes[..., :-1, :, 1] < contact_height
+    slide = jnp.sum(jnp.where(low, contact.foot_steps(toes) * fps, 0.0), axis=-1)
+    times = jnp.sum(low, axis=-1).astype(float)
+    mean = slide / jnp.maximum(times, 1.0)
+    at = {"num_places": num_places}
+    return {
+        "jerk": place_sums(jerk, place[..., 3:], **at),
+        "foot_slide": place_sums(mean, place[..., 1:], weights=times, **at),
+    }
+
+
+def means(sums: Sums) -> ByFrame:
+    """Means of sums."""
+    found = {}
+    for name, (total, weight) in sums.items():
+        total, weight = np.asarray(total, float), np.asarray(weight, float)
+        mean = total / np.maximum(weight, 1e-9)
+        found[name] = np.where(weight > 0, mean, np.nan)
+    return found
 
 
 def by_frame(
@@ -43,7 +95,7 @@ def by_frame(
     num_places: int,
     contact_height: Scalar,
 ) -> ByFrame:
-    """Jerk and slide by place.
+    """Jerk (m/s^3) and slide of low toes (m/s) by place.
 
     A difference belongs to its last frame: a jump from frame 4 to frame 5 shows in the
     jerk of frames 5, 6 and 7 (as 1 : 2 : 1) and in the slide of frame 5.
@@ -59,42 +111,41 @@ def by_frame(
     Returns:
       Means over the batch and time.
     """
-    toes = positions[..., jnp.array(feet), :]
-    jerk = jnp.diff(positions, n=3, axis=-3) * fps**3
-    jerk = jnp.mean(jnp.linalg.norm(jerk, axis=-1), axis=-1)
-    low = toes[..., :-1, :, 1] < contact_height
-    slide = jnp.where(low, contact.foot_steps(toes) * fps, 0.0)
-
-    def sums(values: Array, first: int) -> Array:
-        at = jax.nn.one_hot(place[..., first:], num_places)
-        return jnp.einsum("...fp,...f->p", at, values)
-
-    every = jnp.ones(place.shape)
-    times = jnp.sum(low, axis=-1)
-    divide = lambda a, b: jnp.where(b > 0, a / jnp.maximum(b, 1), 0.0)  # noqa: E731
-    seen = sums(every[..., 3:], 3)
-    return ByFrame(
-        jerk=jnp.where(seen > 0, divide(sums(jerk, 3), seen), jnp.nan),
-        slide=divide(sums(jnp.sum(slide, axis=-1), 1), sums(times.astype(float), 1)),
-        frames=sums(every, 0).astype(jnp.int32),
+    return means(
+        rough_sums(
+            positions,
+            feet,
+            place,
+            fps,
+            num_places=num_places,
+            contact_height=contact_height,
+        )
     )
 
 
-def to_json(rows: dict[str, ByFrame]) -> dict[str, dict[str, list[float]]]:
+def to_json(rows: dict[str, ByFrame]) -> dict[str, dict[str, list[float | None]]]:
+    """Rows as a JSON object; null where no frame stands."""
     return {
-        name: {k: np.asarray(v).tolist() for k, v in row._asdict().items()}
+        name: {
+            column: [float(x) if math.isfinite(x) else None for x in values]
+            for column, values in row.items()
+        }
         for name, row in rows.items()
     }
 
 
-def to_markdown(rows: dict[str, ByFrame]) -> str:
-    """One table: a line of jerk and one of slide per row, a column per place."""
-    number = max(len(row.jerk) for row in rows.values())
-    lines = ["| by frame | " + " | ".join(map(str, range(number))) + " |"]
+def to_markdown(rows: dict[str, ByFrame], *, places: str = "by frame") -> str:
+    """One table: a line per row and column, a column per place.
+
+    Args:
+      rows: As `by_frame` returns them.
+      places: What the places are.
+    """
+    number = max(len(values) for row in rows.values() for values in row.values())
+    lines = [f"| {places} | " + " | ".join(map(str, range(number))) + " |"]
     lines.append("|---" * (number + 1) + "|")
     for name, row in rows.items():
-        jerk = " | ".join(f"{float(x):.0f}" for x in row.jerk)
-        slide = " | ".join(f"{float(x):.2f}" for x in row.slide)
-        lines.append(f"| {name}, jerk m/s³ | {jerk} |")
-        lines.append(f"| {name}, slide m/s | {slide} |")
+        for column, values in row.items():
+            texts = (f"{x:.0f}" if abs(x) >= 10 else f"{x:.2f}" for x in values)
+            lines.append(f"| {name}, {columns.header(column)} | {' | '.join(texts)} |")
     return "\n".join(lines)

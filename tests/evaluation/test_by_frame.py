@@ -1,6 +1,7 @@
 """Roughness by place: planted jumps show where they were planted, and only there."""
 
 import dataclasses
+import functools
 
 import jax.numpy as jnp
 import numpy as np
@@ -42,11 +43,10 @@ def test_a_jump_at_a_border_shows_in_three_frames(skeleton):
     )
     jerk = np.zeros(10)
     jerk[5:8] = np.array([1, 2, 1]) * 0.01 * 30**3
-    np.testing.assert_allclose(found.jerk, jerk, rtol=1e-3, atol=1.0)
+    np.testing.assert_allclose(found["jerk"], jerk, rtol=1e-3, atol=1.0)
     slide = np.zeros(10)
     slide[5] = 0.01 * 30
-    np.testing.assert_allclose(found.slide, slide, atol=1e-4)
-    assert found.frames.tolist() == [4] * 10
+    np.testing.assert_allclose(found["foot_slide"], slide, atol=1e-4)
 
 
 def test_the_mean_over_places_is_the_metric(skeleton):
@@ -61,8 +61,24 @@ def test_the_mean_over_places_is_the_metric(skeleton):
         contact_height=0.0,
     )
     np.testing.assert_allclose(
-        found.jerk[0], smoothness.jerk(positions, 30.0), rtol=1e-5
+        found["jerk"][0], smoothness.jerk(positions, 30.0), rtol=1e-5
     )
-    assert np.isnan(found.jerk[1]) and found.slide.tolist() == [0, 0]
+    # No frame stands at place 1, and no toe is ever below zero.
+    assert np.isnan(found["jerk"][1]) and np.isnan(found["foot_slide"]).all()
     text = by_frame.to_markdown({"row": found})
-    assert "| row, jerk m/s³ |" in text and "nan" in text
+    assert "| row, jerk, m/s³ |" in text and "nan" in text
+    assert by_frame.to_json({"row": found})["row"]["jerk"][1] is None
+
+
+def test_sums_of_parts_add_up_to_those_of_the_whole():
+    generator = np.random.default_rng(0)
+    values = jnp.asarray(generator.normal(size=(4, 20)), jnp.float32)
+    weights = jnp.asarray(generator.random((4, 20)), jnp.float32)
+    place = jnp.asarray(generator.integers(-1, 4, (4, 20)))
+    sums = functools.partial(by_frame.place_sums, num_places=3)
+    whole = sums(values, place, weights=weights)
+    parts = [sums(values[i], place[i], weights=weights[i]) for i in range(4)]
+    np.testing.assert_allclose(sum(parts), whole, rtol=1e-4, atol=1e-5)
+    own = np.asarray(place) == 2
+    expected = (np.asarray(values) * weights)[own].sum(), np.asarray(weights)[own].sum()
+    np.testing.assert_allclose(whole[:, 2], expected, rtol=1e-4)

@@ -212,21 +212,29 @@ def test_one_style_trains_with_clips_held_out_by_name(call, data, tmp_path):
 
 
 @pytest.mark.slow
-def test_speeds_are_measured_beside_data_and_by_frame_of_the_plan(call, trained):
-    call(f"speeds --run {trained} --speeds 0 1 --rollouts 2 --seconds 6")
-    found = json.loads((trained / "speeds" / "metrics.json").read_text())
-    assert [name for name in found["rows"] if name.startswith("told")] == [
-        "told 0 m/s",
-        "told 1 m/s",
-    ]
-    assert found["rows"]["told 0 m/s"]["creep_cm"]["samples"] == 2
-    data = found["rows"]["training, about 1 m/s"]
+def test_steering_is_measured_beside_data_and_by_frame_of_the_plan(call, trained):
+    call(
+        f"steering --run {trained} --speeds 0 1 --courses turn_around --rollouts 2 "
+        "--seconds 14"
+    )
+    found = json.loads((trained / "steering" / "metrics.json").read_text())
+    rows = found["rows"]
+    title = "turn around, told 1.4 m/s"
+    made = ["straight, told 0 m/s", "straight, told 1 m/s", title]
+    locked = [f"{name}, locked feet" for name in made]
+    assert {*made, *locked, f"{title}, the springs themselves"} < {*rows}
+    assert rows["straight, told 0 m/s"]["creep"]["samples"] == 2
+    data = rows["training, about 1 m/s"]
     assert data["windows"]["value"] > 0
     assert 0.8 < data["speed"]["value"] < 1.2
-    places = found["by_frame_of_the_plan"]["told 1 m/s"]
-    assert len(places["jerk"]) == 15 and min(places["frames"]) > 0
-    text = (trained / "speeds" / "table.md").read_text()
-    assert "| told 1 m/s, jerk m/s³ |" in text
+    # The lock moves feet alone: paths are the same.
+    assert rows[made[1]]["path_error"] == rows[locked[1]]["path_error"]
+    assert rows[made[1]]["foot_slide"] != rows[locked[1]]["foot_slide"]
+    assert set(found["by_frame_of_the_plan"]) == {*made, *locked}
+    assert len(found["by_frame_of_the_plan"][made[1]]["jerk"]) == 15
+    assert f"{title}, turn" in found["by_time_since_a_command"]
+    text = (trained / "steering" / "table.md").read_text()
+    assert "| straight, told 1 m/s, jerk, m/s³ |" in text
 
 
 @pytest.mark.slow

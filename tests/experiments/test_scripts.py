@@ -93,7 +93,7 @@ OUT_OF_RANGE = [
     ("camdm", "evaluate --rollouts 0"),
     ("camdm", "evaluate --evaluator-steps 0"),
     ("camdm", "rollout --seconds 0"),
-    ("camdm", "speeds --speeds 1 nan"),
+    ("camdm", "steering --speeds 1 nan"),
     ("camdm_transitions", "--before 0"),
     ("dribble", "--off-ball -0.1"),
     ("emdm", "train --fps 0"),

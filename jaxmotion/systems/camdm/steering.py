@@ -1,0 +1,514 @@
+"""How well a character is steered, and how it moves meanwhile.
+
+A mean over one course hides what is at fault. Here characters are told to go straight
+on at several speeds, to stand, to turn, to stop and to go; each has a row of what is
+displayed and one with locked feet, beside real windows whose own speed is about that.
+The same rollouts are split by frame of the plan, and by time since the last command.
+
+Characters run in parts of a batch, of which only measures are kept, not the frames.
+"""
+
+import dataclasses
+import datetime
+import functools
+import itertools
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.control import courses, steering
+from jaxmotion.control.foot_lock import FootLock, legs, lock_motion
+from jaxmotion.control.frame import Frame
+from jaxmotion.control.steering import Character
+from jaxmotion.data import windows
+from jaxmotion.data.clips import Clips
+from jaxmotion.evaluation import (
+    alignment,
+    by_frame,
+    columns,
+    health,
+    locomotion,
+    table,
+)
+from jaxmotion.evaluation.by_frame import ByFrame, Sums
+from jaxmotion.evaluation.table import Cell, Row, Rows
+from jaxmotion.evaluators.style import in_batches
+from jaxmotion.motion import trajectory
+from jaxmotion.motion.skeleton import Skeleton, joint_positions
+from jaxmotion.motion.spring import Scalar
+from jaxmotion.motion.trajectory import Command
+from jaxmotion.systems.camdm import scoring as camdm_scoring
+
+# Seconds to leave out at the start: characters begin with other speeds.
+SKIP = 3.0
+# Real windows count for a told speed if their own is within 15 %, or 0.1 m/s.
+_NEAR, _STILL = 0.15, 0.1
+# A stop, a start and a turn are done below 0.1 m/s, at 90 % of the told speed, within
+# 10 degrees; those that another command follows too soon are not measured.
+_STOPPED, _STARTED, _TURNED = 0.1, 0.9, 10.0
+_LEAST_SECONDS = 1.5
+_CREEP_SECONDS = 10.0
+# Time since a command, in steps of 0.2 s up to 3 s.
+_STEP_SECONDS, _STEPS = 0.2, 15
+
+KINDS = ("stop", "start", "turn")
+
+
+class Change(NamedTuple):
+    """A new command: which of `KINDS`, its first tick, and the first one without it."""
+
+    kind: str
+    begin: int
+    end: int
+
+
+def changes(commands: Command) -> list[Change]:
+    """New commands of one character [ticks, ...], the first one left out.
+
+    Where both speed and facing change it is a stop or a start. Changes of direction
+    by less than 10 degrees are none.
+    """
+    velocity, facing = np.asarray(commands.velocity), np.asarray(commands.facing)
+    speed = np.linalg.norm(velocity, axis=-1)
+    both = np.concatenate([velocity, facing], axis=-1)
+    begins = np.flatnonzero(np.abs(np.diff(both, axis=0)).max(axis=-1) > 1e-3) + 1
+    found = []
+    for begin, end in itertools.pairwise([*begins, len(speed)]):
+        cosine = float(np.sum(facing[begin] * facing[begin - 1]))
+        moves, moved = speed[begin] > 0, speed[begin - 1] > 0
+        turned = np.rad2deg(np.arccos(np.clip(cosine, -1, 1))) > _TURNED
+        kind = "stop" if moved and not moves else "start" if moves > moved else "turn"
+        if kind != "turn" or turned:
+            found.append(Change(kind, int(begin), int(end)))
+    return found
+
+
+def since_changes(
+    new: Sequence[Change], ticks: int, fps: float
+) -> Int[np.ndarray, "kinds ticks"]:
+    """Steps of 0.2 s since the last change, if it was of that kind of `KINDS`, else -1.
+
+    Args:
+      new: Changes.
+      ticks: Of all commands.
+      fps: Ticks per second.
+    """
+    since, step = np.full((len(KINDS), ticks), -1), round(_STEP_SECONDS * fps)
+    for kind, begin, end in new:
+        since[KINDS.index(kind), begin:end] = np.arange(end - begin) // step
+    return since
+
+
+def _reach(fps: float) -> int:
+    return round(0.25 * fps)
+
+
+class Ground(NamedTuple):
+    """What heights say, in meters: where toes rest, and the root's when it stands."""
+
+    rest: Scalar
+    root: Scalar
+
+    @property
+    def contact(self) -> Scalar:
+        """Below it a toe should not move."""
+        return self.rest + 0.01
+
+
+@jax.jit
+def _window_metrics(
+    skeleton: Skeleton, ground: Ground, x: windows.EvalWindows
+) -> dict[str, Array]:
+    positions = joint_positions(skeleton, x.motion)
+    toes = positions[..., jnp.array(skeleton.feet), 1]
+    reach, fps = _reach(x.motion.fps), x.motion.fps
+    speed = alignment.steady_speed(positions[..., 0, ::2], fps, reach=reach)
+    metrics = locomotion.locomotion_metrics(
+        skeleton, x.motion, x.velocity, x.facing, contact_height=ground.contact
+    )
+    names = ("slide_speed", "slide_seconds", "skate_ratio", "jerk", "orientation_error")
+    return {name: metrics[name] for name in names} | {
+        "speed": jnp.mean(speed[..., reach:-reach], axis=-1),
+        "sink": ground.rest - jnp.min(toes, axis=(-2, -1)),
+        "depth": jnp.mean(jnp.maximum(ground.rest - toes, 0.0), axis=(-2, -1)),
+    }
+
+
+@functools.partial(jax.jit, static_argnames=("skip", "places"))
+def _measure(
+    skeleton: Skeleton,
+    ground: Ground,
+    frames: Frame,
+    facing: Float[Array, "ticks 2"],
+    since: Int[Array, "kinds ticks"],
+    *,
+    skip: int,
+    places: int,
+) -> dict[str, Any]:
+    """All that is kept of some rollouts of one course.
+
+    Args:
+      skeleton: The skeleton.
+      ground: Heights.
+      frames: Of the characters.
+      facing: What they are told.
+      since: From `since_changes`.
+      skip: Ticks to leave out at the start.
+      places: Frames of a plan to play.
+    """
+    fps, reach = frames.fps, _reach(frames.fps)
+    number, ticks = frames.root_position.shape[:2]
+    positions = joint_positions(skeleton, frames.motion)
+    path = frames.root_position[..., ::2]
+    wanted = alignment.commanded_path(frames.desired_velocity, fps)
+    hips = trajectory.root_trajectory(skeleton, frames.motion).facing
+    told = jnp.broadcast_to(facing, hips.shape)
+
+    def still_to_turn(facing: Array) -> Array:
+        return jnp.rad2deg(jnp.abs(alignment.heading_error(told, facing)))
+
+    values = {
+        "speed": alignment.steady_speed(path, fps, reach=reach),
+        "wanted_speed": alignment.steady_speed(wanted, fps, reach=reach),
+        "path_error": 100.0 * alignment.path_distance(path, wanted, reach=reach),
+        "facing_error": still_to_turn(hips),
+        "wanted_facing_error": still_to_turn(frames.desired_facing),
+    }
+    rough = functools.partial(
+        by_frame.rough_sums,
+        positions[:, skip:],
+        skeleton.feet,
+        fps=fps,
+        contact_height=ground.contact,
+    )
+
+    def by_time(place: Int[Array, " ticks"]) -> Sums:
+        place = jnp.broadcast_to(place[skip:], (number, ticks - skip))
+        return rough(place, num_places=_STEPS) | {
+            name: by_frame.place_sums(values[name][:, skip:], place, num_places=_STEPS)
+            for name in ("speed", "path_error", "facing_error")
+        }
+
+    labels = jnp.zeros(number, jnp.int32)
+    cut = windows.rollout_windows(frames, labels, skip=skip)
+    diverged = health.has_diverged(
+        positions, fps=fps, min_root=0.5 * ground.root, max_root=1.5 * ground.root
+    )
+    return {
+        "windows": _window_metrics(skeleton, ground, cut),
+        "by_plan": rough(
+            by_frame.frames_since(frames.planned)[:, skip:], num_places=places
+        ),
+        "by_time": {kind: by_time(since[i]) for i, kind in enumerate(KINDS)},
+        "path": path,
+        "diverged": diverged,
+        "frozen": health.is_frozen(positions, frames.desired_velocity, fps=fps),
+    } | values
+
+
+# Column: metric of a window, metric that weights it, factor.
+_OF_WINDOWS = {
+    "speed": ("speed", None, 1.0),
+    "foot_slide": ("slide_speed", "slide_seconds", 1.0),
+    "skate_ratio": ("skate_ratio", None, 1.0),
+    "jerk": ("jerk", None, 1.0),
+    "toe_sink": ("sink", None, 100.0),
+    "toe_depth": ("depth", None, 100.0),
+    "orientation_error": ("orientation_error", None, float(np.rad2deg(1.0))),
+}
+_OF_ROLLOUTS = ("speed_error", "path_error", "path_error_max", "creep")
+_REACTIONS = ("stop_time", "start_time", "turn_time", "disobeyed")
+_COUNTS = ("diverged", "frozen", "minutes")
+_NONE = Cell(value=float("nan"), samples=0)
+
+
+def _count(value: float | int | np.generic, samples: int) -> Cell:
+    return Cell(value=float(value), samples=samples)
+
+
+def _window_cells(values: dict[str, np.ndarray], groups: np.ndarray) -> Row:
+    row = dict.fromkeys((*_OF_WINDOWS, *_OF_ROLLOUTS, *_REACTIONS, *_COUNTS), _NONE)
+    if groups.size:
+        for column, (name, weights, scale) in _OF_WINDOWS.items():
+            weight = None if weights is None else values[weights]
+            means = table.group_means(values[name], groups, weight)
+            bounds = columns.COLUMNS[column].bounds
+            row[column] = table.cell(means, scale=scale, bounds=bounds)
+    return row | {"windows": _count(groups.size, groups.size)}
+
+
+def _reaction_cells(
+    values: dict[str, Any], told: list[Change], commands: Command, fps: float
+) -> Row:
+    """Times until new commands are obeyed: cells over characters.
+
+    Args:
+      values: "speed" and "facing_error" [characters, ticks].
+      told: New commands.
+      commands: All of them [ticks, ...].
+      fps: Ticks per second.
+    """
+    least = round(_LEAST_SECONDS * fps)
+    wanted = np.linalg.norm(np.asarray(commands.velocity), axis=-1)
+    reached = {
+        "stop": values["speed"] < _STOPPED,
+        "start": values["speed"] >= _STARTED * wanted,
+        "turn": values["facing_error"] <= _TURNED,
+    }
+    row, failed = {}, []
+    for kind in KINDS:
+        some = [c for c in told if c.kind == kind and c.end - c.begin >= least]
+        if some:
+            spans = [c.begin for c in some], [c.end for c in some]
+            found = alignment.reaction(reached[kind], *spans, fps)
+            row[f"{kind}_time"] = table.cell(jnp.asarray(found.seconds.mean(axis=-1)))
+            failed.append(~found.obeyed)
+    if failed:
+        share = np.concatenate(failed, axis=-1).mean(axis=-1)
+        row["disobeyed"] = table.cell(jnp.asarray(share), bounds=(0.0, 1.0))
+    return row
+
+
+def _rollout_row(
+    kept: dict[str, Any],
+    told: list[Change],
+    commands: Command,
+    *,
+    fps: float,
+    skip: int,
+) -> Row:
+    """The row of all rollouts of one course."""
+    number, ticks = kept["speed"].shape
+    per = kept["windows"]["jerk"].size // number
+    row = _window_cells(kept["windows"], np.repeat(np.arange(number), per))
+    error = kept["path_error"][:, skip:]
+    row["path_error"] = table.cell(jnp.asarray(error.mean(axis=-1)))
+    row["path_error_max"] = table.cell(jnp.asarray(error.max(axis=-1)))
+    wanted = kept["wanted_speed"][:, skip:].mean(axis=-1)
+    if np.any(np.asarray(commands.velocity)):
+        off = kept["speed"][:, skip:].mean(axis=-1) / wanted - 1.0
+        row["speed_error"] = table.cell(jnp.asarray(np.abs(off)), scale=100.0)
+    length = round(_CREEP_SECONDS * fps)
+    if not (told or np.any(np.asarray(commands.velocity))) and ticks - skip >= length:
+        away = alignment.creep(jnp.asarray(kept["path"][:, skip:]), length=length)
+        row["creep"] = table.cell(away, scale=100.0)
+    row |= _reaction_cells(kept, told, commands, fps)
+    row["diverged"] = _count(kept["diverged"].sum(), number)
+    row["frozen"] = _count(kept["frozen"].sum(), number)
+    row["minutes"] = _count(number * ticks / fps / 60.0, number)
+    return row
+
+
+_SUMS = ("by_plan", "by_time")
+
+
+def _join(parts: list[dict[str, Any]]) -> dict[str, Any]:
+    """What was kept of all parts of a batch."""
+    arrays = [{k: v for k, v in x.items() if k not in _SUMS} for x in parts]
+    sums = [{k: x[k] for k in _SUMS} for x in parts]
+    return jax.tree.map(lambda *x: np.concatenate(x), *arrays) | jax.tree.map(
+        lambda *x: np.sum(x, axis=0, dtype=np.float64), *sums
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("lock",))
+def _with_locked_feet(skeleton: Skeleton, frames: Frame, *, lock: FootLock) -> Frame:
+    """What a character of `foot_lock.lock_feet` displays: its plans are the same."""
+    shown = jax.vmap(lambda x: lock_motion(skeleton, x, lock=lock))(frames.motion)
+    return dataclasses.replace(frames, joint_rotation=shown.joint_rotation)
+
+
+class _Real:
+    """Windows of real clips with a label, and where the ground is by the first clips.
+
+    Attributes:
+      ground: Heights.
+      values: Metrics of the windows and their clips, by name of the clips.
+    """
+
+    def __init__(self, clips: dict[str, Clips], *, field: str, label: int):
+        found = {
+            name: windows.eval_windows(
+                some, stride=windows.EVAL_WINDOW // 2, field=field
+            )
+            for name, some in clips.items()
+        }
+        first = next(iter(clips))
+        skeleton = clips[first].skeleton
+        height = camdm_scoring.contact_height(skeleton, found[first])
+        root = np.asarray(found[first].motion.root_position)[..., 1]
+        self.ground = Ground(rest=height - 0.01, root=float(np.median(root)))
+        measure = functools.partial(_window_metrics, skeleton, self.ground)
+        self.values = {}
+        for name, some in found.items():
+            values, is_own = in_batches(measure, some), np.asarray(some.label) == label
+            groups = np.asarray(some.group)[is_own]
+            self.values[name] = {k: v[is_own] for k, v in values.items()}, groups
+
+    def rows(self, speed: float) -> Rows:
+        """A row for each clips' windows whose own speed is about that, m/s."""
+        rows = {}
+        for name, (values, groups) in self.values.items():
+            off = np.abs(values["speed"] - speed)
+            near = off < (_NEAR * speed if speed else _STILL)
+            part = {k: v[near] for k, v in values.items()}
+            rows[f"{name}, about {speed:g} m/s"] = _window_cells(part, groups[near])
+        return rows
+
+
+class _Progress:
+    """Prints every ten seconds how much is done, and how long the rest takes."""
+
+    def __init__(self, parts: int, minutes: float):
+        self.parts, self.minutes, self.done = parts, minutes, 0
+        self.begun = self.said = time.perf_counter()
+
+    def step(self) -> None:
+        self.done += 1
+        now = time.perf_counter()
+        if self.done == 1:  # it was compiled meanwhile
+            self.begun = now
+        elif now - self.said > 10.0:
+            self.said = now
+            rest = (self.parts - self.done) / (self.done - 1)
+            left = datetime.timedelta(seconds=round((now - self.begun) * rest))
+            made = self.minutes * self.done / self.parts
+            text = f"{made:.1f} of {self.minutes:.1f} character-minutes, {left} left"
+            print(text, file=sys.stderr, flush=True)
+
+
+def _title(name: str, speed: float) -> str:
+    """What a row is called; whoever turns on the spot has no speed."""
+    stands = name in ("stand", "turn_on_the_spot")
+    title = name.replace("_", " ")
+    return title if stands else f"{title}, told {speed:g} m/s"
+
+
+class Steered(NamedTuple):
+    """The table, the same by frame of the plan and by 0.2 s since a command; report."""
+
+    rows: Rows
+    by_plan: dict[str, ByFrame]
+    by_time: dict[str, ByFrame]
+    report: dict[str, Any]
+
+
+def steering_table(
+    character: Character,
+    held_out: Clips,
+    train: Clips,
+    *,
+    field: str,
+    label: str,
+    speeds: Sequence[float],
+    names: Sequence[str] = (),
+    course_speed: float = 1.4,
+    places: int = 15,
+    rollouts: int = 16,
+    seconds: float = 20.0,
+    foot_lock: FootLock | None = None,
+    chunk: int = 4,
+    seed: int = 0,
+) -> Steered:
+    """Steers characters straight on and along courses, and measures them.
+
+    Args:
+      character: What moves them.
+      held_out: Clips that it never saw: rows of real motion, poses to start from, and
+        where the ground is.
+      train: Clips that it was trained on: rows of real motion.
+      field: Their label field.
+      label: Of all characters, and of the real windows.
+      speeds: What characters are told that go straight on, m/s; 0 to stand.
+      names: Courses that they follow besides.
+      course_speed: What they are told there, m/s.
+      places: Frames of a plan to play.
+      rollouts: Characters per speed and per course; all courses begin with the same
+        poses and noise.
+      seconds: Of each rollout; the first three are left out.
+      foot_lock: Settings of the lock for second rows; None for none.
+      chunk: Characters to run at a time, at most (the largest number that divides
+        theirs).
+      seed: Of start poses and noise.
+
+    Raises:
+      ValueError: if rollouts are too short to measure, there is no such label or
+        course, or the skeleton has no feet to lock.
+    """
+    fps, index = character.fps, character.label(label)
+    skip, ticks = round(SKIP * fps), round(seconds * fps)
+    windows.check_ticks(ticks, fps=fps, skip=skip)
+    courses_ = [("straight", speed) for speed in speeds]
+    courses_ += [(name, course_speed) for name in names]
+    told = {
+        _title(name, speed): courses.course_commands(
+            name, seconds=seconds, fps=fps, speed=speed, label=index
+        )
+        for name, speed in courses_
+    }
+    if foot_lock is not None:
+        legs(character.skeleton)  # raises where there is nothing to lock
+    real = _Real({"held-out": held_out, "training": train}, field=field, label=index)
+    states = character.start(rollouts, labels=index, clips=held_out, seed=seed)
+    chunk = max(size for size in range(1, chunk + 1) if rollouts % size == 0)
+    minutes = len(told) * rollouts * seconds / 60.0
+    progress = _Progress(len(told) * rollouts // chunk, minutes)
+    measure = functools.partial(
+        _measure, character.skeleton, real.ground, skip=skip, places=places
+    )
+
+    def kept(commands: Command, since: np.ndarray) -> dict[str, dict[str, Any]]:
+        every = jax.tree.map(lambda x: jnp.stack([x] * chunk), commands)
+        parts: dict[str, list[dict[str, Any]]] = {}
+        for first in range(0, rollouts, chunk):
+            part = jax.tree.map(lambda x, i=first: x[i : i + chunk], states)
+            key = jax.random.key(seed)
+            shown = {
+                "": steering.steered_rollouts(character, key, part, every, first=first)
+            }
+            if foot_lock is not None:
+                shown[", locked feet"] = _with_locked_feet(
+                    character.skeleton, shown[""], lock=foot_lock
+                )
+            for feet, frames in shown.items():
+                found = measure(frames, commands.facing, since)
+                parts.setdefault(feet, []).append(jax.device_get(found))
+            progress.step()
+        return {feet: _join(some) for feet, some in parts.items()}
+
+    rows: Rows = {}
+    by_plan: dict[str, ByFrame] = {}
+    by_time: dict[str, ByFrame] = {}
+    for (course, speed), (title, commands) in zip(courses_, told.items(), strict=True):
+        new = changes(commands)
+        for feet, one in kept(commands, since_changes(new, ticks, fps)).items():
+            rows[title + feet] = _rollout_row(one, new, commands, fps=fps, skip=skip)
+            by_plan[title + feet] = by_frame.means(one["by_plan"])
+            for kind, sums in one["by_time"].items():
+                if sums["speed"][1].any():
+                    # The lock moves feet, and nothing that steering is measured by.
+                    some = ("foot_slide", "jerk") if feet else tuple(sums)
+                    part = {name: sums[name] for name in some}
+                    by_time[f"{title}{feet}, {kind}"] = by_frame.means(part)
+        if course == "straight":
+            rows |= real.rows(speed)
+        springs = {name: one[f"wanted_{name}"] for name in ("speed", "facing_error")}
+        if row := _reaction_cells(springs, new, commands, fps):
+            rows[f"{title}, the springs themselves"] = row
+    report = {
+        "source": character.source,
+        "label": label,
+        "rollouts": rollouts,
+        "seconds": seconds,
+        "character_minutes": minutes,
+        "contact_height_m": real.ground.contact,
+        "by_frame_of_the_plan": by_frame.to_json(by_plan),
+        "by_time_since_a_command": by_frame.to_json(by_time),
+    }
+    return Steered(rows=rows, by_plan=by_plan, by_time=by_time, report=report)

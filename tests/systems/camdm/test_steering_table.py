@@ -1,0 +1,251 @@
+"""The table of steering finds what is planted in characters that need no network."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.control import courses, rollout, steering
+from jaxmotion.control.frame import Frame
+from jaxmotion.motion import spring
+from jaxmotion.systems.camdm import steering as camdm_steering
+from tests import tiny
+
+FPS, SECONDS = 30.0, 14.0
+HONEST = dict(gain=1.0, aside=0.0, creep=0.0, late=0.0, swing=0.5, sink=0.0, jump=0.0)
+
+
+def yaw_columns(direction):
+    """A rotation about y that turns +z to a direction, as two columns."""
+    x, z = direction
+    zero = jnp.zeros_like(x)
+    return jnp.stack([z, zero, -x, zero, jnp.ones_like(x), zero])
+
+
+def pitch_columns(angle):
+    c, s, zero = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle)
+    return jnp.stack([zero + 1, zero, zero, zero, c, s])
+
+
+def advance(faults, state, command):
+    """Goes and faces as told, but for its faults; turns `late` seconds late."""
+    times = dict(half_life=0.27, dt=1.0 / FPS)
+    position, velocity, acceleration = spring.velocity_spring(
+        *state["motion"], command.velocity, **times
+    )
+    facing, rate = spring.facing_spring(*state["turn"], command.facing, **times)
+    wait = jnp.where(
+        jnp.all(command.facing == state["told"]),
+        state["wait"] - 1,
+        faults["late"] * FPS,
+    )
+    hips = jnp.where(wait <= 0, command.facing, state["hips"])
+    tick = state["tick"] + 1
+    right = jnp.array([facing[1], -facing[0]])
+    place = faults["gain"] * position + faults["aside"] * right
+    place = place + faults["creep"] * tick / FPS * jnp.array([1.0, 0.0])
+    place = place + jnp.where(tick == 200, faults["jump"], 0.0)
+    swing = faults["swing"] * jnp.sin(2 * jnp.pi * tick / FPS)
+    still = pitch_columns(jnp.zeros(()))
+    legs = [pitch_columns(swing), still, pitch_columns(-swing), still]
+    frame = Frame(
+        root_position=jnp.array([place[0], 0.9 - faults["sink"], place[1]]),
+        joint_rotation=jnp.stack([yaw_columns(hips), *legs]),
+        desired_velocity=velocity,
+        desired_facing=facing,
+        planned=tick % 15 == 1,
+        fps=FPS,
+    )
+    return {
+        "motion": (position, velocity, acceleration),
+        "turn": (facing, rate),
+        "told": command.facing,
+        "hips": hips,
+        "wait": wait,
+        "tick": tick,
+    }, frame
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    def __call__(self, faults):
+        return rollout.Controller(
+            plan_level=lambda state, command: jnp.zeros((), jnp.int32),
+            plans=(),
+            advance=functools.partial(advance, faults),
+        )
+
+
+def starts(clips, labels, seed):
+    zero, ahead = jnp.zeros(2), jnp.array([0.0, 1.0])
+    state = {
+        "motion": (zero, zero, zero),
+        "turn": (ahead, jnp.zeros(())),
+        "told": ahead,
+        "hips": ahead,
+        "wait": jnp.zeros(()),
+        "tick": jnp.zeros((), jnp.int32),
+    }
+    return jax.tree.map(lambda x: jnp.stack([x] * len(labels)), state)
+
+
+@functools.cache
+def clips():
+    return tiny.clips(120)
+
+
+def table(*names, speeds=(), rollouts=2, speed=1.0, chunk=2, **faults):
+    faults = jax.tree.map(jnp.float32, HONEST | faults)
+    character = steering.Character(
+        skeleton=clips().skeleton,
+        labels=tiny.STYLES,
+        fps=FPS,
+        source="tests",
+        params=faults,
+        method=Method(),
+        starts=functools.partial(starts, None),
+        clip_starts=starts,
+    )
+    return camdm_steering.steering_table(
+        character,
+        clips(),
+        clips(),
+        field="style",
+        label="calm",
+        speeds=speeds,
+        names=names,
+        course_speed=speed,
+        rollouts=rollouts,
+        seconds=SECONDS,
+        chunk=chunk,
+    )
+
+
+def value(found, row, column):
+    return found.rows[row][column].value
+
+
+def test_who_does_as_told_has_no_errors():
+    found = table("figure_eight", speeds=(0.0, 1.0))
+    stands, goes = "straight, told 0 m/s", "straight, told 1 m/s"
+    for row in (stands, goes, "figure eight, told 1 m/s"):
+        assert value(found, row, "path_error") < 0.1
+        assert value(found, row, "frozen") == value(found, row, "diverged") == 0
+        assert value(found, row, "minutes") == pytest.approx(2 * SECONDS / 60)
+    assert value(found, stands, "creep") == 0
+    assert value(found, goes, "speed") == pytest.approx(1.0, abs=1e-3)
+    assert value(found, goes, "speed_error") < 0.1
+    # Nothing to say of who stands' speed, or of who goes' creep.
+    assert found.rows[stands]["speed_error"].samples == 0
+    assert found.rows[goes]["creep"].samples == 0
+    # Real windows: the calm walker goes at 0.7 m/s and never at 1.
+    assert value(found, "held-out, about 1 m/s", "windows") == 0
+    assert found.report["character_minutes"] == pytest.approx(6 * SECONDS / 60)
+    assert set(found.by_plan) == {stands, goes, "figure eight, told 1 m/s"}
+    assert len(found.by_plan[goes]["jerk"]) == 15
+
+
+def test_a_circle_beside_the_path_is_as_far_off_as_it_is():
+    found = table("figure_eight", aside=0.1)
+    row = "figure eight, told 1 m/s"
+    # Averaged over half a second of a turn, a little less.
+    assert value(found, row, "path_error") == pytest.approx(10.0, rel=0.03)
+    assert value(found, row, "path_error_max") == pytest.approx(10.0, rel=0.03)
+
+
+def test_creep_is_centimeters_in_ten_seconds():
+    found = table(speeds=(0.0,), creep=0.003)
+    assert value(found, "straight, told 0 m/s", "creep") == pytest.approx(3.0, rel=0.01)
+
+
+def test_who_is_slow_has_an_error_of_speed_and_falls_behind():
+    found = table(speeds=(1.0,), gain=0.9)
+    row = "straight, told 1 m/s"
+    assert value(found, row, "speed_error") == pytest.approx(10.0, abs=0.1)
+    assert value(found, row, "speed") == pytest.approx(0.9, abs=1e-3)
+    # A tenth of the way, less what the spring's start took: 14 m at the end.
+    assert value(found, row, "path_error_max") == pytest.approx(136.0, abs=5.0)
+
+
+@pytest.mark.parametrize("late", [0.0, 1.0])
+def test_who_turns_late_takes_that_long(late):
+    found = table("turn_on_the_spot", late=late)
+    # Turned at once, a tick after the command at the earliest.
+    expected = max(late, 1 / FPS) + (1 / FPS if late else 0)
+    assert value(found, "turn on the spot", "turn_time") == pytest.approx(
+        expected, abs=0.01
+    )
+    assert value(found, "turn on the spot", "disobeyed") == 0
+    turning = found.by_time["turn on the spot, turn"]["facing_error"]
+    np.testing.assert_allclose(turning[:5], 90.0 if late else 0.0, atol=0.1)
+    np.testing.assert_allclose(turning[6:10], 0.0, atol=0.1)
+    # Commands come every two seconds.
+    assert np.isnan(turning[10:]).all()
+
+
+def test_who_never_turns_disobeys():
+    found = table("turn_around", late=100.0)
+    row = "turn around, told 1 m/s"
+    # It faces ahead all along, which is what the second of three turns asks for; the
+    # last one has two seconds left.
+    assert value(found, row, "disobeyed") == pytest.approx(2 / 3)
+    seconds = (4 + 1 / FPS + 2) / 3
+    assert value(found, row, "turn_time") == pytest.approx(seconds, abs=1e-4)
+
+
+def test_stops_and_starts_take_the_springs_time():
+    found = table("stop_and_go")
+    row, springs = "stop and go, told 1 m/s", "stop and go, told 1 m/s, the springs"
+    rate = 2 * np.log(2) / 0.27
+    seconds = np.arange(0.0, 2.0, 1e-3)
+    left = (1 + rate * seconds) * np.exp(-rate * seconds)
+    for column in ("stop_time", "start_time"):
+        own = value(found, row, column)
+        assert own == value(found, f"{springs} themselves", column)
+        # Half a second is looked at: what is not steady comes a little later.
+        assert own == pytest.approx(seconds[np.argmax(left < 0.1)], abs=0.1)
+
+
+def test_frozen_and_diverged_rollouts_are_counted():
+    found = table(speeds=(1.0,), swing=0.0, rollouts=4, chunk=3)
+    assert value(found, "straight, told 1 m/s", "frozen") == 4
+    found = table(speeds=(0.0,), swing=0.0)
+    assert value(found, "straight, told 0 m/s", "frozen") == 0
+    found = table(speeds=(1.0,), jump=2.0)
+    assert value(found, "straight, told 1 m/s", "diverged") == 2
+
+
+def test_sunk_toes_are_that_deep():
+    row = "straight, told 0 m/s"
+    plain, sunk = (
+        table(speeds=(0.0,), swing=0.0, sink=x).rows[row] for x in (0.0, 0.05)
+    )
+    rest = plain["toe_sink"].value
+    assert sunk["toe_sink"].value - rest == pytest.approx(5.0, abs=0.01)
+    # Who stands still is as deep on the mean; above the ground there is no depth.
+    assert sunk["toe_depth"].value == pytest.approx(5.0 + rest, abs=0.01)
+    assert plain["toe_depth"].value == pytest.approx(max(rest, 0.0), abs=0.01)
+
+
+def test_changes_are_stops_starts_and_turns():
+    commands = courses.course_commands(
+        "stop_and_go", seconds=9.0, fps=FPS, speed=1.0, label=0
+    )
+    assert camdm_steering.changes(commands) == [
+        ("stop", 90, 150),
+        ("start", 150, 240),
+        ("stop", 240, 270),
+    ]
+    since = camdm_steering.since_changes(camdm_steering.changes(commands), 270, FPS)
+    assert (since[:, :90] == -1).all() and (since[2] == -1).all()
+    np.testing.assert_array_equal(since[0, 90:102], [0] * 6 + [1] * 6)
+    assert since[0, 149] == 9 and since[0, 150] == -1 and since[1, 150] == 0
+
+
+def test_rollouts_too_short_to_measure_are_named(monkeypatch):
+    monkeypatch.setattr("tests.systems.camdm.test_steering_table.SECONDS", 4.0)
+    with pytest.raises(ValueError, match="4 s are too short to measure"):
+        table(speeds=(1.0,))
