@@ -41,9 +41,9 @@ def place_sums(
 
     Args:
       values: One a frame.
-      place: Of each frame, in 0..num_places-1; others are left out.
+      place: Place of each frame, in 0..num_places-1; others are left out.
       num_places: Length of the result.
-      weights: Of the values; None for equal ones.
+      weights: Weights of the values; None for equal ones.
     """
     at = jax.nn.one_hot(place, num_places)
     weights = jnp.ones(values.shape) if weights is None else weights

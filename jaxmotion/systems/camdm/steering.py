@@ -96,7 +96,7 @@ def since_changes(
 
     Args:
       new: Changes.
-      ticks: Of all commands.
+      ticks: Number of all commands.
       fps: Ticks per second.
     """
     since, step = np.full((len(KINDS), ticks), -1), round(_STEP_SECONDS * fps)
@@ -156,7 +156,7 @@ def _measure(
     Args:
       skeleton: The skeleton.
       ground: Heights.
-      frames: Of the characters.
+      frames: What the characters display.
       facing: What they are told.
       since: From `since_changes`.
       skip: Ticks to leave out at the start.
@@ -424,18 +424,18 @@ def steering_table(
         where the ground is.
       train: Clips that it was trained on: rows of real motion.
       field: Their label field.
-      label: Of all characters, and of the real windows.
+      label: Label of all characters and of the real windows.
       speeds: What characters are told that go straight on, m/s; 0 to stand.
       names: Courses that they follow besides.
       course_speed: What they are told there, m/s.
       places: Frames of a plan to play.
       rollouts: Characters per speed and per course; all courses begin with the same
         poses and noise.
-      seconds: Of each rollout; the first three are left out.
+      seconds: Length of each rollout; the first three are left out.
       foot_lock: Settings of the lock for second rows; None for none.
       chunk: Characters to run at a time, at most (the largest number that divides
         theirs).
-      seed: Of start poses and noise.
+      seed: Seeds start poses and noise.
 
     Raises:
       ValueError: if rollouts are too short to measure, there is no such label or
