@@ -103,6 +103,11 @@ def test_the_number_of_characters_changes_nothing(commands):
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[:2]), fewer, whole)
 
 
+def test_a_part_of_a_batch_is_as_in_the_whole(commands):
+    part, whole = run(commands[2:], first=2), run(commands)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[2:]), part, whole)
+
+
 def test_characters_and_ticks_draw_their_own_numbers():
     _, frames = run(jnp.ones((CHARACTERS, TICKS), jnp.int32))
     assert np.unique(np.asarray(frames["value"])).size == CHARACTERS * TICKS
