@@ -1,9 +1,31 @@
-"""How a script ends."""
+"""How a script starts and ends."""
+
+import dataclasses
 
 import pytest
 
 from jaxmotion import cli
 from jaxmotion.learning.loop import TrainingDiverged
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    steps: int = 7
+    rate: float | None = None
+    out: str = "here"
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    steps: int = 1
+    rate: float = 0.5
+    own: int = 3
+
+
+def test_settings_take_the_options_of_their_names_that_are_given():
+    assert cli.given(Settings, Options()) == {"steps": 7}
+    found = Settings(**cli.given(Settings, Options(rate=0.0)))
+    assert found == Settings(steps=7, rate=0.0, own=3)
 
 
 def raising(error):

@@ -11,6 +11,7 @@ import pytest
 import jaxmotion as jm
 from jaxmotion.control import steering
 from jaxmotion.data import bvh, bvh_text
+from jaxmotion.diffusion import chain
 from jaxmotion.motion.skeleton import joint_positions
 from tests import samples
 
@@ -158,7 +159,8 @@ def test_frames_are_indexed_and_never_looped_over(frames):
 @pytest.mark.slow
 def test_shipped_models_lock_their_feet_unless_told_otherwise(model):
     """Told to stand, toes stay where they are on the ground; else they creep."""
-    free = jm.load("locomotion", foot_lock=False)
+    free = jm.load("locomotion", foot_lock=False, step=chain.dpm_solver_step)
+    assert free.method.step is chain.dpm_solver_step
     moved = []
     for each in (model, free):
         commands = jm.commands("stand", each, 2, seconds=1.0)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.control import rollout
+from jaxmotion.diffusion import chain
 from jaxmotion.motion import features
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.aamdm import controller as aamdm_controller
@@ -287,3 +288,18 @@ def test_characters_together_are_what_each_is_alone():
             both = zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True)
             for a, b in both:
                 np.testing.assert_allclose(a[c, i], b, rtol=2e-3, atol=2e-3)
+
+
+def test_the_step_of_the_chain_reaches_the_sampler(monkeypatch):
+    seen = []
+
+    def sampler(networks, **options):
+        seen.append(options["step"])
+        return lambda key, previous: previous
+
+    monkeypatch.setattr(aamdm_model, "sampler", sampler)
+    method = aamdm_controller.Method(config=CONFIG, num_joints=JOINTS, fps=FPS)
+    other = dataclasses.replace(method, step=chain.ddim_step)
+    method(({}, space())), other(({}, space()))
+    assert seen == [chain.ancestral_step, chain.ddim_step]
+    assert hash(method) != hash(other)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.control import rollout
+from jaxmotion.diffusion import chain
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
@@ -175,3 +176,21 @@ def test_bad_input_is_named(parts):
             config=config,
             control=smgdiff_controller.Control(apply=13),
         )
+
+
+def test_the_step_of_the_chain_reaches_both_samplers(parts, monkeypatch):
+    seen = []
+
+    def sampler(params, **options):
+        seen.append(options["step"])
+        return lambda key, given: given
+
+    for module in (smgdiff_trajectory, smgdiff_guidance):
+        monkeypatch.setattr(module, "sampler", sampler)
+    method = smgdiff_controller.Method(
+        config=smgdiff_model.Config(num_features=1, num_labels=1),
+        paths=smgdiff_trajectory.Config(num_labels=1),
+        step=chain.ddim_step,
+    )
+    method(({}, {}, parts[0]))
+    assert seen == [chain.ddim_step] * 2
