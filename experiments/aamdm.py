@@ -197,8 +197,7 @@ def train(args: Train) -> None:
 def evaluate(args: Evaluate) -> None:
     """Writes the tables."""
     rows.check(args.rows)
-    out = args.out or args.run / "evaluation"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "evaluation")
     run = aamdm_training.load_run(args.run)
     cli.announce("compiling the rollouts of each row", 40)
     table, report = tables.evaluate(run, args, out)
@@ -215,8 +214,7 @@ def rollout(args: Rollout) -> None:
     """Writes rollout.bvh, rollout.gif and rollout.html."""
     rows.check((args.row,))
     run = aamdm_training.load_run(args.run)
-    out = args.out or args.run / "rollout"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "rollout")
     space = aamdm_training.load_space(run, rows.space_of(args.row))
     step = rows.load_row(args.row, run, space, scale=args.scale)
     states = aamdm_evaluation.start_states(run, space, 1, seed=args.seed)

@@ -73,7 +73,7 @@ class Train:
       frame_kernel: Frames of a convolution after the tokens; None for the preset's.
       diffusion_steps: Steps T of the diffusion.
       devices: Split each batch over so many devices; 1 for no mesh.
-      seed: Of everything random.
+      seed: Seeds everything random.
       override: Go on with these settings where the run began with others.
     """
 
@@ -164,7 +164,7 @@ class Evaluate:
       evaluator_steps: Updates of the evaluator of styles, if it is trained here.
       evaluator: File of a frozen evaluator of styles, from evaluator.py; None trains
         one here.
-      seed: Of poses, noise, evaluator and subsets.
+      seed: Seeds poses, noise, evaluator and subsets.
     """
 
     run: Path = Path("runs/camdm")
@@ -206,7 +206,7 @@ class Steering:
         to steer by velocity alone; None for what the model ships with.
       foot_lock: Measure what is displayed with locked feet, too.
       chunk: Characters to run at a time, at most.
-      seed: Of poses and noise.
+      seed: Seeds poses and noise.
     """
 
     run: Path = Path("runs/camdm")
@@ -245,7 +245,7 @@ class Rollout:
       course: Commands.
       speed: Meters per second; None for the style's own median speed.
       out: Folder; None for <run>/rollout.
-      seed: Of the start pose and the noise.
+      seed: Seeds the start pose and the noise.
     """
 
     run: Path = Path("runs/camdm")
@@ -263,8 +263,7 @@ def evaluate(args: Evaluate) -> None:
     """Writes the table."""
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = camdm_training.load_run(args.run, args.data, args.contents)
-    out = args.out or args.run / "evaluation"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "evaluation")
     cli.announce("compiling the rollouts", 40)
     rows, report = camdm_evaluation.evaluate_run(
         run,
@@ -277,8 +276,7 @@ def evaluate(args: Evaluate) -> None:
         seed=args.seed,
         evaluator=evaluator,
     )
-    report = {"arguments": reporting.arguments_json(args)} | report
-    report |= reporting.provenance()
+    report |= reporting.provenance(args)
     notes = (frozen.note(report["evaluator"]),)
     reporting.write_table(out, rows, report, notes)
     print(report)
@@ -291,8 +289,7 @@ def steering(args: Steering) -> None:
     else:
         run = camdm_training.exported_run(args.run, args.data, args.held_out_clips)
     model, control = run.model, None
-    out = args.out or args.run / "steering"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "steering")
     if args.follow is not None:
         control = camdm_controller.Control(follow=args.follow)
     cli.announce("compiling the rollouts", 40)
@@ -311,8 +308,7 @@ def steering(args: Steering) -> None:
         chunk=args.chunk,
         seed=args.seed,
     )
-    report = {"arguments": reporting.arguments_json(args)} | found.report
-    report |= reporting.provenance()
+    report = found.report | reporting.provenance(args)
     notes = [by_frame.to_markdown(found.by_plan, places="by frame of the plan")]
     if found.by_time:
         title = "by 0.2 s since a command"
@@ -323,8 +319,7 @@ def steering(args: Steering) -> None:
 def rollout(args: Rollout) -> None:
     """Writes rollout.bvh, rollout.gif and rollout.html."""
     run = camdm_training.load_run(args.run, args.data)
-    out = args.out or args.run / "rollout"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "rollout")
     cli.announce("compiling the rollout", 40)
     motion, velocity = camdm_evaluation.steer_one(
         run,

@@ -19,7 +19,6 @@ import tyro
 from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
 from jaxmotion.evaluators import frozen
-from jaxmotion.learning import loop
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.systems.camdm import transitions as camdm_transitions
@@ -73,8 +72,7 @@ def measure(args: Config) -> None:
     """Writes the table."""
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = camdm_training.load_run(args.run, args.data, args.contents)
-    out = args.out or args.run / "transitions"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "transitions")
     cli.announce("compiling the rollouts of each row", 40)
     changes = camdm_transitions.make_changes(
         run,
@@ -92,7 +90,6 @@ def measure(args: Config) -> None:
         run, changes, CONTROLS, chosen, chunk=args.chunk, seed=args.seed
     )
     report = {
-        "arguments": reporting.arguments_json(args),
         "source": run.model.source,
         "rollouts": int(changes.old.size),
         "recognized_in_clips_%": camdm_transitions.clip_accuracy(run, chosen).value,
@@ -101,7 +98,7 @@ def measure(args: Config) -> None:
             evaluator,
             reference=frozen.clips_fingerprint(run.train, run.field),
         ),
-        **reporting.provenance(),
+        **reporting.provenance(args),
     }
     notes = (
         f"{changes.old.size} rollouts a row: every ordered pair of "

@@ -23,7 +23,6 @@ from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluators import frozen
 from jaxmotion.evaluators.text_motion import Padding
 from jaxmotion.learning import loop, runs
-from jaxmotion.reporting import arguments_json
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import evaluation as emdm_evaluation
 from jaxmotion.systems.emdm import model as emdm_model
@@ -267,8 +266,7 @@ def train(args: Train) -> None:
 def evaluate(args: Evaluate) -> None:
     """Writes the table."""
     emdm_training.check_rows(args.rows)
-    out = args.out or args.run / "evaluation"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "evaluation")
     cli.announce("compiling the evaluator and the sampler of each row", 40)
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     given = cli.given(emdm_scoring.Settings, args)
@@ -277,10 +275,9 @@ def evaluate(args: Evaluate) -> None:
         args.run, settings, rows=args.rows, long_replications=args.long_replications
     )
     report = {
-        "arguments": arguments_json(args),
         "run": runs.load(args.run, system="emdm").settings,
         "evaluator": scorer.describe,
-    } | reporting.provenance()
+    } | reporting.provenance(args)
     notes = (frozen.note(scorer.describe), *scorer.notes)
     if places:
         report["by_frame_of_the_token"] = by_frame.to_json(places)
@@ -290,8 +287,7 @@ def evaluate(args: Evaluate) -> None:
 
 def sample(args: Sample) -> None:
     """Writes one motion for each action or sentence."""
-    out = args.out or args.run / "samples"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "samples")
     cli.announce("compiling the sampler", 40)
     made, source = emdm_evaluation.make_motions(
         args.run,

@@ -189,8 +189,7 @@ def evaluate(args: Evaluate) -> None:
         smgdiff_guidance.on_schedule(guided, schedule)
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = smgdiff_training.load_run(args.run)
-    out = args.out or args.run / "evaluation"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "evaluation")
     cli.announce("compiling the evaluator and each row's plans", 40)
     setting = smgdiff_evaluation.make_setting(
         run.train,
@@ -205,12 +204,9 @@ def evaluate(args: Evaluate) -> None:
     described = smgdiff_evaluation.describe_evaluator(run, setting, evaluator)
 
     def write(name: str, rows: Rows, more: dict[str, Any], *notes: str) -> None:
-        report = {
-            "arguments": reporting.arguments_json(args),
-            "source": run.model.source,
-        }
+        report = {"source": run.model.source, "evaluator": described} | more
         report |= {"windows": int(setting.known.label.shape[0])}
-        report |= {"evaluator": described} | more | reporting.provenance()
+        report |= reporting.provenance(args)
         notes = (frozen.note(described), *notes)
         reporting.write_table(out / name, rows, report, notes)
 
@@ -250,8 +246,7 @@ def rollout(args: Rollout) -> None:
     """Writes the rollout, and prints what is worth knowing before one looks."""
     guided = Guidance(**cli.given(Guidance, args))
     run = smgdiff_training.load_run(args.run)
-    out = args.out or args.run / "rollout"
-    loop.check_writable(out)
+    out = cli.out_folder(args, "rollout")
     cli.announce("compiling the rollout", 40)
     features = run.model.representation
     skills = args.skills or run.model.labels

@@ -3,11 +3,12 @@
 import dataclasses
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 from jax.errors import JaxRuntimeError
 
-from jaxmotion.learning.loop import TrainingDiverged
+from jaxmotion.learning.loop import TrainingDiverged, check_writable
 
 Arguments = TypeVar("Arguments")
 
@@ -120,6 +121,17 @@ def given(kind: type, args: Any) -> dict[str, Any]:
     """
     names = {field.name for field in dataclasses.fields(kind)}
     return {k: x for k, x in vars(args).items() if k in names and x is not None}
+
+
+def out_folder(args: Any, name: str) -> Path:
+    """Folder that a command writes to: `args.out`, or one of that name in `args.run`.
+
+    Raises:
+      OSError: if it cannot be written, before any work.
+    """
+    out = args.out or args.run / name
+    check_writable(out)
+    return out
 
 
 def announce(what: str, seconds: int) -> None:

@@ -47,7 +47,7 @@ def load(
       foot_lock: Settings of the lock that keeps planted feet in place; True for the
         defaults, False for none. None: on for shipped models, off for runs and files,
         whose frames are then what the network makes.
-      **options: Of the system's `controller.load_character`: `step` makes another step
+      **options: For the system's `controller.load_character`: `step` makes another step
         of the chain, such as `diffusion.chain.ddim_step`; CAMDM has `control` as well.
 
     Returns:

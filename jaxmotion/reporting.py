@@ -239,13 +239,18 @@ def git_commit() -> str | None:
         return None
 
 
-def provenance() -> dict[str, Any]:
+def provenance(arguments: Any = None) -> dict[str, Any]:
     """What a table was made with.
 
+    Args:
+      arguments: Dataclass of a command line; None where there is none.
+
     Returns:
-      Versions, hardware, commit, command and date, as a JSON object.
+      Versions, hardware, commit, command and date, and the "arguments", as a JSON
+      object.
     """
-    return {
+    given = {} if arguments is None else {"arguments": arguments_json(arguments)}
+    return given | {
         **runs.versions(),
         "machine": platform.machine(),
         "cpu": processor(),

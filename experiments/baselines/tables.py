@@ -147,11 +147,7 @@ def evaluate(
     for name, (step, space) in steppers.items():
         found[name] = measure(name, run, space, step, reference, args)
         files.write_text(out / "rows.json", json.dumps(table.to_json(found), indent=1))
-    report = {
-        "arguments": reporting.arguments_json(args),
-        "source": run.source,
-        **reporting.provenance(),
-    }
+    report = {"source": run.source} | reporting.provenance(args)
     if args.long_minutes and "aamdm" in steppers:
         step, space = steppers["aamdm"]
         report["long"] = long_rollouts(run, space, step, reference, args)

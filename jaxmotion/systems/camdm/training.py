@@ -91,7 +91,7 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
     Args:
       clips: The clips; their skeleton, rate, styles and source become the model's.
       field: Label field that is the style.
-      **sizes: Of `camdm.Config`, but for those that the clips decide.
+      **sizes: Fields of `camdm.Config`, but for those that the clips decide.
 
     Returns:
       The model; where rotations are scaled, with the mean of the clips' rotations.

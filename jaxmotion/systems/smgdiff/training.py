@@ -46,7 +46,7 @@ def make_model(
 
     Args:
       data: Training clips; their skeleton, rate, skills and source become the model's.
-      sizes: Sizes of `smgdiff.Config`, but for those that the clips decide.
+      sizes: Fields of `smgdiff.Config`, but for those that the clips decide.
       paths: The same of `smgdiff_trajectory.Config`.
 
     Returns:

@@ -60,7 +60,7 @@ def setting_of(run, evaluator_steps):
 
 @pytest.fixture(scope="module")
 def setting(run):
-    """With a recognizer of one update."""
+    """With an evaluator of one update."""
     return setting_of(run, 1)
 
 
