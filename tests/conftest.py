@@ -31,7 +31,7 @@ DRAWS = ("control", "diffusion", "evaluators", "learning", "networks", "systems"
 # the other's last module.
 FIRST = ("systems", "contracts", "learning", "test_face.py", "evaluators")
 # Compiled programs of so many modules are kept: they take memory, and time to forget.
-MODULES_REMEMBERED = 2
+MODULES_REMEMBERED = 4
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -75,6 +75,12 @@ def _part(path):
 def pytest_collection_modifyitems(items):
     rank = {part: place for place, part in enumerate(FIRST)}
     items.sort(key=lambda item: rank.get(_part(item.path), len(FIRST)))
+
+
+def pytest_collection_finish():
+    """What is loaded by now stays: garbage is not looked for in it."""
+    gc.collect()
+    gc.freeze()
 
 
 def _known(flags, cache):

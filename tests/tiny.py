@@ -13,7 +13,7 @@ import numpy as np
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips, clips_from_motions
 from jaxmotion.learning import runs, training
-from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
 
@@ -21,6 +21,9 @@ NAMES = ("Hips", "LeftUpLeg", "LeftToe", "RightUpLeg", "RightToe")
 PARENTS = (-1, 0, 1, 0, 3)
 OFFSETS = ((0, 0, 0), (0.1, 0, 0), (0, -0.9, 0.1), (-0.1, 0, 0), (0, -0.9, 0.1))
 STYLES = ("calm", "brisk")
+
+# Compiled as one: operation by operation it takes five times as long.
+positions = jax.jit(joint_positions)
 
 
 def skeleton() -> Skeleton:

@@ -14,7 +14,7 @@ from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
-from tests import tiny
+from tests import mostly_slow, tiny
 
 chex = pytest.importorskip("chex")
 CONFIG = tiny.config(depth=1, heading="facing")
@@ -122,7 +122,7 @@ EMDM = emdm_model.Config(
 )
 
 
-@pytest.mark.parametrize("guided", [True, False])
+@pytest.mark.parametrize("guided", mostly_slow([True, False], [True]))
 def test_a_sampler_of_whole_motions_is_traced_once(guided):
     """Other parameters, keys, conditions, lengths and guidance scales."""
 

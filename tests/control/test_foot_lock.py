@@ -15,8 +15,8 @@ from jaxmotion.motion.skeleton import (
     Motion,
     Skeleton,
     forward_kinematics,
-    joint_positions,
 )
+from tests import tiny
 
 FPS = 30.0
 LOCK = foot_lock.FootLock()
@@ -161,7 +161,7 @@ def test_no_toe_and_no_ankle_goes_below_the_ground():
 def test_feet_that_slide_stand():
     motion = drift(0.05)
     found = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
-    toes = joint_positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
+    toes = tiny.positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
     # The first frame has no speed, and the second begins the contact.
     moved = np.linalg.norm(np.asarray(toes)[15:] - np.asarray(toes)[15], axis=-1)
     assert moved.max() < 1e-3
@@ -200,7 +200,7 @@ def test_a_lock_ends_at_its_radius_and_begins_anew():
     states, state = [], foot_lock.init_lock(SKELETON)
     motion = drift(0.3, seconds=1.5)
     step = jax.jit(functools.partial(foot_lock.step_lock, fps=FPS, lock=LOCK))
-    toes = joint_positions(SKELETON, motion)[:, jnp.array(SKELETON.feet)]
+    toes = tiny.positions(SKELETON, motion)[:, jnp.array(SKELETON.feet)]
     for now in toes:
         state = step(state, now)
         states.append(np.asarray(state.locked))
@@ -227,7 +227,7 @@ def test_nothing_jumps():
         fps=FPS,
     )
     found = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
-    step = lambda x: np.abs(np.diff(joint_positions(SKELETON, x), axis=0)).max()  # noqa: E731
+    step = lambda x: np.abs(np.diff(tiny.positions(SKELETON, x), axis=0)).max()  # noqa: E731
     assert step(found) < step(motion) + 0.02
 
 
@@ -323,7 +323,7 @@ def test_offsets_are_those_of_the_normal_equations():
 def test_a_clip_is_cleaned():
     motion = drift(0.05)
     found = foot_lock.clean_motion(SKELETON, motion, lock=LOCK)
-    toes = joint_positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
+    toes = tiny.positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
     speed = np.linalg.norm(np.diff(toes, axis=0), axis=-1) * FPS
     assert speed.max() < 0.005
 

@@ -12,6 +12,7 @@ from jaxmotion.data import bvh, bvh_text
 from jaxmotion.data.bvh_text import format_bvh
 from jaxmotion.motion import skeleton as skeletons
 from jaxmotion.motion.skeleton import Motion
+from tests import tiny
 from tests.data import samples
 
 TURNS = {"X": "Xrotation", "Y": "Yrotation", "Z": "Zrotation"}
@@ -137,7 +138,7 @@ def test_motion_has_the_world_positions_of_the_file():
     skeleton, motion = bvh.motion_from_bvh(content, feet=("Left Leg",))
     assert (skeleton.names, skeleton.feet) == (content.names, (2,))
     assert motion.fps == 60.0
-    found = np.asarray(skeletons.joint_positions(skeleton, motion))
+    found = np.asarray(tiny.positions(skeleton, motion))
     np.testing.assert_allclose(100 * found, reference_world(content)[0], atol=1e-3)
     np.testing.assert_array_equal(np.asarray(skeleton.offsets[0]), 0.0)
 
@@ -149,7 +150,7 @@ def test_ancestors_are_composed_into_the_new_root():
     assert skeleton.names == ("mixamorig:Hips", "Left Leg", "Head")
     assert skeleton.parents == (-1, 0, 0)
     positions, turns = reference_world(content)
-    found = np.asarray(skeletons.joint_positions(skeleton, motion))
+    found = np.asarray(tiny.positions(skeleton, motion))
     np.testing.assert_allclose(found, positions[:, 1:4], atol=1e-3)
     expected = samples.columns(turns[:, 1])
     np.testing.assert_allclose(motion.joint_rotation[:, 0], expected, atol=1e-6)
@@ -198,8 +199,8 @@ def test_writing_puts_breadth_first_joints_depth_first(tmp_path):
     bvh_text.write_bvh(tmp_path / "a.bvh", bvh.bvh_from_motion(skeleton, motion))
     found, moved = bvh.motion_from_bvh(bvh_text.read_bvh(tmp_path / "a.bvh"))
     assert found.names == base.names
-    positions = np.asarray(skeletons.joint_positions(skeleton, motion))
-    again = np.asarray(skeletons.joint_positions(found, moved))
+    positions = np.asarray(tiny.positions(skeleton, motion))
+    again = np.asarray(tiny.positions(found, moved))
     np.testing.assert_allclose(again[:, order], positions, atol=2e-6)
 
 
@@ -260,7 +261,7 @@ def test_second_library_has_the_same_positions(tmp_path):
     content = bvh_text.read_bvh(tmp_path / "a.bvh")
     skeleton, motion = bvh.motion_from_bvh(content)
     names, expected = second_library(tmp_path / "a.bvh", range(5))
-    found = 100 * np.asarray(skeletons.joint_positions(skeleton, motion))
+    found = 100 * np.asarray(tiny.positions(skeleton, motion))
     order = [names.index(name) for name in skeleton.names]
     np.testing.assert_allclose(found, expected[:, order], atol=1e-3)
 
@@ -271,7 +272,7 @@ def test_second_library_reads_what_is_written(tmp_path):
         tmp_path / "a.bvh", bvh.bvh_from_motion(samples.skeleton(), motion)
     )
     names, found = second_library(tmp_path / "a.bvh", range(5))
-    expected = 100 * np.asarray(skeletons.joint_positions(samples.skeleton(), motion))
+    expected = 100 * np.asarray(tiny.positions(samples.skeleton(), motion))
     order = [names.index(name) for name in samples.NAMES]
     np.testing.assert_allclose(found[:, order], expected, atol=1e-3)
 
@@ -290,7 +291,7 @@ def test_ten_recordings_agree_with_the_second_library():
         skeleton, motion = bvh.motion_from_bvh(content, root=top)
         frames = np.linspace(0, content.num_frames - 1, 20).astype(int)
         names, expected = second_library(path, frames)
-        found = np.asarray(skeletons.joint_positions(skeleton, motion))[frames]
+        found = np.asarray(tiny.positions(skeleton, motion))[frames]
         order = [names.index(name) for name in skeleton.names]
         np.testing.assert_allclose(100 * found, expected[:, order], atol=1e-3)
 

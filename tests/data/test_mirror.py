@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxmotion.data import mirror
 from jaxmotion.motion import skeleton as skeletons
+from tests import tiny
 from tests.data import samples
 
 PARTNER = np.array([0, 1, 4, 5, 2, 3])
@@ -17,8 +18,8 @@ RIGS = {"plain": samples.PLAIN, "turned": samples.TURNED}
 def test_joints_of_the_mirror_image_are_the_mirrored_joints(rig):
     skeleton, motion = samples.skeleton(RIGS[rig]), samples.motion(6, 0)
     found = mirror.mirror(skeleton, motion)
-    before = np.asarray(skeletons.joint_positions(skeleton, motion))
-    after = np.asarray(skeletons.joint_positions(skeleton, found))
+    before = np.asarray(tiny.positions(skeleton, motion))
+    after = np.asarray(tiny.positions(skeleton, found))
     np.testing.assert_allclose(after, before[:, PARTNER] * [-1, 1, 1], atol=2e-6)
     assert np.abs(np.asarray(found.joint_rotation - motion.joint_rotation)).max() > 0.5
 
@@ -129,8 +130,8 @@ def test_small_asymmetry_passes_and_large_is_refused_by_joint():
     offsets[5, 1] += 0.008
     skeleton, motion = samples.skeleton(offsets), samples.motion(4, 5)
     found = mirror.mirror(skeleton, motion)
-    before = np.asarray(skeletons.joint_positions(skeleton, motion))
-    after = np.asarray(skeletons.joint_positions(skeleton, found))
+    before = np.asarray(tiny.positions(skeleton, motion))
+    after = np.asarray(tiny.positions(skeleton, found))
     assert np.abs(after - before[:, PARTNER] * [-1, 1, 1]).max() < 0.009
     offsets[5, 1] += 0.01
     with pytest.raises(ValueError, match="not symmetric at joint 'LeftLeg'.*0.018"):

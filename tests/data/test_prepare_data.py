@@ -168,6 +168,11 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path):
     status, line = run_full("procedural", "--out", out)
     assert (status, line) == (1, f"error: [Errno 27] File too large: '{out}'")
     assert os.listdir(out.parent) == []
+
+
+@pytest.mark.slow
+def test_a_full_disk_under_a_builder_is_one_line_and_leaves_nothing(tmp_path):
+    out = tmp_path / "made" / "w.npz"
     text = test_builders.lafan_text(0)
     head, rows = text.split("Frame Time", 1)
     rows = rows.split("\r\n", 1)

@@ -8,8 +8,8 @@ import pytest
 
 from jaxmotion.control import courses
 from jaxmotion.data import gaits, procedural
-from jaxmotion.motion.skeleton import Motion, joint_positions
-from tests import mostly_slow
+from jaxmotion.motion.skeleton import Motion
+from tests import mostly_slow, tiny
 
 FPS, SECONDS = 30.0, 16.0
 BONES = procedural.walker_skeleton()
@@ -79,7 +79,7 @@ def test_contacts_are_exact_and_nothing_is_below_the_ground(case):
 @pytest.mark.parametrize("gait", gaits.GAITS)
 def test_bones_keep_their_length(gait):
     _, walk, expected = steered(gait, "strafe")
-    position = np.asarray(joint_positions(BONES, walk.motion))
+    position = np.asarray(tiny.positions(BONES, walk.motion))
     np.testing.assert_allclose(position, expected, atol=2e-5)
     parents = np.array(BONES.parents[1:])
     length = np.linalg.norm(position[:, 1:] - position[:, parents], axis=-1)

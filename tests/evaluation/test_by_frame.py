@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.evaluation import by_frame, smoothness
-from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.motion.skeleton import Motion
 from tests import tiny
 
 
@@ -34,7 +34,7 @@ def test_a_jump_at_a_border_shows_in_three_frames(skeleton):
         motion, root_position=motion.root_position.at[:, 0].add(hops)
     )
     found = by_frame.by_frame(
-        joint_positions(skeleton, motion),
+        tiny.positions(skeleton, motion),
         skeleton.feet,
         jnp.arange(40) % 10,
         30.0,
@@ -51,7 +51,7 @@ def test_a_jump_at_a_border_shows_in_three_frames(skeleton):
 
 def test_the_mean_over_places_is_the_metric(skeleton):
     motion = tiny.walk(33, turn=0.5)
-    positions = joint_positions(skeleton, motion)
+    positions = tiny.positions(skeleton, motion)
     found = by_frame.by_frame(
         positions,
         skeleton.feet,

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from jaxmotion.evaluation import health
-from jaxmotion.motion import skeleton
 from tests import tiny
 
 FPS, FRAMES = 30.0, 300
@@ -15,7 +14,7 @@ BOUNDS = dict(fps=FPS, min_root=0.45, max_root=1.4)
 @pytest.fixture(scope="module")
 def alive():
     motion = tiny.walk(FRAMES, speed=1.0, turn=0.3)
-    return np.asarray(skeleton.joint_positions(tiny.skeleton(), motion))
+    return np.asarray(tiny.positions(tiny.skeleton(), motion))
 
 
 def told(speed=1.0):
@@ -72,7 +71,7 @@ def test_breathing_does_not_save_a_statue_but_walking_slowly_does(alive):
     wave = 0.02 * np.sin(np.arange(FRAMES) / FPS)[:, None, None]
     assert frozen(held(alive, 0, 250) + wave * (np.arange(5) > 0)[:, None])
     slow = tiny.walk(FRAMES, speed=0.3)
-    assert not frozen(skeleton.joint_positions(tiny.skeleton(), slow))
+    assert not frozen(tiny.positions(tiny.skeleton(), slow))
 
 
 def test_too_short_to_be_frozen_or_to_have_a_window(alive):

@@ -56,7 +56,7 @@ def measure(motion, velocity=None, facing=None):
 
 
 def toes(motion):
-    positions = skeleton.joint_positions(BONES, motion)
+    positions = tiny.positions(BONES, motion)
     return positions, positions[:, jnp.array(BONES.feet)]
 
 
@@ -122,7 +122,7 @@ def test_a_height_in_millimeters(height):
 def test_rollouts_that_freeze_and_diverge_at_known_times():
     """Six rollouts of a minute: one is a statue from 24 s on, and one sinks at 40 s."""
     frames = 1800
-    alive = np.asarray(skeleton.joint_positions(BONES, tiny.walk(frames, turn=0.1)))
+    alive = np.asarray(tiny.positions(BONES, tiny.walk(frames, turn=0.1)))
     statue, sunk = alive.copy(), alive.copy()
     statue[720:] = statue[720]
     sunk[1200:, :, 1] -= 0.6

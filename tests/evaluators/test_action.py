@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from jaxmotion.evaluators import action as action_evaluator
-from jaxmotion.motion.skeleton import joint_positions
 from tests import tiny
 
 CONFIG = action_evaluator.Config(num_classes=2, num_joints=5, num_features=6, hidden=8)
+
+
+classify = jax.jit(action_evaluator.classify, static_argnames="config")
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +26,7 @@ def test_the_key_alone_decides_the_states(params):
 
     def recognize(seed, **changes):
         config = dataclasses.replace(CONFIG, **changes)
-        return action_evaluator.classify(params, jax.random.key(seed), x, config=config)
+        return classify(params, jax.random.key(seed), x, config=config)
 
     for first, second in zip(recognize(0), recognize(0), strict=True):
         np.testing.assert_array_equal(first, second)
@@ -47,7 +49,7 @@ def test_states_are_standard_normal(params):
     kept["feature"]["kernel"] += 1e-3 * jnp.eye(CONFIG.hidden)[:, :6]
     x = jnp.ones((count, 3, 15))
     for scale in (1.0, 0.5):
-        found, _ = action_evaluator.classify(
+        found, _ = classify(
             kept,
             jax.random.key(2),
             x,
@@ -63,10 +65,10 @@ def test_states_are_standard_normal(params):
 def test_the_loss_is_the_cross_entropy(params):
     x = jnp.asarray(np.random.default_rng(1).normal(size=(6, 4, 15)), jnp.float32)
     labels = np.array([0, 1, 1, 0, 1, 0])
-    loss, info = action_evaluator.loss(
+    loss, info = jax.jit(action_evaluator.loss, static_argnames="config")(
         params, jax.random.key(1), (x, jnp.asarray(labels)), config=CONFIG
     )
-    _, logits = action_evaluator.classify(params, jax.random.key(1), x, config=CONFIG)
+    _, logits = classify(params, jax.random.key(1), x, config=CONFIG)
     logits = np.asarray(logits, np.float64)
     chance = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)
     expected = -np.mean(np.log(chance[np.arange(6), labels]))
@@ -85,7 +87,7 @@ def test_it_learns_to_tell_two_actions(skeleton):
         for turn in (-0.8, 0.8)
     ]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *walks)
-    x = joint_positions(skeleton, together).reshape(48, 12, 15)
+    x = tiny.positions(skeleton, together).reshape(48, 12, 15)
     train, held_out = (
         x.reshape(12, 2, 2, 12, 15)[:, i].reshape(24, 12, 15) for i in range(2)
     )

@@ -44,8 +44,13 @@ def gated_unit(h, x, cell):
     return (1 - update) * new + update * h
 
 
-def test_the_equations(net, inputs, variables):
-    found_features, found_logits = net.apply(variables, *inputs)
+@pytest.fixture(scope="module")
+def apply(net):
+    return jax.jit(net.apply)
+
+
+def test_the_equations(apply, inputs, variables):
+    found_features, found_logits = apply(variables, *inputs)
     params = variables["params"]
     for x, (lower, upper), features, logits in zip(
         *(np.asarray(y, np.float64) for y in inputs),
@@ -78,19 +83,19 @@ def test_published_sizes():
     assert count == lower + upper + rest - 2 * 2 * 128
 
 
-def test_samples_are_independent(net, inputs, variables):
+def test_samples_are_independent(apply, inputs, variables):
     x, state = inputs
-    features, logits = net.apply(variables, x, state)
-    alone = net.apply(variables, x[1:2], state[1:2])
+    features, logits = apply(variables, x, state)
+    alone = apply(variables, x[1:2], state[1:2])
     np.testing.assert_allclose(alone[0][0], features[1], atol=1e-6)
     np.testing.assert_allclose(alone[1][0], logits[1], atol=1e-6)
 
 
-def test_both_states_and_the_order_of_frames_matter(net, inputs, variables):
+def test_both_states_and_the_order_of_frames_matter(apply, inputs, variables):
     x, state = inputs
-    plain, _ = net.apply(variables, x, state)
+    plain, _ = apply(variables, x, state)
     for layer in range(2):
-        other, _ = net.apply(variables, x, state.at[:, layer].add(1.0))
+        other, _ = apply(variables, x, state.at[:, layer].add(1.0))
         assert np.abs(other - plain).max() > 1e-3
-    backwards, _ = net.apply(variables, x[:, ::-1], state)
+    backwards, _ = apply(variables, x[:, ::-1], state)
     assert np.abs(backwards - plain).max() > 1e-3

@@ -7,7 +7,7 @@ import pytest
 
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.motion import features, trajectory
-from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from tests import tiny
 
 CONFIG = style_evaluator.Config(num_classes=2, num_joints=5, frames=12)
@@ -16,7 +16,7 @@ CONFIG = style_evaluator.Config(num_classes=2, num_joints=5, frames=12)
 def test_the_input_against_a_loop(skeleton):
     motion = tiny.walk(20, turn=1.0, start=0.5)
     found = style_evaluator.window_input(skeleton, motion)
-    positions = np.asarray(joint_positions(skeleton, motion), np.float64)
+    positions = np.asarray(tiny.positions(skeleton, motion), np.float64)
     for frame in range(20):
         root = positions[frame, 0]
         across = positions[frame, 1] - positions[frame, 3]
@@ -133,7 +133,7 @@ def test_the_released_input_is_that_of_the_released_scripts(names):
         joint_rotation=jnp.asarray(rng.normal(size=(6, len(joints), 6)), jnp.float32),
         fps=30.0,
     )
-    positions = np.asarray(joint_positions(skeleton, motion), np.float64)
+    positions = np.asarray(tiny.positions(skeleton, motion), np.float64)
     at = lambda name: positions[:, joints.index(name)]  # noqa: E731
     left_top, right_top, left_hip, right_hip = map(at, ACROSS[names])
     across = np.zeros((6, 3))

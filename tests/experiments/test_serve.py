@@ -28,7 +28,7 @@ from jaxmotion.control.frame import Frame
 from jaxmotion.data import clips_io
 from jaxmotion.learning import checkpoint
 from jaxmotion.systems.camdm import model as camdm_model
-from tests import samples, tiny
+from tests import mostly_slow, samples, tiny
 
 ROOT = Path(__file__).parents[2]
 FPS = 100.0
@@ -792,7 +792,7 @@ def test_the_shipped_locomotion_is_served(script_load, protocol):
     assert simulation._tick._cache_size() == 1
 
 
-@pytest.mark.parametrize("name", ["locomotion", "walker"])
+@pytest.mark.parametrize("name", mostly_slow(["locomotion", "walker"], ["walker"]))
 def test_shipped_models_start_without_clips(script_load, name):
     state = script_load(name, None).start(0)[1].inner  # beside its feet
     np.testing.assert_allclose(state.past.root_position[-1, ::2], 0, atol=1e-5)

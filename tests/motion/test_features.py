@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.motion import features, rotation, trajectory
-from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+from jaxmotion.motion.skeleton import Motion, Skeleton
+from tests import tiny
 
 BONES = Skeleton(
     offsets=jnp.array([[0, 0, 0], [0.1, 0.3, 0], [0, 0.2, 0.4]], jnp.float32),
@@ -50,8 +51,8 @@ def test_to_frame_moves_every_joint_rigidly():
     yaw, origin = [0.4, -3.0], [[1.0, 2.0], [-5.0, 0.5]]
     world = motion((2, 4))
     local = features.to_frame(world, frame(yaw, origin))
-    before = np.asarray(joint_positions(BONES, world))
-    after = np.asarray(joint_positions(BONES, local))
+    before = np.asarray(tiny.positions(BONES, world))
+    after = np.asarray(tiny.positions(BONES, local))
     for b in range(2):
         moved = before[b] - np.array([origin[b][0], 0.0, origin[b][1]])
         turn = Rotation.from_rotvec([0, yaw[b], 0]).inv()
@@ -112,7 +113,7 @@ def test_motions_are_moved_to_their_own_first_pose(shape):
     np.testing.assert_array_equal(
         found.joint_rotation[..., 1:, :], world.joint_rotation[..., 1:, :]
     )
-    place = jax.jit(lambda m: joint_positions(HIPS, m))
+    place = jax.jit(lambda m: tiny.positions(HIPS, m))
     before, after = (
         np.asarray(place(m)).reshape(*shape[:-1], -1, 3) for m in (world, found)
     )

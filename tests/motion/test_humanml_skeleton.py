@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.motion import humanml_layout, humanml_skeleton
-from jaxmotion.motion.skeleton import Skeleton, joint_positions
-from tests import person
+from jaxmotion.motion.skeleton import Skeleton
+from tests import mostly_slow, person, tiny
 from tests.person import float32
 
 SMPL = humanml_skeleton.SMPL_JOINTS
@@ -131,7 +131,7 @@ def rigid_clip(seed=0, swing=0.8):
     root = person.waves(time, 3, seed + 1, 0.8) + [2.0, 1.0, 0.0]
     body = Skeleton(offsets=float32(offsets), parents=PARENTS, names=SMPL)
     motion = person.motion(root, matrices.reshape(FRAMES, 22, 3, 3), 20.0)
-    return np.asarray(joint_positions(body, motion), np.float64)
+    return np.asarray(tiny.positions(body, motion), np.float64)
 
 
 def lengths(positions):
@@ -142,11 +142,11 @@ def lengths(positions):
 def errors(positions):
     """Distances [F, 22] of the joints of the fitted motion."""
     skeleton, motion = fit(float32(positions), fps=20.0)
-    found = np.asarray(joint_positions(skeleton, motion), np.float64)
+    found = np.asarray(tiny.positions(skeleton, motion), np.float64)
     return np.linalg.norm(found - positions, axis=-1)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", mostly_slow(range(3), [0]))
 def test_rigid_bodies_are_followed_exactly(seed):
     assert errors(rigid_clip(seed)).max() < 2e-5
 
@@ -199,11 +199,11 @@ def test_single_bones_swing_without_twist():
     angle = np.linspace(0.1, 2.0, FRAMES)
     body[:, 18] = Rotation.from_rotvec(np.outer(angle, [0.0, -1.0, 0.0])).as_matrix()
     motion = person.motion(np.zeros((FRAMES, 3)), body, 20.0)
-    _, found = fit(joint_positions(skeleton, motion), fps=20.0)
+    _, found = fit(tiny.positions(skeleton, motion), fps=20.0)
     np.testing.assert_allclose(found.joint_rotation, motion.joint_rotation, atol=1e-4)
 
 
-@pytest.mark.parametrize("noise", [0.005, 0.02])
+@pytest.mark.parametrize("noise", mostly_slow([0.005, 0.02], [0.02]))
 def test_noisy_joints_are_followed_to_about_the_noise(noise):
     positions = rigid_clip(4)
     generator = np.random.default_rng(9)
@@ -258,11 +258,12 @@ def test_export_as_bvh_has_the_same_joints():
     text = bvh_text.format_bvh(bvh.bvh_from_motion(skeleton, motion))
     read_bones, read = bvh.motion_from_bvh(bvh_text.parse_bvh(text))
     assert read.fps == pytest.approx(20.0)
-    found = np.asarray(joint_positions(read_bones, read))
+    found = np.asarray(tiny.positions(read_bones, read))
     order = [read_bones.names.index(name) for name in SMPL]
     np.testing.assert_allclose(found[:, order], positions, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_fit_maps_over_clips():
     clips = float32(np.stack([rigid_clip(0), rigid_clip(1)]))
     motion = jax.vmap(lambda clip: fit(clip, fps=20.0)[1])(clips)

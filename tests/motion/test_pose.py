@@ -9,9 +9,8 @@ from jaxmotion.motion.skeleton import (
     Motion,
     Skeleton,
     global_transforms,
-    joint_positions,
 )
-from tests import person
+from tests import person, tiny
 from tests.person import float32
 from tests.reference import pose as reference
 
@@ -312,7 +311,7 @@ def test_character_transforms_of_a_clip_are_its_joints_seen_from_the_bone(skelet
         float32(parts["position"]).reshape(FRAMES, 6, 3),
         float32(parts["rotation"]).reshape(FRAMES, 6, 6),
     )
-    world = np.asarray(joint_positions(skeleton, motion), np.float64)
+    world = np.asarray(tiny.positions(skeleton, motion), np.float64)
     _, world_turns = global_transforms(
         skeleton, motion.root_position, motion.joint_rotation
     )

@@ -161,7 +161,10 @@ def energies(shape, parents=PARENTS):
     return written, plain
 
 
-@pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
+@pytest.mark.parametrize(
+    "shape",
+    [(5,), *(pytest.param(s, marks=pytest.mark.slow) for s in [(), (2, 3)])],
+)
 def test_written_gradient_is_that_of_a_plain_loop(shape):
     root, _, rot6d = pose(8, shape)
     # Not orthonormal, as a network gives them.
@@ -234,6 +237,7 @@ def test_gradient_of_a_gradient_is_that_of_a_plain_loop():
     assert all(np.isfinite(x).all() for x in singular)
 
 
+@pytest.mark.slow
 def test_gradients_of_many_skeletons_by_vmap():
     """The chain is differentiated under vmap over offsets as well."""
     root, _, rot6d = pose(11, (3,))

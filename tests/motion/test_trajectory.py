@@ -6,8 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxmotion.motion import facing as facing_module
 from jaxmotion.motion import ground, trajectory
-from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
+from tests import tiny
 from tests.reference import trajectory as oracle
 
 
@@ -239,7 +240,7 @@ def test_root_trajectory_is_that_of_full_kinematics():
         root_position=jax.random.normal(key_p, (2, 5, 3)), joint_rotation=rot6d
     )
     got = trajectory.root_trajectory(skeleton, motion)
-    joints = np.asarray(joint_positions(skeleton, motion))
+    joints = np.asarray(tiny.positions(skeleton, motion))
     forward = np.cross(joints[..., 2, :] - joints[..., 3, :], [0, 1, 0])[..., ::2]
     forward /= np.linalg.norm(forward, axis=-1, keepdims=True)
     np.testing.assert_allclose(got.facing, forward, atol=1e-5)

@@ -57,7 +57,7 @@ def test_network_is_the_formula():
         norm = params[f"GroupNorm_{i - 1}"]
         h = silu(h * np.float64(norm["scale"]) + np.float64(norm["bias"]))
     expected = dense(params["Dense_3"], np.concatenate([h, given]))
-    found = NET.apply(parameters(False), x, jnp.array(2), c, z)
+    found = jax.jit(NET.apply)(parameters(False), x, jnp.array(2), c, z)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -69,7 +69,7 @@ def test_discriminator_is_the_formula():
         h = dense(params[f"Dense_{i}"], h)
         h = np.where(h > 0, h, 0.2 * h)
     expected = dense(params["Dense_2"], h)[0]
-    found = DISCRIMINATOR.apply(parameters(True), x, y, jnp.array(3), c)
+    found = jax.jit(DISCRIMINATOR.apply)(parameters(True), x, y, jnp.array(3), c)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
@@ -79,6 +79,6 @@ def test_a_batch_is_its_samples(adversary):
     x, y, z = vectors(3, 2, 5)
     t = jnp.arange(10).reshape(2, 5) % 4 + 1
     order = (x, y, t, z) if adversary else (x, t, y, z)
-    together = net.apply(params, *order)
-    alone = jax.vmap(jax.vmap(lambda *a: net.apply(params, *a)))(*order)
+    together = jax.jit(net.apply)(params, *order)
+    alone = jax.jit(jax.vmap(jax.vmap(lambda *a: net.apply(params, *a))))(*order)
     np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)

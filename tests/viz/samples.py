@@ -5,8 +5,8 @@ import numpy as np
 
 from jaxmotion.data import procedural, walker
 from jaxmotion.data.gaits import GAITS
-from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.motion.trajectory import Command
+from tests import tiny
 
 PARENTS = (-1, 0, 1, 0)
 NAMES = ("Hips", "Spine", "LeftHand", "RightFoot")
@@ -44,4 +44,4 @@ def person(seconds=4.0, speed=1.4, turn=1.2):
     )
     made = procedural.walk(commands, next(iter(GAITS.values())), fps=FPS)
     skeleton = walker.walker_skeleton()
-    return np.asarray(joint_positions(skeleton, made.motion), float), skeleton
+    return np.asarray(tiny.positions(skeleton, made.motion), float), skeleton

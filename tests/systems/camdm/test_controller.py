@@ -14,12 +14,12 @@ import pytest
 
 from jaxmotion.control import rollout
 from jaxmotion.motion import features, rotation, trajectory
-from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import mostly_slow, tiny
 
-CONFIG = tiny.config(heading="facing")
+CONFIG = tiny.config(heading="facing", depth=1, num_steps=2)
 CONTROL = camdm_controller.Control(apply=5, reuse=6, seam=0.0)
 
 
@@ -46,6 +46,11 @@ def obedient(height):
         return plan
 
     return sampler
+
+
+@pytest.fixture(scope="module")
+def params():
+    return tiny.random_params(camdm_model.init, CONFIG, seed=7)
 
 
 @pytest.fixture
@@ -482,7 +487,7 @@ def test_the_mean_pose_stands_on_the_ground():
     )
     motion = camdm_controller.mean_pose(model)
     assert motion.root_position.shape == (config.past, 3)
-    feet = joint_positions(model.skeleton, motion)[:, [2, 4], 1]
+    feet = tiny.positions(model.skeleton, motion)[:, [2, 4], 1]
     np.testing.assert_allclose(feet, 0.0, atol=1e-6)
     np.testing.assert_allclose(motion.root_position[-1], [0, 0.9, 0], atol=1e-6)
 

@@ -13,9 +13,9 @@ from jaxmotion.data import windows
 from jaxmotion.data.clips import clip_motion
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.style import Config
-from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.systems.camdm import release as camdm_release
-from tests import samples
+from tests import samples, tiny
 from tests.reference import metrics as oracle
 
 LABELS = np.array([0, 1, 1])
@@ -45,7 +45,7 @@ def recordings():
 
 
 def joints(motion):
-    return joint_positions(samples.run().model.skeleton, motion)
+    return tiny.positions(samples.run().model.skeleton, motion)
 
 
 def of_scripts(motion, command=None):

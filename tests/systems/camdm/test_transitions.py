@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.systems.camdm import transitions as camdm_transitions
 from jaxmotion.systems.camdm.controller import Control
-from tests import samples
+from tests import samples, tiny
 from tests.reference import metrics as oracle
 
 FPS = 30.0
@@ -100,7 +100,7 @@ def test_planted_changes_are_found_at_their_time(changes):
             root_position=frames.root_position[i],
             joint_rotation=frames.joint_rotation[i],
         )
-        joints = joint_positions(skeleton, motion)
+        joints = tiny.positions(skeleton, motion)
         wanted.append(oracle.camdm_release(skeleton.names, joints))
     released = {name: row[f"{name}_camdm_release"] for name in wanted[0]}
     for name, cell in released.items():

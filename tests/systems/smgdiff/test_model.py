@@ -10,7 +10,7 @@ import pytest
 
 from jaxmotion.motion import rotation, trajectory
 from jaxmotion.motion.ball import Scene
-from jaxmotion.motion.skeleton import Skeleton, joint_positions
+from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
 from jaxmotion.systems.smgdiff import model as smgdiff_model
@@ -100,7 +100,7 @@ def test_a_scene_comes_back_from_its_features(scenes, representation):
         atol=1e-5,
     )
     np.testing.assert_allclose(found.touch, scenes.touch, atol=1e-6)
-    feet = joint_positions(tiny.skeleton(), scenes.motion)[..., FEET, :]
+    feet = tiny.positions(tiny.skeleton(), scenes.motion)[..., FEET, :]
     speed = np.linalg.norm(np.diff(np.float64(feet), axis=1), axis=-1) * 30
     inner = np.asarray(stands)[:, :-1]
     clear = np.abs(speed - 0.3) > 1e-3
