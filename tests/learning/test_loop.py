@@ -362,7 +362,7 @@ def command(folder, steps):
 @pytest.mark.slow
 def test_a_killed_training_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
     clips_io.save_clips(tmp_path / "walker.npz", tiny.clips())
-    steps = 40
+    steps = 16
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     quick = os.environ | {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     process = subprocess.Popen(command(killed, steps), cwd=ROOT, env=quick)
