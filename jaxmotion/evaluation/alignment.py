@@ -126,13 +126,13 @@ def commanded_path(
 
 
 @functools.partial(jax.jit, static_argnames=("reach",))
-def path_distance(
+def path_offset(
     position: Float[Array, "*batch frames 2"],
     wanted: Float[Array, "*batch frames 2"],
     *,
     reach: int,
-) -> Float[Array, "*batch frames"]:
-    """Distance on the ground from where a character is to where it should be by now.
+) -> Float[Array, "*batch frames 2"]:
+    """Way on the ground from where a character should be by now to where it is.
 
     What lags behind is off its path as what strays to a side.
 
@@ -148,8 +148,7 @@ def path_distance(
     gap = position - wanted
     frame, last = np.arange(gap.shape[-2]), gap.shape[-2] - 1
     around = [np.clip(frame + i, 0, last) for i in range(-reach, reach + 1)]
-    mean = sum(gap[..., i, :] for i in around) / len(around)
-    return jnp.linalg.norm(mean, axis=-1)
+    return sum(gap[..., i, :] for i in around) / len(around)
 
 
 @functools.partial(jax.jit, static_argnames=("reach",))

@@ -87,6 +87,7 @@ COLUMNS: dict[str, Column] = {
         Column(id="speed_error", title="speed error", unit="%"),
         Column(id="path_error", title="path error", unit="cm"),
         Column(id="path_error_max", title="largest path error", unit="cm"),
+        Column(id="path_lead", title="ahead, as it should face", unit="cm", better=""),
         Column(id="facing_error", title="still to turn", unit="°"),
         Column(id="creep", title="creep in 10 s", unit="cm"),
         Column(id="stop_time", title="time to stop", unit="s"),

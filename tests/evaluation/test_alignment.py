@@ -73,9 +73,10 @@ def test_sway_does_not_count_but_a_side_step_and_a_lag_do():
     sway = 0.03 * np.sin(2 * np.pi * frame / 17)  # the mean is of 17 frames
     path = wanted + np.array([0.1, -0.2]) + np.stack([sway, 0 * sway], axis=-1)
     both = (jnp.asarray(x, jnp.float32) for x in (path, wanted))
-    found = alignment.path_distance(*both, reach=8)
-    np.testing.assert_allclose(found[8:-8], np.hypot(0.1, 0.2), atol=1e-5)
-    assert found.shape == (60,)
+    found = alignment.path_offset(*both, reach=8)
+    expected = np.broadcast_to([0.1, -0.2], (44, 2))
+    np.testing.assert_allclose(found[8:-8], expected, atol=1e-5)
+    assert found.shape == (60, 2)
 
 
 def test_steady_speed_is_a_straight_walks_speed_to_its_ends():

@@ -10,7 +10,8 @@ One tick (1/30 s) of one character:
       classifier-free guidance on the past, which frees the model from its old style;
    e. an inertialized seam: the plan starts where the displayed motion is, with its
       velocity, and takes up the model's motion within 0.2 s.
-2. Display the next pose of the plan, and move the springs on.
+2. Display the next pose of the plan, and move the springs on. A frame's `extra` has
+   the "anchor", where the desired motion is: (x, z) meters.
 
 Source: Chen et al. 2024 (CAMDM), section 3.2; the released Unity run-time for what the
 paper does not say (noted at each constant).
@@ -389,6 +390,7 @@ def advance(
         desired_velocity=velocity,
         desired_facing=facing,
         planned=state.cursor == 0,
+        extra={"anchor": anchor},
         fps=config.fps,
     )
     # A style that changes while the old plan still plays arms the next plans.

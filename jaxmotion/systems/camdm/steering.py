@@ -167,6 +167,9 @@ def _measure(
     positions = joint_positions(skeleton, frames.motion)
     path = frames.root_position[..., ::2]
     wanted = alignment.commanded_path(frames.desired_velocity, fps)
+    # A controller may take where a character came to a stop for where it should be.
+    anchor = frames.extra.get("anchor", wanted)
+    offset = 100.0 * alignment.path_offset(path, anchor, reach=reach)
     hips = trajectory.root_trajectory(skeleton, frames.motion).facing
     told = jnp.broadcast_to(facing, hips.shape)
 
@@ -176,7 +179,8 @@ def _measure(
     values = {
         "speed": alignment.steady_speed(path, fps, reach=reach),
         "wanted_speed": alignment.steady_speed(wanted, fps, reach=reach),
-        "path_error": 100.0 * alignment.path_distance(path, wanted, reach=reach),
+        "path_error": jnp.linalg.norm(offset, axis=-1),
+        "path_lead": jnp.sum(offset * told, axis=-1),
         "facing_error": still_to_turn(hips),
         "wanted_facing_error": still_to_turn(frames.desired_facing),
     }
@@ -192,7 +196,7 @@ def _measure(
         place = jnp.broadcast_to(place[skip:], (number, ticks - skip))
         return rough(place, num_places=_STEPS) | {
             name: by_frame.place_sums(values[name][:, skip:], place, num_places=_STEPS)
-            for name in ("speed", "path_error", "facing_error")
+            for name in ("speed", "path_error", "path_lead", "facing_error")
         }
 
     labels = jnp.zeros(number, jnp.int32)
@@ -321,7 +325,9 @@ def _join(parts: list[dict[str, Any]]) -> dict[str, Any]:
 def _with_locked_feet(skeleton: Skeleton, frames: Frame, *, lock: FootLock) -> Frame:
     """What a character of `foot_lock.lock_feet` displays: its plans are the same."""
     shown = jax.vmap(lambda x: lock_motion(skeleton, x, lock=lock))(frames.motion)
-    return dataclasses.replace(frames, joint_rotation=shown.joint_rotation)
+    return dataclasses.replace(
+        frames, root_position=shown.root_position, joint_rotation=shown.joint_rotation
+    )
 
 
 class _Real:
@@ -492,7 +498,7 @@ def steering_table(
             by_plan[title + feet] = by_frame.means(one["by_plan"])
             for kind, sums in one["by_time"].items():
                 if sums["speed"][1].any():
-                    # The lock moves feet, and nothing that steering is measured by.
+                    # The lock hardly moves what steering is measured by.
                     some = ("foot_slide", "jerk") if feet else tuple(sums)
                     part = {name: sums[name] for name in some}
                     by_time[f"{title}{feet}, {kind}"] = by_frame.means(part)

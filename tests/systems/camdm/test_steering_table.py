@@ -166,8 +166,15 @@ def test_who_is_slow_has_an_error_of_speed_and_falls_behind():
     row = "straight, told 1 m/s"
     assert value(found, row, "speed_error") == pytest.approx(10.0, abs=0.1)
     assert value(found, row, "speed") == pytest.approx(0.9, abs=1e-3)
-    # A tenth of the way, less what the spring's start took: 14 m at the end.
+    # A tenth of the way of 14 m, less what the spring's start took.
     assert value(found, row, "path_error_max") == pytest.approx(136.0, abs=5.0)
+
+
+def test_who_is_slow_lags_behind_by_the_part_that_is_missing():
+    """At the ends of two stops after 3 m ahead, and 3 m more at 60 degrees."""
+    found = table("stop_and_go", gain=0.9)
+    lead = found.by_time["stop and go, told 1 m/s, stop"]["path_lead"]
+    assert lead[9] == pytest.approx(-(30.0 + 30.0 * (1 + 0.5)) / 2, abs=0.5)
 
 
 @pytest.mark.parametrize("late", [0.0, 1.0])
