@@ -10,7 +10,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.evaluation import bench, by_frame, table
@@ -116,7 +115,7 @@ def _features(
     frames: int | None,
     scale: float | None,
     seed: int,
-) -> np.ndarray:
+) -> Array:
     """Features of one motion for each vector, cut to their length."""
     params, config = emdm_training.load_row(run, row)
     length = config.frames if frames is None else frames
