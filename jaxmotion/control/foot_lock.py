@@ -29,8 +29,9 @@ bends the leg to reach it.
    (`softness`): a leg that is pulled too far does not snap straight. The foot keeps its
    orientation, but for what the leg cannot reach and a heel that would sink.
 
-A frame that needs no correction comes back as it was. The lock works on what is
-displayed; the planner's own past stays untouched, so plans are those without it.
+A frame that needs no correction comes back as it was. A controller that can be told
+what was displayed (`Controller.shown`) plans on from there: the next plan begins with
+the feet where they stand, and no offset outlives a plan.
 
 Source: the offset spring and the order of lock and release after D. Holden's notes on
 motion matching; two-bone inverse kinematics is textbook geometry.
@@ -530,18 +531,32 @@ class LockedState:
     feet: LockState
 
 
+def _absorb(state: LockState) -> LockState:
+    """The state at the start of a plan that goes on from what is displayed."""
+    keep = state.locked[:, None]
+    none = jnp.zeros_like(state.body)
+    return dataclasses.replace(
+        state,
+        animated=state.shown,
+        offset=jnp.where(keep, state.offset, 0.0),
+        offset_velocity=jnp.where(keep, state.offset_velocity, 0.0),
+        body=none,
+        body_velocity=none,
+    )
+
+
 def locked(
     controller: Controller, skeleton: Skeleton, *, fps: float, lock: FootLock
 ) -> Controller:
     """A controller that displays its frames with locked feet.
 
-    Its state is a `LockedState`. What the controller itself remembers are the frames
-    without the lock.
+    Its state is a `LockedState`.
     """
 
     def planner(plan: Any) -> Any:
         def run(key: Any, state: LockedState, command: Any) -> LockedState:
-            return dataclasses.replace(state, inner=plan(key, state.inner, command))
+            feet = state.feet if controller.shown is None else _absorb(state.feet)
+            return LockedState(inner=plan(key, state.inner, command), feet=feet)
 
         return run
 
@@ -556,6 +571,8 @@ def locked(
             lock=lock,
         )
         frame = dataclasses.replace(frame, root_position=root, joint_rotation=rotations)
+        if controller.shown is not None:
+            inner = controller.shown(inner, frame)
         return LockedState(inner=inner, feet=feet), frame
 
     return dataclasses.replace(

@@ -47,3 +47,12 @@ class Frame:
             joint_rotation=self.joint_rotation,
             fps=self.fps,
         )
+
+
+def as_displayed(past: Motion, frame: Frame) -> Motion:
+    """The last poses, of which the very last is that of a frame."""
+    return dataclasses.replace(
+        past,
+        root_position=past.root_position.at[-1].set(frame.root_position),
+        joint_rotation=past.joint_rotation.at[-1].set(frame.joint_rotation),
+    )

@@ -42,11 +42,14 @@ class Controller:
       plan_level: `(state, command) -> int32`.
       plans: Planners in the order of their cost, `(key, state, command) -> state`.
       advance: `(state, command) -> (state, frame)`.
+      shown: `(state, frame) -> state` that remembers this frame as the last displayed
+        one, for who changes frames on their way to the screen; None if it cannot.
     """
 
     plan_level: Callable[[State, Commands], Int[Array, ""]]
     plans: tuple[Callable[[Key, State, Commands], State], ...]
     advance: Callable[[State, Commands], tuple[State, Frame]]
+    shown: Callable[[State, Frame], State] | None = None
 
 
 def tick(

@@ -269,20 +269,72 @@ def test_many_are_each_alone():
         )
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """What a controller displays."""
+
+    root_position: jax.Array
+    joint_rotation: jax.Array
+
+
+def creeping(speed, *, knows):
+    """A controller whose plans of ten frames creep on from the last pose it knows."""
+    own = Pose(jnp.asarray(stood(), jnp.float32), pose())
+
+    def plan(key, state, command):
+        return state | {"start": state["last"], "cursor": jnp.zeros((), jnp.int32)}
+
+    def advance(state, command):
+        cursor, start = state["cursor"] + 1, state["start"]
+        root = start.root_position.at[2].add(speed / FPS * cursor)
+        now = Pose(root, start.joint_rotation)
+        return state | {"cursor": cursor, "last": now}, now
+
+    start = {"start": own, "last": own, "cursor": jnp.full((), 10, jnp.int32)}
+    made = rollout.Controller(
+        plan_level=lambda state, command: (state["cursor"] >= 10).astype(jnp.int32),
+        plans=(plan,),
+        advance=advance,
+        shown=(lambda s, frame: s | {"last": frame}) if knows else None,
+    )
+    return made, start
+
+
+def test_plans_go_on_from_what_is_displayed():
+    """So no offset outlives a plan: feet and body are where the next one has them."""
+    offsets = {}
+    for knows in (True, False):
+        made, start = creeping(0.1, knows=knows)
+        made = foot_lock.locked(made, SKELETON, fps=FPS, lock=LOCK)
+
+        def tick(state, i, made=made):
+            state, frame = rollout.tick(made, jax.random.key(0), state, i)
+            return state, (frame, state)
+
+        state = foot_lock.LockedState(inner=start, feet=foot_lock.init_lock(SKELETON))
+        run = jax.jit(lambda s, f=tick: jax.lax.scan(f, s, jnp.arange(40))[1])
+        frames, states = run(state)
+        for first in (10, 20, 30):
+            began = jax.tree.map(lambda x, i=first: x[i], states.inner["start"])
+            same = jax.tree.map(lambda x, i=first: x[i - 1], frames)
+            equal = [
+                np.array_equal(*x)
+                for x in zip(*map(jax.tree.leaves, (began, same)), strict=True)
+            ]
+            assert all(equal) == knows
+            offsets[knows] = float(np.linalg.norm(states.feet.body[first]))
+        steps = np.abs(np.diff(frames.root_position, axis=0)).max() * FPS
+        assert steps < 0.15
+    assert offsets[True] < 0.005 and offsets[False] > 0.05
+
+
 def test_a_controller_displays_locked_feet():
     """A controller that plays a clip: the same as the clip locked on its own."""
     motion = drift(0.05)
 
-    @dataclasses.dataclass(frozen=True)
-    class Shown:
-        root_position: jax.Array
-        joint_rotation: jax.Array
-
-    jax.tree_util.register_dataclass(Shown, ["root_position", "joint_rotation"], [])
-
     def advance(tick, command):
-        shown = Shown(motion.root_position[tick], motion.joint_rotation[tick])
-        return tick + 1, shown
+        return tick + 1, Pose(motion.root_position[tick], motion.joint_rotation[tick])
 
     plays = rollout.Controller(
         plan_level=lambda state, command: jnp.zeros((), jnp.int32),

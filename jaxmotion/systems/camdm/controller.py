@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.control import inertia
-from jaxmotion.control.frame import Frame
+from jaxmotion.control.frame import Frame, as_displayed
 from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character, check_labels
 from jaxmotion.data import windows
@@ -455,6 +455,9 @@ def controller(
         plan_level=functools.partial(plan_level, control=control),
         plans=(plan(False), plan(True)),
         advance=functools.partial(advance, config=config, control=control),
+        shown=lambda state, frame: dataclasses.replace(
+            state, past=as_displayed(state.past, frame)
+        ),
     )
 
 

@@ -30,7 +30,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from jaxmotion.control import inertia
-from jaxmotion.control.frame import Frame
+from jaxmotion.control.frame import Frame, as_displayed
 from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character, check_labels
 from jaxmotion.data.ball_clips import BallClips
@@ -263,24 +263,32 @@ def advance(
     Returns:
       The next state, and what is displayed.
     """
-    shown = jax.tree.map(
+    now = jax.tree.map(
         lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
     )
     past = jax.tree.map(
-        lambda old, new: jnp.concatenate([old[1:], new]), state.past, shown
+        lambda old, new: jnp.concatenate([old[1:], new]), state.past, now
     )
     frame = Frame(
-        root_position=shown.motion.root_position[0],
-        joint_rotation=shown.motion.joint_rotation[0],
+        root_position=now.motion.root_position[0],
+        joint_rotation=now.motion.joint_rotation[0],
         desired_velocity=command.velocity,
         desired_facing=command.facing,
         planned=state.cursor == 0,
-        extra={"ball": shown.ball[0], "touch": shown.touch[0]},
-        fps=shown.motion.fps,
+        extra={"ball": now.ball[0], "touch": now.touch[0]},
+        fps=now.motion.fps,
     )
     return dataclasses.replace(
         state, past=past, cursor=state.cursor + 1, command=command
     ), frame
+
+
+def shown(state: PlayerState, frame: Frame) -> PlayerState:
+    """The state after a frame whose pose was displayed in place of the plan's own."""
+    motion = as_displayed(state.past.motion, frame)
+    return dataclasses.replace(
+        state, past=dataclasses.replace(state.past, motion=motion)
+    )
 
 
 def controller(
@@ -323,6 +331,7 @@ def controller(
         plan_level=functools.partial(plan_level, control=control),
         plans=(plan,),
         advance=advance,
+        shown=shown,
     )
 
 
