@@ -382,8 +382,8 @@ def advance(
     facing, turn_rate = spring.facing_spring(
         state.facing, state.turn_rate, command.facing, **times
     )
-    stopped = _is_still(velocity) & ~_is_still(state.velocity)
-    anchor = jnp.where(stopped, pose.root_position[0, ::2], anchor)
+    stops = _is_still(command.velocity) & ~_is_still(state.velocity)
+    anchor = jnp.where(stops, pose.root_position[0, ::2], anchor)
     frame = Frame(
         root_position=pose.root_position[0],
         joint_rotation=pose.joint_rotation[0],

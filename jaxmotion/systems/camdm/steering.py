@@ -1,14 +1,13 @@
 """How well a character is steered, and how it moves meanwhile.
 
 A mean over one course hides what is at fault. Here characters are told to go straight
-on at several speeds, to stand, to turn, to stop and to go; each has a row of what is
-displayed and one with locked feet, beside real windows whose own speed is about that.
+on at several speeds, to stand, to turn, to stop and to go, as they are and with locked
+feet, beside real windows whose own speed is about that.
 The same rollouts are split by frame of the plan, and by time since the last command.
 
 Characters run in parts of a batch, of which only measures are kept, not the frames.
 """
 
-import dataclasses
 import datetime
 import functools
 import itertools
@@ -23,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.control import courses, steering
-from jaxmotion.control.foot_lock import FootLock, legs, lock_motion
+from jaxmotion.control.foot_lock import FootLock, lock_feet
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.steering import Character
 from jaxmotion.data import windows
@@ -321,15 +320,6 @@ def _join(parts: list[dict[str, Any]]) -> dict[str, Any]:
     )
 
 
-@functools.partial(jax.jit, static_argnames=("lock",))
-def _with_locked_feet(skeleton: Skeleton, frames: Frame, *, lock: FootLock) -> Frame:
-    """What a character of `foot_lock.lock_feet` displays: its plans are the same."""
-    shown = jax.vmap(lambda x: lock_motion(skeleton, x, lock=lock))(frames.motion)
-    return dataclasses.replace(
-        frames, root_position=shown.root_position, joint_rotation=shown.joint_rotation
-    )
-
-
 class _Real:
     """Windows of real clips with a label, and where the ground is by the first clips.
 
@@ -458,10 +448,14 @@ def steering_table(
         )
         for name, speed in courses_
     }
+    characters = {"": character}
     if foot_lock is not None:
-        legs(character.skeleton)  # raises where there is nothing to lock
+        characters[", locked feet"] = lock_feet(character, foot_lock)
     real = _Real({"held-out": held_out, "training": train}, field=field, label=index)
-    states = character.start(rollouts, labels=index, clips=held_out, seed=seed)
+    starts = {
+        feet: one.start(rollouts, labels=index, clips=held_out, seed=seed)
+        for feet, one in characters.items()
+    }
     chunk = max(size for size in range(1, chunk + 1) if rollouts % size == 0)
     minutes = len(told) * rollouts * seconds / 60.0
     progress = _Progress(len(told) * rollouts // chunk, minutes)
@@ -473,16 +467,11 @@ def steering_table(
         every = jax.tree.map(lambda x: jnp.stack([x] * chunk), commands)
         parts: dict[str, list[dict[str, Any]]] = {}
         for first in range(0, rollouts, chunk):
-            part = jax.tree.map(lambda x, i=first: x[i : i + chunk], states)
-            key = jax.random.key(seed)
-            shown = {
-                "": steering.steered_rollouts(character, key, part, every, first=first)
-            }
-            if foot_lock is not None:
-                shown[", locked feet"] = _with_locked_feet(
-                    character.skeleton, shown[""], lock=foot_lock
+            for feet, one in characters.items():
+                part = jax.tree.map(lambda x, i=first: x[i : i + chunk], starts[feet])
+                frames = steering.steered_rollouts(
+                    one, jax.random.key(seed), part, every, first=first
                 )
-            for feet, frames in shown.items():
                 found = measure(frames, commands.facing, since)
                 parts.setdefault(feet, []).append(jax.device_get(found))
             progress.step()
@@ -498,10 +487,7 @@ def steering_table(
             by_plan[title + feet] = by_frame.means(one["by_plan"])
             for kind, sums in one["by_time"].items():
                 if sums["speed"][1].any():
-                    # The lock hardly moves what steering is measured by.
-                    some = ("foot_slide", "jerk") if feet else tuple(sums)
-                    part = {name: sums[name] for name in some}
-                    by_time[f"{title}{feet}, {kind}"] = by_frame.means(part)
+                    by_time[f"{title}{feet}, {kind}"] = by_frame.means(sums)
         if course == "straight":
             rows |= real.rows(speed)
         springs = {name: one[f"wanted_{name}"] for name in ("speed", "facing_error")}
