@@ -98,8 +98,9 @@ RELEASED = Control(
 # A desired velocity below this one is a stop, meters per second.
 STILL = 0.02
 
-# For models that ship: the walked path is the commanded one.
-OWN_STARTS = Control(follow=1.0)
+# For models that ship: the walked path is the commanded one. Blended with the own path of
+# the last plan (HFTE), it answers 0.2 s later and cuts corners by 27 cm instead of 2.
+OWN_STARTS = Control(follow=1.0, extend=False)
 
 
 @jax.tree_util.register_dataclass
