@@ -66,7 +66,7 @@ class Control:
       follow: Half-life, seconds, in which the wanted path returns to the commanded
         one, the integral of the desired velocity; 0 to steer by velocity alone, as
         the paper does. Ours: without it every rollout drifts off its course. Whoever
-        stands wants to stand where he came to a stop, not where the command ends.
+        is told to stand wants to stand where he comes to a stop.
     """
 
     apply: int = 15
@@ -98,8 +98,8 @@ RELEASED = Control(
 # A desired velocity below this one is a stop, meters per second.
 STILL = 0.02
 
-# For models that ship: the walked path is the commanded one. Blended with the own path of
-# the last plan (HFTE), it answers 0.2 s later and cuts corners by 27 cm instead of 2.
+# For models that ship: the walked path is the commanded one. Blended with the path of
+# the last plan (HFTE), it would answer 0.2 s later: 27 cm off a figure eight, not 2.
 OWN_STARTS = Control(follow=1.0, extend=False)
 
 
