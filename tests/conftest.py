@@ -31,7 +31,7 @@ DRAWS = ("control", "diffusion", "evaluators", "learning", "networks", "systems"
 # the other's last module.
 FIRST = ("systems", "contracts", "learning", "test_face.py", "evaluators")
 # Compiled programs of so many modules are kept: they take memory, and time to forget.
-MODULES_REMEMBERED = 4
+MODULES_REMEMBERED = 3
 
 
 @pytest.hookimpl(tryfirst=True)

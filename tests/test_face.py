@@ -38,6 +38,7 @@ def test_many_characters_in_six_lines(model, frames):
     assert len(np.unique(np.asarray(frames.root_position)[:, -1], axis=0)) > 200
 
 
+@pytest.mark.slow
 def test_a_second_call_compiles_nothing(model, frames):
     """Other start poses, commands, labels, speeds, keys; and the model loaded again."""
     counted = steering._rollouts._cache_size()

@@ -140,6 +140,7 @@ def test_rollouts_show_a_frame_a_tick_from_where_they_start(run):
     assert gap[:, -1].max() < 0.1 < 0.5 < gap[:, 0].min()
 
 
+@pytest.mark.slow
 def test_the_step_of_the_chain_is_the_users_choice(run):
     """DDIM of full noise is the default; of two steps DPM-Solver++ is DDIM without."""
     start = camdm_controller.start_states

@@ -163,6 +163,7 @@ def test_the_ground_moves_under_the_character_and_stands_in_the_world(tmp_path):
         assert np.all(np.abs(corners.mean(axis=1) - center)[:, [0, 2]] < 3)
 
 
+@pytest.mark.slow
 def test_eight_seconds_are_small_and_at_most_20_pictures_a_second(tmp_path):
     positions, skeleton = samples.person(seconds=8.0)
     walked = positions[:, 0, ::2]

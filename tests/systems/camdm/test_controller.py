@@ -391,6 +391,7 @@ def whole(params, skeleton):
     return program(4, None)(params, skeleton, jax.random.key(0), states, commands)
 
 
+@pytest.mark.slow
 def test_chunks_and_batches_change_nothing(params, skeleton, whole):
     states, commands = states_of(skeleton, 4), commands_of(*turning(4, 9))
     chunked = program(4, 2)(params, skeleton, jax.random.key(0), states, commands)

@@ -106,6 +106,7 @@ def test_it_plans_at_first_when_played_out_and_when_told(frames):
     np.testing.assert_array_equal(planned, [0, 5, 7, 12])
 
 
+@pytest.mark.slow
 def test_a_plan_begins_where_body_and_ball_are_displayed(parts):
     """Beside the same plan without a seam, which starts wherever the network says."""
     representation, config, driver = parts
