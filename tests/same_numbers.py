@@ -32,6 +32,7 @@ TIMES = (
     "first_ms",
     "seconds",
     "latency_ms",
+    "frame_time",
     "fps",
 )
 TRAIN = {

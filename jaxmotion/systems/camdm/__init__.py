@@ -52,9 +52,19 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
   steps of the walker.
 * `train --warmup 300 --max-norm 1 --ema 0.999`: a rate that rises first, clipped
   gradients, averaged parameters.
+* `attention="prefix"`: condition tokens do not see the noisy frames, and are computed
+  once per plan; `noise_levels=4`: a window is noised at four levels, its condition
+  encoded once; `train --balance 0.5`: windows of rare speeds and turns are drawn more
+  often. The shipped `locomotion` is trained so.
+* `frame_kernel`: a convolution over frames after the tokens; `weight_acceleration`:
+  second differences of positions (in `--preset planted`).
 * `Control(follow=...)`: the wanted path returns to the commanded one.
+* `Control(extend=False)`: no blend of the wanted path with the last plan's, which the
+  shipped models go without: they answer a command 0.2 s earlier.
+* Locked feet (`jaxmotion/control/foot_lock.py`): what is displayed is the past of the
+  next plan.
 
-`experiments/camdm.py train` starts from `--preset small`, which uses all but the last
+`experiments/camdm.py train` starts from `--preset small`, which uses the first seven
 and no dropout, since it is meant for a CPU; the shipped walker is such a model, without
 margins, whose feet were planted by a second training (`--preset planted`). `--preset
 paper` trains as the authors do (AdamW, 1e-4, batch 512; their 100 epochs are for
