@@ -59,8 +59,8 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
 * `frame_kernel`: a convolution over frames after the tokens; `weight_acceleration`:
   second differences of positions (in `--preset planted`).
 * `Control(follow=...)`: the wanted path returns to the commanded one.
-* `Control(extend=False)`: no blend of the wanted path with the last plan's, which the
-  shipped models go without: they answer a command 0.2 s earlier.
+* `controller.OWN_STARTS`: exponents of 3 in the blend with the path of the last plan;
+  the shipped models answer a command 0.2 s earlier than with the paper's.
 * Locked feet (`jaxmotion/control/foot_lock.py`): what is displayed is the past of the
   next plan.
 
