@@ -98,9 +98,9 @@ RELEASED = Control(
 # A desired velocity below this one is a stop, meters per second.
 STILL = 0.02
 
-# For models that ship: the walked path is the commanded one, which outweighs the path of
-# the last plan from the first frames on. With the paper's exponents it would follow
-# 0.2 s later: 27 cm off a figure eight, not 5.
+# For models that ship: the walked path is the commanded one, which soon outweighs the
+# path of the last plan. With the paper's exponents it would follow 0.2 s later: 27 cm
+# off a figure eight, not 5.
 OWN_STARTS = Control(follow=1.0, bias_position=3.0, bias_facing=3.0)
 
 
