@@ -1,7 +1,7 @@
 """AAMDM and what it is compared with, on prepared clips: train, evaluate, roll out.
 
 Examples:
-  python experiments/prepare_data.py lafan1 --manual-dir ../shared/data/lafan1 --out data/lafan1.npz
+  python experiments/prepare_data.py lafan1 --manual-dir path/to/zips --out data/lafan1.npz
   python experiments/aamdm.py train --data data/lafan1.npz --out runs/aamdm
   python experiments/aamdm.py evaluate --run runs/aamdm
   python experiments/aamdm.py rollout --run runs/aamdm --seconds 20

@@ -1,10 +1,11 @@
-"""CAMDM on prepared clips: train, evaluate, roll out; its authors' weights too.
+"""CAMDM on prepared clips: train, evaluate, roll out, export; its authors' weights too.
 
 Examples:
-  python experiments/prepare_data.py bandai_namco/2 --manual-dir ../shared/data/bandai_namco --out data/bandai2.npz
+  python experiments/prepare_data.py bandai_namco/2 --manual-dir path/to/zips --out data/bandai2.npz
   python experiments/camdm.py train --data data/bandai2.npz --out runs/camdm
   python experiments/camdm.py evaluate --run runs/camdm
   python experiments/camdm.py rollout --run runs/camdm --style elderly --seconds 20
+  python experiments/camdm.py steering --run runs/camdm --style elderly
   python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --out runs/camdm_released
 """  # noqa: E501
 
@@ -54,10 +55,10 @@ class Train:
       balance: Draw windows of rare changes of speed and direction more often: a kind
         that n windows are of has a share that grows with n^(1 - balance).
       steps: Optimizer steps of the whole run.
-      batch: Windows a step (of 55 frames: 10 past, 45 future).
+      batch: Windows per step (of 55 frames: 10 past, 45 future).
       optimizer: "muon" or "adamw" (cosine decay), "radam" or "adam" (constant).
-      learning_rate: Peak of its rate; cosine to a tenth.
-      warmup: Steps of linear rise.
+      learning_rate: Peak learning rate; the cosine decays to a tenth of it.
+      warmup: Steps in which the learning rate rises linearly.
       max_norm: Gradients are clipped to this global norm; 0 for no clipping.
       ema: Decay per step of the parameters' moving average; 0 for no average.
       chunk: Steps of one compiled call.
@@ -185,10 +186,8 @@ class Evaluate:
 class Steering:
     """Steer characters straight on at several speeds and along courses; measure each.
 
-    Examples:
-      python experiments/camdm.py steering --run runs/locomotion --style neutral
-      python experiments/camdm.py steering --run locomotion --data data/o3de.npz
-        --held-out-clips WalkStopTurn1 RunPivotTurn1 --out runs/steering
+    Example: python experiments/camdm.py steering --run locomotion --data data/o3de.npz
+    --held-out-clips WalkStopTurn1 RunPivotTurn1 --out runs/steering
 
     Attributes:
       run: Run folder of `train`; or a shipped model or an exported file, with `data`.

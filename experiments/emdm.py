@@ -1,8 +1,8 @@
 """EMDM and what it is compared with: train, evaluate, sample.
 
 Examples:
-  python experiments/prepare_data.py bandai_namco/1 --manual-dir ../shared/data/bandai_namco --out data/bandai1.npz
-  python experiments/prepare_data.py bandai_namco/2 --manual-dir ../shared/data/bandai_namco --out data/bandai2.npz
+  python experiments/prepare_data.py bandai_namco/1 --manual-dir path/to/zips --out data/bandai1.npz
+  python experiments/prepare_data.py bandai_namco/2 --manual-dir path/to/zips --out data/bandai2.npz
   python experiments/emdm.py train --task action --out runs/emdm_action
   python experiments/emdm.py evaluate --run runs/emdm_action
   python experiments/emdm.py sample --run runs/emdm_action --action bow
@@ -314,11 +314,11 @@ def sample(args: Sample) -> None:
 class Import:
     """Put the authors' weights into a run folder of texts; no code of theirs is run.
 
-    The folder comes of `train` without rows (see the example), with HumanML3D or KIT-ML
-    as prepare_data.py leaves them. Then evaluate and sample as ever.
+    The folder comes from `emdm.py train --task text --data data/humanml3d.npz --encoder
+    clip --frames 196 --out runs/emdm_released --rows` (no rows), with HumanML3D or
+    KIT-ML as prepare_data.py writes them. Then evaluate and sample as usual.
 
-    Example: python experiments/emdm.py train --task text --data data/humanml3d.npz --encoder clip --frames 196 --out runs/emdm_released --rows
-    python experiments/emdm.py import --weights humanml.pth --run runs/emdm_released
+    Example: python experiments/emdm.py import --weights humanml.pth --run runs/emdm_released
 
     Attributes:
       weights: Their checkpoint (.pth), with the generator's moving average.

@@ -210,7 +210,7 @@ def budgets() -> str:
     lines = []
     swept = {name: x for name, x in registry.SYSTEMS.items() if x.swept}
     for name, system in swept.items():
-        lines.append(f"Budgets of {name}, quick / full:")
+        lines.extend(["", f"Budgets of {name}, quick / full:"])
         for key, amount in system.bench.amounts.items():
             numbers = f"{amount.quick:g} / {amount.full:g}"
             lines.append(f"  {key} {numbers}: {amount.meaning}")
