@@ -77,7 +77,7 @@ def trained(call, data, tmp_path_factory):
     "command, words",
     [
         ("", ["train", "evaluate", "rollout", "Examples:", "--data data/bandai2.npz"]),
-        ("train", ["(default: 11000)", "in (0, 1)", "Windows a step", "Example:"]),
+        ("train", ["(default: 11000)", "in (0, 1)", "Windows per step", "Example:"]),
         ("evaluate", ["(default: 60.0)", "seconds", "Meters per second", "Example:"]),
         ("rollout", ["(default: 20.0)", "seconds", "Meters per second", "Example:"]),
     ],
