@@ -63,6 +63,7 @@ def test_a_planner_is_traced_once():
     assert np.abs(results[1] - results[0]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_rollout_is_traced_once(skeleton):
     """Other states, commands and moments at which plans are made."""
     control = camdm_controller.Control(apply=5, reuse=6)
@@ -95,6 +96,7 @@ def test_a_rollout_is_traced_once(skeleton):
     assert planned[0] != planned[1]
 
 
+@pytest.mark.slow
 def test_a_chunk_of_training_is_traced_once(monkeypatch):
     """Both for a first state and for the state that it returns."""
     counted = chex.assert_max_traces(camdm_loss.loss, n=1)

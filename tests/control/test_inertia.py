@@ -170,6 +170,7 @@ def test_fade_across_a_half_turn_keeps_its_side():
     np.testing.assert_allclose(yaw, want, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_batches_and_zero_offsets_are_finite():
     same = motion(np.zeros((4, 3)), np.zeros((4, 2, 3)), 30.0)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), same)

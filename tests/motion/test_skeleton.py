@@ -216,6 +216,7 @@ def test_written_gradient_is_that_of_finite_differences(part):
             np.testing.assert_allclose(slopes[index], expected, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_gradient_of_a_gradient_is_that_of_a_plain_loop():
     few = PARENTS[:4]
     root, _, rot6d = pose(10, (2,))

@@ -144,6 +144,7 @@ def test_a_mean_over_time_keeps_a_straight_line():
     np.testing.assert_allclose(camera.smooth(line[:1], 6.0), line[:1])
 
 
+@pytest.mark.slow
 def test_the_ground_moves_under_the_character_and_stands_in_the_world(tmp_path):
     positions, skeleton = samples.person(seconds=3.0, turn=0.0)
     paths = {}

@@ -266,6 +266,7 @@ def test_an_unsteered_character_ignores_its_commands():
     np.testing.assert_array_equal(found[0].frame, found[1].frame)
 
 
+@pytest.mark.slow
 def test_characters_together_are_what_each_is_alone():
     params = tiny.random_params(aamdm_model.init, CONFIG)
     transition = aamdm_model.sampler(params, config=CONFIG)

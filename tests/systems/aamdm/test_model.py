@@ -50,6 +50,7 @@ def test_drafts_come_before_polishes(drafts, polishes):
     np.testing.assert_allclose(found, x, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_characters_batch_by_vmap_and_compile_once():
     step = aamdm_model.sampler(parameters(), config=CONFIG)
     traced = chex.assert_max_traces(lambda *a: jax.vmap(step)(*a), n=1)

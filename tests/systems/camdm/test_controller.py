@@ -158,6 +158,7 @@ def test_guidance_only_in_the_first_plans_after_a_style_change(
         assert set(heights(frames, other)) <= {-1.0, 1.0}
 
 
+@pytest.mark.slow
 def test_a_released_character_starts_with_guided_plans(skeleton, use):
     """Two of them; the first style is then no change of style without the option."""
     use(scale_as_height)
@@ -419,6 +420,7 @@ def test_256_characters_at_a_time_are_256_alone(params, skeleton):
     assert np.asarray(alone.root_position).std(axis=0).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_live_ticks_are_the_rollout(params, skeleton, whole):
     commands = commands_of(*turning(4, 9))
 
@@ -480,6 +482,7 @@ def test_more_frames_than_a_plan_has_cannot_be_played(params, skeleton, apply):
         camdm_controller.controller(params, skeleton, config=CONFIG, control=control)
 
 
+@pytest.mark.slow
 def test_the_mean_pose_stands_on_the_ground():
     still = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0) * len(tiny.NAMES)
     config = tiny.config(heading="facing", rotation_scale=4.0, rotation_mean=still)

@@ -112,6 +112,7 @@ def test_styles_are_recognized_far_above_chance():
     assert rows["rollouts"]["style_accuracy"].value > 75.0
 
 
+@pytest.mark.slow
 def test_walking_is_nearer_to_the_data_than_standing_and_noise_is_nearest():
     walking, standing = evaluated("walking")[0], evaluated("standing")[0]
     assert walking[TRUTH] == standing[TRUTH] and walking[FLOOR] == standing[FLOOR]

@@ -234,12 +234,14 @@ def test_dropout_only_in_training_and_by_its_key(name):
     assert np.abs(first - forward(name)(*args)).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_convolution_over_frames_starts_as_zero():
     name = "prefix, convolution"
     kernel = KINDS[name].init(jax.random.key(0), *arguments())["params"]["smooth"]
     assert not np.any(kernel["kernel"])
 
 
+@pytest.mark.slow
 def test_many_noisy_samples_share_one_prefix():
     """Under vmap its keys are read by all, and no operation copies them."""
     net, variables = KINDS["prefix"], parameters("prefix")

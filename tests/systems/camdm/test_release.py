@@ -55,6 +55,7 @@ def of_scripts(motion, command=None):
     )
 
 
+@pytest.mark.slow
 def test_rollouts_are_measured_whole_against_what_was_told():
     """From the first frame, and not against the springs that follow the commands."""
     frames, commands = rollouts()

@@ -194,6 +194,7 @@ def test_a_root_that_stands_still_divides_by_a_centimeter():
         assert found[name] == pytest.approx(wanted[name], rel=1e-5), name
 
 
+@pytest.mark.slow
 def test_what_nobody_steers_has_no_errors_of_angle():
     found = camdm_release.clip_metrics(BONES, clip(5))
     assert set(found) == {"slide", "coherence"}

@@ -128,6 +128,7 @@ def value(found, row, column):
     return found.rows[row][column].value
 
 
+@pytest.mark.slow
 def test_who_does_as_told_has_no_errors():
     found = table("figure_eight", speeds=(0.0, 1.0))
     stands, goes = "straight, told 0 m/s", "straight, told 1 m/s"

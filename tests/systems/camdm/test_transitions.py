@@ -76,6 +76,7 @@ def sees_height(monkeypatch):
     monkeypatch.setattr(style_evaluator, "features_and_hits", recognized)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("sees_height")
 def test_planted_changes_are_found_at_their_time(changes):
     # All of a window must be high: its center is a second after the change.

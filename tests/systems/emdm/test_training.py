@@ -19,6 +19,7 @@ from tests import mostly_slow, tiny
 
 # Orbax abandons its other reads when one fails.
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 

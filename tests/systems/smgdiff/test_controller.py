@@ -17,6 +17,8 @@ from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from tests import ball_walker, tiny
 
+pytestmark = pytest.mark.slow
+
 CONTROL = smgdiff_controller.Control(apply=5, reuse=4)
 
 

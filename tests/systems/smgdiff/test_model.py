@@ -188,6 +188,7 @@ def test_nothing_to_guide_is_the_plain_chain(
     np.testing.assert_allclose(found, plain, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_guidance_pulls_foot_and_ball_together(
     params, config, representation, condition, plain
 ):

@@ -19,6 +19,8 @@ from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff.guidance import UNGUIDED
 from tests import ball_walker, tiny
 
+pytestmark = pytest.mark.slow
+
 SIZES = dict(
     past=4, future=12, num_steps=2, width=16, depth=1, heads=2, hidden=32, dropout=0.0
 )
