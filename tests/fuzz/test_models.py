@@ -308,7 +308,7 @@ def test_runs_of_camdm(tmp_path, capsys, camdm_value, params):
     paths = sorted(x.relative_to(whole) for x in whole.rglob("*") if x.is_file())
 
     def confirm(_, found):
-        model, loaded, _ = found
+        model, loaded = found
         says(camdm_model.to_json(model), json.loads(json.dumps(camdm_value)))
         for name, array in flat(loaded):
             np.testing.assert_array_equal(array, expected[name])
