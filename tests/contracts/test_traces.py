@@ -124,6 +124,7 @@ EMDM = emdm_model.Config(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guided", mostly_slow([True, False], [True]))
 def test_a_sampler_of_whole_motions_is_traced_once(guided):
     """Other parameters, keys, conditions, lengths and guidance scales."""

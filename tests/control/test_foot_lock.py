@@ -380,6 +380,7 @@ def test_a_clip_is_cleaned():
     assert speed.max() < 0.005
 
 
+@pytest.mark.slow
 def test_a_character_is_displayed_with_locked_feet_by_one_program():
     """As its rollout locked afterwards; other values compile nothing."""
     skeleton = SKELETON

@@ -163,6 +163,7 @@ def run_full(*arguments) -> tuple[int, str]:
     return done.returncode, done.stderr[done.stderr.rindex("error: ") :].strip()
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path):
     out = tmp_path / "made" / "w.npz"
     status, line = run_full("procedural", "--out", out)

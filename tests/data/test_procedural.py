@@ -249,6 +249,7 @@ def features(clips):
     )
 
 
+@pytest.mark.slow
 def test_styles_can_be_told_apart_by_the_nearest_mean():
     train = procedural.make_clips(seed=1, minutes=6.0)
     held_out = procedural.make_clips(seed=2, minutes=6.0)

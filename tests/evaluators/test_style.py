@@ -13,6 +13,7 @@ from tests import tiny
 CONFIG = style_evaluator.Config(num_classes=2, num_joints=5, frames=12)
 
 
+@pytest.mark.slow
 def test_the_input_against_a_loop(skeleton):
     motion = tiny.walk(20, turn=1.0, start=0.5)
     found = style_evaluator.window_input(skeleton, motion)
@@ -122,6 +123,7 @@ ACROSS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [MIXAMO, STYLE])
 def test_the_released_input_is_that_of_the_released_scripts(names):
     """Float64: across = shoulders + hips, each of length 1; facing +x; no root."""

@@ -98,6 +98,7 @@ def test_the_loss_is_the_loops():
     assert shifts == {1, 2, 3}
 
 
+@pytest.mark.slow
 def test_equal_embeddings_have_finite_gradients():
     params = tiny.random_params(text_motion_evaluator.init_matcher, CONFIG)
     for tower in (params["text"]["sequence"], params["motion"]):

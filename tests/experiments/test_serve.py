@@ -792,6 +792,7 @@ def test_the_shipped_locomotion_is_served(script_load, protocol):
     assert simulation._tick._cache_size() == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", mostly_slow(["locomotion", "walker"], ["walker"]))
 def test_shipped_models_start_without_clips(script_load, name):
     state = script_load(name, None).start(0)[1].inner  # beside its feet

@@ -68,6 +68,7 @@ def test_a_rollout_is_a_motion_with_a_ball(invoke, trained, capsys):
     assert "from the root" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_dribble_makes_skills_of_labels(invoke, tmp_path):
     from jaxmotion.data import procedural
 

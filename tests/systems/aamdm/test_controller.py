@@ -141,6 +141,7 @@ def test_objective_is_half_the_squared_distance_of_the_path():
     np.testing.assert_allclose(found, [*gap, *np.zeros(8)], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_without_a_goal_the_step_is_the_transition():
     transition = aamdm_model.sampler(
         tiny.random_params(aamdm_model.init, CONFIG), config=CONFIG

@@ -29,6 +29,7 @@ def normal(*shape, seed=0):
     return jnp.asarray(values, jnp.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("drafts", "polishes"), mostly_slow([(3, 2), (5, 0), (0, 5), (1, 1)], [(3, 2)])
 )

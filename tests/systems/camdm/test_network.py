@@ -133,7 +133,13 @@ def test_one_step_for_a_whole_batch(name):
     np.testing.assert_array_equal(for_all, for_each)
 
 
-@pytest.mark.parametrize("name", [name for name in KINDS if name != "one label"])
+@pytest.mark.parametrize(
+    "name",
+    mostly_slow(
+        [name for name in KINDS if name != "one label"],
+        ("transformer", "prefix", "mlp", "single token"),
+    ),
+)
 def test_every_argument_matters(name):
     args = list(arguments())
     args[-1] = jnp.ones((), bool)

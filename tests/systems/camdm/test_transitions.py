@@ -135,6 +135,7 @@ def test_what_is_wrong_is_named(wrong, message):
         camdm_transitions.make_changes(samples.run(), **(SETTINGS | wrong))
 
 
+@pytest.mark.slow
 def test_rows_share_everything_but_the_run_time(monkeypatch, changes):
     """Each row gets its control; the last one's serve for those who keep the style."""
     given = []

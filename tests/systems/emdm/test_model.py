@@ -242,6 +242,7 @@ def test_networks_have_the_sizes_of_the_configuration():
     assert (whole.num_steps, whole.latent, whole.frames) == (10, 64, 60)
 
 
+@pytest.mark.slow
 def test_both_networks_are_drawn_from_the_key():
     init = jax.jit(lambda key: emdm_model.init(key, CONFIG))
     made, same, other = (init(jax.random.key(seed)) for seed in (0, 0, 1))

@@ -87,6 +87,7 @@ def test_smpl_with_four_feet_has_162_channels():
     assert dict((n, (a, b)) for n, a, b in names.fields)["ball"] == (147, 154)
 
 
+@pytest.mark.slow
 def test_a_scene_comes_back_from_its_features(scenes, representation):
     x = smgdiff_scene.to_features(scenes, representation)
     found, stands = smgdiff_scene.to_scene(x, scenes.ball[:, 0], representation)
@@ -231,6 +232,7 @@ def test_a_guided_plan_can_be_differentiated(params, config, representation, con
     assert bool(jnp.isfinite(gradient).all())
 
 
+@pytest.mark.slow
 def test_the_truth_costs_nothing_but_its_own_slide(scenes, representation):
     x = smgdiff_scene.to_features(scenes, representation)
     terms = smgdiff_loss.loss_terms(x, x, representation=representation)
