@@ -12,7 +12,7 @@ frame: the losses of MDM and CAMDM are written so, with weight 1.
 """
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -126,9 +126,9 @@ def foot_slide_loss(
 def predict_clean(
     key: Key,
     x_0: Float[Array, "batch *shape"],
+    condition: tuple[Array, ...],
     *,
-    encode: Callable[..., object],
-    denoise: Callable[..., Float[Array, "batch *shape"]],
+    apply: Callable[..., Any],
     table: schedule.Schedule,
     levels: int = 1,
 ) -> Float[Array, "levels batch *shape"]:
@@ -137,8 +137,8 @@ def predict_clean(
     Args:
       key: Consumed.
       x_0: Clean samples.
-      encode: `(key) -> context`, the conditions of the batch.
-      denoise: `(key, context, x_t, t) -> x_0` of the batch.
+      condition: What the network's method `encode` takes, batch axis first.
+      apply: The network with its parameters: `(*arguments, method=, rngs=)`.
       table: Schedule.
       levels: Noise levels of each sample: evenly spread over 1..T after a random
         first, so that every one of them is uniform by itself.
@@ -147,12 +147,12 @@ def predict_clean(
     first = jax.random.randint(key_t, x_0.shape[:1], 0, table.num_steps)
     apart = jnp.arange(levels) * table.num_steps // levels
     t = 1 + (first[None] + apart[:, None]) % table.num_steps
-    context = encode(key_encode)
+    context = apply(*condition, method="encode", rngs={"dropout": key_encode})
 
     def predict(key: Key, t: Array) -> Array:
         key_noise, key_drop = jax.random.split(key)
         noise = jax.random.normal(key_noise, x_0.shape)
         x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
-        return denoise(key_drop, context, x_t, t)
+        return apply(context, x_t, t, method="denoise", rngs={"dropout": key_drop})
 
     return jax.vmap(predict)(jax.random.split(key_denoise, levels), t)

@@ -166,11 +166,17 @@ def test_samples_are_noised_at_levels_that_are_uniform_and_apart(levels):
     encoded = []
 
     def predict(show):
+        def apply(*given, method, rngs):
+            if method == "encode":
+                return encoded.append(given)
+            _, x_t, t = given
+            return show(x_t, t[:, None] + 0.0 * x_t)
+
         return losses.predict_clean(
             jax.random.key(0),
             x_0,
-            encode=encoded.append,
-            denoise=lambda key, context, x_t, t: show(x_t, t[:, None] + 0.0 * x_t),
+            (x_0,),
+            apply=apply,
             table=table,
             levels=levels,
         )
@@ -192,11 +198,16 @@ def test_samples_are_noised_at_levels_that_are_uniform_and_apart(levels):
 
 
 def test_each_noise_level_has_its_own_noise_and_dropout():
+    def apply(*given, method, rngs):
+        if method == "encode":
+            return given
+        return given[1] + jax.random.normal(rngs["dropout"], given[1].shape)
+
     keys = losses.predict_clean(
         jax.random.key(0),
         jnp.zeros((5, 2)),
-        encode=lambda key: key,
-        denoise=lambda key, context, x_t, t: x_t + jax.random.normal(key, x_t.shape),
+        (),
+        apply=apply,
         table=schedule.cosine_schedule(4),
         levels=4,
     )

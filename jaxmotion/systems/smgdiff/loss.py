@@ -115,16 +115,13 @@ def loss(
     condition, x_0 = jax.vmap(
         lambda k, w, c: example(k, w, c, representation=representation, config=config)
     )(keys, windows, labels)
-    call = functools.partial(
-        network(config).apply, {"params": params}, train=config.dropout > 0
-    )
     predictions = losses.predict_clean(
         key_noise,
         x_0,
-        encode=lambda k: call(
-            *condition.arguments(), method="encode", rngs={"dropout": k}
+        condition.arguments(),
+        apply=functools.partial(
+            network(config).apply, {"params": params}, train=config.dropout > 0
         ),
-        denoise=lambda k, *x: call(*x, method="denoise", rngs={"dropout": k}),
         table=schedule.cosine_schedule(config.num_steps),
         levels=config.noise_levels,
     )
