@@ -8,10 +8,10 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFilter, ImageFont
 
-from jaxmotion.viz import body as bodies
 from jaxmotion.viz import camera as cameras
 from jaxmotion.viz import figure as drawing
 from jaxmotion.viz import raster
+from jaxmotion.viz import sketch as bodies
 
 _GROUND, _TILE, _INK, _FAINT = "#f6f8fa", "#dde4ec", "#20262e", "#707884"
 _PATH_COLORS = (drawing.COMMANDED, drawing.WALKED)

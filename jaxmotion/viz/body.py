@@ -1,342 +1,359 @@
 """A body around a skeleton: limbs as tapered capsules, a head, hands and feet.
 
 Joints are points without thickness, and most skeletons end at the skull's base, at the
-wrists and at the balls of the feet. What is missing is added from the joints' positions
-alone, in proportions of an adult, scaled to the legs. A head's turn about itself is not
-in the positions: it looks where the chest does.
+wrists and at the balls of the feet. What is missing is added in proportions of an
+adult, scaled to the legs. A body is made once, from the skeleton in its T-pose; every
+capsule then follows the joints that its two ends are fixed to. Pictures, pages, files
+and the live page all draw this one description.
 """
 
 import dataclasses
-import re
 
 import numpy as np
+from jaxtyping import Float
 
-from jaxmotion.viz.figure import LEFT, MIDDLE, RIGHT
+from jaxmotion.motion import anatomy
+from jaxmotion.motion.anatomy import Anatomy, Limb
+from jaxmotion.motion.skeleton import Skeleton
 
+LEFT, RIGHT, MIDDLE = "#2878c8", "#d63a3a", "#6b7480"
 LEFT_DARK, RIGHT_DARK, SKIN = "#174f8c", "#942020", "#c9a084"
+_COLORS = {anatomy.LEFT: LEFT, anatomy.RIGHT: RIGHT, anatomy.MIDDLE: MIDDLE}
+_DARK = {LEFT: LEFT_DARK, RIGHT: RIGHT_DARK, MIDDLE: MIDDLE}
 
 # Thigh and shank of the adult whose measures stand below, meters.
 _LEG = 0.87
-_SIDES = (
-    re.compile(r"(left|right)", re.IGNORECASE),
-    re.compile(r"(?:^|(?<=[_\-.: ]))([lr])(?=$|[_\-.: ])", re.IGNORECASE),
-    re.compile(r"^([lrLR])(?=[A-Z])"),
-)
-_TIP = re.compile(r"end|top|site|nub|tip")
+_UP, _AHEAD = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Body:
-    """Capsules between points.
+    """Capsules whose ends are fixed to joints.
 
     Attributes:
-      points: [F, P, 3] world, meters: the joints, then what is added.
-      ends: [S, 2] the points that each capsule joins; twice the same for a ball.
+      joints: [S, 2] joint that each end follows, mostly the same for both.
+      places: [S, 2, 3] ends in those joints' frames, meters; twice the same for a ball.
       radii: [S, 2] at both ends, meters.
-      colors: S.
+      colors: S, such as "#2878c8".
     """
 
-    points: np.ndarray
-    ends: np.ndarray
+    joints: np.ndarray
+    places: np.ndarray
     radii: np.ndarray
     colors: tuple[str, ...]
 
+    def ends(
+        self,
+        positions: Float[np.ndarray, "*batch joints 3"],
+        rotations: Float[np.ndarray, "*batch joints 3 3"],
+    ) -> Float[np.ndarray, "*batch capsules 2 3"]:
+        """Where the capsules end in the world, meters.
 
-def bone_colors(names: tuple[str, ...] | None, number: int) -> list[str]:
-    """Blue for the left side, red for the right, gray for the rest and without names.
+        Args:
+          positions: Of the joints, world, meters; see `skeleton.global_transforms`.
+          rotations: Of the joints, world.
+        """
+        turned = rotations[..., self.joints, :, :] @ self.places[..., None]
+        return positions[..., self.joints, :] + turned[..., 0]
 
-    Returns:
-      One color a joint, for the bone that ends at it.
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Mesh:
+    """Triangles that follow one joint rigidly.
+
+    Attributes:
+      joint: Its world transform is the mesh's.
+      vertices: [V, 3] in the joint's frame, meters.
+      normals: [V, 3].
+      faces: [T, 3] counterclockwise from outside.
+      color: Such as "#2878c8".
     """
 
-    def color(name: str) -> str:
-        found = next(filter(None, (p.search(name) for p in _SIDES)), None)
-        if found is None:
-            return MIDDLE
-        return LEFT if found.group(1).lower().startswith("l") else RIGHT
-
-    return [MIDDLE] * number if names is None else [color(name) for name in names]
+    joint: int
+    vertices: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    color: str
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.maximum(length, 1e-9)
+def capsule_mesh(
+    ends: np.ndarray, radii: np.ndarray, *, around: int = 12, rings: int = 4
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A tapered capsule as triangles.
+
+    Args:
+      ends: [2, 3] centers of its two balls, meters.
+      radii: [2] meters.
+      around: Vertices in a ring.
+      rings: Rings of each ball's half.
+
+    Returns:
+      Vertices [V, 3] and normals [V, 3]; the end (0 or 1) that each belongs to [V];
+      faces [T, 3], counterclockwise from outside.
+    """
+    along = ends[1] - ends[0]
+    length = float(np.linalg.norm(along))
+    z = along / length if length > 1e-9 else _UP
+    x = np.cross(z, _UP if abs(z[1]) < 0.9 else _AHEAD)
+    x = x / np.linalg.norm(x)
+    y = np.cross(z, x)
+    # Where the balls' common tangent cone touches them.
+    lean = np.arcsin(np.clip((radii[0] - radii[1]) / max(length, 1e-9), -0.99, 0.99))
+    lean = lean if length > 1e-9 else 0.0
+    low = np.linspace(-np.pi / 2, lean, rings + 1)
+    high = np.linspace(lean, np.pi / 2, rings + 1)
+    angle = np.concatenate([low, high])[:, None]
+    owner = np.repeat([0, 1], rings + 1)
+    turn = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    flat = np.cos(turn)[:, None] * x + np.sin(turn)[:, None] * y
+    normals = np.cos(angle)[..., None] * flat + np.sin(angle)[..., None] * z
+    vertices = ends[owner][:, None] + radii[owner][:, None, None] * normals
+    here = np.arange(len(angle) - 1)[:, None] * around + np.arange(around)
+    right = np.roll(here, -1, axis=1)
+    faces = np.stack(
+        [here, right, right + around, here, right + around, here + around], axis=-1
+    ).reshape(-1, 3)
+    # The outermost rings are points: half of their triangles have no area.
+    corner = vertices.reshape(-1, 3)[faces]
+    sides = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    faces = faces[np.linalg.norm(sides, axis=-1) > 1e-12]
+    owner = np.repeat(owner, around)
+    return vertices.reshape(-1, 3), normals.reshape(-1, 3), owner, faces
+
+
+def meshes(body: Body, skeleton: Skeleton, **detail: int) -> tuple[Mesh, ...]:
+    """The body as rigid meshes, one per joint and color, for viewers with instances.
+
+    A capsule between two joints that move against each other follows the first.
+
+    Args:
+      **detail: `around` and `rings` of `capsule_mesh`.
+    """
+    positions, rotations = anatomy.t_pose(skeleton)
+    ends = body.ends(positions, rotations)
+    parts: dict[tuple[int, str], list] = {}
+    for s, color in enumerate(body.colors):
+        joint = int(body.joints[s, 0])
+        local = (ends[s] - positions[joint]) @ rotations[joint]
+        made = capsule_mesh(local, body.radii[s], **detail)
+        parts.setdefault((joint, color), []).append(made)
+    found = []
+    for (joint, color), shapes in parts.items():
+        starts = np.cumsum([0, *(len(shape[0]) for shape in shapes)])
+        found.append(
+            Mesh(
+                joint=joint,
+                vertices=np.concatenate([shape[0] for shape in shapes]),
+                normals=np.concatenate([shape[1] for shape in shapes]),
+                faces=np.concatenate(
+                    [s[3] + start for s, start in zip(shapes, starts, strict=False)]
+                ),
+                color=color,
+            )
+        )
+    return tuple(found)
 
 
 class _Builder:
     """Collects points and capsules; `s` are meters of this body in one of the adult."""
 
-    def __init__(self, positions: np.ndarray, scale: float):
-        self.points = list(np.moveaxis(positions, 1, 0))
+    def __init__(self, skeleton: Skeleton, sides: tuple[str, ...] | None):
+        self.parents = skeleton.parents
+        joints, self.turns = anatomy.t_pose(skeleton, sides)
+        self.joints = joints
+        self.points = list(joints)
+        self.owners = list(range(len(joints)))
         self.shapes: list[tuple[int, int, float, float, str]] = []
-        self.s = scale
+        self.s = 1.0
 
-    def point(self, place: np.ndarray) -> int:
+    def point(self, place: np.ndarray, owner: int) -> int:
         self.points.append(place)
+        self.owners.append(owner)
         return len(self.points) - 1
 
     def capsule(self, a: int, b: int, ra: float, rb: float, color: str) -> None:
         self.shapes.append((a, b, ra * self.s, rb * self.s, color))
 
-    def between(self, a: int, b: int, part: float) -> int:
-        return self.point((1 - part) * self.points[a] + part * self.points[b])
+    def between(self, a: int, b: int, part: float, owner: int) -> int:
+        return self.point((1 - part) * self.points[a] + part * self.points[b], owner)
+
+    def _followed(self, a: int, b: int) -> tuple[int, int]:
+        """Joints that the ends follow: one for both where that comes to the same."""
+        could = [{self.owners[p]} for p in (a, b)]
+        for found, p in zip(could, (a, b), strict=True):
+            if p < len(self.parents) and self.parents[p] >= 0:
+                found.add(self.parents[p])
+        common = could[0] & could[1]
+        return (min(common),) * 2 if common else (self.owners[a], self.owners[b])
 
     def body(self) -> Body:
+        followed = [self._followed(a, b) for a, b, *_ in self.shapes]
+        places = [
+            [
+                self.turns[joint].T @ (self.points[p] - self.joints[joint])
+                for p, joint in zip((a, b), pair, strict=True)
+            ]
+            for (a, b, *_), pair in zip(self.shapes, followed, strict=True)
+        ]
         return Body(
-            points=np.stack(self.points, axis=1),
-            ends=np.array([shape[:2] for shape in self.shapes], int).reshape(-1, 2),
-            radii=np.array([shape[2:4] for shape in self.shapes]).reshape(-1, 2),
+            joints=np.array(followed, int),
+            places=np.array(places),
+            radii=np.array([shape[2:4] for shape in self.shapes]),
             colors=tuple(shape[4] for shape in self.shapes),
         )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Limb:
-    """Joints of an arm or a leg: what leads to it, its three joints, what follows."""
-
-    before: tuple[int, ...]
-    upper: int
-    middle: int
-    end: int
-    after: tuple[int, ...]
-
-
-def _chain(parents: tuple[int, ...], joint: int) -> list[int]:
-    """Joints from the root to one."""
-    found = []
-    while joint >= 0:
-        found.append(joint)
-        joint = parents[joint]
-    return found[::-1]
-
-
-def _head(
-    positions: np.ndarray, parents: tuple[int, ...], names: tuple[str, ...] | None
-) -> tuple[int | None, bool]:
-    """The head's joint, and whether it is a neck's; unnamed, it is the highest leaf."""
-    for word in ("head", "neck"):
-        found = [j for j, name in enumerate(names or ()) if word in name.lower()]
-        found = [j for j in found if not _TIP.search(names[j].lower())]
-        if found:
-            # A neck may have several joints.
-            return (found[0], False) if word == "head" else (found[-1], True)
-    sided = [color != MIDDLE for color in bone_colors(names, len(parents))]
-    leaves = [j for j in range(1, len(parents)) if j not in parents and not sided[j]]
-    height = positions[:, :, 1].mean(axis=0)
-    top = max(leaves, key=lambda j: height[j], default=None)
-    return (
-        (top, False) if top is not None and height[top] > height[0] else (None, False)
-    )
-
-
-def _limbs(
-    parents: tuple[int, ...], lengths: np.ndarray, trunk: list[int]
-) -> tuple[list[_Limb], list[_Limb]]:
-    """Arms and legs: legs are what leaves the trunk at its lowest joint.
-
-    The two longest bones in a row are the upper arm and the forearm, thigh and shank.
-    """
-    parts: dict[int, list[int]] = {}
-    for leaf in (j for j in range(len(parents)) if j not in parents):
-        part = [j for j in _chain(parents, leaf) if j not in trunk]
-        best = parts.get(part[0], []) if part else None
-        if best is not None and lengths[part].sum() > lengths[best].sum():
-            parts[part[0]] = part
-    found = [p for p in parts.values() if len(p) > 2 and parents[p[0]] != trunk[-1]]
-    lowest = min((trunk.index(parents[part[0]]) for part in found), default=0)
-    arms, legs = [], []
-    for part in found:
-        i = 1 + int(np.argmax(lengths[part[1:-1]] + lengths[part[2:]]))
-        limb = _Limb(
-            before=tuple(part[: i - 1]),
-            upper=part[i - 1],
-            middle=part[i],
-            end=part[i + 1],
-            after=tuple(part[i + 2 :]),
-        )
-        low = trunk.index(parents[part[0]]) == lowest
-        (legs if low else arms).append(limb)
-    return arms, legs
-
-
-def build(
-    positions: np.ndarray, parents: tuple[int, ...], names: tuple[str, ...] | None
-) -> Body:
-    """The body of a motion.
+def describe(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> Body:
+    """The body of a skeleton.
 
     Args:
-      positions: [F, J, 3] world positions of the joints, meters, y up.
-      names: To find the head and tell left from right; None for guesses from the
-        tree, and gray.
+      sides: `anatomy.LEFT`, `RIGHT` or `MIDDLE` of each joint; None for what the names
+        and the zero pose say. Left is blue and right is red.
+
+    Raises:
+      ValueError: if `sides` are not one a joint.
     """
-    up_tree = np.array([max(p, 0) for p in parents])
-    skeleton = np.linalg.norm(positions - positions[:, up_tree], axis=-1)
-    lengths = np.median(skeleton, axis=0)
-    head, is_neck = _head(positions, parents, names)
-    trunk = _chain(parents, 0 if head is None else head)
-    arms, legs = ([], []) if head is None else _limbs(parents, lengths, trunk)
-    if legs:
-        scale = np.mean([lengths[leg.middle] + lengths[leg.end] for leg in legs]) / _LEG
+    found = anatomy.find_anatomy(skeleton, sides)
+    made = _Builder(skeleton, sides)
+    parents = skeleton.parents
+    offsets = np.asarray(skeleton.offsets, float)
+    lengths = np.linalg.norm(offsets, axis=-1) * (np.arange(len(parents)) > 0)
+    if found.legs:
+        leg = [lengths[leg.middle] + lengths[leg.end] for leg in found.legs]
+        made.s = max(float(np.mean(leg)) / _LEG, 1e-3)
     else:
-        chains = [lengths[_chain(parents, j)].sum() for j in range(len(parents))]
-        scale = max(max(chains) / 1.2, 1e-3)
-    made = _Builder(positions, float(scale))
-    colors = bone_colors(names, len(parents))
-    done = set(trunk) if arms and legs else set()
-    front = _forward(positions, arms, legs)
-    if arms and legs:
-        _add_trunk(made, parents, trunk, arms, legs)
-    for leg in legs:
-        _add_leg(made, leg, colors[leg.middle], front)
+        reach = lengths.copy()
+        for joint, parent in enumerate(parents):
+            reach[joint] += reach[parent] if parent >= 0 else 0.0
+        made.s = max(float(reach.max()) / 1.2, 1e-3)
+    colors = [_COLORS[side] for side in found.sides]
+    done: set[int] = set()
+    if found.legs:
+        done |= set(found.trunk)
+        _add_trunk(made, found)
+    for leg in found.legs:
+        _add_leg(made, leg, colors[leg.middle])
         done |= {leg.upper, leg.middle, leg.end, *leg.before, *leg.after[:1]}
-    for arm in arms:
-        _add_arm(made, parents, arm, colors[arm.middle])
+    for arm in found.arms:
+        _add_arm(made, arm, colors[arm.middle])
         done |= {arm.upper, arm.middle, arm.end, *arm.before}
-    ends = {arm.end for arm in arms}
+    hands = {arm.end for arm in found.arms}
     for joint in range(1, len(parents)):
-        if joint in done:
+        if parents[joint] in hands:
+            hands.add(joint)
+        if joint in done or lengths[joint] < 1e-6:
             continue
-        finger = ends & set(_chain(parents, parents[joint]))
-        radius = 0.011 if finger else min(0.04, 0.2 * lengths[joint] / scale + 0.01)
+        finger = parents[joint] in hands
+        radius = 0.011 if finger else min(0.04, 0.2 * lengths[joint] / made.s + 0.01)
         color = SKIN if finger else colors[joint]
         made.capsule(parents[joint], joint, radius, radius, color)
-    if head is not None:
-        _add_head(made, parents, trunk, is_neck, arms, front)
+    if len(found.trunk) > 1:
+        _add_head(made, found)
     if not made.shapes:
         made.capsule(0, 0, 0.05, 0.05, MIDDLE)
     return made.body()
 
 
-def _forward(
-    positions: np.ndarray, arms: list[_Limb], legs: list[_Limb]
-) -> np.ndarray | None:
-    """Where the chest faces [F, 3], level; None if the tree does not tell."""
-    pair = arms if len(arms) == 2 else legs
-    feet = [leg for leg in legs if leg.after]
-    if len(pair) != 2 or not feet:
-        return None
-    across = positions[:, pair[0].upper] - positions[:, pair[1].upper]
-    forward = _unit(np.stack([-across[:, 2], 0 * across[:, 1], across[:, 0]], -1))
-    # Joints are listed left first or right first: toes point ahead in both.
-    toes = sum(positions[:, leg.after[0]] - positions[:, leg.end] for leg in feet)
-    return forward * (np.sign(np.mean(np.sum(forward * toes, -1))) or 1.0)
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
-def _add_trunk(
-    made: _Builder,
-    parents: tuple[int, ...],
-    trunk: list[int],
-    arms: list[_Limb],
-    legs: list[_Limb],
-) -> None:
+def _carrier(made: _Builder, arm: Limb) -> int:
+    """The joint of the trunk that an arm leaves."""
+    return made.parents[arm.before[0] if arm.before else arm.upper]
+
+
+def _add_trunk(made: _Builder, found: Anatomy) -> None:
     """Belly, chest, pelvis, flanks and shoulders."""
-    first = min(
-        trunk.index(parents[arm.before[0] if arm.before else arm.upper]) for arm in arms
-    )
+    trunk = found.trunk
+    pelvis = made.parents[
+        found.legs[0].before[0] if found.legs[0].before else found.legs[0].upper
+    ]
+    first = min(trunk.index(_carrier(made, arm)) for arm in found.arms)
     for a, b in zip(trunk[:first], trunk[1 : first + 1], strict=True):
-        made.capsule(a, b, 0.105, 0.105, MIDDLE)
+        if trunk.index(a) >= trunk.index(pelvis):
+            made.capsule(a, b, 0.105, 0.105, MIDDLE)
     chest = trunk[first]
     nape = trunk[min(first + 1, len(trunk) - 1)]
     made.capsule(chest, nape, 0.1, 0.055, MIDDLE)
-    for leg in legs:
-        hip = made.between(leg.upper, trunk[0], 0.15)
-        made.capsule(trunk[0], hip, 0.1, 0.088, MIDDLE)
-    for arm in arms:
-        shoulder = made.between(arm.upper, chest, 0.3)
+    for leg in found.legs:
+        hip = made.between(leg.upper, pelvis, 0.15, pelvis)
+        made.capsule(pelvis, hip, 0.1, 0.088, MIDDLE)
+    for arm in found.arms:
+        owner = arm.before[-1] if arm.before else chest
+        shoulder = made.between(arm.upper, chest, 0.3, owner)
         made.capsule(chest, shoulder, 0.1, 0.066, MIDDLE)
         made.capsule(nape, shoulder, 0.05, 0.06, MIDDLE)
-        side = made.points[arm.upper] - made.points[chest]
+        away = made.joints[arm.upper] - made.joints[chest]
         hip = max(
-            legs,
-            key=lambda leg, side=side: np.mean(
-                np.sum(side * (made.points[leg.upper] - made.points[trunk[0]]), -1)
-            ),
-        ).upper
-        low = made.between(hip, trunk[0], 0.25)
-        ribs = made.between(shoulder, low, 0.35)
-        made.capsule(shoulder, ribs, 0.066, 0.085, MIDDLE)
+            (leg.upper for leg in found.legs),
+            key=lambda hip, away=away: away @ (made.joints[hip] - made.joints[pelvis]),
+        )
+        low = made.between(hip, pelvis, 0.25, pelvis)
+        ribs = made.between(shoulder, low, 0.35, chest)
+        made.capsule(ribs, shoulder, 0.085, 0.066, MIDDLE)
         made.capsule(ribs, low, 0.085, 0.085, MIDDLE)
 
 
-def _add_leg(made: _Builder, leg: _Limb, color: str, front: np.ndarray | None) -> None:
-    dark = {LEFT: LEFT_DARK, RIGHT: RIGHT_DARK}.get(color, MIDDLE)
+def _add_leg(made: _Builder, leg: Limb, color: str) -> None:
+    dark = _DARK[color]
     made.capsule(leg.upper, leg.middle, 0.082, 0.056, color)
-    calf = made.between(leg.middle, leg.end, 0.3)
+    calf = made.between(leg.middle, leg.end, 0.3, leg.middle)
     made.capsule(leg.middle, calf, 0.056, 0.054, color)
     made.capsule(calf, leg.end, 0.054, 0.038, color)
-    knee, ankle = made.points[leg.middle], made.points[leg.end]
-    shank = _unit(ankle - knee)
+    ankle = made.joints[leg.end]
     if leg.after:
-        toe = made.points[leg.after[0]]
-    elif front is not None:
-        toe = ankle + (0.15 * front + 0.05 * shank) * made.s
+        ball = leg.after[0]
     else:
-        made.capsule(leg.end, leg.end, 0.05, 0.05, dark)
-        return
-    # The sole: level where the foot stands, so it keeps the angle at which the bone
-    # to the toes then falls.
-    foot = np.median(np.linalg.norm(toe - ankle, axis=-1))
-    low = np.percentile(ankle[:, 1], 10) - np.percentile(toe[:, 1], 10)
-    slope = np.arcsin(np.clip(low / max(foot, 1e-9), 0.3, 0.65))
-    ahead = _unit(toe - ankle)
-    lift = -shank - ahead * np.sum(-shank * ahead, -1, keepdims=True)
-    lift = _unit(lift)
-    level = np.cos(slope) * ahead + np.sin(slope) * lift
-    above = np.cos(slope) * lift - np.sin(slope) * ahead
-    thick = 0.03 * made.s
-    drop = max(np.sin(slope) * foot - 0.008 * made.s, 0.0)
-    heel = made.point(ankle - above * drop - level * 0.035 * made.s)
-    ball = leg.after[0] if leg.after else made.point(toe)
-    tip = made.point(made.points[ball] + level * 0.055 * made.s - above * 0.1 * thick)
+        ball = made.point(ankle + (0.15 * _AHEAD - 0.05 * _UP) * made.s, leg.end)
+    # The T-pose stands: the sole is level there.
+    level = (made.points[ball] - ankle) * [1.0, 0.0, 1.0]
+    level = _unit(level) if np.linalg.norm(level) > 1e-6 else _AHEAD
+    drop = max(ankle[1] - made.points[ball][1] - 0.008 * made.s, 0.0)
+    heel = made.point(ankle - _UP * drop - level * 0.035 * made.s, leg.end)
+    place = made.points[ball] + level * 0.055 * made.s - _UP * 0.003 * made.s
+    tip = made.point(place, made.owners[ball])
+    middle = made.between(leg.end, heel, 0.5, leg.end)
     made.capsule(leg.end, heel, 0.04, 0.036, dark)
     made.capsule(leg.end, ball, 0.042, 0.034, dark)
-    made.capsule(made.between(leg.end, heel, 0.5), ball, 0.038, 0.034, dark)
+    made.capsule(middle, ball, 0.038, 0.034, dark)
     made.capsule(heel, ball, 0.036, 0.034, dark)
     made.capsule(ball, tip, 0.034, 0.026, dark)
 
 
-def _add_arm(made: _Builder, parents: tuple[int, ...], arm: _Limb, color: str) -> None:
+def _add_arm(made: _Builder, arm: Limb, color: str) -> None:
     made.capsule(arm.upper, arm.upper, 0.062, 0.062, color)
     made.capsule(arm.upper, arm.middle, 0.054, 0.041, color)
     made.capsule(arm.middle, arm.end, 0.042, 0.029, color)
-    along = _unit(made.points[arm.end] - made.points[arm.middle])
-    knuckles = [j for j, parent in enumerate(parents) if parent == arm.end]
+    along = _unit(made.joints[arm.end] - made.joints[arm.middle])
+    knuckles = [j for j, parent in enumerate(made.parents) if parent == arm.end]
     if knuckles:
-        place = np.mean([made.points[j] for j in knuckles], axis=0)
+        place = np.mean([made.joints[j] for j in knuckles], axis=0)
     else:
-        place = made.points[arm.end] + along * 0.075 * made.s
-    palm = made.point(place)
+        place = made.joints[arm.end] + along * 0.075 * made.s
+    palm = made.point(place, arm.end)
     made.capsule(arm.end, palm, 0.03, 0.038, SKIN)
-    if all(j not in parents for j in knuckles):
-        tip = made.point(place + along * 0.055 * made.s)
+    if all(j not in made.parents for j in knuckles):
+        tip = made.point(place + along * 0.055 * made.s, arm.end)
         made.capsule(palm, tip, 0.038, 0.024, SKIN)
 
 
-def _add_head(
-    made: _Builder,
-    parents: tuple[int, ...],
-    trunk: list[int],
-    is_neck: bool,
-    arms: list[_Limb],
-    front: np.ndarray | None,
-) -> None:
-    head = made.points[trunk[-1]]
-    below = made.points[trunk[-2]] if len(trunk) > 1 else head - [0.0, 1.0, 0.0]
-    up = _unit(head - below)
-    # Who leans keeps the head level, more or less; the joints do not tell.
-    up = _unit(up + np.array([0.0, 0.8, 0.0]) * np.clip(up[:, 1:2], 0.0, 1.0))
-    base = head + up * (0.09 * made.s if is_neck else 0.0)
-    ahead = np.zeros_like(head) if front is None else front
-    ahead = _unit(ahead - up * np.sum(ahead * up, -1, keepdims=True))
-    chest = {parents[arm.before[0] if arm.before else arm.upper] for arm in arms}
-    above = next((i for i, joint in enumerate(trunk) if joint in chest), len(trunk) - 2)
+def _add_head(made: _Builder, found: Anatomy) -> None:
+    trunk = found.trunk
+    top = trunk[-1]
+    up = _unit(made.joints[top] - made.joints[trunk[-2]])
+    up = _unit(up + 1.5 * _UP) if up[1] > 0 else up
+    base = made.joints[top] + up * (0.0 if found.has_head else 0.09 * made.s)
+    carriers = [trunk.index(_carrier(made, arm)) for arm in found.arms]
+    above = min(carriers, default=len(trunk) - 2)
     for a, b in zip(trunk[above + 1 :], trunk[above + 2 :], strict=False):
         made.capsule(a, b, 0.06, 0.056, SKIN)
-    throat = made.point(base + (0.03 * up) * made.s)
-    made.capsule(trunk[-1], throat, 0.056, 0.054, SKIN)
-    chin = made.point(base + (0.012 * up + 0.03 * ahead) * made.s)
-    skull = made.point(base + (0.078 * up + 0.006 * ahead) * made.s)
+    ahead = _unit(_AHEAD - up * (_AHEAD @ up))
+    throat = made.point(base + (0.03 * up) * made.s, top)
+    made.capsule(top, throat, 0.056, 0.054, SKIN)
+    chin = made.point(base + (0.012 * up + 0.03 * ahead) * made.s, top)
+    skull = made.point(base + (0.078 * up + 0.006 * ahead) * made.s, top)
     made.capsule(chin, skull, 0.07, 0.094, SKIN)
-    if front is not None:
-        nose = made.point(base + (0.036 * up + 0.102 * ahead) * made.s)
+    if found.legs:
+        nose = made.point(base + (0.036 * up + 0.102 * ahead) * made.s, top)
         made.capsule(nose, nose, 0.016, 0.016, SKIN)

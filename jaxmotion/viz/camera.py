@@ -4,8 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from jaxmotion.viz.body import Body
 from jaxmotion.viz.figure import view_axes
+from jaxmotion.viz.sketch import Body
 
 # Focal length in heights of the picture: a field of view of 28 degrees.
 _FOCAL = 2.0

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxmotion.viz import body as bodies
 from jaxmotion.viz import figure as drawing
+from jaxmotion.viz import sketch as bodies
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>__TITLE__</title>

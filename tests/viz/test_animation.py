@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.viz import animation, body, camera
+from jaxmotion.viz import animation, camera
+from jaxmotion.viz import sketch as body
 from tests.viz import samples
 
 

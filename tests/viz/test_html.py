@@ -7,8 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from jaxmotion.viz import body
 from jaxmotion.viz import html as page
+from jaxmotion.viz import sketch as body
 from tests.viz import samples
 
 

@@ -1,0 +1,291 @@
+"""Trunk, limbs and sides of a skeleton, and the T-pose of it.
+
+What a joint is follows from the tree and the bones' lengths, and where there are names,
+from them: a limb is a chain of at least three joints that leaves the trunk, its longest
+two bones in a row are thigh and shank, or upper arm and forearm. So skeletons of any
+convention are told apart, also those whose zero pose is no pose of a person (LaFAN1's
+bones all lie along x).
+"""
+
+import dataclasses
+import re
+
+import numpy as np
+
+from jaxmotion.motion.skeleton import Skeleton
+
+LEFT, RIGHT, MIDDLE = "left", "right", "middle"
+_SIDES = (
+    re.compile(r"(left|right)", re.IGNORECASE),
+    re.compile(r"(?:^|(?<=[_\-.: ]))([lr])(?=$|[_\-.: ])", re.IGNORECASE),
+    re.compile(r"^([lrLR])(?=[A-Z])"),
+)
+_TIP = re.compile(r"end|top|site|nub|tip")
+# How far the sole's bone falls, per length, where the zero pose does not tell.
+_SOLE = 0.45
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Limb:
+    """Joints of an arm or a leg.
+
+    Attributes:
+      before: What leads to it from the trunk, such as a clavicle.
+      upper: Shoulder or hip.
+      middle: Elbow or knee.
+      end: Wrist or ankle.
+      after: The longest chain behind it: ball of the foot, or a finger.
+      side: LEFT, RIGHT, or MIDDLE where neither names nor the zero pose tell.
+    """
+
+    before: tuple[int, ...]
+    upper: int
+    middle: int
+    end: int
+    after: tuple[int, ...]
+    side: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Anatomy:
+    """What the joints are.
+
+    Attributes:
+      trunk: From the root to the head; the root alone where no head is found.
+      has_head: Whether the trunk ends at a head; at a neck otherwise.
+      arms, legs: Limbs; both empty for a skeleton that is no person's.
+      sides: LEFT, RIGHT or MIDDLE, one a joint.
+      upright: Whether the zero pose stands, with y up.
+    """
+
+    trunk: tuple[int, ...]
+    has_head: bool
+    arms: tuple[Limb, ...]
+    legs: tuple[Limb, ...]
+    sides: tuple[str, ...]
+    upright: bool
+
+
+def side_of(name: str) -> str:
+    """LEFT, RIGHT or MIDDLE, as a joint's name says."""
+    found = next(filter(None, (pattern.search(name) for pattern in _SIDES)), None)
+    if found is None:
+        return MIDDLE
+    return LEFT if found.group(1).lower().startswith("l") else RIGHT
+
+
+def _chain(parents: tuple[int, ...], joint: int) -> list[int]:
+    """Joints from the root to one."""
+    found = []
+    while joint >= 0:
+        found.append(joint)
+        joint = parents[joint]
+    return found[::-1]
+
+
+def _zero_pose(skeleton: Skeleton) -> np.ndarray:
+    """Joints [J, 3] where no joint is turned, from the root."""
+    places = np.array(skeleton.offsets, float)
+    places[0] = 0.0
+    for joint, parent in enumerate(skeleton.parents):
+        if parent >= 0:
+            places[joint] += places[parent]
+    return places
+
+
+def _head(skeleton: Skeleton, sides: tuple[str, ...], height: np.ndarray) -> tuple:
+    """The joint at the trunk's upper end (None for none), and whether it is a head."""
+    parents, names = skeleton.parents, skeleton.names
+    for word in ("head", "neck"):
+        found = [j for j, name in enumerate(names) if word in name.lower()]
+        found = [j for j in found if not _TIP.search(names[j].lower())]
+        if found:
+            # A neck may have several joints.
+            return (found[0], True) if word == "head" else (found[-1], False)
+    free = [
+        j for j in range(1, len(parents)) if j not in parents and sides[j] == MIDDLE
+    ]
+    top = max(free, key=lambda j: height[j], default=None)
+    return (top, True) if top is not None and height[top] > height[0] else (None, False)
+
+
+def _limbs(
+    parents: tuple[int, ...], lengths: np.ndarray, trunk: list[int]
+) -> tuple[list[dict], list[dict]]:
+    """Arms and legs: legs are what leaves the trunk at its lowest joint."""
+    parts: dict[int, list[int]] = {}
+    for leaf in (j for j in range(len(parents)) if j not in parents):
+        part = [j for j in _chain(parents, leaf) if j not in trunk]
+        best = parts.get(part[0], []) if part else None
+        if best is not None and lengths[part].sum() > lengths[best].sum():
+            parts[part[0]] = part
+    found = [p for p in parts.values() if len(p) > 2 and parents[p[0]] != trunk[-1]]
+    lowest = min((trunk.index(parents[part[0]]) for part in found), default=0)
+    arms, legs = [], []
+    for part in found:
+        i = 1 + int(np.argmax(lengths[part[1:-1]] + lengths[part[2:]]))
+        limb = dict(
+            before=tuple(part[: i - 1]),
+            upper=part[i - 1],
+            middle=part[i],
+            end=part[i + 1],
+            after=tuple(part[i + 2 :]),
+        )
+        low = trunk.index(parents[part[0]]) == lowest
+        (legs if low else arms).append(limb)
+    return arms, legs
+
+
+def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> Anatomy:
+    """What the joints of a skeleton are.
+
+    Args:
+      sides: LEFT, RIGHT or MIDDLE of each joint; None for what the names say, and
+        where they say nothing, the zero pose.
+
+    Raises:
+      ValueError: if `sides` are not one a joint.
+    """
+    parents = skeleton.parents
+    if sides is not None and (
+        len(sides) != len(parents) or set(sides) - {LEFT, RIGHT, MIDDLE}
+    ):
+        raise ValueError(
+            f"sides are {sides}, expected {len(parents)} of {LEFT}, {RIGHT}, {MIDDLE}"
+        )
+    named = tuple(map(side_of, skeleton.names)) if sides is None else tuple(sides)
+    places = _zero_pose(skeleton)
+    lengths = np.linalg.norm(np.asarray(skeleton.offsets, float), axis=-1)
+    lengths[0] = 0.0
+    head, has_head = _head(skeleton, named, places[:, 1])
+    trunk = _chain(parents, 0 if head is None else head)
+    arms, legs = ([], []) if head is None else _limbs(parents, lengths, trunk)
+    if not (arms and legs):
+        return Anatomy(
+            trunk=tuple(trunk),
+            has_head=has_head,
+            arms=(),
+            legs=(),
+            sides=named,
+            upright=True,
+        )
+    rise = places[trunk[-1]] - np.mean([places[leg["end"]] for leg in legs], axis=0)
+    upright = rise[1] > 0.8 * np.linalg.norm(rise)
+    if set(named) == {MIDDLE} and upright and sides is None:
+        named = _guess_sides(parents, places, arms, legs)
+    made = [
+        tuple(Limb(**limb, side=named[limb["middle"]]) for limb in limbs)
+        for limbs in (arms, legs)
+    ]
+    return Anatomy(
+        trunk=tuple(trunk),
+        has_head=has_head,
+        arms=made[0],
+        legs=made[1],
+        sides=named,
+        upright=bool(upright),
+    )
+
+
+def _guess_sides(
+    parents: tuple[int, ...], places: np.ndarray, arms: list[dict], legs: list[dict]
+) -> tuple[str, ...]:
+    """Sides of a zero pose that stands: toes point ahead."""
+    toes = [
+        places[leg["after"][0]] - places[leg["end"]] for leg in legs if leg["after"]
+    ]
+    ahead = np.sum(toes, axis=0) if toes else np.zeros(3)
+    left = np.array([ahead[2], 0.0, -ahead[0]])
+    found = [MIDDLE] * len(parents)
+    for limb in (*arms, *legs):
+        first = (*limb["before"], limb["upper"])[0]
+        away = float(left @ (places[limb["upper"]] - places[parents[first]]))
+        if abs(away) > 1e-9:
+            for joint in range(len(parents)):
+                if first in _chain(parents, joint):
+                    found[joint] = LEFT if away > 0 else RIGHT
+    return tuple(found)
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-9)
+
+
+def _swing(start: np.ndarray, end: np.ndarray, half_turn: np.ndarray) -> np.ndarray:
+    """The smallest rotation between directions; about `half_turn` if they oppose."""
+    a, b = _unit(start), _unit(end)
+    if a @ b < -0.9:
+        first = 2 * np.outer(half_turn, half_turn) - np.eye(3)
+        return _swing(first @ a, b, half_turn) @ first
+    v = np.cross(a, b)
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + a @ b)
+
+
+def t_pose(
+    skeleton: Skeleton, sides: tuple[str, ...] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The skeleton standing with its arms level to the sides, facing +z.
+
+    The trunk, the feet's slope and what has no part in the pose stay as in the zero
+    pose; a skeleton that is no person's stays so whole.
+
+    Returns:
+      Positions [J, 3], meters, the root at the origin; world rotations [J, 3, 3].
+    """
+    offsets = np.asarray(skeleton.offsets, float)
+    parents = skeleton.parents
+    found = find_anatomy(skeleton, sides)
+    wanted: dict[int, tuple[int, np.ndarray]] = {}
+    turn = np.eye(3)
+    if found.legs:
+        places = _zero_pose(skeleton)
+        turn = _root_turn(found, places)
+        for leg in found.legs:
+            wanted[leg.upper] = (leg.middle, np.array([0.0, -1.0, 0.0]))
+            wanted[leg.middle] = (leg.end, np.array([0.0, -1.0, 0.0]))
+            if leg.after:
+                sole = places[leg.after[0]] - places[leg.end]
+                fall = -sole[1] / max(np.linalg.norm(sole), 1e-9)
+                if not (found.upright and 0.0 <= fall < 0.8):
+                    fall = _SOLE
+                ahead = np.array([0.0, -fall, np.sqrt(1 - fall**2)])
+                wanted[leg.end] = (leg.after[0], ahead)
+        for number, arm in enumerate(found.arms):
+            left = arm.side == LEFT or (arm.side == MIDDLE and number == 0)
+            out = np.array([1.0 if left else -1.0, 0.0, 0.0])
+            chain = [*arm.before[-1:], arm.upper, arm.middle, arm.end, *arm.after[:1]]
+            for joint, child in zip(chain, chain[1:], strict=False):
+                bone = turn @ (places[child] - places[joint])
+                # A clavicle keeps its slope.
+                if joint not in arm.before or _unit(bone) @ out < 0.6:
+                    wanted[joint] = (child, out)
+    turns, points = np.zeros((len(parents), 3, 3)), np.zeros((len(parents), 3))
+    for joint, parent in enumerate(parents):
+        if parent < 0:
+            turns[joint] = turn
+            continue
+        points[joint] = points[parent] + turns[parent] @ offsets[joint]
+        turns[joint] = turns[parent]
+        if joint in wanted:
+            child, direction = wanted[joint]
+            bone = turns[joint] @ offsets[child]
+            axis = np.array([0.0, 0.0, 1.0])
+            turns[joint] = _swing(bone, direction, axis) @ turns[joint]
+    return points, turns
+
+
+def _root_turn(found: Anatomy, places: np.ndarray) -> np.ndarray:
+    """Turns the zero pose so that it stands and faces +z."""
+    hips = {leg.side: places[leg.upper] for leg in found.legs}
+    if LEFT in hips and RIGHT in hips:
+        left = hips[LEFT] - hips[RIGHT]
+    elif len(found.legs) == 2:
+        left = places[found.legs[0].upper] - places[found.legs[1].upper]
+    else:
+        return np.eye(3)
+    base = next(i for i in found.trunk if places[found.trunk[-1]] is not places[i])
+    up = places[found.trunk[-1]] - places[base]
+    up = np.array([0.0, 1.0, 0.0]) if found.upright else _unit(up)
+    left = _unit(left - up * (left @ up))
+    return np.stack([left, up, np.cross(left, up)])

@@ -1,0 +1,99 @@
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion.data.walker import walker_skeleton
+from jaxmotion.motion import anatomy
+from jaxmotion.motion.skeleton import Skeleton
+
+# LaFAN1's convention: all bones along x, the zero pose is no pose of a person.
+BONES = (
+    ("Hips", None, (0, 0, 0)),
+    ("LeftUpLeg", "Hips", (0, 0.02, 0.105)),
+    ("LeftLeg", "LeftUpLeg", (0.435, 0, 0)),
+    ("LeftFoot", "LeftLeg", (0.42, 0, 0)),
+    ("LeftToe", "LeftFoot", (0.17, 0, 0)),
+    ("RightUpLeg", "Hips", (0, 0.02, -0.105)),
+    ("RightLeg", "RightUpLeg", (0.435, 0, 0)),
+    ("RightFoot", "RightLeg", (0.42, 0, 0)),
+    ("RightToe", "RightFoot", (0.17, 0, 0)),
+    ("Spine", "Hips", (0.07, -0.03, 0)),
+    ("Spine1", "Spine", (0.25, 0, 0)),
+    ("Head", "Spine1", (0.37, 0, 0)),
+    ("LeftShoulder", "Spine1", (0.2, -0.01, 0.06)),
+    ("LeftArm", "LeftShoulder", (0.11, 0, 0)),
+    ("LeftForeArm", "LeftArm", (0.33, 0, 0)),
+    ("LeftHand", "LeftForeArm", (0.25, 0, 0)),
+    ("RightShoulder", "Spine1", (0.2, -0.01, -0.06)),
+    ("RightArm", "RightShoulder", (0.11, 0, 0)),
+    ("RightForeArm", "RightArm", (0.33, 0, 0)),
+    ("RightHand", "RightForeArm", (0.25, 0, 0)),
+)
+
+
+def along_x():
+    names = [name for name, _, _ in BONES]
+    return Skeleton(
+        offsets=jnp.asarray([place for _, _, place in BONES], jnp.float32),
+        parents=tuple(-1 if up is None else names.index(up) for _, up, _ in BONES),
+        names=tuple(names),
+    )
+
+
+def test_sides_are_read_from_names():
+    names = {
+        "LeftArm": "left",
+        "r_foot": "right",
+        "mixamorig:RightLeg": "right",
+        "hand_l": "left",
+        "UpperArm_L": "left",
+        "L_Wrist": "left",
+        "rHip": "right",
+        "l_uparm_JNT": "left",
+        "Head": "middle",
+        "C_pelvis_JNT": "middle",
+        "Chest": "middle",
+        "lowerback": "middle",
+    }
+    assert {name: anatomy.side_of(name) for name in names} == names
+
+
+def test_limbs_of_a_person_are_found():
+    skeleton = walker_skeleton()
+    found = anatomy.find_anatomy(skeleton)
+    name = lambda joints: [skeleton.names[j] for j in joints]  # noqa: E731
+    assert name(found.trunk) == ["Hips", "Spine", "Spine1", "Spine2", "Neck", "Head"]
+    arm = next(arm for arm in found.arms if arm.side == "left")
+    assert name((*arm.before, arm.upper, arm.middle, arm.end)) == [
+        "LeftShoulder",
+        "LeftArm",
+        "LeftForeArm",
+        "LeftHand",
+    ]
+    leg = next(leg for leg in found.legs if leg.side == "right")
+    assert name((leg.upper, leg.middle, leg.end, *leg.after)) == [
+        "RightUpLeg",
+        "RightLeg",
+        "RightFoot",
+        "RightToeBase",
+    ]
+    assert found.upright and not anatomy.find_anatomy(along_x()).upright
+
+
+def test_a_t_pose_stands_faces_ahead_and_keeps_the_bones():
+    for skeleton in (walker_skeleton(), along_x()):
+        places, turns = anatomy.t_pose(skeleton)
+        joint = lambda name, s=skeleton, p=places: p[s.index(name)]  # noqa: E731
+        assert joint("Head")[1] > 0.4 and joint("LeftFoot")[1] < -0.8
+        arm = joint("LeftHand") - joint("LeftArm")
+        np.testing.assert_allclose(arm / np.linalg.norm(arm), [1, 0, 0], atol=1e-6)
+        leg = joint("RightFoot") - joint("RightUpLeg")
+        np.testing.assert_allclose(leg / np.linalg.norm(leg), [0, -1, 0], atol=1e-6)
+        toe = places[skeleton.index("RightFoot") + 1] - joint("RightFoot")
+        assert toe[2] > 0.1 and toe[1] < 0
+        np.testing.assert_allclose(np.linalg.det(turns), 1, atol=1e-6)
+        for j, parent in enumerate(skeleton.parents):
+            if parent >= 0:
+                bone = turns[parent] @ np.asarray(skeleton.offsets[j], float)
+                np.testing.assert_allclose(places[j], places[parent] + bone, atol=1e-6)
+    # A zero pose that is a T-pose stays as it is.
+    np.testing.assert_allclose(anatomy.t_pose(walker_skeleton())[1], [np.eye(3)] * 22)
