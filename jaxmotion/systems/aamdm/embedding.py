@@ -89,8 +89,9 @@ class Statistics:
 
     Attributes:
       pose: Mean and deviation of each channel: the decoder's output.
-      group: The same mean, and one deviation for each kind of channel: the encoder's
-        input. It keeps a joint that hardly moves from being blown up.
+      group: The same mean, and one deviation for each kind of channel, that of all its
+        numbers: the encoder's input. It keeps a joint that hardly moves from being
+        blown up.
       path: Mean of each path feature, and the mean deviation of the positions and of
         the facings.
     """
@@ -116,14 +117,12 @@ def fit_statistics(
     Returns:
       The statistics.
 
-    Source: Holden et al. 2020, released code: train_decompressor, database. Differs:
-      the deviation of a kind is the mean of its channels', there of all its numbers.
+    Source: Holden et al. 2020, released code: train_decompressor, database.
     """
     own = features.fit_normalizer(poses)
-    spread = jnp.sqrt(jnp.mean((poses - own.mean[None]) ** 2, axis=0))
     layout = pose.pose_layout(config.num_joints)
     groups = [
-        jnp.full(stop - start, jnp.mean(spread[start:stop]))
+        jnp.full(stop - start, jnp.std(poses[:, start:stop]))
         for _, start, stop in layout.fields
     ]
     group = jnp.maximum(jnp.concatenate(groups), 1e-4)
