@@ -93,6 +93,8 @@ class Evaluate:
       speed: Meters per second that are commanded.
       scale: Strength of AAMDM's guidance, epsilon of eq. 13.
       amdm_scale: Strength of AMDM's.
+      noise_half_life: Seconds in which noise of AAMDM's posteriors is forgotten; 0 to
+        draw it anew in every frame (paper).
       long_minutes: Length of the long rollouts of the row "aamdm"; 0 for none.
       long_rollouts: Their number.
       seed: Seeds poses, noise and pairs.
@@ -107,6 +109,7 @@ class Evaluate:
     speed: float = aamdm_evaluation.SPEED
     scale: float = aamdm_controller.SCALE
     amdm_scale: float = 1.0
+    noise_half_life: float = 0.0
     long_minutes: float = 10.0
     long_rollouts: int = 16
     seed: int = 0
@@ -121,6 +124,7 @@ class Rollout:
     Attributes:
       speed: Meters per second that are commanded.
       scale: Strength of the guidance, epsilon of eq. 13.
+      noise_half_life: As of `evaluate`.
       out: Folder; None for <run>/rollout.
     """
 
@@ -131,6 +135,7 @@ class Rollout:
     course: Course = aamdm_evaluation.COURSE
     speed: float = aamdm_evaluation.SPEED
     scale: float = aamdm_controller.SCALE
+    noise_half_life: float = 0.0
     out: Path | None = None
     seed: int = 0
 
@@ -216,8 +221,10 @@ def rollout(args: Rollout) -> None:
     run = aamdm_training.load_run(args.run)
     out = cli.out_folder(args, "rollout")
     space = aamdm_training.load_space(run, rows.space_of(args.row))
-    step = rows.load_row(args.row, run, space, scale=args.scale)
-    states = aamdm_evaluation.start_states(run, space, 1, seed=args.seed)
+    step = rows.load_row(
+        args.row, run, space, scale=args.scale, half_life=args.noise_half_life
+    )
+    states = aamdm_evaluation.start_states(run, space, step, 1, seed=args.seed)
     ticks = round(args.seconds * run.train.fps)
     given = aamdm_evaluation.commands(
         run, 1, ticks, course=args.course, speed=args.speed

@@ -17,6 +17,7 @@ from jaxtyping import Array
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.networks import mlp
 from jaxmotion.systems.aamdm import controller as aamdm_controller
+from jaxmotion.systems.aamdm.controller import Stepper
 from jaxmotion.typing import Key, Params
 
 
@@ -80,7 +81,7 @@ def loss(params: Params, key: Key, windows: Array, *, config: Config):
     return jnp.mean(jnp.abs(found - noise)), {}
 
 
-def stepper(params: Params, *, config: Config, scale: float = 0.0):
+def stepper(params: Params, *, config: Config, scale: float = 0.0) -> Stepper:
     """The sampler `step(key, previous, goal) -> next`; its noise has variance beta.
 
     With a goal for the path features every prediction of the clean frame moves down
@@ -107,4 +108,4 @@ def stepper(params: Params, *, config: Config, scale: float = 0.0):
 
         return chain.sample(reverse, key, previous.shape, num_steps=config.num_steps)
 
-    return step
+    return Stepper(step)

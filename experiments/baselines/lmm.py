@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxmotion.systems.aamdm.controller import Stepper
 from jaxmotion.typing import Key, Params
 
 
@@ -80,7 +81,7 @@ def _next(params: Params, x: Array, config: Config, change: Array | None) -> Arr
     return x + scale * found
 
 
-def stepper(params: Params, *, config: Config, change: Array | None = None):
+def stepper(params: Params, *, config: Config, change: Array | None = None) -> Stepper:
     """The deterministic `step(key, previous, goal) -> next`.
 
     With a goal for the path features, the projector's frame is asked for at some ticks.
@@ -96,7 +97,7 @@ def stepper(params: Params, *, config: Config, change: Array | None = None):
         asked = jax.random.bernoulli(key, config.projections)
         return jnp.where(asked, 0.5 * (frame + fitting), frame)
 
-    return step
+    return Stepper(step)
 
 
 def loss(

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxmotion.systems.aamdm import controller as aamdm_controller
+from jaxmotion.systems.aamdm.controller import Stepper
 from jaxmotion.typing import Key, Params
 
 
@@ -130,7 +131,7 @@ def loss(params: Params, key: Key, windows: Array, *, config: Config):
     return value + config.weight_kl * kl, {"value": value, "kl": kl}
 
 
-def stepper(params: Params, *, config: Config, candidates: int = 32):
+def stepper(params: Params, *, config: Config, candidates: int = 32) -> Stepper:
     """The sampler `step(key, previous, goal) -> next`: a latent, decoded.
 
     With a goal for the path features, it is the best of several latents drawn for the
@@ -150,4 +151,4 @@ def stepper(params: Params, *, config: Config, candidates: int = 32):
         values = jax.vmap(aamdm_controller.path_objective(goal))(frames)
         return frames[jnp.argmin(values)]
 
-    return step
+    return Stepper(step)

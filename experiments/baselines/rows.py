@@ -24,7 +24,7 @@ from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
 from jaxmotion.systems.aamdm import training as aamdm_training
-from jaxmotion.systems.aamdm.controller import Stepper
+from jaxmotion.systems.aamdm.controller import Memory, Stepper
 from jaxmotion.systems.aamdm.space import Space
 from jaxmotion.systems.aamdm.training import Run, SpaceName
 
@@ -174,7 +174,9 @@ def train_row(
         aamdm_training.train_generator(run, where, space, config, generator)
 
 
-def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
+def load_row(
+    name: str, run: Run, space: Space, *, scale: float, half_life: float = 0.0
+) -> Stepper:
     """The stepper of a trained row.
 
     Args:
@@ -182,9 +184,11 @@ def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
       run: The run.
       space: The row's space.
       scale: Strength of the guidance, for those that are guided.
+      half_life: In which noise of a chain's posteriors is forgotten, seconds; 0 to draw
+        it anew in every frame.
 
     Returns:
-      `step(key, previous, goal)`.
+      The stepper.
 
     Raises:
       CheckpointError: if the row was not trained, or its folder holds another.
@@ -199,7 +203,10 @@ def load_row(name: str, run: Run, space: Space, *, scale: float) -> Stepper:
             polishes=polishes,
             target=_target(name),
         )
-        return aamdm_controller.guided(transition, scale=scale)
+        memory = None
+        if half_life:
+            memory = Memory(num_steps=polishes + drafts, half_life=half_life)
+        return aamdm_controller.guided(transition, scale=scale, memory=memory)
     module = _BASELINES[name]
     config = runs.stage_config(run.record, _stage(name), module.Config)
     params = runs.load_params(

@@ -30,7 +30,9 @@ def trained_rows(
         try:
             if where not in spaces:
                 spaces[where] = aamdm_training.load_space(run, where)
-            step = rows.load_row(name, run, spaces[where], scale=scale)
+            step = rows.load_row(
+                name, run, spaces[where], scale=scale, half_life=args.noise_half_life
+            )
             found[name] = (step, spaces[where])
         except checkpoint.CheckpointError as error:
             if names:
@@ -46,7 +48,9 @@ def _unbounded(
 ) -> table.Cell:
     """Free rollouts that diverge if nothing keeps them within the data's bounds."""
     ticks = round(args.seconds * run.train.fps)
-    states = aamdm_evaluation.start_states(run, space, args.rollouts, seed=args.seed)
+    states = aamdm_evaluation.start_states(
+        run, space, step, args.rollouts, seed=args.seed
+    )
     given = aamdm_evaluation.commands(
         run, args.rollouts, ticks, course=args.course, speed=args.speed
     )
@@ -122,7 +126,7 @@ def long_rollouts(
     given = aamdm_evaluation.commands(
         run, number, ticks, course=args.course, speed=args.speed
     )
-    states = aamdm_evaluation.start_states(run, space, number, seed=args.seed)
+    states = aamdm_evaluation.start_states(run, space, step, number, seed=args.seed)
     for steered in (False, True):
         roll = aamdm_evaluation.roller(run, space, step, steered=steered)
         frames = roll(jax.random.key(args.seed), states, given)[1]

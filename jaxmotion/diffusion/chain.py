@@ -132,7 +132,12 @@ def sample_from(
     return step.finish(state)
 
 
-def ancestral_step(schedule: Schedule, denoise: Denoiser) -> Step:
+def ancestral_step(
+    schedule: Schedule,
+    denoise: Denoiser,
+    *,
+    noise: Float[Array, "steps *shape"] | None = None,
+) -> Step:
     """Step that samples the posterior given the predicted clean sample.
 
     At t = 1 the result is the prediction itself, without noise. With a stochastic
@@ -141,6 +146,8 @@ def ancestral_step(schedule: Schedule, denoise: Denoiser) -> Step:
     Args:
       schedule: Table of T steps.
       denoise: Predicts x_0 from x_t.
+      noise: Normal noise of steps 1..T, for who does not want it drawn anew from the
+        key; None draws it.
 
     Returns:
       The step.
@@ -155,8 +162,11 @@ def ancestral_step(schedule: Schedule, denoise: Denoiser) -> Step:
         key_denoise, key_noise = jax.random.split(key)
         x_0 = denoise(key_denoise, x_t, t).astype(x_t.dtype)
         mean, variance = _schedule.posterior(schedule, x_0, x_t, t)
-        noise = jax.random.normal(key_noise, x_t.shape, x_t.dtype)
-        return mean + jnp.sqrt(variance) * noise
+        if noise is None:
+            own = jax.random.normal(key_noise, x_t.shape, x_t.dtype)
+        else:
+            own = noise[t - 1]
+        return mean + jnp.sqrt(variance) * own
 
     return step
 

@@ -93,6 +93,18 @@ def test_ancestral_step_is_the_published_update():
         np.testing.assert_allclose(found, expected, atol=2e-6)
 
 
+def test_ancestral_step_takes_the_noise_that_it_is_given():
+    table = schedule.cosine_schedule(T)
+    x_t, noise = random(0), random(1, (T, 5, 3))
+    step = chain.ancestral_step(table, tanh_denoiser, noise=noise)
+    for t in (1, 3, T):
+        found = step(jax.random.key(t), x_t, jnp.array(t))
+        x_0 = tanh_denoiser(None, x_t, jnp.array(t))
+        mean, variance = schedule.posterior(table, x_0, x_t, jnp.array(t))
+        expected = mean + jnp.sqrt(variance) * noise[t - 1]
+        np.testing.assert_allclose(found, expected, atol=2e-6)
+
+
 @pytest.mark.parametrize("eta", [0.0, 0.4, 1.0])
 def test_ddim_step_is_the_published_update(eta):
     betas = reference.vp_betas(T)

@@ -8,8 +8,8 @@ One tick (1/60 s) of one character:
    between its path features and those wanted (eq. 13), or unguided;
 3. the pose that the frame means, and the simulation bone moved on by its velocity.
 
-The controller takes any stepper `step(key, frame, goal) -> frame`, so that baselines,
-which are steered in other ways, run in it too; `guided` makes one of AAMDM.
+The controller takes any `Stepper`, so that baselines, which are steered in other ways,
+run in it too; `guided` makes one of AAMDM.
 
 Source: Li et al. 2024 (AAMDM), sections 3.5 and 3.6. J is ours: half the squared
 distance of the 12 features in units of their deviation over the data.
@@ -21,6 +21,7 @@ What frames hold as `extra`: the simulation bone in the world ("bone_origin",
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -48,8 +49,49 @@ from jaxmotion.typing import Key, Objective, Params
 # Strength of the guidance, epsilon of eq. 13; ours.
 SCALE = 10.0
 
-# `step(key, previous, goal)`; the goal is None where nothing is asked for.
-Stepper = Callable[[Key, Array, Array | None], Array]
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Memory:
+    """Noise of the chain's posteriors that is correlated in time; ours.
+
+    The paper draws it anew in every frame, which one sees: the polisher does not take
+    all of it away, and joints shake. Remembered, it is r z + sqrt(1 - r^2) e, with e
+    drawn anew: normal noise again, so that each frame by itself is what it was.
+
+    Attributes:
+      num_steps: T of the chain.
+      half_life: Seconds in which r halves, positive; infinite for noise that a rollout
+        keeps.
+    """
+
+    num_steps: int
+    half_life: float
+
+    def __call__(self, key: Key, noise: Array, *, fps: float) -> Array:
+        """The noise of the next tick."""
+        keep = 0.5 ** (1.0 / (fps * self.half_life))
+        fresh = jax.random.normal(key, noise.shape, noise.dtype)
+        return keep * noise + math.sqrt(1.0 - keep**2) * fresh
+
+
+@dataclasses.dataclass(frozen=True)
+class Stepper:
+    """How the next frame is made.
+
+    Attributes:
+      step: `(key, previous, goal) -> frame`; the goal is None where nothing is asked
+        for. With a memory it takes the noise of the chain as `noise`, too.
+      memory: How that noise is remembered; None if it is drawn by the step.
+    """
+
+    step: Callable[..., Array]
+    memory: Memory | None = None
+
+    def __call__(
+        self, key: Key, previous: Array, goal: Array | None = None, **noise: Array
+    ) -> Array:
+        """The next frame."""
+        return self.step(key, previous, goal, **noise)
 
 
 @jax.tree_util.register_dataclass
@@ -62,18 +104,21 @@ class CharacterState:
       bone: Its simulation bone, world.
       velocity: Velocity of the bone, meters per second, world.
       turn_rate: Turn rate of the bone, radians per second.
+      noise: Noise of the chain's posteriors that is remembered; no steps if none is.
     """
 
     frame: Float[Array, "*batch channels"]
     bone: PlanarFrame
     velocity: Float[Array, "*batch 2"]
     turn_rate: Float[Array, "*batch"]
+    noise: Float[Array, "*batch steps channels"]
 
 
 def init_state(
     space: Space,
     vector: Float[Array, " features"],
     path: Float[Array, " 12"],
+    noise: Float[Array, "steps channels"] | None = None,
     *,
     num_joints: int,
 ) -> CharacterState:
@@ -83,6 +128,7 @@ def init_state(
       space: The space.
       vector: Its pose vector.
       path: Its path features.
+      noise: Normal noise that its first tick remembers; None if none is.
       num_joints: Joints of the skeleton.
 
     Returns:
@@ -94,6 +140,7 @@ def init_state(
         bone=PlanarFrame(origin=jnp.zeros(2), facing=jnp.array([0.0, 1.0])),
         velocity=parts["root_velocity"][::2],
         turn_rate=parts["root_angular_velocity"][1],
+        noise=jnp.zeros((0, space.num_features)) if noise is None else noise,
     )
 
 
@@ -150,24 +197,31 @@ def path_objective(goal: Float[Array, " 12"]) -> Objective:
     return objective
 
 
-def guided(sample: Sample, *, scale: float | Float[Array, ""]) -> Stepper:
+def guided(
+    sample: Sample,
+    *,
+    scale: float | Float[Array, ""],
+    memory: Memory | None = None,
+) -> Stepper:
     """AAMDM as a stepper: steered by the gradient of the objective.
 
     Args:
       sample: From `aamdm_model.sampler`.
       scale: Strength of the guidance, epsilon of eq. 13.
+      memory: How the noise of its posteriors is remembered; None draws it anew in
+        every frame (paper).
 
     Returns:
-      `step(key, previous, goal)`; unguided where the goal is None.
+      The stepper; unguided where the goal is None.
     """
 
-    def step(key: Key, previous: Array, goal: Array | None) -> Array:
+    def step(key: Key, previous: Array, goal: Array | None, **noise: Array) -> Array:
         if goal is None:
-            return sample(key, previous)
+            return sample(key, previous, **noise)
         objective = path_objective(goal)
-        return sample(key, previous, objective=objective, scale=scale)
+        return sample(key, previous, objective=objective, scale=scale, **noise)
 
-    return step
+    return Stepper(step, memory)
 
 
 def advance(
@@ -199,8 +253,8 @@ def advance(
     velocity = ground.out_of_frame(moved[::2], bone.facing)
     root, rot6d = pose.place(vector, bone, num_joints=num_joints)
     path = aamdm_space.to_paths(space, state.frame)
-    state = CharacterState(
-        frame=state.frame, bone=bone, velocity=velocity, turn_rate=turned[1]
+    state = dataclasses.replace(
+        state, bone=bone, velocity=velocity, turn_rate=turned[1]
     )
     return state, Frame(
         root_position=root,
@@ -252,10 +306,15 @@ def controller(
         if steered:
             path = aamdm_space.path_normalizer(space)
             goal = features.normalize(path, wanted(state, command))
-        frame = step(key, state.frame, goal)
+        noise, given = state.noise, {}
+        if step.memory is not None:
+            key, key_noise = jax.random.split(key)
+            noise = step.memory(key_noise, noise, fps=fps)
+            given = {"noise": noise}
+        frame = step(key, state.frame, goal, **given)
         if bounded:
             frame = aamdm_space.keep_within(space, frame)
-        return dataclasses.replace(state, frame=frame)
+        return dataclasses.replace(state, frame=frame, noise=noise)
 
     def show(state: CharacterState, command: Command) -> tuple[CharacterState, Frame]:
         return advance(
@@ -283,6 +342,7 @@ class Method:
       num_joints: Joints of the skeleton.
       fps: Frames per second.
       scale: Strength of the guidance.
+      memory: How the noise of the posteriors is remembered.
       step: Makes the chain's step from the schedule and a denoiser.
     """
 
@@ -290,6 +350,7 @@ class Method:
     num_joints: int
     fps: float
     scale: float = SCALE
+    memory: Memory | None = None
     step: chain.StepFactory = chain.ancestral_step
 
     def __call__(self, params: tuple[Params, Space]) -> Controller:
@@ -300,7 +361,7 @@ class Method:
             networks, config=self.config, change=change, step=self.step
         )
         return controller(
-            guided(sample, scale=self.scale),
+            guided(sample, scale=self.scale, memory=self.memory),
             space,
             num_joints=self.num_joints,
             fps=self.fps,
@@ -308,7 +369,13 @@ class Method:
 
 
 def start_states(
-    data: PoseData, space: Space, number: int, *, num_joints: int, seed: int
+    data: PoseData,
+    space: Space,
+    number: int,
+    *,
+    num_joints: int,
+    seed: int,
+    memory: Memory | None = None,
 ) -> CharacterState:
     """Characters in poses of the data, each at the origin and facing +z.
 
@@ -317,14 +384,17 @@ def start_states(
       space: The space.
       number: Characters.
       num_joints: Joints of the skeleton.
-      seed: Seeds the choice of poses.
+      seed: Seeds the choice of poses, and the noise that is remembered.
+      memory: How noise is remembered, if it is.
 
     Returns:
       States, batch axis first.
     """
     chosen = np.random.default_rng(seed).integers(0, data.num_frames, number)
     init = functools.partial(init_state, space, num_joints=num_joints)
-    return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen])
+    steps = 0 if memory is None else memory.num_steps
+    noise = jax.random.normal(jax.random.key(seed), (number, steps, space.num_features))
+    return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen], noise)
 
 
 def load_character(

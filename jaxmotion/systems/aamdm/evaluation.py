@@ -45,10 +45,17 @@ from jaxmotion.systems.aamdm.training import Run, load_chain, load_run, load_spa
 from jaxmotion.typing import Key
 
 
-def start_states(run: Run, space: Space, number: int, *, seed: int) -> CharacterState:
+def start_states(
+    run: Run, space: Space, step: Stepper, number: int, *, seed: int
+) -> CharacterState:
     """Characters in held-out poses, each at the origin and facing +z."""
     return aamdm_controller.start_states(
-        run.held_out, space, number, num_joints=run.skeleton.num_joints, seed=seed
+        run.held_out,
+        space,
+        number,
+        num_joints=run.skeleton.num_joints,
+        seed=seed,
+        memory=step.memory,
     )
 
 
@@ -188,7 +195,7 @@ def frames_per_second(
     Returns:
       Frames per second, decoding and placing included, compilation not.
     """
-    states = start_states(run, space, 1, seed=0)
+    states = start_states(run, space, step, 1, seed=0)
     given = commands(run, 1, ticks, course="forward", speed=1.0)
     roll = roller(run, space, step, steered=False)
     times = timing.time_calls(
@@ -440,7 +447,7 @@ def score_stepper(
     given = commands(run, rollouts, ticks + skip, course=course, speed=speed)
     for i, steered in enumerate((False, True)):
         key, key_pairs = jax.random.split(jax.random.key(seed + i))
-        states = start_states(run, space, rollouts, seed=seed)
+        states = start_states(run, space, step, rollouts, seed=seed)
         roll = roller(run, space, step, steered=steered)
         frames = jax.tree.map(lambda x: x[:, skip:], roll(key, states, given)[1])
         found = free_row(
@@ -567,8 +574,9 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         return {name: row[name] for name in (*truth, *_STEERED) if name in row}
 
     def sampler(point: bench.Point) -> Callable[[Key], Any]:
-        roll = roller(run, space, stepper(point), steered=False)
-        states = start_states(run, space, 1, seed=seed)
+        step = stepper(point)
+        roll = roller(run, space, step, steered=False)
+        states = start_states(run, space, step, 1, seed=seed)
         given = commands(run, 1, 1, course=COURSE, speed=SPEED)
         return lambda key: roll(key, states, given)
 

@@ -259,8 +259,9 @@ def sampler(
         paper's. One that looks back forgets where the polisher takes over.
 
     Returns:
-      `sample(key, previous, *, objective=None, scale=0.0) -> next`. With an objective
-      of the predicted frame every step is guided down its gradient (eq. 13).
+      `sample(key, previous, *, objective=None, scale=0.0, noise=None) -> next`. With an
+      objective of the predicted frame every step is guided down its gradient (eq. 13).
+      `noise` is that of the posteriors, [T, features], for steps that take one.
 
     Raises:
       ValueError: if `change` does not fit the target.
@@ -274,7 +275,10 @@ def sampler(
         *,
         objective: Objective | None = None,
         scale: float | Float[Array, ""] = 0.0,
+        noise: Float[Array, "steps *batch features"] | None = None,
     ) -> Float[Array, "*batch features"]:
+        make = step if noise is None else functools.partial(step, noise=noise)
+
         def part(denoise: Denoiser, x: Array, start: int, stop: int) -> Array:
             if objective is not None:
                 denoise = guidance.gradient_guidance(
@@ -283,7 +287,7 @@ def sampler(
                     lambda x_0: objective(from_target(x_0, previous, change)),
                     scale=scale,
                 )
-            move = step(table, denoise)
+            move = make(table, denoise)
             return chain.sample_from(move, key_chain, x, start=start, stop=stop)
 
         key_start, key_chain = jax.random.split(key)

@@ -82,6 +82,8 @@ def command(velocity, yaw):
 
 
 def driver(step, **options):
+    if not isinstance(step, aamdm_controller.Stepper):
+        step = aamdm_controller.Stepper(step)
     return aamdm_controller.controller(
         step, space(), num_joints=JOINTS, fps=FPS, **options
     )
@@ -265,6 +267,38 @@ def test_an_unsteered_character_ignores_its_commands():
     tick = jax.jit(lambda s, c: rollout.tick(made, jax.random.key(0), s, c)[0])
     found = [tick(start(), command([x, 0.0], x)) for x in (0.0, 2.0)]
     np.testing.assert_array_equal(found[0].frame, found[1].frame)
+
+
+@pytest.mark.parametrize("half_life", [0.05, np.inf])
+def test_remembered_noise_is_normal_and_forgotten_by_half_in_its_half_life(half_life):
+    memory = aamdm_controller.Memory(num_steps=2, half_life=half_life)
+    first = normal(2, 20_000, seed=8)
+
+    def tick(noise, key):
+        noise = memory(key, noise, fps=FPS)
+        return noise, noise
+
+    keys = jax.random.split(jax.random.key(0), 6)
+    noise = np.float64(jax.jit(lambda: jax.lax.scan(tick, first, keys)[1])())
+    np.testing.assert_allclose(noise.std(axis=(1, 2)), 1.0, atol=0.02)
+    for lag in (1, 3, 6):
+        found = np.mean(noise[lag - 1] * first)
+        np.testing.assert_allclose(found, 0.5 ** (lag / FPS / half_life), atol=0.02)
+
+
+def test_the_noise_of_a_character_reaches_its_chain_and_stays_with_it():
+    given = []
+
+    def step(key, previous, goal, noise):
+        given.append(noise)
+        return previous
+
+    memory = aamdm_controller.Memory(num_steps=3, half_life=np.inf)
+    made = driver(aamdm_controller.Stepper(step, memory), steered=False)
+    state = dataclasses.replace(start(), noise=normal(3, 12 + SIZE, seed=2))
+    after = made.plans[0](jax.random.key(0), state, command([1.0, 0.0], 1.5))
+    np.testing.assert_array_equal(given[0], state.noise)
+    np.testing.assert_array_equal(after.noise, state.noise)
 
 
 @pytest.mark.slow
