@@ -51,6 +51,7 @@ class Train:
       batch: Windows per update.
       width: Channels of the networks of AAMDM and AMDM (Learned Motion Matching has
         512, Motion VAE 256, as published).
+      gan_window: Frames of the windows of the GANs (paper: 10).
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
       override: Go on with these settings where a stage began with others.
@@ -73,6 +74,7 @@ class Train:
     batch: int = 64
     width: int = 256
     schedule: Literal["cosine", "vp"] = "cosine"
+    gan_window: int = 3
     previous_noise: float = 0.05
     seed: int = 0
     override: bool = False
@@ -158,6 +160,7 @@ def train(args: Train) -> None:
     sizes = rows.Sizes(
         width=args.width,
         schedule=args.schedule,
+        gan_window=args.gan_window,
         previous_noise=args.previous_noise,
     )
 

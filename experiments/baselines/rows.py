@@ -48,11 +48,13 @@ class Sizes:
     Attributes:
       width: Channels of the networks of AAMDM and AMDM.
       schedule: Schedule of AAMDM's chains.
+      gan_window: Frames of the windows of AAMDM's GANs.
       previous_noise: Noise on given previous frames in training, for all rows alike.
     """
 
     width: int = 256
     schedule: str = "cosine"
+    gan_window: int = 3
     previous_noise: float = 0.05
 
 
@@ -97,6 +99,7 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
             polishes=polishes,
             drafts=drafts,
             schedule=sizes.schedule,
+            gan_window=sizes.gan_window,
             previous_noise=sizes.previous_noise,
             target=_target(name),
         )

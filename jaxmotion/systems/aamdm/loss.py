@@ -3,9 +3,9 @@
 Source: Li et al. 2024 (AAMDM), eq. 6-12; norms and weights are ours (L1 means).
 Differs: eq. 8 divides differences of neighboring frames by h times the frame's time,
 here they are per frame and `Config.weight_velocity` scales them. The paper trains both
-modules on windows of ten frames and does not say how the GAN's are used; here the GAN
-sees three: one to predict, the one before it, and one more from which the generator may
-have predicted that. The R1 penalty and `own_previous` are ours.
+modules on windows of ten frames and does not say how the GAN's are used; here each
+frame of its windows from the third on is predicted from the one before, which the
+generator may have predicted itself. The R1 penalty and `own_previous` are ours.
 """
 
 import jax
@@ -112,13 +112,13 @@ def discriminator_loss(
     config: Config,
     change: Scale = None,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The discriminator's loss on the last frames of windows, with its R1 penalty.
+    """The discriminator's loss on windows, with its R1 penalty.
 
     Args:
       params: The discriminator's.
       generator: The generator's.
       key: Consumed.
-      windows: Frames of the data, at least three each; the last three are used.
+      windows: Frames of the data, `config.gan_window` each, at least three.
       config: The method.
       change: Deviation of each channel's changes; for `target` "change" only.
 
@@ -143,13 +143,13 @@ def generator_loss(
     config: Config,
     change: Scale = None,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The generator's loss on the last frames of windows.
+    """The generator's loss on windows.
 
     Args:
       params: The generator's.
       discriminator: The discriminator's.
       key: Consumed.
-      windows: Frames of the data, at least three each; the last three are used.
+      windows: Frames of the data, `config.gan_window` each, at least three.
       config: The method.
       change: Deviation of each channel's changes; for `target` "change" only.
 
@@ -165,27 +165,49 @@ def generator_loss(
 def _pairs(
     generator: Params, key: Key, windows: Frames, config: Config, change: Scale
 ) -> tuple[Array, ...]:
-    """Previous frame, step, real x_{t-1}, x_t, and generated x_{t-1}."""
-    aamdm_model.check_change(config, change)
-    table, size = config.table(), windows.shape[0]
-    names = ("own", "choice", "t", "pair", "latent", "posterior")
-    keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
-    before, previous, frame = (windows[:, i] for i in (-3, -2, -1))
-    if config.previous_noise:
-        keys["own"], key_shake = jax.random.split(keys["own"])
-        previous = _shaken(key_shake, previous, config, change)
-    own = _own(generator, keys["own"], before, previous, config, change)
-    choice = jax.random.bernoulli(keys["choice"], config.own_previous, (size, 1))
-    previous = jnp.where(choice, jax.lax.stop_gradient(own), previous)
+    """Previous frame, step, real x_{t-1}, x_t, and generated x_{t-1}.
 
-    t = jax.random.randint(keys["t"], (size,), 1, config.num_steps + 1)
+    Of every frame of the windows from the third on, one row each.
+    """
+    aamdm_model.check_change(config, change)
+    key_own, *keys = jax.random.split(key, 5)
+    previous = _previous(generator, key_own, windows, config, change)
+    rows = lambda x: x.reshape(-1, x.shape[-1])  # noqa: E731
+    previous, frame = rows(previous), rows(jnp.swapaxes(windows[:, 2:], 0, 1))
+
+    table = config.table()
+    t = jax.random.randint(keys[0], frame.shape[:1], 1, config.num_steps + 1)
     x_0 = aamdm_model.to_target(frame, previous, change)
-    x_prev, x_t = gan.q_pair(table, keys["pair"], x_0, t)
-    prediction = aamdm_model.draft(generator, previous, config=config)(
-        keys["latent"], x_t, t
-    )
-    fake = gan.posterior_sample(table, keys["posterior"], prediction, x_t, t)
+    x_prev, x_t = gan.q_pair(table, keys[1], x_0, t)
+    prediction = aamdm_model.draft(generator, previous, config=config)(keys[2], x_t, t)
+    fake = gan.posterior_sample(table, keys[3], prediction, x_t, t)
     return previous, t, x_prev, x_t, fake
+
+
+def _previous(
+    generator: Params, key: Key, windows: Frames, config: Config, change: Scale
+) -> Float[Array, "later batch features"]:
+    """What stands before each frame of the windows from the third on.
+
+    With probability `config.own_previous` it is the generator's own prediction, made
+    from what stood before that; else it is the data's.
+    """
+    over_time = jnp.swapaxes(windows, 0, 1)
+
+    def follow(before: Array, given: tuple[Key, Array]) -> tuple[Array, Array]:
+        key, frame = given
+        key_shake, key_own, key_choice = jax.random.split(key, 3)
+        if config.previous_noise:
+            frame = _shaken(key_shake, frame, config, change)
+        own = _own(generator, key_own, before, frame, config, change)
+        choice = jax.random.bernoulli(
+            key_choice, config.own_previous, (*frame.shape[:1], 1)
+        )
+        frame = jnp.where(choice, jax.lax.stop_gradient(own), frame)
+        return frame, frame
+
+    keys = jax.random.split(key, windows.shape[1] - 2)
+    return jax.lax.scan(follow, over_time[0], (keys, over_time[1:-1]))[1]
 
 
 def _own(

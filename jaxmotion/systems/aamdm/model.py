@@ -50,6 +50,7 @@ class Config:
       width: Channels of a hidden layer.
       depth: Hidden layers.
       window: Frames that the diffusion model predicts in a row in training (paper).
+      gan_window: Frames of the windows of the GAN, at least three (paper: 10).
       weight_velocity: Weight of the differences of neighboring frames.
       previous_noise: Largest deviation of the noise that is added in training to the
         previous frames of the data, in units of the target's scale; ours, so that a
@@ -68,6 +69,7 @@ class Config:
     width: int = 512
     depth: int = 4
     window: int = 10
+    gan_window: int = 3
     weight_velocity: float = 0.1
     previous_noise: float = 0.0
     own_previous: float = 0.5

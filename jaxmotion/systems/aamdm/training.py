@@ -398,7 +398,7 @@ def train_generator(
         adversarial.make_gan_update(
             discriminate, generate, (optimizer, optimizer), ema_decay=budget.ema
         ),
-        *frame_windows(frames, run.train, 3, batch=budget.batch),
+        *frame_windows(frames, run.train, config.gan_window, batch=budget.batch),
         budget=budget,
         model=_shared(config),
         show=("generator/loss", "discriminator/loss"),

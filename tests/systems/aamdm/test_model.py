@@ -279,3 +279,29 @@ def test_players_are_given_shaken_frames(monkeypatch, config, change):
         units = np.ones(3) if change is None else np.float64(change)
         expected = largest / 2 * np.sqrt(2 / np.pi) * units
         np.testing.assert_allclose(noise, expected, rtol=0.1, atol=1e-6)
+
+
+@pytest.mark.parametrize("own_previous", [0.0, 1.0])
+def test_players_are_given_the_generators_frames_through_a_window(
+    monkeypatch, own_previous
+):
+    seen, pace = [], np.array([1.0, -2.0, 0.5])
+
+    class Discriminator:
+        def apply(self, params, x, x_t, t, previous):
+            seen.append(previous)
+            return jnp.zeros(len(x))
+
+    monkeypatch.setattr(aamdm_model, "discriminator", lambda config: Discriminator())
+    made = Constant(jnp.asarray(pace[None], jnp.float32))
+    monkeypatch.setattr(aamdm_model, "network", lambda config: made)
+    config = dataclasses.replace(CHANGING, own_previous=own_previous, gan_window=5)
+    windows = normal(4, 5, 3)
+    given = dict(config=config, change=CHANGE)
+    aamdm_loss.generator_loss({}, {}, jax.random.key(0), windows, **given)
+    # A generator that always adds the same change to the first frame.
+    expected = windows[:, 1:4]
+    if own_previous:
+        expected = windows[:, :1] + np.arange(1, 4)[:, None] * pace * CHANGE
+    expected = np.swapaxes(np.broadcast_to(expected, (4, 3, 3)), 0, 1).reshape(-1, 3)
+    np.testing.assert_allclose(seen[0], expected, atol=1e-5)
