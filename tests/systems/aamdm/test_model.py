@@ -300,8 +300,10 @@ def test_players_are_given_the_generators_frames_through_a_window(
     given = dict(config=config, change=CHANGE)
     aamdm_loss.generator_loss({}, {}, jax.random.key(0), windows, **given)
     # A generator that always adds the same change to the first frame.
-    expected = windows[:, 1:4]
+    data = np.asarray(windows)
+    expected = data[:, 1:4]
     if own_previous:
-        expected = windows[:, :1] + np.arange(1, 4)[:, None] * pace * CHANGE
-    expected = np.swapaxes(np.broadcast_to(expected, (4, 3, 3)), 0, 1).reshape(-1, 3)
+        changes = np.arange(1, 4)[:, None] * pace * np.asarray(CHANGE)
+        expected = data[:, :1] + changes
+    expected = np.swapaxes(expected, 0, 1).reshape(-1, 3)
     np.testing.assert_allclose(seen[0], expected, atol=1e-5)
