@@ -20,13 +20,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import suite
-import torch
-import torch_camdm
 import workload
 
 from jaxmotion import cli
 from jaxmotion.evaluation import timing
 from jaxmotion.systems.camdm import model as camdm_model
+
+try:
+    import torch
+    import torch_camdm
+except ModuleNotFoundError as error:
+    raise SystemExit(
+        f'error: peers.py needs {error.name}: pip install -e ".[parity]"'
+    ) from None
 
 EAGER = "torch eager"
 OURS = "ours, constants"

@@ -34,7 +34,7 @@ class Train:
 
     Attributes:
       data: Clips from prepare_data.py.
-      rows: What to train; none: all rows of both tables. "aamdm" alone is the system.
+      rows: What to train; "all": both tables; "aamdm" alone is the system.
       field: Label field by which clips are chosen.
       labels: Labels of the clips to use; none: all clips.
       fps: Frames per second to which clips are resampled.
@@ -59,7 +59,7 @@ class Train:
 
     data: Path = Path("data/lafan1.npz")
     out: Path = Path("runs/aamdm")
-    rows: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ("all",)
     field: str = aamdm_evaluation.FIELD
     labels: tuple[str, ...] = aamdm_evaluation.LABELS
     fps: float = 60.0
@@ -87,7 +87,7 @@ class Evaluate:
     Example: python experiments/aamdm.py evaluate --run runs/aamdm
 
     Attributes:
-      rows: Which rows; none: all that were trained.
+      rows: Which rows; "all": those that were trained.
       out: Folder for metrics.json and table.md; None for <run>/evaluation.
       rollouts: Characters; a multiple of 4.
       seconds: Length of each rollout, seconds (the paper: 1000 frames).
@@ -103,7 +103,7 @@ class Evaluate:
     """
 
     run: Path = Path("runs/aamdm")
-    rows: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ("all",)
     out: Path | None = None
     rollouts: int = 16
     seconds: float = 1000 / 60
@@ -144,7 +144,7 @@ class Rollout:
 
 def train(args: Train) -> None:
     """Trains, stage by stage."""
-    names = args.rows or rows.ALL
+    names = cli.chosen_rows(args, rows.ALL)
     rows.check(names)
     loop.check_writable(args.out)
     run = aamdm_training.prepare(
@@ -204,7 +204,7 @@ def train(args: Train) -> None:
 
 def evaluate(args: Evaluate) -> None:
     """Writes the tables."""
-    rows.check(args.rows)
+    rows.check(cli.chosen_rows(args))
     out = cli.out_folder(args, "evaluation")
     run = aamdm_training.load_run(args.run)
     cli.announce("compiling the rollouts of each row", 40)

@@ -39,73 +39,69 @@ class Train:
 
     Attributes:
       data: Clips from prepare_data.py.
-      out: Run folder: config.json, data, and the stage motion with its losses.jsonl.
-      preset: Sizes, weights and how they are trained: "small" for a CPU or a short run,
-        "paper" (AdamW, 1e-4, batch 512, no warm-up, clipping or averaging; its authors
-        made 100 epochs), or "planted" for a second training of a small model in which
-        feet learn to stand. Options given as None are the preset's.
-      init: Run folder or exported model to start from; None for random parameters.
-      contents: Use only clips of these contents (for Bandai-Namco walk, run ...);
-        none: all clips.
+      out: Run folder: config.json, data, and the stage motion.
+      preset: Sizes, and all options below that have no default. "small" is for a CPU,
+        "paper" for 100 epochs, "planted" a second training of a small model in which
+        feet learn to stand.
+      init: Run folder or exported model to start from.
+      contents: Use only clips of these contents; none: all clips.
       label: Field of the clips that is the style.
       labels: Use only clips of these styles; none: all.
-      held_out: Fraction of clips kept for evaluation, in (0, 1).
-      held_out_clips: Keep these clips for evaluation, by name, instead of a fraction.
-      mirror: Add a mirrored copy of every training clip.
-      balance: Draw windows of rare changes of speed and direction more often: a kind
-        that n windows are of has a share that grows with n^(1 - balance).
+      held_out: Part of the clips kept for evaluation.
+      held_out_clips: Keep these instead, by name.
+      mirror: Add a mirrored copy of each.
+      balance: Draw rare changes more often, up to 1.
       steps: Optimizer steps of the whole run.
-      batch: Windows per step (of 55 frames: 10 past, 45 future).
-      optimizer: "muon" or "adamw" (cosine decay), "radam" or "adam" (constant).
-      learning_rate: Peak learning rate; the cosine decays to a tenth of it.
-      warmup: Steps in which the learning rate rises linearly.
-      max_norm: Gradients are clipped to this global norm; 0 for no clipping.
-      ema: Decay per step of the parameters' moving average; 0 for no average.
+      batch: Windows of 55 frames per step.
+      optimizer: "muon", "adamw", "radam" or "adam".
+      learning_rate: Its peak.
+      warmup: Steps in which the rate rises.
+      max_norm: Norm to clip gradients to; 0: none.
+      ema: Decay of the parameters' average; 0: none.
       chunk: Steps of one compiled call.
       save_every: Steps between checkpoints.
-      network: "transformer", or a denoiser of the ablation (table 3).
-      width: Channels of a token; None for the preset's.
-      depth: Layers; None for the preset's.
-      token_margin: Frames that neighboring output tokens share; None for the preset's.
+      network: Denoiser (two of table 3).
+      width: Channels of a token.
+      depth: Layers.
+      token_margin: Frames that neighboring tokens share.
       token_window: How they are cross-faded.
-      attention: "full" (the paper's) or "prefix", whose condition tokens do not see the
-        noisy frames and are computed once per plan; None for the preset's.
-      noise_levels: Noise levels of each window in a step; None for the preset's.
-      frame_kernel: Frames of a convolution after the tokens; None for the preset's.
+      attention: "full", or "prefix": computed once per plan.
+      noise_levels: Of each window in a step.
+      frame_kernel: Frames of a last convolution.
       diffusion_steps: Steps T of the diffusion.
-      devices: Split each batch over so many devices; 1 for no mesh.
+      devices: Devices to split each batch over.
       seed: Seeds everything random.
-      override: Go on with these settings where the run began with others.
+      override: Go on with other settings than before.
     """
 
     data: Path = Path("data/bandai2.npz")
     out: Path = Path("runs/camdm")
     preset: Literal["small", "planted", "paper"] = "small"
-    init: Path | None = None
-    contents: tuple[str, ...] = camdm_training.CONTENTS
+    init: cli.Optional[Path] = None
+    contents: cli.Names = camdm_training.CONTENTS
     label: str = "style"
-    labels: tuple[str, ...] = ()
+    labels: cli.Names = ()
     held_out: float = 0.1
-    held_out_clips: tuple[str, ...] = ()
+    held_out_clips: cli.Names = ()
     mirror: bool = True
     balance: float = 0.0
     steps: int = 11000
-    batch: int | None = None
-    optimizer: OptimizerName | None = None
-    learning_rate: float | None = None
-    warmup: int | None = None
-    max_norm: float | None = None
-    ema: float | None = None
+    batch: cli.Optional[int] = None
+    optimizer: cli.Optional[OptimizerName] = None
+    learning_rate: cli.Optional[float] = None
+    warmup: cli.Optional[int] = None
+    max_norm: cli.Optional[float] = None
+    ema: cli.Optional[float] = None
     chunk: int = 50
     save_every: int = 1000
     network: Literal["transformer", "mlp", "single_token"] = "transformer"
-    width: int | None = None
-    depth: int | None = None
-    token_margin: int | None = None
+    width: cli.Optional[int] = None
+    depth: cli.Optional[int] = None
+    token_margin: cli.Optional[int] = None
     token_window: Literal["hann", "trapezoid"] = "hann"
-    attention: Literal["full", "prefix"] | None = None
-    noise_levels: int | None = None
-    frame_kernel: int | None = None
+    attention: cli.Optional[Literal["full", "prefix"]] = None
+    noise_levels: cli.Optional[int] = None
+    frame_kernel: cli.Optional[int] = None
     diffusion_steps: int = 8
     devices: int = 1
     seed: int = 0

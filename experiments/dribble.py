@@ -57,9 +57,15 @@ class Config:
     overwrite: bool = False
 
 
-def chosen(clips: Clips, field: str, labels: tuple[str, ...]) -> Clips | None:
-    """Clips of those labels; None for the label "none"."""
-    return None if labels == ("none",) else selection.select(clips, field, labels)
+def chosen(clips: Clips, config: Config, skill: str) -> Clips | None:
+    """Clips of a skill's labels; None for the label "none"."""
+    labels = getattr(config, skill)
+    if labels == ("none",):
+        return None
+    try:
+        return selection.select(clips, config.field, labels)
+    except ValueError as error:
+        raise ValueError(f"--{skill}: {error}; give labels of these, or none") from None
 
 
 def synthesise(config: Config, clips: Clips) -> BallClips:
@@ -73,19 +79,16 @@ def synthesise(config: Config, clips: Clips) -> BallClips:
       Clips with a ball, of the label field "skill".
     """
     parts, moving = [], []
-    for skill, labels, gap in (
-        ("dribble", config.dribble, (0.3, 1.2)),
-        ("sprint", config.sprint, (0.5, 1.6)),
-    ):
-        own = chosen(clips, config.field, labels)
+    for skill, gap in (("dribble", (0.3, 1.2)), ("sprint", (0.5, 1.6))):
+        own = chosen(clips, config, skill)
         if own is not None:
             settings = Dribble(gap=gap)
             moving.append(own)
             parts.append(
                 dribble_clips(own, skill=skill, settings=settings, seed=config.seed)
             )
-    for skill, labels in (("stand", config.stand), ("celebrate", config.celebrate)):
-        own = chosen(clips, config.field, labels)
+    for skill in ("stand", "celebrate"):
+        own = chosen(clips, config, skill)
         if own is not None:
             near = dict(distance=_NEAR, angle=np.pi / 3, travel=0.5)
             parts.append(resting_clips(own, skill=skill, seed=config.seed, **near))

@@ -39,59 +39,53 @@ class Train:
 
     Attributes:
       task: What motions are made from.
-      data: Clips from prepare_data.py, of one skeleton; for texts also one file of text
-        motions (humanml3d, kit_ml).
-      rows: What to train; "emdm" alone is the system.
+      data: Clips of one skeleton; or a file of text motions.
+      rows: What to train; "all"; "none": only data.
       field: Label field that is the action.
-      merge: Labels that name the same action as others, "old=new".
+      merge: Labels of one action, "old=new".
       least: Fewest clips of an action.
-      encoder: Encoder of texts: "wordllama", "hashed", or a folder with CLIP's weights.
-      text_form: "released": CLIP's vectors as they are, of the first 20 tokens of a
-        text; "unit" (ours): vectors of whole texts, scaled to mean square 1. None for
-        "released" with CLIP, "unit" with the other encoders, which no release has.
-      unseen: "content/style" pairs whose clips are kept for evaluation (texts).
-      frames: Longest motion; None for 60 (actions) or 120 (texts).
-      fps: Frames per second; None for 15 (actions) or 20 (texts).
+      encoder: "wordllama", "hashed", or CLIP's folder.
+      text_form: "released" (20 tokens) or "unit" (ours: all).
+      unseen: "content/style" pairs kept for evaluation (texts).
+      frames: Longest motion; else 60, or 120 (texts).
+      fps: Per second; else 15, or 20 (texts).
       held_out: Part of the clips kept for evaluation.
       steps: Updates of each GAN.
-      ddpm_steps: Updates of each diffusion model, which are cheaper.
+      ddpm_steps: Updates of each diffusion model.
       batch: Motions an update.
       width: Channels of a token.
       hidden: Channels of the feed-forward layers.
-      dropout: Rate (paper: 0.1; short trainings do without).
+      dropout: Rate (paper: 0.1).
       frames_per_token: Frames of one token (paper: 1).
-      token_margin: Frames that neighboring output tokens share, on either side of each
-        (paper: 0); their values are cross-faded, so motion does not jump at borders.
-      mask_frames: Hide what follows a motion's end, and average losses over all frames
-        of a batch (ours); --no-mask-frames is the released form (see emdm.Config).
-      discriminator_width: Channels of the discriminator's first layers.
-      diffusion_steps: Steps T of the row "emdm" (paper: 10); other rows have theirs.
-      recon: Weight R of the features' error; None for 1 (actions) or 100 (texts).
-      geometry: Joints of the losses relative to the "root" (as released) or in the
-        "world" (ours, with which roots keep to their path).
-      learning_rate: Rate of generators (Muon).
-      ddpm_rate: Rate of diffusion models (Muon).
-      discriminator_rate: Rate of the discriminator (Adam, beta 0.5 and 0.9).
-      override: Go on with these settings where a row began with others.
+      token_margin: Frames that tokens share (paper: 0).
+      mask_frames: Hide what follows a motion's end (ours).
+      discriminator_width: Channels of its first layers.
+      diffusion_steps: Steps T of the row "emdm".
+      recon: Weight R of the features' error; else 1, or 100.
+      geometry: Of the losses (released: root).
+      learning_rate: Of generators (Muon).
+      ddpm_rate: Of diffusion models (Muon).
+      discriminator_rate: Of the discriminator (Adam).
+      override: Go on with other settings than before.
     """
 
     task: emdm_training.TaskName = "action"
     data: tuple[Path, ...] = (Path("data/bandai1.npz"), Path("data/bandai2.npz"))
     out: Path = Path("runs/emdm_action")
-    rows: tuple[str, ...] = ("emdm",)
+    rows: cli.Names = ("emdm",)
     field: str = "content"
-    merge: tuple[str, ...] = emdm_data.MERGE
+    merge: cli.Names = emdm_data.MERGE
     least: int = 10
     encoder: str = "wordllama"
-    text_form: emdm_text.TextForm | None = None
-    unseen: tuple[str, ...] = (
+    text_form: cli.Optional[emdm_text.TextForm] = None
+    unseen: cli.Names = (
         "walk-turn-left/elderly",
         "run/feminine",
         "wave-both-hands/exhausted",
         "raise-up-right-hand/youthful",
     )
-    frames: int | None = None
-    fps: float | None = None
+    frames: cli.Optional[int] = None
+    fps: cli.Optional[float] = None
     held_out: float = 0.1
     steps: int = 5000
     ddpm_steps: int = 7700
@@ -105,7 +99,7 @@ class Train:
     mask_frames: bool = True
     discriminator_width: int = 128
     diffusion_steps: int = 10
-    recon: float | None = None
+    recon: cli.Optional[float] = None
     geometry: Literal["root", "world"] = "world"
     learning_rate: float = 2e-3
     ddpm_rate: float = 2e-3
@@ -121,7 +115,7 @@ class Evaluate:
     Example: python experiments/emdm.py evaluate --run runs/emdm_action
 
     Attributes:
-      rows: Which rows and samplers (ddim_10); none: all that were trained.
+      rows: Which rows and samplers (ddim_10); "all": those that were trained.
       out: Folder; None for <run>/evaluation.
       samples: Motions of a replication (actions: rounded down to as many of each).
       replications: Sets of motions of each row.
@@ -142,7 +136,7 @@ class Evaluate:
     """
 
     run: Path = Path("runs/emdm_action")
-    rows: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ("all",)
     out: Path | None = None
     samples: int = 1000
     replications: int = 20
@@ -238,15 +232,16 @@ def prepare(args: Train) -> emdm_training.Task:
 
 def train(args: Train) -> None:
     """Trains row by row."""
-    emdm_training.check_rows(args.rows)
-    for row in args.rows:
+    rows = cli.chosen_rows(args, tuple(emdm_training.ROWS))
+    emdm_training.check_rows(rows)
+    for row in rows:
         if row in emdm_training.SAMPLERS:
             raise ValueError(
                 f"row {row!r} samples {emdm_training.SAMPLERS[row][0]!r}: train that"
             )
     loop.check_writable(args.out)
     task = prepare(args)
-    for row in args.rows:
+    for row in rows:
         begun = time.perf_counter()
         latent = emdm_training.row_config(task.base, row).latent
         budget = runs.Budget(**cli.given(runs.Budget, args))
@@ -265,14 +260,15 @@ def train(args: Train) -> None:
 
 def evaluate(args: Evaluate) -> None:
     """Writes the table."""
-    emdm_training.check_rows(args.rows)
+    chosen = cli.chosen_rows(args)
+    emdm_training.check_rows(chosen)
     out = cli.out_folder(args, "evaluation")
     cli.announce("compiling the evaluator and the sampler of each row", 40)
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     given = cli.given(emdm_scoring.Settings, args)
     settings = emdm_scoring.Settings(**given | {"evaluator": evaluator})
     rows, places, scorer = emdm_evaluation.evaluate_run(
-        args.run, settings, rows=args.rows, long_replications=args.long_replications
+        args.run, settings, rows=chosen, long_replications=args.long_replications
     )
     report = {
         "run": runs.load(args.run, system="emdm").settings,
@@ -315,7 +311,7 @@ class Import:
     """Put the authors' weights into a run folder of texts; no code of theirs is run.
 
     The folder comes from `emdm.py train --task text --data data/humanml3d.npz --encoder
-    clip --frames 196 --out runs/emdm_released --rows` (no rows), with HumanML3D or
+    clip --frames 196 --out runs/emdm_released --rows none`, with HumanML3D or
     KIT-ML as prepare_data.py writes them. Then evaluate and sample as usual.
 
     Example: python experiments/emdm.py import --weights humanml.pth --run runs/emdm_released

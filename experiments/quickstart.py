@@ -94,7 +94,7 @@ def steer_shipped(args: Config):
     made = windows.rollout_windows(frames, commands.label[:, 0], skip=0)
     toes = joint_positions(model.skeleton, frames.motion)[..., model.skeleton.feet, 1]
     height = float(toes[:, 0].min()) + 0.01  # they stand
-    title = "stand, walk, turn, jog, run, stop, crouch"
+    title = "locomotion, steered along one course"
     rows = write(args, model, frames, made, height=height, title=title)
     return rows, {"source": model.source, "course": COURSE}
 

@@ -31,14 +31,12 @@ class Config:
     """The command line.
 
     Attributes:
-      run: Name of a shipped model, run folder of a system whose characters are
-        steered (CAMDM, AAMDM, SMGDiff), or file of `camdm.py export`.
+      run: Shipped model, run folder (CAMDM, AAMDM, SMGDiff), or exported file.
       data: Clips to start from, for CAMDM; None for the model's own start.
-      host: Address to listen on. Anyone who reaches it can connect: there is no
-        authentication.
+      host: Address. There is no authentication: whoever reaches it can steer.
       port: Port to listen on; 0 for any that is free.
-      max_clients: Connections at a time. Their characters are computed one after the
-        other: all of them must fit into a tick (1/30 s).
+      max_clients: Connections at a time. All of their characters are computed in one
+        tick (1/30 s).
       seed: Seeds the noise of the first character; the next ones count on.
     """
 

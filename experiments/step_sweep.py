@@ -6,11 +6,8 @@ writes table.md, table.csv, table.json, pareto.png and a rollout of each.
 
 Examples:
   python experiments/step_sweep.py --system camdm --steps 2 4 8 16 32 --budget quick
-  python experiments/step_sweep.py --system smgdiff --steps 2 4 8 16 32
-  python experiments/step_sweep.py --system emdm --steps 1 2 5 10 20
   python experiments/step_sweep.py --system aamdm --steps 0+3 1+3 2+3 10+3 2+10
-  python experiments/step_sweep.py --system camdm --change updates=3000 width=192
-  python experiments/step_sweep.py --system camdm --evaluator evaluators/styles.npz
+  python experiments/step_sweep.py --system emdm --change updates=3000 width=192
 """
 
 import dataclasses
@@ -38,33 +35,26 @@ class Config:
 
     Attributes:
       system: camdm, aamdm, emdm or smgdiff.
-      steps: Numbers of steps T: of the motion model (camdm, smgdiff), of the GAN
-        (emdm), polish steps (aamdm; or polish and draft steps as in 2+3).
-      drafts: Draft steps of aamdm, where polish steps alone are given.
-      budget: quick (half an hour of two cores for five numbers of steps, training
-        included) or full; the numbers are listed above.
-      change: Numbers of the budget to change, as in updates=3000.
-      data: Clips from prepare_data.py or dribble.py; none: the system's usual ones.
-      out: Folder of the results; None for runs/sweep_<system>.
-      models: Folder of the models; None for <out>/models. A model that is there is
-        not trained again; one of another budget, seed or data is refused.
-      replications: Sets of samples of each model, each with noise of its own;
-        intervals run over these.
-      evaluator: File of a frozen evaluator, from evaluator.py; None trains one, with
-        the budget's updates. aamdm has none.
-      seed: Seeds parameters, batches, poses, noise and evaluators.
+      steps: Steps T of the model (emdm: GAN; aamdm: polish, or polish+draft).
+      budget: quick (five models in half an hour of two cores) or full.
+      change: Numbers of the budget, as in updates=3000.
+      data: Clips; none: the system's usual ones.
+      out: Results; else runs/sweep_<system>.
+      models: Models to use and keep; else <out>/models.
+      replications: Sets of samples of each model, for intervals.
+      evaluator: A frozen one (not aamdm); else it is trained.
+      seed: Seeds all that is random.
     """
 
     system: str
-    steps: tuple[str, ...] = ("2", "4", "8", "16", "32")
-    drafts: int = 3
+    steps: cli.Names = ("2", "4", "8", "16", "32")
     budget: str = "quick"
-    change: tuple[str, ...] = ()
+    change: cli.Names = ()
     data: tuple[Path, ...] = ()
-    out: Path | None = None
-    models: Path | None = None
+    out: cli.Optional[Path] = None
+    models: cli.Optional[Path] = None
     replications: int = 20
-    evaluator: Path | None = None
+    evaluator: cli.Optional[Path] = None
     seed: int = 0
 
 
@@ -77,7 +67,7 @@ def make_job(args: Config) -> tuple[bench.Job, Path]:
     own = registry.get(args.system).bench
     out = args.out or Path(f"runs/sweep_{args.system}")
     job = bench.Job(
-        points=own.points(args.steps, drafts=args.drafts),
+        points=own.points(args.steps),
         data=args.data or own.data,
         models=args.models or out / "models",
         budget=bench.resolve(own.amounts, args.budget, args.change),
@@ -107,7 +97,7 @@ def check(args: Config, job: bench.Job, out: Path) -> None:
     """
     for file in job.data:
         if not file.is_file():
-            raise FileNotFoundError(f"data: no clips file {file}")
+            raise FileNotFoundError(f"data: no clips file {file}: {files.CLIPS_MAKER}")
     if job.replications < 2:
         raise ValueError(
             f"replications: {job.replications}, expected at least 2 for intervals"
@@ -206,15 +196,15 @@ def notes(own: bench.Bench, job: bench.Job, report: dict[str, Any]) -> list[str]
 
 
 def budgets() -> str:
-    """The numbers of all budgets, for the help."""
-    lines = []
-    swept = {name: x for name, x in registry.SYSTEMS.items() if x.swept}
-    for name, system in swept.items():
-        lines.extend(["", f"Budgets of {name}, quick / full:"])
-        for key, amount in system.bench.amounts.items():
-            numbers = f"{amount.quick:g} / {amount.full:g}"
-            lines.append(f"  {key} {numbers}: {amount.meaning}")
-    return "\n".join(lines)
+    """The numbers of all budgets, for the help: a line a number."""
+    found: dict[str, list[str]] = {}
+    for name, system in registry.SYSTEMS.items():
+        for key, amount in (system.bench.amounts if system.swept else {}).items():
+            line = found.setdefault(key, [amount.meaning])
+            quick, full = f"{amount.quick:g}", f"{amount.full:g}"
+            line.append(f"{name} {quick}" + f"/{full}" * (quick != full))
+    lines = [f"  {key}: {what}: {', '.join(x)}" for key, (what, *x) in found.items()]
+    return "\n".join(["Budgets, quick/full:", *lines])
 
 
 def main() -> None:

@@ -4,13 +4,18 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+import tyro
 from jax.errors import JaxRuntimeError
 
 from jaxmotion.learning.loop import TrainingDiverged, check_writable
 
 Arguments = TypeVar("Arguments")
+Value = TypeVar("Value")
+# An option that may be left out, and several names: in one line of the help.
+Optional = Annotated[Value | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
+Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="...")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +69,6 @@ LIMITS: dict[str, Range] = {
     "long_minutes": Range(0, 86400),
     "warmup": Range(0, 10**9),
     "draft_steps": Range(0, 10**9),
-    "drafts": Range(0, 1000),
     "token_margin": Range(0, 1000),
     "frame_kernel": Range(0, 255),
     "noise_levels": Range(1, 1000),
@@ -101,6 +105,8 @@ def check(args: Arguments) -> Arguments:
     """
     for field in dataclasses.fields(args):
         value = getattr(args, field.name)
+        if field.name == "rows" and not value:
+            raise ValueError('--rows is empty, expected names of rows, or "all"')
         for one in value if isinstance(value, tuple) else (value,):
             if isinstance(one, bool) or not isinstance(one, int | float):
                 continue
@@ -122,6 +128,12 @@ def given(kind: type, args: Any) -> dict[str, Any]:
     """
     names = {field.name for field in dataclasses.fields(kind)}
     return {k: x for k, x in vars(args).items() if k in names and x is not None}
+
+
+def chosen_rows(args: Any, every: tuple[str, ...] = ()) -> tuple[str, ...]:
+    """Names of `args.rows`; `every` for "all", none for "none"."""
+    words = {("all",): every, ("none",): ()}
+    return words.get(args.rows, args.rows)
 
 
 def out_folder(args: Any, name: str) -> Path:

@@ -18,6 +18,10 @@ import numpy as np
 # motions shrinks about 4 times, still frames 20 times; bombs go up to 1,000 times.
 FREE_BYTES = 256 * 2**20
 FREE_RATIO = 50
+# What makes a file of clips, for messages about one that is missing.
+CLIPS_MAKER = (
+    "`experiments/prepare_data.py` makes it, or `experiments/dribble.py` with a ball"
+)
 
 
 def open_regular(path: str | os.PathLike) -> BinaryIO:

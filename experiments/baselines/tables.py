@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from baselines import rows
-from jaxmotion import files, reporting
+from jaxmotion import cli, files, reporting
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Row
 from jaxmotion.learning import checkpoint
@@ -145,7 +145,7 @@ def evaluate(
     run: aamdm_training.Run, args: Any, out: Path
 ) -> tuple[dict[str, Row], dict[str, Any]]:
     """The table, and what belongs beside it; rows.json has what is done so far."""
-    steppers = trained_rows(run, args.rows, args)
+    steppers = trained_rows(run, cli.chosen_rows(args), args)
     reference = aamdm_evaluation.make_reference(run.skeleton, run.train)
     found = data_rows(run, reference, args)
     for name, (step, space) in steppers.items():

@@ -1,45 +1,31 @@
-r"""The protocol between a game engine and the server: lines of JSON over TCP.
+r"""The protocol between a game engine and the server: lines of JSON over TCP, in UTF-8.
 
-Every line is one JSON object in UTF-8 that ends with \n. World axes: y up,
-right-handed; ground vectors are [x, z]. Each connection steers a character of its own.
-
-The engine sends commands, whenever it likes, each with any subset of
-
+World axes: y up, right-handed; ground vectors are [x, z]; each connection steers a
+character of its own. The engine sends any subset, at any time (what is left out keeps
+its value; of several commands between two frames the last counts):
   {"velocity": [0.0, 1.2], "facing": [0.0, 1.0], "label": "elderly"}
   - velocity: wanted, m/s, at most 20 m/s long; at first [0, 0].
-  - facing: wanted direction, of any length from 0.001 to 1000; at first [0, 1].
+  - facing: wanted direction, of a length from 0.001 to 1000; at first [0, 1].
   - label: one of those in the hello; at first their first.
 
-What is left out keeps its last value. Of several commands between two frames the last
-one counts.
-
-The server sends one line when it is connected to,
-
+The server sends one line at the start, with each joint's offset in its parent's frame:
   {"hello": {"version": 1, "fps": 30.0, "joints": [names], "parents": [-1, 0, ...],
              "offsets": [[x, y, z], ...], "labels": [names],
              "units": "meters, y up; rotations 6D two columns"}}
-  - offsets: of each joint in its parent's frame.
 
 and then one line a tick, fps times per second:
-
   {"tick": 7, "time": 0.233, "root": [x, y, z], "rotations": [[6], ...], "late": 0}
-  - tick: from 0. time: tick / fps, seconds.
-  - root: world position of joint 0.
-  - rotations: of each joint relative to its parent (of joint 0: to the world), the
-    first column of the matrix, then the second.
+  - tick: from 0. time: tick / fps, seconds. root: world position of joint 0.
+  - rotations: of each joint relative to its parent (joint 0: to the world), the first
+    column of the matrix, then the second.
   - ball: [x, y, z], in systems with a ball.
-  - late: ticks so far without a frame, because the client read too slowly, or because
-    the server could not keep up (then the character paused).
+  - late: ticks so far without a frame: the client read or the server computed too
+    slowly (then the character paused).
 
-What is wrong with a line (no JSON object, an unknown field or label, a wrong type, a
-number out of range, more than 4096 bytes, which are skipped up to the next \n) is
-answered by one line, changes nothing, and leaves the connection open:
-
-  {"error": "field 'velocity' is ..., expected ..."}
-
-A client that does not read gets neither frames nor answers, and after 10 s no
-connection. One that sends too much is read more slowly. One client too many gets
-{"error": "busy"} and is disconnected.
+A line that is no JSON object of these fields in range, or longer than 4096 bytes, is
+answered by {"error": "field 'velocity' is ..., expected ..."} and changes nothing. A
+client that does not read gets nothing, and after 10 s no connection; one that sends too
+much is read more slowly; one client too many gets {"error": "busy"}.
 """
 
 import dataclasses

@@ -95,7 +95,10 @@ def read_fields(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """
     path = os.fspath(path)
     about = dict(what="clips", format_name=_FORMAT, version=_VERSION)
-    fields = files.read_versioned(path, _FIELDS, **about)
+    try:
+        fields = files.read_versioned(path, _FIELDS, **about)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{error}: {files.CLIPS_MAKER}") from None
     labels = {f"label.{field}": ("i", 1) for field in fields["label_fields"]}
     names = {f"names.{field}": ("U", 1) for field in fields["label_fields"]}
     files.check_fields(path, fields, labels | names)

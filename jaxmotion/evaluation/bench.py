@@ -84,13 +84,12 @@ def plain_points(texts: Sequence[str]) -> tuple[Point, ...]:
     )
 
 
-def paired_points(texts: Sequence[str], *, drafts: int) -> tuple[Point, ...]:
+def paired_points(texts: Sequence[str]) -> tuple[Point, ...]:
     """Polish steps preceded by draft steps.
 
     Args:
       texts: "2+3" for 2 polish steps after 3 draft steps (either may be 0), or "2" for
-        2 after the usual number of draft steps.
-      drafts: That number.
+        2 after the paper's 3 draft steps.
 
     Returns:
       The points, in this order.
@@ -98,15 +97,11 @@ def paired_points(texts: Sequence[str], *, drafts: int) -> tuple[Point, ...]:
     Raises:
       ValueError: if one is neither, has no step at all, or is given twice.
     """
-    if drafts < 0:
-        raise ValueError(f"drafts: {drafts} draft steps, expected 0 or more")
     points = []
     for text in texts:
         polish, plus, draft = text.partition("+")
         both = (
-            (_number(polish, 0), _number(draft, 0))
-            if plus
-            else (_number(polish, 1), drafts)
+            (_number(polish, 0), _number(draft, 0)) if plus else (_number(polish, 1), 3)
         )
         if sum(both) < 1:
             raise ValueError(f"steps: {text!r} has no step, expected at least one")
@@ -237,7 +232,7 @@ class Bench:
     Attributes:
       data: Files of clips, where none are given.
       amounts: Its budgets.
-      points: Reads step counts: `(texts, drafts=...) -> points`.
+      points: Reads step counts: `texts -> points`.
       train: Options of the `train` command of the system's script that leave a point's
         model in the job's folder; one that is there is left alone.
       show: That command of the script, with its options, that writes a motion of a

@@ -140,6 +140,9 @@ def begin(
     if path.exists():
         _check_same(path, _read(folder, system), data, settings)
         return load(folder, system=system)
+    for one in data:
+        if not one.is_file():
+            raise FileNotFoundError(f"no clips file {str(one)!r}: {files.CLIPS_MAKER}")
     prints = [fingerprint.file_fingerprint(one) for one in data]
     content = make()
     for name, write in content.files.items():

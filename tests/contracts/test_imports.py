@@ -67,7 +67,7 @@ DOORS = {
     "matplotlib": ("jaxmotion/viz/",),
     "PIL": ("jaxmotion/viz/",),
     "tqdm": ("jaxmotion/learning/loop.py", "experiments/", "benchmarks/"),
-    "tyro": ("experiments/", "benchmarks/"),
+    "tyro": ("jaxmotion/cli.py", "experiments/", "benchmarks/"),
     "torch": ("benchmarks/",),
     "tokenizers": ("jaxmotion/text/",),
     "wordllama": ("jaxmotion/text/",),

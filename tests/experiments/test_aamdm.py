@@ -181,7 +181,11 @@ def test_a_rollout_is_written_as_bvh_gif_and_page(
 
 BAD = [
     ("train --data {data} --out {out} --rows amdm6", "unknown row 'amdm6'.*lmm"),
-    ("train --data {gone} --out {out} {settings}", "gone.npz"),
+    ("train --data {data} --out {out} --rows", "--rows is empty, expected names"),
+    (
+        "train --data {gone} --out {out} {settings}",
+        "no clips file .*gone.npz.*makes it",
+    ),
     ("train --data {data} --out {file}/below {settings}", "plain/below"),
     ("train --data {data} --out {out} --field mood", "field 'mood'"),
     ("train --data {data} --out {out} {settings} --fps 24", "resampled to 24"),

@@ -195,11 +195,12 @@ BAD = {
         "made otherwise"
     ),
     "train --data {data} --out {new} --merge walk": "expected old=new",
-    "train --data {data} --out {new} --merge hop=walk": "unknown content",
+    "train --data {data} --out {new} --merge hop=walk": "merge: unknown content",
     "train --data {data} --out {new} --merge --least 999": "has 999 clips",
     "train --task text --data {data} --out {new} --encoder nowhere": "'nowhere'",
     "train --task text --data {data} --out {new} --unseen walk/x": "'walk/x'",
     "train --out {new} --rows ddim_10": "samples 'ddpm_1000'",
+    "train --out {new} --rows": "--rows is empty, expected names",
     "train --task text --data {data} --out {new} --encoder hashed --text-form "
     "released": "text form is 'released'.*encoder is 'hashed'",
     "evaluate --run {texts} --matcher finest.tar": (
@@ -258,7 +259,7 @@ def released(call, data, tmp_path_factory):
         samples.folder(folder / "clip")
     call(
         f"train --task text --data {data} --out {folder}/run --held-out 0.3 "
-        f"--encoder {folder}/clip --unseen walk/elderly --frames 40 --rows"
+        f"--encoder {folder}/clip --unseen walk/elderly --frames 40 --rows none"
     )
     size = samples.SIZES["dimensions"]
     peer = peers.randomize(peers.EmdmGenerator("text", size, 263), 0)

@@ -85,11 +85,13 @@ def test_dribble_makes_skills_of_labels(invoke, tmp_path):
     assert bool(data.touch.any()) and "synthetic ball" in data.clips.source
     with pytest.raises(FileExistsError, match="--overwrite"):
         invoke("dribble", f"--data {source} --out {out}")
+    with pytest.raises(ValueError, match="--dribble: unknown content.*give labels"):
+        invoke("dribble", f"--data {source} --out {out}2")
 
 
 BAD = {
     "train --data {data} --out {new} --stages motion": "unknown stage 'motion'",
-    "train --data {none} --out {new}": "none.npz",
+    "train --data {none} --out {new}": "no clips file .*none.npz.*dribble.py",
     f"train --data {{data}} --out {{run}} {SIZES} --width 24": "width is 16, given 24",
     f"train --data {{data}} --out {{run}} {SIZES} --held-out 0.2": "held_out is 0.3, g",
     f"train --data {__file__} --out {{run}} {SIZES}": "other data; use another",

@@ -472,33 +472,30 @@ _AMOUNTS = {
     "autoencoder_updates": Amount(
         quick=4000,
         full=20000,
-        meaning="updates of the pose autoencoder, which all models share",
+        meaning="of the shared pose autoencoder",
     ),
     "polisher_updates": Amount(
-        quick=2000, full=5000, meaning="updates of each diffusion model"
+        quick=2000, full=5000, meaning="of each diffusion model"
     ),
     "generator_updates": Amount(
-        quick=3000, full=8000, meaning="updates of each denoising-diffusion GAN"
+        quick=3000, full=8000, meaning="of each denoising-diffusion GAN"
     ),
     "batch": Amount(quick=64, full=64, meaning="windows per update"),
     "width": Amount(quick=256, full=256, meaning="channels of the networks"),
-    "held_out": Amount(
-        quick=0.1, full=0.1, meaning="part of each clip, at its end, for evaluation"
-    ),
+    "held_out": Amount(quick=0.1, full=0.1, meaning="part for evaluation"),
     "characters": Amount(
         quick=16, full=16, meaning="rollouts of a replication", training=False
     ),
     "seconds": Amount(
         quick=4.0,
         full=4.0,
-        meaning="length of a rollout after its first second, no longer than the "
-        "held-out ends",
+        meaning="of a rollout after its first, within the held-out ends",
         training=False,
     ),
     "rollout_seconds": Amount(
         quick=8.0,
         full=20.0,
-        meaning="length of the rollout that is written to look at",
+        meaning="to look at",
         training=False,
     ),
 }

@@ -476,22 +476,20 @@ def train_style(
 CONTENTS = ("walk", "walk-turn-left", "walk-turn-right")
 _COURSE = "forward"
 _AMOUNTS = {
-    "updates": Amount(quick=900, full=11000, meaning="optimizer updates of each model"),
+    "updates": Amount(quick=900, full=11000, meaning="of each model"),
     "batch": Amount(quick=48, full=48, meaning="windows per update"),
     "width": Amount(quick=128, full=192, meaning="channels of a token"),
     "depth": Amount(quick=4, full=4, meaning="layers"),
     "warmup": Amount(quick=100, full=300, meaning="updates of linear rise of the rate"),
-    "held_out": Amount(
-        quick=0.1, full=0.1, meaning="part of the clips kept for evaluation"
-    ),
+    "held_out": Amount(quick=0.1, full=0.1, meaning="part for evaluation"),
     "seconds": Amount(
         quick=14.0,
         full=30.0,
-        meaning="length of a rollout; each replication has one for each style",
+        meaning="of a rollout",
         training=False,
     ),
     "evaluator_updates": Amount(
-        quick=400, full=1500, meaning="updates of the evaluator", training=False
+        quick=400, full=1500, meaning="of the evaluator", training=False
     ),
     "chunk": Amount(
         quick=10, full=10, meaning="characters to run at a time", training=False
@@ -499,7 +497,7 @@ _AMOUNTS = {
     "rollout_seconds": Amount(
         quick=8.0,
         full=20.0,
-        meaning="length of the rollout that is written to look at",
+        meaning="to look at",
         training=False,
     ),
 }
@@ -614,7 +612,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
 BENCH = bench.Bench(
     data=(Path("data/bandai2.npz"),),
     amounts=_AMOUNTS,
-    points=lambda texts, drafts: bench.plain_points(texts),
+    points=bench.plain_points,
     train=_train,
     show=_show,
     prepare=_prepare,

@@ -99,7 +99,10 @@ def prepare_clips(
     if not paths:
         raise ValueError("no files of clips: at least one is needed")
     clips = selection.concatenate([clips_io.load_clips(path) for path in paths])
-    clips = selection.merge_labels(clips, field, merge)
+    try:
+        clips = selection.merge_labels(clips, field, merge)
+    except ValueError as error:
+        raise ValueError(f"merge: {error}; name labels of these, or none") from None
     kept = selection.frequent_labels(clips, field, least=least)
     left_out = tuple(word for word in clips.names(field) if word not in kept)
     if not kept:

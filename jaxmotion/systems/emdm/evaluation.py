@@ -197,7 +197,7 @@ def make_motions(
 
 _ROW = "emdm"
 _AMOUNTS = {
-    "updates": Amount(quick=1000, full=5000, meaning="updates of each GAN"),
+    "updates": Amount(quick=1000, full=5000, meaning="of each model"),
     "batch": Amount(quick=32, full=32, meaning="motions an update"),
     "width": Amount(quick=128, full=128, meaning="channels of a token"),
     "depth": Amount(quick=4, full=4, meaning="layers"),
@@ -207,19 +207,17 @@ _AMOUNTS = {
     ),
     "frames": Amount(quick=60, full=60, meaning="longest motion, at 15 per second"),
     "least": Amount(quick=10, full=10, meaning="fewest clips of an action"),
-    "held_out": Amount(
-        quick=0.1, full=0.1, meaning="part of the clips kept for evaluation"
-    ),
+    "held_out": Amount(quick=0.1, full=0.1, meaning="part for evaluation"),
     "samples": Amount(
         quick=225,
         full=1000,
-        meaning="motions of a replication, rounded down to as many of each action",
+        meaning="motions of a replication",
         training=False,
     ),
     "evaluator_updates": Amount(
         quick=500,
         full=1500,
-        meaning="updates of the evaluator, which the folder of models keeps",
+        meaning="of the evaluator",
     ),
 }
 _DATA = (Path("data/bandai1.npz"), Path("data/bandai2.npz"))
@@ -295,7 +293,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
 BENCH = bench.Bench(
     data=_DATA,
     amounts=_AMOUNTS,
-    points=lambda texts, drafts: bench.plain_points(texts),
+    points=bench.plain_points,
     train=_train,
     show=_show,
     prepare=_prepare,

@@ -368,32 +368,30 @@ def describe_evaluator(
 
 
 _AMOUNTS = {
-    "updates": Amount(quick=500, full=3000, meaning="updates of each motion model"),
+    "updates": Amount(quick=500, full=3000, meaning="of each model"),
     "draft_updates": Amount(
         quick=400,
         full=3500,
-        meaning="updates before these in which displacements hardly count",
+        meaning="before these, displacements hardly count",
     ),
     "batch": Amount(quick=48, full=48, meaning="windows per update"),
     "width": Amount(quick=128, full=192, meaning="channels of a token"),
     "depth": Amount(quick=4, full=4, meaning="layers"),
-    "held_out": Amount(
-        quick=0.1, full=0.1, meaning="part of the recordings kept for evaluation"
-    ),
+    "held_out": Amount(quick=0.1, full=0.1, meaning="part for evaluation"),
     "windows": Amount(
         quick=160,
         full=600,
-        meaning="held-out windows, at most; a replication plans for half of them",
+        meaning="held out, half of them in a replication",
         training=False,
     ),
     "evaluator_updates": Amount(
-        quick=300, full=800, meaning="updates of the evaluator", training=False
+        quick=300, full=800, meaning="of the evaluator", training=False
     ),
     "chunk": Amount(quick=4, full=4, meaning="plans to make at a time", training=False),
     "rollout_seconds": Amount(
         quick=8.0,
         full=20.0,
-        meaning="length of the rollout that is written to look at",
+        meaning="to look at",
         training=False,
     ),
 }
@@ -473,7 +471,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
 BENCH = bench.Bench(
     data=(Path("data/dribble.npz"),),
     amounts=_AMOUNTS,
-    points=lambda texts, drafts: bench.plain_points(texts),
+    points=bench.plain_points,
     train=_train,
     show=_show,
     prepare=_prepare,
