@@ -43,7 +43,7 @@ class Limb:
     middle: int
     end: int
     after: tuple[int, ...]
-    side: str
+    side: str = MIDDLE
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -74,7 +74,7 @@ def side_of(name: str) -> str:
     return LEFT if found.group(1).lower().startswith("l") else RIGHT
 
 
-def _chain(parents: tuple[int, ...], joint: int) -> list[int]:
+def chain(parents: tuple[int, ...], joint: int) -> list[int]:
     """Joints from the root to one."""
     found = []
     while joint >= 0:
@@ -93,9 +93,16 @@ def _zero_pose(skeleton: Skeleton) -> np.ndarray:
     return places
 
 
-def _head(skeleton: Skeleton, sides: tuple[str, ...], height: np.ndarray) -> tuple:
-    """The joint at the trunk's upper end (None for none), and whether it is a head."""
-    parents, names = skeleton.parents, skeleton.names
+def find_head(
+    parents: tuple[int, ...],
+    names: tuple[str, ...],
+    sides: tuple[str, ...],
+    height: np.ndarray,
+) -> tuple[int | None, bool]:
+    """The joint at the trunk's upper end (None for none), and whether it is a head.
+
+    Without such a name it is the highest leaf in the middle.
+    """
     for word in ("head", "neck"):
         found = [j for j, name in enumerate(names) if word in name.lower()]
         found = [j for j in found if not _TIP.search(names[j].lower())]
@@ -109,13 +116,13 @@ def _head(skeleton: Skeleton, sides: tuple[str, ...], height: np.ndarray) -> tup
     return (top, True) if top is not None and height[top] > height[0] else (None, False)
 
 
-def _limbs(
+def find_limbs(
     parents: tuple[int, ...], lengths: np.ndarray, trunk: list[int]
-) -> tuple[list[dict], list[dict]]:
-    """Arms and legs: legs are what leaves the trunk at its lowest joint."""
+) -> tuple[list[Limb], list[Limb]]:
+    """Arms and legs, not sided: legs are what leaves the trunk at its lowest joint."""
     parts: dict[int, list[int]] = {}
     for leaf in (j for j in range(len(parents)) if j not in parents):
-        part = [j for j in _chain(parents, leaf) if j not in trunk]
+        part = [j for j in chain(parents, leaf) if j not in trunk]
         best = parts.get(part[0], []) if part else None
         if best is not None and lengths[part].sum() > lengths[best].sum():
             parts[part[0]] = part
@@ -124,7 +131,7 @@ def _limbs(
     arms, legs = [], []
     for part in found:
         i = 1 + int(np.argmax(lengths[part[1:-1]] + lengths[part[2:]]))
-        limb = dict(
+        limb = Limb(
             before=tuple(part[: i - 1]),
             upper=part[i - 1],
             middle=part[i],
@@ -157,9 +164,9 @@ def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> An
     places = _zero_pose(skeleton)
     lengths = np.linalg.norm(np.asarray(skeleton.offsets, float), axis=-1)
     lengths[0] = 0.0
-    head, has_head = _head(skeleton, named, places[:, 1])
-    trunk = _chain(parents, 0 if head is None else head)
-    arms, legs = ([], []) if head is None else _limbs(parents, lengths, trunk)
+    head, has_head = find_head(parents, skeleton.names, named, places[:, 1])
+    trunk = chain(parents, 0 if head is None else head)
+    arms, legs = ([], []) if head is None else find_limbs(parents, lengths, trunk)
     if not (arms and legs):
         return Anatomy(
             trunk=tuple(trunk),
@@ -169,12 +176,12 @@ def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> An
             sides=named,
             upright=True,
         )
-    rise = places[trunk[-1]] - np.mean([places[leg["end"]] for leg in legs], axis=0)
+    rise = places[trunk[-1]] - np.mean([places[leg.end] for leg in legs], axis=0)
     upright = rise[1] > 0.8 * np.linalg.norm(rise)
     if set(named) == {MIDDLE} and upright and sides is None:
         named = _guess_sides(parents, places, arms, legs)
     made = [
-        tuple(Limb(**limb, side=named[limb["middle"]]) for limb in limbs)
+        tuple(dataclasses.replace(limb, side=named[limb.middle]) for limb in limbs)
         for limbs in (arms, legs)
     ]
     return Anatomy(
@@ -188,21 +195,19 @@ def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> An
 
 
 def _guess_sides(
-    parents: tuple[int, ...], places: np.ndarray, arms: list[dict], legs: list[dict]
+    parents: tuple[int, ...], places: np.ndarray, arms: list[Limb], legs: list[Limb]
 ) -> tuple[str, ...]:
     """Sides of a zero pose that stands: toes point ahead."""
-    toes = [
-        places[leg["after"][0]] - places[leg["end"]] for leg in legs if leg["after"]
-    ]
+    toes = [places[leg.after[0]] - places[leg.end] for leg in legs if leg.after]
     ahead = np.sum(toes, axis=0) if toes else np.zeros(3)
     left = np.array([ahead[2], 0.0, -ahead[0]])
     found = [MIDDLE] * len(parents)
     for limb in (*arms, *legs):
-        first = (*limb["before"], limb["upper"])[0]
-        away = float(left @ (places[limb["upper"]] - places[parents[first]]))
+        first = (*limb.before, limb.upper)[0]
+        away = float(left @ (places[limb.upper] - places[parents[first]]))
         if abs(away) > 1e-9:
             for joint in range(len(parents)):
-                if first in _chain(parents, joint):
+                if first in chain(parents, joint):
                     found[joint] = LEFT if away > 0 else RIGHT
     return tuple(found)
 

@@ -7,22 +7,17 @@ in the positions: it looks where the chest does.
 """
 
 import dataclasses
-import re
 
 import numpy as np
 
+from jaxmotion.motion import anatomy
+from jaxmotion.motion.anatomy import Limb
 from jaxmotion.viz.figure import LEFT, MIDDLE, RIGHT
 
 LEFT_DARK, RIGHT_DARK, SKIN = "#174f8c", "#942020", "#c9a084"
 
 # Thigh and shank of the adult whose measures stand below, meters.
 _LEG = 0.87
-_SIDES = (
-    re.compile(r"(left|right)", re.IGNORECASE),
-    re.compile(r"(?:^|(?<=[_\-.: ]))([lr])(?=$|[_\-.: ])", re.IGNORECASE),
-    re.compile(r"^([lrLR])(?=[A-Z])"),
-)
-_TIP = re.compile(r"end|top|site|nub|tip")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,14 +43,10 @@ def bone_colors(names: tuple[str, ...] | None, number: int) -> list[str]:
     Returns:
       One color a joint, for the bone that ends at it.
     """
-
-    def color(name: str) -> str:
-        found = next(filter(None, (p.search(name) for p in _SIDES)), None)
-        if found is None:
-            return MIDDLE
-        return LEFT if found.group(1).lower().startswith("l") else RIGHT
-
-    return [MIDDLE] * number if names is None else [color(name) for name in names]
+    colors = {anatomy.LEFT: LEFT, anatomy.RIGHT: RIGHT, anatomy.MIDDLE: MIDDLE}
+    if names is None:
+        return [MIDDLE] * number
+    return [colors[anatomy.side_of(name)] for name in names]
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
@@ -90,75 +81,6 @@ class _Builder:
         )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Limb:
-    """Joints of an arm or a leg: what leads to it, its three joints, what follows."""
-
-    before: tuple[int, ...]
-    upper: int
-    middle: int
-    end: int
-    after: tuple[int, ...]
-
-
-def _chain(parents: tuple[int, ...], joint: int) -> list[int]:
-    """Joints from the root to one."""
-    found = []
-    while joint >= 0:
-        found.append(joint)
-        joint = parents[joint]
-    return found[::-1]
-
-
-def _head(
-    positions: np.ndarray, parents: tuple[int, ...], names: tuple[str, ...] | None
-) -> tuple[int | None, bool]:
-    """The head's joint, and whether it is a neck's; unnamed, it is the highest leaf."""
-    for word in ("head", "neck"):
-        found = [j for j, name in enumerate(names or ()) if word in name.lower()]
-        found = [j for j in found if not _TIP.search(names[j].lower())]
-        if found:
-            # A neck may have several joints.
-            return (found[0], False) if word == "head" else (found[-1], True)
-    sided = [color != MIDDLE for color in bone_colors(names, len(parents))]
-    leaves = [j for j in range(1, len(parents)) if j not in parents and not sided[j]]
-    height = positions[:, :, 1].mean(axis=0)
-    top = max(leaves, key=lambda j: height[j], default=None)
-    return (
-        (top, False) if top is not None and height[top] > height[0] else (None, False)
-    )
-
-
-def _limbs(
-    parents: tuple[int, ...], lengths: np.ndarray, trunk: list[int]
-) -> tuple[list[_Limb], list[_Limb]]:
-    """Arms and legs: legs are what leaves the trunk at its lowest joint.
-
-    The two longest bones in a row are the upper arm and the forearm, thigh and shank.
-    """
-    parts: dict[int, list[int]] = {}
-    for leaf in (j for j in range(len(parents)) if j not in parents):
-        part = [j for j in _chain(parents, leaf) if j not in trunk]
-        best = parts.get(part[0], []) if part else None
-        if best is not None and lengths[part].sum() > lengths[best].sum():
-            parts[part[0]] = part
-    found = [p for p in parts.values() if len(p) > 2 and parents[p[0]] != trunk[-1]]
-    lowest = min((trunk.index(parents[part[0]]) for part in found), default=0)
-    arms, legs = [], []
-    for part in found:
-        i = 1 + int(np.argmax(lengths[part[1:-1]] + lengths[part[2:]]))
-        limb = _Limb(
-            before=tuple(part[: i - 1]),
-            upper=part[i - 1],
-            middle=part[i],
-            end=part[i + 1],
-            after=tuple(part[i + 2 :]),
-        )
-        low = trunk.index(parents[part[0]]) == lowest
-        (legs if low else arms).append(limb)
-    return arms, legs
-
-
 def build(
     positions: np.ndarray, parents: tuple[int, ...], names: tuple[str, ...] | None
 ) -> Body:
@@ -172,13 +94,17 @@ def build(
     up_tree = np.array([max(p, 0) for p in parents])
     skeleton = np.linalg.norm(positions - positions[:, up_tree], axis=-1)
     lengths = np.median(skeleton, axis=0)
-    head, is_neck = _head(positions, parents, names)
-    trunk = _chain(parents, 0 if head is None else head)
-    arms, legs = ([], []) if head is None else _limbs(parents, lengths, trunk)
+    sides = tuple(map(anatomy.side_of, names or [""] * len(parents)))
+    height = positions[:, :, 1].mean(axis=0)
+    head, has_head = anatomy.find_head(parents, names or (), sides, height)
+    trunk = anatomy.chain(parents, 0 if head is None else head)
+    arms, legs = (
+        ([], []) if head is None else anatomy.find_limbs(parents, lengths, trunk)
+    )
     if legs:
         scale = np.mean([lengths[leg.middle] + lengths[leg.end] for leg in legs]) / _LEG
     else:
-        chains = [lengths[_chain(parents, j)].sum() for j in range(len(parents))]
+        chains = [lengths[anatomy.chain(parents, j)].sum() for j in range(len(parents))]
         scale = max(max(chains) / 1.2, 1e-3)
     made = _Builder(positions, float(scale))
     colors = bone_colors(names, len(parents))
@@ -196,19 +122,19 @@ def build(
     for joint in range(1, len(parents)):
         if joint in done:
             continue
-        finger = ends & set(_chain(parents, parents[joint]))
+        finger = ends & set(anatomy.chain(parents, parents[joint]))
         radius = 0.011 if finger else min(0.04, 0.2 * lengths[joint] / scale + 0.01)
         color = SKIN if finger else colors[joint]
         made.capsule(parents[joint], joint, radius, radius, color)
     if head is not None:
-        _add_head(made, parents, trunk, is_neck, arms, front)
+        _add_head(made, parents, trunk, not has_head, arms, front)
     if not made.shapes:
         made.capsule(0, 0, 0.05, 0.05, MIDDLE)
     return made.body()
 
 
 def _forward(
-    positions: np.ndarray, arms: list[_Limb], legs: list[_Limb]
+    positions: np.ndarray, arms: list[Limb], legs: list[Limb]
 ) -> np.ndarray | None:
     """Where the chest faces [F, 3], level; None if the tree does not tell."""
     pair = arms if len(arms) == 2 else legs
@@ -226,8 +152,8 @@ def _add_trunk(
     made: _Builder,
     parents: tuple[int, ...],
     trunk: list[int],
-    arms: list[_Limb],
-    legs: list[_Limb],
+    arms: list[Limb],
+    legs: list[Limb],
 ) -> None:
     """Belly, chest, pelvis, flanks and shoulders."""
     first = min(
@@ -258,7 +184,7 @@ def _add_trunk(
         made.capsule(ribs, low, 0.085, 0.085, MIDDLE)
 
 
-def _add_leg(made: _Builder, leg: _Limb, color: str, front: np.ndarray | None) -> None:
+def _add_leg(made: _Builder, leg: Limb, color: str, front: np.ndarray | None) -> None:
     dark = {LEFT: LEFT_DARK, RIGHT: RIGHT_DARK}.get(color, MIDDLE)
     made.capsule(leg.upper, leg.middle, 0.082, 0.056, color)
     calf = made.between(leg.middle, leg.end, 0.3)
@@ -295,7 +221,7 @@ def _add_leg(made: _Builder, leg: _Limb, color: str, front: np.ndarray | None) -
     made.capsule(ball, tip, 0.034, 0.026, dark)
 
 
-def _add_arm(made: _Builder, parents: tuple[int, ...], arm: _Limb, color: str) -> None:
+def _add_arm(made: _Builder, parents: tuple[int, ...], arm: Limb, color: str) -> None:
     made.capsule(arm.upper, arm.upper, 0.062, 0.062, color)
     made.capsule(arm.upper, arm.middle, 0.054, 0.041, color)
     made.capsule(arm.middle, arm.end, 0.042, 0.029, color)
@@ -317,7 +243,7 @@ def _add_head(
     parents: tuple[int, ...],
     trunk: list[int],
     is_neck: bool,
-    arms: list[_Limb],
+    arms: list[Limb],
     front: np.ndarray | None,
 ) -> None:
     head = made.points[trunk[-1]]
