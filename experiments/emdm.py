@@ -263,6 +263,7 @@ def evaluate(args: Evaluate) -> None:
     chosen = cli.chosen_rows(args)
     emdm_training.check_rows(chosen)
     out = cli.out_folder(args, "evaluation")
+    run = runs.load(args.run, system="emdm")
     cli.announce("compiling the evaluator and the sampler of each row", 40)
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     given = cli.given(emdm_scoring.Settings, args)
@@ -271,7 +272,7 @@ def evaluate(args: Evaluate) -> None:
         args.run, settings, rows=chosen, long_replications=args.long_replications
     )
     report = {
-        "run": runs.load(args.run, system="emdm").settings,
+        "run": run.settings,
         "evaluator": scorer.describe,
     } | reporting.provenance(args)
     notes = (frozen.note(scorer.describe), *scorer.notes)
@@ -284,6 +285,7 @@ def evaluate(args: Evaluate) -> None:
 def sample(args: Sample) -> None:
     """Writes one motion for each action or sentence."""
     out = cli.out_folder(args, "samples")
+    runs.load(args.run, system="emdm")
     cli.announce("compiling the sampler", 40)
     made, source = emdm_evaluation.make_motions(
         args.run,
