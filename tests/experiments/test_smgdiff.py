@@ -85,8 +85,10 @@ def test_dribble_makes_skills_of_labels(invoke, tmp_path):
     assert bool(data.touch.any()) and "synthetic ball" in data.clips.source
     with pytest.raises(FileExistsError, match="--overwrite"):
         invoke("dribble", f"--data {source} --out {out}")
-    with pytest.raises(ValueError, match="--dribble: unknown content.*give labels"):
-        invoke("dribble", f"--data {source} --out {out}2")
+    with pytest.raises(
+        ValueError, match="--dribble: unknown style .none2.*give labels"
+    ):
+        invoke("dribble", f"--data {source} --out {out}2 --field style --dribble none2")
 
 
 BAD = {
