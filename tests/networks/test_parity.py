@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import schedule
+from jaxmotion.diffusion import noise, schedule
 from jaxmotion.motion import trajectory
 from jaxmotion.networks import blocks
 from jaxmotion.systems.camdm import model as camdm_model
@@ -79,31 +79,21 @@ def test_forward_pass(batch_first):
 
 
 def test_sampler():
-    """All steps, fed with the noise that the chain draws from its keys."""
+    """All steps, fed with the noise that the sampler draws from its keys."""
     condition = conditions()
-    shape = (CONFIG.future, CONFIG.num_features)
-
-    def noises(key):
-        key_start, key_chain = jax.random.split(key)
-        steps = jnp.arange(1, CONFIG.num_steps + 1)
-        keys = jax.vmap(
-            lambda t: jax.random.split(jax.random.fold_in(key_chain, t))[1]
-        )(steps)
-        draw = lambda k: jax.random.normal(k, shape)  # noqa: E731
-        return jnp.concatenate([draw(key_start)[None], jax.vmap(draw)(keys)])
-
-    # Debugging of key reuse would forbid drawing the chain's own noise a second time.
-    with jax.debug_key_reuse(False):
-        keys = jax.random.split(jax.random.key(2), BATCH)
-        noise = jax.jit(jax.vmap(noises, out_axes=1))(keys)
-        plan = camdm_model.sampler(parameters(), config=CONFIG)
-        ours = jax.jit(jax.vmap(plan))(keys, condition)
+    plan = camdm_model.sampler(parameters(), config=CONFIG)
+    keys = jax.random.split(jax.random.key(2), BATCH)
+    draw = functools.partial(noise.draw_noise, plan)
+    tapes = jax.vmap(draw)(keys, condition)
+    ours = jax.jit(jax.vmap(noise.with_noise(plan)))(tapes, condition)
+    start, (steps,) = tapes  # of steps T to 1; the peer takes them from 1 to T
+    given_noise = np.concatenate([start[None], jnp.swapaxes(steps, 0, 1)[::-1]])
     beta = schedule.cosine_schedule(CONFIG.num_steps).beta
     table = torch_camdm.posterior_table(np.asarray(beta))
     with torch.inference_mode():
         given = as_torch(condition.arguments(CONFIG))
         theirs = torch_camdm.sample(
-            peer(), table, torch.from_numpy(np.array(noise)), given
+            peer(), table, torch.from_numpy(given_noise), given
         ).numpy()
     np.testing.assert_allclose(ours, theirs, atol=2e-5)
 
