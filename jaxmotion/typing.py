@@ -5,6 +5,7 @@ any leading batch axes. Callables are protocols, so that a plain function or a c
 fits without inheriting from anything.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Float, Int
@@ -19,6 +20,17 @@ class Gaussian(NamedTuple):
 
     mean: Float[Array, "*shape"]
     variance: Float[Array, "*#shape"]
+
+
+class Exported(NamedTuple):
+    """A function that can leave Python: names of what it takes, and of what it gives.
+
+    The first that it takes is "key" if it draws; what leaves then takes "noise".
+    """
+
+    function: Callable
+    takes: tuple[str, ...]
+    gives: tuple[str, ...]
 
 
 @runtime_checkable

@@ -171,7 +171,7 @@ def contacts(
     """Which toes are in contact now, given which were: thresholds with hysteresis."""
     begins = (speed < lock.begin_speed) & (height < lock.begin_height)
     goes_on = (speed < lock.end_speed) & (height < lock.end_height)
-    return jnp.where(was, goes_on, begins)
+    return (was & goes_on) | (~was & begins)
 
 
 def step_lock(

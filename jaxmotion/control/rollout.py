@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-from jaxmotion.typing import Key
+from jaxmotion.typing import Exported, Key
 
 State = Any
 Commands = Any
@@ -50,6 +50,24 @@ class Controller:
     plans: tuple[Callable[[Key, State, Commands], State], ...]
     advance: Callable[[State, Commands], tuple[State, Frame]]
     shown: Callable[[State, Frame], State] | None = None
+
+
+def exports(controller: Controller) -> dict[str, Exported]:
+    """The functions of a controller that plans now and then, for who composes them.
+
+    They are "plan_level", "plan" ("plan_2" and so on, where there are several planners)
+    and "advance"; a tick calls them as `tick` does.
+    """
+    takes = ("state", "command")
+    plans = {
+        "plan" if i == 1 else f"plan_{i}": Exported(plan, ("key", *takes), ("state",))
+        for i, plan in enumerate(controller.plans, start=1)
+    }
+    return {
+        "plan_level": Exported(controller.plan_level, takes, ("level",)),
+        **plans,
+        "advance": Exported(controller.advance, takes, ("state", "frame")),
+    }
 
 
 def tick(

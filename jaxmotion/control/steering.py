@@ -20,7 +20,7 @@ from jaxmotion.control import rollout
 from jaxmotion.control.frame import Frame
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.motion.trajectory import Command
-from jaxmotion.typing import Key, Params
+from jaxmotion.typing import Exported, Key, Params
 
 # Makes the controller of a character from arrays. Hashable, and equal to another of
 # equal settings: it is a static argument of the compiled program.
@@ -42,6 +42,8 @@ class Character:
         that face +z; raises `ValueError` where it cannot.
       clip_starts: `(clips, labels, seed) -> states` in poses of recorded clips; None
         where a system has no such start.
+      exports: `(controller) -> functions by name` that can leave Python, and together
+        are a tick; all on "state" and "command".
     """
 
     skeleton: Skeleton
@@ -52,6 +54,7 @@ class Character:
     method: Method
     starts: Callable[[np.ndarray, int], Any]
     clip_starts: Callable[[Any, np.ndarray, int], Any] | None = None
+    exports: Callable[[rollout.Controller], dict[str, Exported]] = rollout.exports
 
     def label(self, name: str) -> int:
         """Index of a label; raises `ValueError` that names those there are."""

@@ -40,6 +40,8 @@ MAY_IMPORT = {
         "text",
     },
     "viz": {"typing", "motion"},
+    # Functions and shapes of whatever system; a graph's noise is an input.
+    "export": {"typing", "files", "diffusion"},
     # The face composes what stands below it.
     "face.py": BASE
     | {"motion", "control", "data", "learning", "systems", "viz", "export"},
@@ -69,6 +71,7 @@ DOORS = {
     "tqdm": ("jaxmotion/learning/loop.py", "experiments/", "benchmarks/"),
     "tyro": ("jaxmotion/cli.py", "experiments/", "benchmarks/"),
     "torch": ("benchmarks/",),
+    **dict.fromkeys(("jax2onnx", "onnx", "onnxruntime"), ("jaxmotion/export/",)),
     "tokenizers": ("jaxmotion/text/",),
     "wordllama": ("jaxmotion/text/",),
 }

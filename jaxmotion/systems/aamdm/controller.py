@@ -44,7 +44,7 @@ from jaxmotion.systems.aamdm.data import PoseData
 from jaxmotion.systems.aamdm.embedding import PATH
 from jaxmotion.systems.aamdm.model import Sample
 from jaxmotion.systems.aamdm.space import Space
-from jaxmotion.typing import Key, Objective, Params
+from jaxmotion.typing import Exported, Key, Objective, Params
 
 # Strength of the guidance, epsilon of eq. 13; ours.
 SCALE = 10.0
@@ -333,6 +333,18 @@ def controller(
     )
 
 
+def exports(controller: Controller) -> dict[str, Exported]:
+    """What can leave Python: "step", a whole tick, since every tick makes a frame."""
+
+    def step(
+        key: Key, state: CharacterState, command: Command
+    ) -> tuple[CharacterState, Frame]:
+        state = controller.plans[0](key, state, command)
+        return controller.advance(state, command)
+
+    return {"step": Exported(step, ("key", "state", "command"), ("state", "frame"))}
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Method:
     """What makes a controller of `(networks' parameters, space)`; hashable.
@@ -427,4 +439,5 @@ def load_character(
         starts=lambda labels, seed: start_states(
             run.held_out, space, len(labels), num_joints=num_joints, seed=seed
         ),
+        exports=exports,
     )

@@ -15,7 +15,7 @@ from jaxtyping import Array
 from jaxmotion.evaluation import bench, by_frame, table
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Cell, Row, Rows
-from jaxmotion.learning import runs
+from jaxmotion.learning import model_json, runs
 from jaxmotion.motion import humanml_skeleton
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.systems.emdm import action_evaluation, text_evaluation
@@ -25,7 +25,7 @@ from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import text as emdm_text
 from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.emdm.scoring import Many, RowScorer, Settings
-from jaxmotion.typing import Key
+from jaxmotion.typing import Exported, Key
 
 # Rows with so many network calls a motion are replicated less often.
 _LONG = 500
@@ -193,6 +193,52 @@ def make_motions(
         for i, name in enumerate(actions or ("motion",))
     }
     return found, run.clips.source
+
+
+def exports(
+    folder: Path, *, row: str = "emdm", scale: float | None = None
+) -> tuple[dict[str, Exported], emdm_model.Condition, dict[str, Any]]:
+    """What can leave Python: "sample", from a condition to a motion.
+
+    Args:
+      folder: The run folder.
+      row: Which model.
+      scale: Guidance; None for the paper's.
+
+    Returns:
+      The function by its name, a condition, and what else a player must know.
+
+    Raises:
+      CheckpointError: if the row was not trained.
+      ValueError: if it is no run folder of EMDM, or there is no such row.
+    """
+    record = runs.load(folder, system=emdm_training.SYSTEM)
+    emdm_training.check_rows((row,))
+    params, config = emdm_training.load_row(record, row)
+    sample = emdm_training.row_sampler(params, config, row)
+    scale = emdm_training.guidance_scale(scale, task=config.condition)
+    vector = jnp.zeros((1, config.condition_size))
+    condition = emdm_model.make_condition(vector, config=config)
+    if config.condition == "text":
+        run = emdm_text.load_run(folder)
+        decode, gives = (lambda x: emdm_text.joints(run, x)), "joints"
+        facts = {"fps": run.motions.fps, "source": run.motions.source}
+    else:
+        run = emdm_data.load_run(folder)
+        decode = lambda x: emdm_features.to_motion(x, run.representation)  # noqa: E731
+        gives = "motion"
+        facts = {
+            "fps": run.representation.fps,
+            "source": run.clips.source,
+            "labels": list(run.actions) if config.condition == "action" else [],
+            "skeleton": model_json.skeleton_to_json(run.clips.skeleton),
+        }
+
+    def made(key: Key, condition: emdm_model.Condition) -> Any:
+        return decode(sample(key, condition, scale=scale))
+
+    function = Exported(made, ("key", "condition"), (gives,))
+    return {"sample": function}, jax.tree.map(lambda x: x[0], condition), facts
 
 
 _ROW = "emdm"

@@ -1,0 +1,166 @@
+"""A character leaves Python: its run-time as ONNX or StableHLO.
+
+Writes to a folder: the graphs; character.json (names, shapes and meanings of all
+arrays, the order of calls, the skeleton); start.npz (how a character starts, for each
+label); for ONNX also player.py, which needs onnxruntime and NumPy alone and steers the
+character for ten seconds. A run of EMDM gives the graph of its sampler.
+
+Example: python experiments/export.py --model locomotion --format onnx --out runs/onnx
+"""
+
+import dataclasses
+import json
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import tyro
+
+import jaxmotion as jm
+from jaxmotion import cli, files
+from jaxmotion.export import graph, onnx, stablehlo
+from jaxmotion.learning import loop, model_json, runs
+from jaxmotion.systems import registry
+
+FORMATS = {"onnx": onnx, "stablehlo": stablehlo}
+CONVENTIONS = (
+    "meters, seconds, radians; y up, right-handed; vectors on the ground are (x, z), "
+    "and a character that starts faces +z. Rotations are parent-local (the root's "
+    "global), six numbers: the first two columns of the matrix, one after the other."
+)
+CALLS = {
+    "step": ["state, frame = step(noise, state, command)"],
+    "sample": ["motion = sample(noise, condition)"],
+    "advance": [
+        "level = plan_level(state, command)",
+        "if level == 1: state = plan(noise, state, command)",
+        "if level == n > 1: state = plan_n(noise, state, command)",
+        "state, frame = advance(state, command)",
+    ],
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Writes the graphs of a shipped model or a run.
+
+    Attributes:
+      model: Name of a shipped model.
+      run: Run folder of any system, or a file of camdm.py export, in its place.
+      out: Folder to write to.
+      format: onnx or stablehlo.
+      batch: one (arrays have no axis for characters), a number, or any.
+      foot_lock: Planted feet stay; None as jm.load has it (on for shipped models).
+      row: EMDM's row.
+      scale: EMDM's guidance; None for the paper's.
+    """
+
+    model: str | None = None
+    run: Path | None = None
+    out: Path = Path("runs/export")
+    format: str = "onnx"
+    batch: str = "one"
+    foot_lock: bool | None = None
+    row: str = "emdm"
+    scale: float | None = None
+
+
+def batch_of(text: str) -> graph.Batch:
+    """What --batch asks for."""
+    if text in ("one", graph.ANY):
+        return None if text == "one" else text
+    if not text.isdecimal() or not 1 <= int(text) <= 10**6:
+        raise ValueError(
+            f"--batch is {text!r}, expected 'one', a number of characters, or 'any'"
+        )
+    return int(text)
+
+
+def steered(character: Any) -> tuple[dict, dict, dict, dict]:
+    """Functions, arguments, facts and starts of a steered character."""
+    functions = character.exports(character.method(character.params))
+    labels = character.labels or (None,)
+    states = character.start(labels=list(range(len(labels))))
+    command = jm.commands("stand", character, 1, seconds=1.0)
+    first = lambda tree: jax.tree.map(lambda x: x[0], tree)  # noqa: E731
+    arguments = {"state": first(states), "command": first(first(command))}
+    names = [port.name for port in graph.ports({"state": states})]
+    starts = dict(zip(names, map(np.asarray, jax.tree.leaves(states)), strict=True))
+    facts = {
+        "fps": character.fps,
+        "source": character.source,
+        "labels": list(character.labels),
+        "skeleton": model_json.skeleton_to_json(character.skeleton),
+    }
+    return functions, arguments, facts, starts
+
+
+def export(args: Config) -> None:
+    """Loads, converts, and writes.
+
+    Raises:
+      OSError: if the model cannot be read or the folder not be written.
+      ValueError: if an option is wrong, a package missing, or a function has no form
+        in the format.
+    """
+    cli.check(args)
+    batch = batch_of(args.batch)
+    if args.format not in FORMATS:
+        raise ValueError(
+            f"--format is {args.format!r}, expected one of {', '.join(FORMATS)}"
+        )
+    if (args.model is None) == (args.run is None):
+        raise ValueError("expected either --model or --run")
+    writer = FORMATS[args.format]
+    if writer is onnx:
+        onnx.check()
+    loop.check_writable(args.out)
+    source = args.model if args.run is None else args.run
+    system = None
+    if args.run is not None and not args.run.is_file():
+        config = files.read_object(
+            args.run / "config.json", what="expected a run folder"
+        )
+        system = registry.get(str(config.get("system")))
+    if system is not None and not system.steerable:
+        functions, condition, facts = system.room("evaluation").exports(
+            args.run, row=args.row, scale=args.scale
+        )
+        arguments, starts = {"condition": condition}, {}
+    else:
+        character = jm.load(source, foot_lock=args.foot_lock)
+        functions, arguments, facts, starts = steered(character)
+    graphs = {}
+    for name, function in functions.items():
+        begun, path = time.perf_counter(), args.out / (name + writer.SUFFIX)
+        made = graph.make(name, function, arguments)
+        writer.write(path, made, batch=batch)
+        graphs[name] = graph.to_json(made, path.name, batch=batch)
+        size, seconds = path.stat().st_size / 1e6, time.perf_counter() - begun
+        print(f"{path}: {size:.2f} MB, {seconds:.0f} s", flush=True)
+    kind = next(name for name in CALLS if name in graphs)
+    about = {
+        "format": 1,
+        "model": str(source),
+        **facts,
+        "conventions": CONVENTIONS,
+        "batch": batch,
+        "calls": CALLS[kind],
+        "noise": "standard normal, drawn anew for each call",
+        "graphs": graphs,
+        "versions": runs.versions(),
+    }
+    files.write_text(args.out / "character.json", json.dumps(about, indent=1) + "\n")
+    if starts:
+        files.write_arrays(args.out / "start.npz", starts)
+    if starts and args.format == "onnx":
+        player = Path(jm.__file__).with_name("export") / "player.py"
+        shutil.copyfile(player, args.out / player.name)
+    print(f"{args.out / 'character.json'}: {', '.join(graphs)}")
+
+
+if __name__ == "__main__":
+    cli.start(lambda: export(tyro.cli(Config, description=__doc__)))

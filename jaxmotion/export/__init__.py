@@ -1,0 +1,1 @@
+"""Functions that leave Python: as ONNX, as StableHLO, and what plays them."""

@@ -1,0 +1,41 @@
+"""Graphs as StableHLO by `jax.export`: what any JAX, or another compiler, runs.
+
+    call = jax.export.deserialize(Path("plan.stablehlo").read_bytes()).call
+    outputs = call(*inputs)  # in the order of the JSON
+
+Parameters are constants of the file, and nothing of this library is needed to load it.
+"""
+
+from pathlib import Path
+
+import jax
+import jax.export
+
+from jaxmotion import files
+from jaxmotion.export.graph import ANY, Batch, Graph
+
+SUFFIX = ".stablehlo"
+# Where a file runs, whatever machine wrote it.
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+
+
+def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
+    """Writes a graph, with its parameters in it.
+
+    Args:
+      path: The file.
+      graph: The graph.
+      batch: None for one character, without an axis for it; a number of them, or
+        `graph.ANY`, for a first axis of all arrays.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    lead = () if batch is None else (batch,)
+    if batch == ANY:
+        lead = jax.export.symbolic_shape(ANY)
+    run = graph.run if batch is None else jax.vmap(graph.run)
+    structs = [port.struct(*lead) for port in graph.inputs]
+    exported = jax.export.export(jax.jit(run), platforms=PLATFORMS)(*structs)
+    with files.replacing(path) as file:
+        file.write(exported.serialize())
