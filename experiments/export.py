@@ -156,7 +156,7 @@ def export(args: Config) -> None:
     files.write_text(args.out / "character.json", json.dumps(about, indent=1) + "\n")
     if starts:
         files.write_arrays(args.out / "start.npz", starts)
-    if starts and args.format == "onnx":
+    if starts and args.format == "onnx" and batch is None:
         player = Path(jm.__file__).with_name("export") / "player.py"
         shutil.copyfile(player, args.out / player.name)
     print(f"{args.out / 'character.json'}: {', '.join(graphs)}")

@@ -77,7 +77,22 @@ def _converted(graph: Graph, *, inner: bool) -> Any:
         name = own + port.name
         model.graph.node.append(helper.make_node("Identity", [value.name], [name]))
         value.name = name
+    _prune(model.graph)
     return model
+
+
+def _prune(body: Any) -> set[str]:
+    """Takes constants out that nothing reads; returns the names that are read."""
+    read = {value.name for value in body.output}
+    for node in body.node:
+        read.update(node.input)
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                read |= _prune(attribute.g)
+    kept = [constant for constant in body.initializer if constant.name in read]
+    del body.initializer[:]
+    body.initializer.extend(kept)
+    return read
 
 
 def _over_characters(model: Any, graph: Graph, batch: int | str) -> Any:
