@@ -162,5 +162,10 @@ def export(args: Config) -> None:
     print(f"{args.out / 'character.json'}: {', '.join(graphs)}")
 
 
+def main() -> None:
+    """Parses the command line and exports."""
+    export(tyro.cli(Config, description=__doc__))
+
+
 if __name__ == "__main__":
-    cli.start(lambda: export(tyro.cli(Config, description=__doc__)))
+    cli.start(main)

@@ -90,10 +90,12 @@ def make(name: str, exported: Exported, arguments: dict[str, Any]) -> Graph:
         return tuple(jax.tree.leaves(function(*jax.tree.unflatten(tree, arrays))))
 
     named = dict(zip(exported.gives, found, strict=True))
-    return Graph(name=name, run=run, inputs=ports(given), outputs=ports(named, OUT))
+    return Graph(
+        name=name, run=run, inputs=ports(given), outputs=ports(named, before=OUT)
+    )
 
 
-def ports(trees: dict[str, Any], before: str = "") -> tuple[Port, ...]:
+def ports(trees: dict[str, Any], *, before: str = "") -> tuple[Port, ...]:
     """The arrays of trees by their place, in the order of their leaves."""
     found = []
     for head, tree in trees.items():

@@ -24,6 +24,7 @@ BEFORE_KEY = {
     "model",  # a character, in the face
     "run_chunk",
     "sample",
+    "function",
     "generate",
     "self",
 }

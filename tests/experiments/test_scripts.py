@@ -18,6 +18,7 @@ WRONG = {
     "dribble": ("--data {gone} --out {out}", "gone"),
     "emdm": ("evaluate --run {gone}", "gone"),
     "evaluator": ("show {gone}", "gone"),
+    "export": ("--model locomotion --format fbx --out {out}", "onnx, stablehlo"),
     "prepare_data": ("lafan1 --manual-dir {gone} --out {out}.npz", "gone"),
     "quickstart": ("--out {file}/below", "file/below"),
     "report": ("--runs {gone}", "gone"),
