@@ -29,6 +29,7 @@ from jaxmotion.systems.smgdiff import model as smgdiff_model
 from jaxmotion.systems.smgdiff import players as smgdiff_players
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff.guidance import SCHEDULES, TUNED, Guidance
+from jaxmotion.viz.stage import Ball
 
 
 @dataclasses.dataclass(frozen=True)
@@ -267,7 +268,7 @@ def rollout(args: Rollout) -> None:
         commands.velocity,
         title=", ".join(skills),
         caption=run.model.source,
-        ball=reporting.Ball(
+        ball=Ball(
             position=np.asarray(scene.ball),
             touch=touch,
             joints=features.joints,

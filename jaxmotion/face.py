@@ -30,6 +30,7 @@ from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.trajectory import Command, integrate_path
 from jaxmotion.systems import registry
 from jaxmotion.typing import Key
+from jaxmotion.viz.stage import Ball, Stage, make_stage
 
 ASSETS = Path(__file__).with_name("assets")
 # Characters at a time on a CPU, where one large batch falls out of the cache.
@@ -205,23 +206,25 @@ def _one(frames: Frame | Motion) -> Motion:
     return frames.motion if isinstance(frames, Frame) else frames
 
 
-def _drawing(skeleton: Skeleton, frames: Frame | Motion) -> dict[str, Any]:
-    """What pictures of one character are drawn from."""
-    motion = _one(frames)
-    positions = np.asarray(joint_positions(skeleton, motion))
-    found = dict(
-        positions=positions,
-        parents=skeleton.parents,
-        fps=motion.fps,
-        names=skeleton.names,
-        walked=positions[:, 0, ::2],
+def _stage(skeleton: Skeleton, frames: Frame | Motion) -> Stage:
+    """What pictures are drawn from: one character or many."""
+    if not isinstance(frames, Frame | Motion):
+        raise ValueError(f"frames are a {type(frames).__name__}, expected a Frame")
+    if isinstance(frames, Motion):
+        return make_stage(skeleton, frames)
+    if frames.root_position.ndim not in (2, 3):
+        raise ValueError(
+            f"frames of shape {frames.root_position.shape[:-1]}: expected those of "
+            "one character, such as frames[0], or of many"
+        )
+    start = frames.root_position[..., :1, ::2]
+    ball = frames.extra.get("ball")
+    return make_stage(
+        skeleton,
+        frames.motion,
+        wanted=start + integrate_path(frames.desired_velocity, frames.fps),
+        ball=None if ball is None else Ball(position=np.asarray(ball, float)),
     )
-    if isinstance(frames, Frame):
-        path = np.asarray(integrate_path(frames.desired_velocity, motion.fps))
-        found["commanded"] = path + found["walked"][0]
-        if "ball" in frames.extra:
-            found["ball"] = np.asarray(frames.extra["ball"])
-    return found
 
 
 def _save_bvh(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
@@ -233,13 +236,13 @@ def _save_bvh(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
 def _save_gif(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     from jaxmotion.viz import animation
 
-    animation.save_gif(path, **_drawing(skeleton, frames))
+    animation.save_gif(path, _stage(skeleton, frames))
 
 
 def _save_html(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     from jaxmotion.viz import html
 
-    html.save_html(path, title=path.stem, **_drawing(skeleton, frames))
+    html.save_html(path, _stage(skeleton, frames), title=path.stem)
 
 
 def _save_npz(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
@@ -323,15 +326,16 @@ def show(
 
     Args:
       skeleton: The skeleton.
-      frames: Frames of one character, such as `frames[0]`.
+      frames: Frames of one character, such as `frames[0]`, or of many, which are set
+        apart where they would start within each other.
       title: Above the picture.
       caption: Below it, such as the data's source and license.
       height: Height of the view, pixels.
 
     Raises:
-      ValueError: if frames are not those of one character, or not finite.
+      ValueError: if frames are not those of characters over time, or not finite.
     """
     from jaxmotion.viz import html
 
-    drawn = _drawing(skeleton, frames)
-    return View(html.page(**drawn, title=title, caption=caption), height)
+    stage = _stage(skeleton, frames)
+    return View(html.page(stage, title=title, caption=caption), height)

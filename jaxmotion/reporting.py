@@ -14,31 +14,15 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxmotion import files
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.evaluation import bench, columns, table
 from jaxmotion.learning import runs
 from jaxmotion.motion import trajectory
-from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Ball:
-    """A ball beside a motion.
-
-    Attributes:
-      position: World position of its center, meters.
-      touch: Which of the joints touch it.
-      joints: Joints that may touch it.
-      radius: Meters.
-    """
-
-    position: Float[np.ndarray, "frames 3"]
-    touch: Bool[np.ndarray, "frames touching"]
-    joints: tuple[int, ...]
-    radius: float
+from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.viz.stage import Ball, make_stage
 
 
 def write_rollout(
@@ -74,31 +58,25 @@ def write_rollout(
     fps = motion.fps
     folder.mkdir(parents=True, exist_ok=True)
     bvh_text.write_bvh(folder / f"{name}.bvh", bvh.bvh_from_motion(skeleton, motion))
-    positions = np.asarray(joint_positions(skeleton, motion))
-    walked = positions[:, 0, ::2]
-    commanded = None
+    wanted = None
     if desired_velocity is not None:
         path = trajectory.integrate_path(desired_velocity, fps)
-        commanded = np.asarray(path) + walked[0]
-    shown = dict(fps=fps, names=skeleton.names, commanded=commanded, walked=walked)
-    shown |= dict(title=title, caption=caption)
-    gif, page = dict(shown), dict(shown)
+        wanted = np.asarray(path) + np.asarray(motion.root_position)[0, ::2]
     if ball is not None:
         _write_ball(folder / f"{name}_ball.csv", ball, fps)
-        place = dict(ball=ball.position, radius=ball.radius)
-        gif |= place | dict(feet=ball.joints, contact=ball.touch)
-        page |= place | dict(touch=np.any(ball.touch, axis=-1))
-    animation.save_gif(folder / f"{name}.gif", positions, skeleton.parents, **gif)
-    html.save_html(folder / f"{name}.html", positions, skeleton.parents, **page)
+    stage = make_stage(skeleton, motion, wanted=wanted, ball=ball)
+    texts = dict(title=title, caption=caption)
+    animation.save_gif(folder / f"{name}.gif", stage, **texts)
+    html.save_html(folder / f"{name}.html", stage, **texts)
     print(f"wrote {name}.bvh, {name}.gif and {name}.html to {folder}")
 
 
 def _write_ball(path: Path, ball: Ball, fps: float) -> None:
     """Time, position in meters, and whether something touches it, one frame a line."""
     lines = ["seconds,x,y,z,touch"]
-    for frame, (place, touch) in enumerate(zip(ball.position, ball.touch, strict=True)):
+    for frame, place in enumerate(ball.position):
         numbers = ",".join(f"{value:.4f}" for value in place)
-        lines.append(f"{frame / fps:.4f},{numbers},{int(np.any(touch))}")
+        lines.append(f"{frame / fps:.4f},{numbers},{int(bool(ball.touching(frame)))}")
     files.write_text(path, "\n".join(lines) + "\n")
 
 

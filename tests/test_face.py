@@ -134,7 +134,7 @@ def test_a_view_lives_without_a_kernel(model, frames):
             "2 states and commands for 3 characters",
         ),
         (lambda m, f: jm.save("a.fbx", m.skeleton, f[0]), "'.fbx', expected one of"),
-        (lambda m, f: jm.save("a.gif", m.skeleton, f), r"\(32, 3\): expected those"),
+        (lambda m, f: jm.save("a.bvh", m.skeleton, f), r"\(32, 3\): expected those"),
         (lambda m, f: jm.show(m.skeleton, f[0, 0]), "expected those of one"),
     ],
 )

@@ -8,14 +8,16 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFilter, ImageFont
 
+from jaxmotion.viz import body as bodies
 from jaxmotion.viz import camera as cameras
 from jaxmotion.viz import figure as drawing
 from jaxmotion.viz import raster
-from jaxmotion.viz import sketch as bodies
+from jaxmotion.viz.stage import Stage
 
 _GROUND, _TILE, _INK, _FAINT = "#f6f8fa", "#dde4ec", "#20262e", "#707884"
 _PATH_COLORS = (drawing.COMMANDED, drawing.WALKED)
 _TOUCH, _BALL = "#2fae4a", "#e8e4da"
+_GHOST = "#8fa3b8"
 _SHADOW = 0.3
 # Trunk, head and feet are of many capsules: meters over which their light is smoothed.
 _SOFT = {
@@ -113,23 +115,27 @@ def _page(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class _Scene:
-    """What is drawn; capsules and paths are in world coordinates."""
+class _Shot:
+    """A stage before a camera.
+
+    Attributes:
+      ends: [C, F, S, 2, 3] of the bodies; of the ghosts, or None.
+      paths: Ground paths [C, F, 3], and their colors.
+    """
 
     page: _Page
     camera: cameras.Camera
-    body: bodies.Body
+    stage: Stage
+    ends: np.ndarray
+    ghosts: np.ndarray | None
     paths: tuple[tuple[np.ndarray, str], ...]
-    contacts: tuple[tuple[int, ...], np.ndarray] | None
-    ball: np.ndarray | None
-    radius: float
 
-    @property
+    @functools.cached_property
     def colors(self) -> list[str]:
         """What has shades."""
-        found = {*self.body.colors}
-        found |= set() if self.contacts is None else {_TOUCH}
-        return sorted(found | (set() if self.ball is None else {_BALL}))
+        more = set() if self.stage.ball is None else {_TOUCH, _BALL}
+        more |= set() if self.ghosts is None else {_GHOST}
+        return sorted({*self.stage.body.colors} | more)
 
     @property
     def reach(self) -> float:
@@ -137,10 +143,10 @@ class _Scene:
         return 0.85 * self.camera.distance
 
 
-def _fade(scene: _Scene, points: np.ndarray, frame: int) -> np.ndarray:
+def _fade(shot: _Shot, points: np.ndarray, frame: int) -> np.ndarray:
     """1 near the target, 0 where the ground is no longer drawn."""
-    target = scene.camera.targets[frame]
-    far = np.linalg.norm((points - target)[..., [0, 2]], axis=-1) / scene.reach
+    target = shot.camera.targets[frame]
+    far = np.linalg.norm((points - target)[..., [0, 2]], axis=-1) / shot.reach
     return np.clip((1.0 - far) / 0.6, 0.0, 1.0)
 
 
@@ -155,12 +161,12 @@ def tiles(center: np.ndarray, reach: float) -> np.ndarray:
     return corner[:, None] + square
 
 
-def _draw_tiles(pen: ImageDraw.ImageDraw, scene: _Scene, frame: int) -> None:
+def _draw_tiles(pen: ImageDraw.ImageDraw, shot: _Shot, frame: int) -> None:
     """A chequered ground that fades into the distance."""
-    corners = tiles(scene.camera.targets[frame], scene.reach)
-    level = np.round(_TONES * _fade(scene, corners.mean(axis=1), frame)).astype(int)
-    pixels, _, near = scene.camera.project(corners, frame)
-    ahead = near.max(axis=1) < 0.98 * scene.camera.distance  # not behind the camera
+    corners = tiles(shot.camera.targets[frame], shot.reach)
+    level = np.round(_TONES * _fade(shot, corners.mean(axis=1), frame)).astype(int)
+    pixels, _, near = shot.camera.project(corners, frame)
+    ahead = near.max(axis=1) < 0.98 * shot.camera.distance  # not behind the camera
     shapes = pixels.reshape(-1, 8).tolist()
     for shape, tone in zip(shapes, (level * ahead).tolist(), strict=True):
         if tone:
@@ -169,7 +175,7 @@ def _draw_tiles(pen: ImageDraw.ImageDraw, scene: _Scene, frame: int) -> None:
 
 def _draw_lines(
     pen: ImageDraw.ImageDraw,
-    scene: _Scene,
+    shot: _Shot,
     frame: int,
     points: np.ndarray,
     color: str,
@@ -178,9 +184,9 @@ def _draw_lines(
     width: int,
 ) -> None:
     """Lines [..., n, 3] on the ground that fade with their distance."""
-    fade = _fade(scene, 0.5 * (points[..., 1:, :] + points[..., :-1, :]), frame)
+    fade = _fade(shot, 0.5 * (points[..., 1:, :] + points[..., :-1, :]), frame)
     levels = np.ceil(4 * fade).astype(int)
-    pixels = _FINE * scene.camera.project(points, frame)[0]
+    pixels = _FINE * shot.camera.project(points, frame)[0]
     ends = np.concatenate([pixels[..., :-1, :], pixels[..., 1:, :]], axis=-1)
     ramp = [_mix(_GROUND, color, strength * level / 4) for level in range(5)]
     # Pale ones first: where lines cross, the strong one is seen.
@@ -189,27 +195,33 @@ def _draw_lines(
             pen.line(end, fill=ramp[level], width=width)
 
 
-def _capsules(scene: _Scene, frame: int) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Ends [S, 2, 3] and radii [S, 2] of body, marks and ball, meters, and colors."""
-    ends, radii = [scene.body.points[frame, scene.body.ends]], [scene.body.radii]
-    colors = list(scene.body.colors)
-    if scene.contacts is not None:
-        feet, down = scene.contacts
-        marks = scene.body.points[frame, np.array(feet)[down[frame]]]
-        ends.append(np.stack([marks, marks], axis=1))
-        radii.append(np.full((len(marks), 2), _MARK))
-        colors += [_TOUCH] * len(marks)
-    if scene.ball is not None:
-        ends.append(scene.ball[[frame, frame]][None])
-        radii.append(np.full((1, 2), scene.radius))
-        colors.append(_BALL)
+def _capsules(
+    shot: _Shot, frame: int, *, ghost: bool = False
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Ends [S, 2, 3] and radii [S, 2] of all bodies, or ghosts, and colors.
+
+    With the bodies come the ball and the marks of what touches it.
+    """
+    stage = shot.stage
+    body, ball = stage.body, stage.ball
+    shown = shot.ghosts if ghost else shot.ends
+    ends = [shown[:, frame].reshape(-1, 2, 3)]
+    radii = [np.tile(body.radii, (len(shown), 1))]
+    if ghost:
+        return ends[0], radii[0], [_GHOST] * len(ends[0])
+    colors = list(body.colors) * len(shown)
+    if ball is not None:
+        marks = stage.positions[0, frame, ball.touching(frame)].reshape(-1, 3)
+        ends += [np.stack([marks, marks], axis=1), ball.position[[frame, frame]][None]]
+        radii += [np.full((len(marks), 2), _MARK), np.full((1, 2), ball.radius)]
+        colors += [_TOUCH] * len(marks) + [_BALL]
     return np.concatenate(ends), np.concatenate(radii), colors
 
 
-def _draw_shadow(scene: _Scene, frame: int, picture: Image.Image) -> None:
+def _draw_shadow(shot: _Shot, frame: int, picture: Image.Image) -> None:
     """What the light casts on the ground, soft."""
-    ends, radii, _ = _capsules(scene, frame)
-    light = scene.camera.axes.T @ raster.LIGHT
+    ends, radii, _ = _capsules(shot, frame)
+    light = shot.camera.axes.T @ raster.LIGHT
     ground = (ends - ends[..., 1:2] / light[1] * light)[..., [0, 2]]
     along = ground[:, 1] - ground[:, 0]
     angles = np.arctan2(along[:, 1], along[:, 0])[:, None]
@@ -219,7 +231,7 @@ def _draw_shadow(scene: _Scene, frame: int, picture: Image.Image) -> None:
     near = ground[:, 0, None] - radii[:, 0, None, None] * arc
     rims = np.concatenate([far, near], axis=1)
     points = np.stack([rims[..., 0], 0 * rims[..., 0], rims[..., 1]], axis=-1)
-    pixels = scene.camera.project(points, frame)[0]
+    pixels = shot.camera.project(points, frame)[0]
     mask = Image.new("L", picture.size)
     pen = ImageDraw.Draw(mask)
     for polygon in pixels.reshape(len(pixels), -1).tolist():
@@ -229,12 +241,14 @@ def _draw_shadow(scene: _Scene, frame: int, picture: Image.Image) -> None:
     picture.paste(_INK, mask=mask.point([16 * round(v / 16) for v in range(256)]))
 
 
-def _draw_body(scene: _Scene, frame: int, picture: Image.Image) -> None:
-    """Body, marks of touching joints, and ball."""
-    ends, radii, colors = _capsules(scene, frame)
-    number = {color: i for i, color in enumerate(scene.colors)}
-    pixels, scale, near = scene.camera.project(ends, frame)
-    usual = scene.camera.focal / scene.camera.distance
+def _draw_bodies(
+    shot: _Shot, frame: int, picture: Image.Image, *, ghost: bool = False
+) -> None:
+    """Bodies, marks of touching joints, and ball; or ghosts, which one sees through."""
+    ends, radii, colors = _capsules(shot, frame, ghost=ghost)
+    number = {color: i for i, color in enumerate(shot.colors)}
+    pixels, scale, near = shot.camera.project(ends, frame)
+    usual = shot.camera.focal / shot.camera.distance
     seen = raster.capsules(
         _FINE * np.concatenate([pixels, near[..., None] * usual], axis=-1),
         _FINE * radii * scale,
@@ -243,29 +257,32 @@ def _draw_body(scene: _Scene, frame: int, picture: Image.Image) -> None:
         height=picture.height,
         soft={number[c]: _FINE * m * usual for c, m in _SOFT.items() if c in number},
     )
-    shades = [raster.shades(_rgb(color)) for color in scene.colors]
+    shades = [raster.shades(_rgb(color)) for color in shot.colors]
     table = np.round(np.concatenate([np.zeros((1, 3)), *shades])).astype(np.uint8)
-    mask = Image.fromarray(np.where(seen > 0, 255, 0).astype(np.uint8))
+    opacity = 110 if ghost else 255
+    mask = Image.fromarray(np.where(seen > 0, opacity, 0).astype(np.uint8))
     picture.paste(Image.fromarray(table[seen]), mask=mask)
 
 
-def _draw(scene: _Scene, frame: int) -> Image.Image:
+def _draw(shot: _Shot, frame: int) -> Image.Image:
     """One frame."""
-    page = scene.page
+    page = shot.page
     picture = Image.new("RGB", (page.width, page.height), _GROUND)
-    _draw_tiles(ImageDraw.Draw(picture), scene, frame)
-    _draw_shadow(scene, frame, picture)
+    _draw_tiles(ImageDraw.Draw(picture), shot, frame)
+    _draw_shadow(shot, frame, picture)
     fine = (_FINE * page.width, _FINE * page.height)
     picture = picture.resize(fine, Image.Resampling.NEAREST)
     pen = ImageDraw.Draw(picture)
-    for line, color in scene.paths:
-        if color == drawing.COMMANDED:  # what is still to come of it
-            rest = line[frame:]
-            _draw_lines(pen, scene, frame, rest, color, strength=0.6, width=_FINE)
-        _draw_lines(
-            pen, scene, frame, line[: frame + 1], color, strength=1.0, width=2 * _FINE
-        )
-    _draw_body(scene, frame, picture)
+    for lines, color in shot.paths:
+        for line in lines:
+            if color == drawing.COMMANDED:  # what is still to come of it
+                rest = line[frame:]
+                _draw_lines(pen, shot, frame, rest, color, strength=0.6, width=_FINE)
+            done = line[: frame + 1]
+            _draw_lines(pen, shot, frame, done, color, strength=1.0, width=2 * _FINE)
+    if shot.ghosts is not None:
+        _draw_bodies(shot, frame, picture, ghost=True)
+    _draw_bodies(shot, frame, picture)
     picture = picture.reduce(_FINE)
     pen = ImageDraw.Draw(picture)
     for key, color in page.keys:
@@ -276,16 +293,18 @@ def _draw(scene: _Scene, frame: int) -> Image.Image:
     return picture
 
 
-def _palette(scene: _Scene) -> np.ndarray:
+def _palette(shot: _Shot) -> np.ndarray:
     """The colors of a GIF [n, 3]; each with what lies between it and the ground."""
     ramps = [(_TILE, _TONES), (_INK, 6), (_FAINT, 2)]
-    ramps += [(color, 4) for _, color in scene.paths]
+    ramps += [(color, 4) for _, color in shot.paths]
     found = [_mix(_GROUND, _GROUND, 0.0)]
     found += [_mix(_GROUND, c, i / n) for c, n in ramps for i in range(1, n + 1)]
     found += [_mix(_GROUND, _INK, _SHADOW * i / 4) for i in range(1, 5)]
-    for color in scene.colors:
+    for color in shot.colors:
         table = raster.shades(_rgb(color))
         found += [*table, 0.5 * (table[1] + _rgb(_GROUND))]
+        if color == _GHOST:
+            found += [*(0.43 * table + 0.57 * _rgb(_GROUND))]
     return np.round(np.array(found))
 
 
@@ -295,111 +314,81 @@ def _durations(number: int, seconds: float) -> list[int]:
     return (10 * np.maximum(np.diff(times), 1)).tolist()
 
 
-def _contacts(
-    contact: np.ndarray | None, feet: tuple[int, ...] | None, frames: int
-) -> tuple[tuple[int, ...], np.ndarray] | None:
-    if contact is None:
-        return None
-    expected = (frames, len(feet or ()))
-    if not feet or np.shape(contact) != expected:
-        raise ValueError(
-            f"contact is {np.shape(contact)} of feet {feet}, expected feet and "
-            "[frames, feet]"
-        )
-    return feet, np.asarray(contact, bool)
-
-
 def save_gif(
     path: str | Path,
-    positions: np.ndarray,
-    parents: tuple[int, ...],
+    stage: Stage,
     *,
-    fps: float,
-    names: tuple[str, ...] | None = None,
-    commanded: np.ndarray | None = None,
-    walked: np.ndarray | None = None,
-    feet: tuple[int, ...] | None = None,
-    contact: np.ndarray | None = None,
-    ball: np.ndarray | None = None,
-    radius: float = 0.11,
     title: str = "",
     caption: str = "",
     every: int | None = None,
     azimuth: float | None = None,
-    elevation: float = 16.0,
+    elevation: float | None = None,
     size: int | tuple[int, int] = (480, 360),
 ) -> None:
-    """Writes an animated GIF whose camera follows the character.
+    """Writes an animated GIF whose camera follows the characters.
 
-    The ground grid has meter squares and stands still, so that sliding feet show.
+    All bodies stay in the picture whole. The ground grid has meter squares and stands
+    still, so that sliding feet show.
 
     Args:
       path: File to write.
-      positions: [F, J, 3] world positions, meters, y up.
-      fps: Frames per second of the motion.
-      names: Joint names, to find the head and color left and right; None for guesses
-        and gray.
-      commanded: [F, 2] commanded path (x, z), or None.
-      walked: [F, 2] walked path, or None.
-      feet: Joints to mark while they are in contact.
-      contact: [F, feet] bool, or None.
-      ball: [F, 3] world position of a ball's center, or None.
-      radius: Radius of the ball, meters.
+      stage: From `stage.make_stage`.
       title: Above the picture, in one line: shrunk, then elided.
       caption: Below it, small: the source of the data and its license.
       every: Draw every so many frames; the speed stays true. None for at most 20
         pictures per second.
       azimuth: Azimuth of the camera, degrees about +y. None for one toward which the
-        character comes, all in all.
-      elevation: Elevation of the camera, degrees.
+        characters come, all in all.
+      elevation: Elevation of the camera, degrees. None for 16, or 28 over a crowd.
       size: Width and height, or the side of a square, pixels.
 
     Raises:
-      ValueError: if an array has a wrong shape or is not finite (names it), or `every`
-        is not positive.
+      ValueError: if `every` is not positive, or the size is too small.
       OSError: if the file cannot be written.
     """
-    ground = {"commanded": commanded, "walked": walked}
-    positions = drawing.check_motion(positions, parents, fps=fps, paths=ground)
-    marks = _contacts(contact, feet, len(positions))
-    every = max(int(np.ceil(fps / 20.0)), 1) if every is None else every
+    every = max(int(np.ceil(stage.fps / 20.0)), 1) if every is None else every
     width, height = (size, size) if isinstance(size, int) else size
     if every < 1 or min(width, height) < 64:
         raise ValueError(
             f"every {every}, size {size}: expected every >= 1 and size >= 64 pixels"
         )
-    ball = drawing.check_ball(ball, len(positions))
     path = drawing.check_writable(path)
-    shown = [
-        (name, color, drawing.on_ground(line))
-        for (name, line), color in zip(ground.items(), _PATH_COLORS, strict=True)
-        if line is not None
-    ]
-    page = _page(title, caption, [line[:2] for line in shown], width, height)
-    body = bodies.build(positions, parents, names)
-    way = positions[-1, 0] - positions[0, 0]
-    if azimuth is None:
-        moved = np.hypot(way[0], way[2]) > 0.3
-        azimuth = 35.0 + (np.rad2deg(np.arctan2(way[0], way[2])) if moved else 0.0)
-    scene = _Scene(
+    shown = [("walked", drawing.WALKED, stage.walked)]
+    if stage.wanted is not None:
+        shown.insert(0, ("commanded", drawing.COMMANDED, stage.wanted))
+    keys = [line[:2] for line in shown]
+    keys += [] if stage.ghost is None else [("plan", _GHOST)]
+    page = _page(title, caption, keys, width, height)
+    ends = stage.ends
+    camera = cameras.follow(
+        ends,
+        stage.body.radii,
+        fps=stage.fps,
+        azimuth=cameras.toward(stage.walked) if azimuth is None else azimuth,
+        elevation=(16.0 if len(ends) < 4 else 28.0) if elevation is None else elevation,
+        box=page.box,
+    )
+    shot = _Shot(
         page=page,
-        camera=cameras.follow(
-            body, fps=fps, azimuth=azimuth, elevation=elevation, box=page.box
-        ),
-        body=body,
-        paths=tuple((line, color) for _, color, line in shown),
-        contacts=marks,
-        ball=ball,
-        radius=radius,
+        camera=camera,
+        stage=stage,
+        ends=ends,
+        ghosts=stage.ghost_ends,
+        paths=tuple((_on_ground(line), color) for _, color, line in shown),
     )
     palette = Image.new("P", (1, 1))
-    palette.putpalette(_palette(scene).astype(np.uint8).ravel().tolist())
-    frames = range(0, len(positions), every)
+    palette.putpalette(_palette(shot).astype(np.uint8).ravel().tolist())
+    frames = range(0, ends.shape[1], every)
     images = [
-        _draw(scene, frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        _draw(shot, frame).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in frames
     ]
-    times = _durations(len(images), every / fps)
+    times = _durations(len(images), every / stage.fps)
     images[0].save(
         path, save_all=True, append_images=images[1:], duration=times, loop=0
     )
+
+
+def _on_ground(paths: np.ndarray) -> np.ndarray:
+    """World points [..., 3] of ground paths [..., 2], meters."""
+    return np.stack([paths[..., 0], 0 * paths[..., 0], paths[..., 1]], axis=-1)

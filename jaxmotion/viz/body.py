@@ -15,8 +15,8 @@ from jaxtyping import Float
 from jaxmotion.motion import anatomy
 from jaxmotion.motion.anatomy import Anatomy, Limb
 from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.viz.figure import LEFT, MIDDLE, RIGHT
 
-LEFT, RIGHT, MIDDLE = "#2878c8", "#d63a3a", "#6b7480"
 LEFT_DARK, RIGHT_DARK, SKIN = "#174f8c", "#942020", "#c9a084"
 _COLORS = {anatomy.LEFT: LEFT, anatomy.RIGHT: RIGHT, anatomy.MIDDLE: MIDDLE}
 _DARK = {LEFT: LEFT_DARK, RIGHT: RIGHT_DARK, MIDDLE: MIDDLE}

@@ -4,9 +4,6 @@ import dataclasses
 
 import numpy as np
 
-from jaxmotion.viz.figure import view_axes
-from jaxmotion.viz.sketch import Body
-
 # Focal length in heights of the picture: a field of view of 28 degrees.
 _FOCAL = 2.0
 
@@ -52,6 +49,32 @@ class Camera:
         return np.stack([x, y], axis=-1), scale, near
 
 
+def view_axes(*, azimuth: float, elevation: float) -> np.ndarray:
+    """Right, up and toward the viewer of a view in the world, rows of [3, 3].
+
+    Args:
+      azimuth: Degrees about +y; 0 looks along -z (a character that faces +z walks
+        toward the viewer).
+      elevation: Degrees above the ground.
+    """
+    a, e = np.deg2rad([azimuth, elevation])
+    right = [np.cos(a), 0.0, -np.sin(a)]
+    up = [-np.sin(e) * np.sin(a), np.cos(e), -np.sin(e) * np.cos(a)]
+    toward = [np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)]
+    return np.array([right, up, toward])
+
+
+def toward(walked: np.ndarray) -> float:
+    """Azimuth of a view toward which characters come, all in all, degrees.
+
+    Args:
+      walked: [characters, F, 2] their paths (x, z), meters.
+    """
+    way = (walked[:, -1] - walked[:, 0]).mean(axis=0)
+    moved = np.linalg.norm(way) > 0.3
+    return 35.0 + (float(np.rad2deg(np.arctan2(*way))) if moved else 0.0)
+
+
 def smooth(values: np.ndarray, frames: float) -> np.ndarray:
     """Gaussian mean over time, continued straight beyond both ends.
 
@@ -68,27 +91,33 @@ def smooth(values: np.ndarray, frames: float) -> np.ndarray:
 
 
 def follow(
-    body: Body,
+    ends: np.ndarray,
+    radii: np.ndarray,
     *,
     fps: float,
     azimuth: float,
     elevation: float,
     box: tuple[int, int, int, int],
 ) -> Camera:
-    """The nearest camera that has the whole body in a box in all frames.
+    """The nearest camera that has all bodies whole in a box in all frames.
 
     Args:
+      ends: [characters, F, S, 2, 3] of their capsules, world, meters.
+      radii: [S, 2] meters.
       azimuth: Degrees about +y; 0 looks along -z.
       elevation: Degrees above the ground.
       box: Left, top, right and bottom, pixels.
     """
     axes = view_axes(azimuth=azimuth, elevation=elevation)
-    points, radii = body.points[:, body.ends.ravel()], body.radii.ravel()
-    heights = points[..., 1]
-    middle = 0.5 * ((heights - radii).min(axis=1) + (heights + radii).max(axis=1))
-    root = smooth(body.points[:, 0], 0.35 * fps)
-    up = smooth(middle[:, None], 1.0 * fps)[:, 0]
-    targets = np.stack([root[:, 0], up, root[:, 2]], axis=-1)
+    frames = ends.shape[1]
+    points = np.moveaxis(ends, 1, 0).reshape(frames, -1, 3)
+    radii = np.tile(radii.ravel(), len(ends))
+    low = (points - radii[:, None]).min(axis=1)
+    high = (points + radii[:, None]).max(axis=1)
+    middle = 0.5 * (low + high)
+    level = smooth(middle[:, [0, 2]], 0.35 * fps)
+    up = smooth(middle[:, 1:2], 1.0 * fps)
+    targets = np.concatenate([level[:, :1], up, level[:, 1:]], axis=-1)
     local = (points - targets[:, None]) @ axes.T
     half = 0.5 * np.array([box[2] - box[0], box[3] - box[1]])
     focal = _FOCAL * 2 * half[1]

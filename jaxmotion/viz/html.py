@@ -1,209 +1,431 @@
-"""A self-contained page that plays a motion: no network, no library.
+"""A self-contained page that plays a stage: no network, no library, WebGL.
 
-Drag to orbit, wheel to zoom, slider to scrub, space to pause.
+Drag to turn, wheel to zoom, slider or arrow keys to scrub, space to pause. The page has
+the joints' rotations and the capsules of `body.describe`; the kinematics are done
+there.
 """
 
+import base64
 import html as escaping
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from jaxmotion.motion.skeleton import Motion
+from jaxmotion.viz import camera as cameras
 from jaxmotion.viz import figure as drawing
-from jaxmotion.viz import sketch as bodies
+from jaxmotion.viz.stage import Stage
 
 _PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>__TITLE__</title>
 <style>
 body { margin: 0; font: 14px sans-serif; background: #f6f8fa; color: #20262e; }
-body { display: flex; flex-direction: column; height: 100vh; }
-canvas { display: block; width: 100vw; flex: 1; min-height: 0; }
+body { display: flex; flex-direction: column; height: 100vh; overflow: hidden; }
+canvas { display: block; width: 100vw; flex: 1; min-height: 0; touch-action: none; }
 #bar { display: flex; gap: 12px; align-items: center; padding: 8px 12px; }
-#time { flex: 1; }
+#bar span { white-space: nowrap; font-variant-numeric: tabular-nums; }
+#play { width: 4.5em; }
+#time { flex: 1; min-width: 60px; }
 .key { display: inline-block; width: 18px; height: 4px; vertical-align: middle; }
 h1 { font-size: 14px; margin: 8px 12px 0; font-weight: 600; }
+h1 { white-space: nowrap; overflow: hidden; text-overflow: ellipsis; }
 p { font-size: 11px; margin: 4px 12px; color: #707884; }
 </style></head><body>
 <h1>__TITLE__</h1>
 <div id="bar"><button id="play" aria-label="play or pause">pause</button>
 <input id="time" type="range" min="0" value="0" aria-label="frame">
-<span id="clock"></span>
-<span><i class="key" style="background:#2ca02c"></i> commanded</span>
-<span><i class="key" style="background:#ff7f0e"></i> walked</span></div>
+<span id="clock"></span><span id="keys"></span></div>
 <canvas id="view"></canvas>
 <p>__CAPTION__</p>
 <script>
 const data = __DATA__;
-const canvas = document.getElementById("view"), pen = canvas.getContext("2d");
-const slider = document.getElementById("time");
-const clock = document.getElementById("clock");
-const button = document.getElementById("play");
-const frames = data.positions.length;
+const element = id => document.getElementById(id);
+const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
+const floats = text => text && new Float32Array(bytes(text));
+const joints = data.parents.length, capsules = data.capsules.length;
+const [characters, frames] = data.shape;
+const poses = m => m && {root: floats(m.root), turn: new Int16Array(bytes(m.turn))};
+const body = poses(data.motion), ghost = poses(data.ghost);
+const targets = floats(data.targets), ball = data.ball;
+if (ball) ball.place = floats(ball.position);
+
+// World position (3) and rotation (9, three columns) of all joints.
+const world = new Float32Array(12 * joints);
+function kinematics(pose, character, frame) {
+  const at = character * frames + frame;
+  for (let j = 0; j < joints; j++) {
+    const from = 6 * (at * joints + j), to = 12 * j, up = 12 * data.parents[j];
+    const c = [];
+    for (let i = 0; i < 6; i++) c.push(pose.turn[from + i] / 32767);
+    c.push(c[1] * c[5] - c[2] * c[4], c[2] * c[3] - c[0] * c[5],
+           c[0] * c[4] - c[1] * c[3]);
+    if (!j) {
+      for (let i = 0; i < 3; i++) world[i] = pose.root[3 * at + i];
+      for (let i = 0; i < 9; i++) world[3 + i] = c[i];
+      continue;
+    }
+    place(up, data.offsets[j], world, to);
+    for (let k = 0; k < 3; k++) for (let i = 0; i < 3; i++) {
+      let sum = 0;
+      for (let n = 0; n < 3; n++) sum += world[up + 3 + 3 * n + i] * c[3 * k + n];
+      world[to + 3 + 3 * k + i] = sum;
+    }
+  }
+}
+function place(joint, p, out, to) {
+  for (let i = 0; i < 3; i++) out[to + i] = world[joint + i]
+    + world[joint + 3 + i] * p[0] + world[joint + 6 + i] * p[1]
+    + world[joint + 9 + i] * p[2];
+}
+function rgb(color) {
+  return [1, 3, 5].map(i => parseInt(color.slice(i, i + 2), 16) / 255);
+}
+// What is drawn of a capsule: both ends, both radii, color.
+const WIDTH = 11;
+const more = ball ? 1 + joints : 0;
+const shapes = new Float32Array(WIDTH * (characters * capsules + more));
+const colors = data.capsules.map(c => rgb(c[6]));
+function assemble(pose, frame, paint) {
+  let count = 0;
+  const shape = (ra, rb, color) => {
+    shapes.set([ra, rb, ...color], WIDTH * count++ + 6);
+  };
+  for (let who = 0; who < characters; who++) {
+    kinematics(pose, who, frame);
+    for (let s = 0; s < capsules; s++) {
+      const [a, b, pa, pb, ra, rb] = data.capsules[s];
+      place(12 * a, pa, shapes, WIDTH * count);
+      place(12 * b, pb, shapes, WIDTH * count + 3);
+      shape(ra, rb, paint || colors[s]);
+    }
+  }
+  if (ball && !paint) {
+    const sphere = (from, at, radius, color) => {
+      for (let i = 0; i < 6; i++) shapes[WIDTH * count + i] = from[at + i % 3];
+      shape(radius, radius, rgb(color));
+    };
+    sphere(ball.place, 3 * frame, ball.radius, "#e8e4da");
+    for (const j of ball.touching[frame]) sphere(world, 12 * j, 0.05, "#2fae4a");
+  }
+  return count;
+}
+
+const canvas = element("view"), slider = element("time"), button = element("play");
+const gl = canvas.getContext("webgl2", {antialias: true, stencil: true, alpha: false});
+if (!gl) {
+  element("clock").textContent = "This browser has no WebGL 2: nothing can be drawn.";
+  throw new Error("no WebGL 2");
+}
+function program(vertex, fragment) {
+  const made = gl.createProgram(), head = "#version 300 es\\nprecision highp float;\\n";
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex],
+                              [gl.FRAGMENT_SHADER, fragment]]) {
+    const part = gl.createShader(kind);
+    gl.shaderSource(part, head + text); gl.compileShader(part);
+    if (!gl.getShaderParameter(part, gl.COMPILE_STATUS))
+      throw new Error(gl.getShaderInfoLog(part));
+    gl.attachShader(made, part);
+  }
+  ["corner", "a", "b", "radii", "color"].forEach(
+    (name, i) => gl.bindAttribLocation(made, i, name));
+  gl.linkProgram(made);
+  return {made, at: name => gl.getUniformLocation(made, name)};
+}
+const solid = program(`
+in vec3 corner, a, b, color; in vec2 radii;  // corner: part of the arc, turn, end
+uniform mat4 view; uniform vec3 light; uniform bool shadow;
+out vec3 normal, paint;
+void main() {
+  float far = length(b - a), half_pi = 1.5707963;
+  vec3 z = far > 1e-5 ? (b - a) / far : vec3(0, 1, 0);
+  vec3 x = normalize(cross(z, abs(z.y) < 0.9 ? vec3(0, 1, 0) : vec3(1, 0, 0)));
+  vec3 y = cross(z, x);
+  float lean = asin(clamp((radii.x - radii.y) / max(far, 1e-5), -0.99, 0.99));
+  if (far <= 1e-5) lean = 0.0;
+  float angle = corner.z < 0.5 ? mix(-half_pi, lean, corner.x)
+                               : mix(lean, half_pi, corner.x);
+  normal = cos(angle) * (cos(corner.y) * x + sin(corner.y) * y) + sin(angle) * z;
+  vec3 p = mix(a, b, corner.z) + mix(radii.x, radii.y, corner.z) * normal;
+  if (shadow) p = vec3(p.xz - max(p.y, 0.0) / light.y * light.xz, 0.004).xzy;
+  paint = color;
+  gl_Position = view * vec4(p, 1);
+}`, `
+in vec3 normal, paint; uniform vec3 light; uniform float alpha; uniform bool shadow;
+out vec4 shown;
+void main() {
+  float v = clamp(0.42 + 0.62 * dot(normalize(normal), light), 0.0, 1.0);
+  vec3 c = v < 0.6 ? mix(0.52 * paint, paint, v / 0.6)
+                   : mix(paint, mix(paint, vec3(1), 0.38), (v - 0.6) / 0.4);
+  shown = shadow ? vec4(0.125, 0.15, 0.18, 0.3) : vec4(c, alpha);
+}`);
+const flat = program(`
+in vec3 corner; uniform mat4 view; uniform vec3 target; uniform float reach;
+out vec3 p;
+void main() {
+  p = reach > 0.0 ? corner * reach + vec3(target.x, 0, target.z) : corner;
+  gl_Position = view * vec4(p, 1);
+}`, `
+in vec3 p; uniform vec3 target; uniform float reach; uniform vec4 paint;
+out vec4 shown;
+void main() {
+  if (reach <= 0.0) { shown = paint; return; }
+  vec2 w = max(fwidth(p.xz), 1e-4), q = abs(fract(p.xz * 0.5) - 0.5);
+  vec2 s = clamp((q - 0.25) / (0.5 * w) , -0.5, 0.5);
+  float tile = 0.5 - 2.0 * s.x * s.y;
+  float near = clamp(1.6 * (1.0 - length(p.xz - target.xz) / reach), 0.0, 1.0);
+  shown = vec4(0.867, 0.894, 0.925, tile * near);
+}`);
+function upload(values) {
+  const made = gl.createBuffer();
+  gl.bindBuffer(gl.ARRAY_BUFFER, made);
+  gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+  return made;
+}
+function attribute(i, size, stride, offset, each) {
+  gl.enableVertexAttribArray(i);
+  gl.vertexAttribPointer(i, size, gl.FLOAT, false, 4 * stride, 4 * offset);
+  gl.vertexAttribDivisor(i, each);
+}
+// One capsule: rings of both ends.
+const [around, rings] = characters > 8 ? [8, 2] : [24, 6], mesh = [];
+for (const end of [0, 1]) for (let r = 0; r < rings + (end ? 0 : 1); r++)
+  for (let k = 0; k < around; k++) {
+    const bridge = !end && r == rings;
+    const corner = (i, j) => mesh.push(
+      bridge ? 1 - i : (r + i) / rings, 2 * Math.PI * (k + j) / around,
+      bridge ? i : end);
+    for (const [i, j] of [[0, 0], [0, 1], [1, 1], [0, 0], [1, 1], [1, 0]]) corner(i, j);
+  }
+const cornerCount = mesh.length / 3;
+const vao = gl.createVertexArray(), buffer = gl.createBuffer();
+gl.bindVertexArray(vao);
+upload(new Float32Array(mesh)); attribute(0, 3, 3, 0, 0);
+gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+[[1, 3, 0], [2, 3, 3], [3, 2, 6], [4, 3, 8]].forEach(
+  ([i, size, offset]) => attribute(i, size, WIDTH, offset, 1));
+const plane = gl.createVertexArray();
+gl.bindVertexArray(plane);
+upload(new Float32Array([-1, 0, -1, 1, 0, -1, -1, 0, 1, 1, 0, 1]));
+attribute(0, 3, 3, 0, 0);
+// Paths are ribbons on the ground.
+function ribbons(path, high) {
+  if (!path) return null;
+  const width = 0.012 * data.size, found = new Float32Array(characters * frames * 6);
+  for (let who = 0; who < characters; who++) for (let f = 0; f < frames; f++) {
+    const at = 2 * (who * frames + f), end = 2 * (who * frames + frames - 1);
+    const b = Math.max(at - 2, 2 * who * frames), a = Math.min(at + 2, end);
+    let dx = path[a] - path[b], dz = path[a + 1] - path[b + 1];
+    const long = Math.hypot(dx, dz) || 1;
+    dx *= width / long; dz *= width / long;
+    found.set([path[at] - dz, high, path[at + 1] + dx,
+               path[at] + dz, high, path[at + 1] - dx], 3 * at);
+  }
+  const made = gl.createVertexArray();
+  gl.bindVertexArray(made); upload(found); attribute(0, 3, 3, 0, 0);
+  return made;
+}
+const paths = data.paths.map(([name, color, values], i) =>
+  [name, color, ribbons(floats(values), 0.006 + 0.002 * i)]);
+for (const [name, color] of [...data.paths, ...(ghost ? [["plan", "#8fa3b8"]] : [])]) {
+  const key = document.createElement("i");
+  key.className = "key"; key.style.background = color;
+  element("keys").append(key, " " + name + " ");
+}
+
+let frame = 0, playing = true, azimuth = data.azimuth, elevation = data.elevation;
+let zoom = 1, stale = true;
 slider.max = frames - 1;
-let frame = 0, playing = true, azimuth = 0.6, elevation = 0.35, zoom = 1;
-function project(p, center) {
-  const x = p[0] - center[0], y = p[1] - 0.85, z = p[2] - center[2];
-  const right = x * Math.cos(azimuth) - z * Math.sin(azimuth);
-  const depth = x * Math.sin(azimuth) + z * Math.cos(azimuth);
-  const up = y * Math.cos(elevation) - depth * Math.sin(elevation);
-  const scale = size();
-  const near = y * Math.sin(elevation) + depth * Math.cos(elevation);
-  return [canvas.width / 2 + right * scale, canvas.height / 2 - up * scale, near];
-}
-function size() { return canvas.height / 3.2 * zoom; }
-function capsule(a, b, ra, rb, color) {
-  const along = Math.atan2(b[1] - a[1], b[0] - a[0]), half = Math.PI / 2;
-  pen.beginPath();
-  pen.arc(a[0], a[1], ra, along + half, along + 3 * half);
-  pen.arc(b[0], b[1], rb, along - half, along + half);
-  pen.closePath(); pen.fillStyle = color; pen.fill();
-}
-function shaded(a, b, ra, rb, color) {
-  const lit = (p, r) => [p[0] - 0.25 * r, p[1] - 0.3 * r];
-  capsule(a, b, ra, rb, color);
-  capsule(a, b, ra, rb, "#0000002e");
-  capsule(lit(a, 0.5 * ra), lit(b, 0.5 * rb), 0.86 * ra, 0.86 * rb, color);
-  capsule(lit(a, ra), lit(b, rb), 0.5 * ra, 0.5 * rb, "#ffffff2a");
-}
-function line(points, center, color, width) {
-  pen.strokeStyle = color; pen.lineWidth = width; pen.beginPath();
-  points.forEach((p, i) => {
-    const q = project(p, center);
-    if (i) pen.lineTo(q[0], q[1]); else pen.moveTo(q[0], q[1]);
-  });
-  pen.stroke();
+function matrix(target, distance, aspect) {
+  const [ca, sa] = [Math.cos(azimuth), Math.sin(azimuth)];
+  const [ce, se] = [Math.cos(elevation), Math.sin(elevation)];
+  const axes = [[ca, 0, -sa], [-se * sa, ce, -se * ca], [ce * sa, se, ce * ca]];
+  const shift = axes.map(a => -a[0] * target[0] - a[1] * target[1] - a[2] * target[2]);
+  shift[2] -= distance;
+  const focal = 4, near = 0.02 * distance, far = 30 * distance;
+  const rows = [[focal / aspect, 0, 0, 0], [0, focal, 0, 0],
+    [0, 0, (far + near) / (near - far), 2 * far * near / (near - far)], [0, 0, -1, 0]];
+  const found = [];
+  for (let k = 0; k < 4; k++) for (const row of rows) {
+    let sum = k == 3 ? row[3] : 0;
+    for (let n = 0; n < 3; n++) sum += row[n] * (k == 3 ? shift[n] : axes[n][k]);
+    found.push(sum);
+  }
+  return new Float32Array(found);
 }
 function draw() {
-  const ratio = window.devicePixelRatio || 1;
-  canvas.width = canvas.clientWidth * ratio;
-  canvas.height = canvas.clientHeight * ratio;
-  const now = Math.floor(frame), pose = data.positions[now], c = pose[0];
-  const points = pose.concat(data.added[now]);
-  const ground = p => project([p[0], 0, p[2]], c);
-  pen.clearRect(0, 0, canvas.width, canvas.height); pen.lineCap = "round";
-  const x0 = Math.floor(c[0]) - 5, z0 = Math.floor(c[2]) - 5;
-  for (let x = x0; x < x0 + 10; x++) for (let z = z0; z < z0 + 10; z++) {
-    if ((x + z) % 2) continue;
-    pen.beginPath();
-    for (const [i, k] of [[0, 0], [1, 0], [1, 1], [0, 1]]) {
-      const q = project([x + i, 0, z + k], c);
-      if (i + k) pen.lineTo(q[0], q[1]); else pen.moveTo(q[0], q[1]);
+  const ratio = window.devicePixelRatio || 1, now = Math.floor(frame);
+  const [w, h] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio];
+  if (canvas.width != w || canvas.height != h) { canvas.width = w; canvas.height = h; }
+  const target = targets.slice(3 * now, 3 * now + 3), aspect = w / h;
+  const distance = data.reach / Math.sin(Math.atan(Math.min(aspect, 1) / 4)) / zoom;
+  const view = matrix(target, distance, aspect);
+  gl.viewport(0, 0, w, h);
+  gl.clearColor(0.965, 0.973, 0.98, 1);
+  gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT | gl.STENCIL_BUFFER_BIT);
+  gl.enable(gl.BLEND);
+  gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+  gl.disable(gl.DEPTH_TEST);
+  gl.useProgram(flat.made);
+  gl.uniformMatrix4fv(flat.at("view"), false, view);
+  gl.uniform3fv(flat.at("target"), target);
+  gl.uniform1f(flat.at("reach"), 0.9 * distance);
+  gl.bindVertexArray(plane);
+  gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+  gl.uniform1f(flat.at("reach"), 0);
+  for (const [name, color, made] of paths) for (let who = 0; who < characters; who++) {
+    gl.bindVertexArray(made);
+    const start = 2 * who * frames;
+    if (name == "commanded") {
+      gl.uniform4f(flat.at("paint"), ...rgb(color), 0.35);
+      gl.drawArrays(gl.TRIANGLE_STRIP, start, 2 * frames);
     }
-    pen.closePath(); pen.fillStyle = "#dde4ec"; pen.fill();
+    gl.uniform4f(flat.at("paint"), ...rgb(color), 1);
+    gl.drawArrays(gl.TRIANGLE_STRIP, start, 2 * now + 2);
   }
-  // Light from straight above: a shadow as flat as the ground is seen.
-  const flat = Math.max(Math.sin(elevation), 0.15);
-  for (const [a, b, ra, rb] of data.shapes) {
-    capsule(ground(points[a]), ground(points[b]), ra * flat * size(),
-            rb * flat * size(), "#b9c1ca");
+  gl.useProgram(solid.made);
+  gl.uniformMatrix4fv(solid.at("view"), false, view);
+  gl.uniform3fv(solid.at("light"), data.light);
+  gl.bindVertexArray(vao);
+  const cast = (shadow, alpha, count) => {
+    gl.uniform1i(solid.at("shadow"), shadow);
+    gl.uniform1f(solid.at("alpha"), alpha);
+    gl.drawArraysInstanced(gl.TRIANGLES, 0, cornerCount, count);
+  };
+  const bring = (pose, paint) => {
+    const count = assemble(pose, now, paint);
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    gl.bufferData(gl.ARRAY_BUFFER, shapes, gl.DYNAMIC_DRAW);
+    return count;
+  };
+  const count = bring(body);
+  gl.enable(gl.STENCIL_TEST);  // each pixel once
+  gl.stencilFunc(gl.EQUAL, 0, 255);
+  gl.stencilOp(gl.KEEP, gl.KEEP, gl.INCR);
+  cast(1, 1, count);
+  gl.disable(gl.STENCIL_TEST);
+  gl.enable(gl.DEPTH_TEST);
+  gl.depthFunc(gl.LEQUAL);
+  cast(0, 1, count);
+  if (ghost) {
+    const pale = bring(ghost, rgb("#8fa3b8"));
+    gl.colorMask(false, false, false, false);
+    cast(0, 1, pale);
+    gl.colorMask(true, true, true, true);
+    cast(0, 0.45, pale);
   }
-  for (const [path, color] of [[data.commanded, "#2ca02c"], [data.walked, "#ff7f0e"]]) {
-    if (!path) continue;
-    line(path.map(p => [p[0], 0, p[1]]), c, color + "55", ratio);
-    line(path.slice(0, now + 1).map(p => [p[0], 0, p[1]]), c, color, 2 * ratio);
-  }
-  const solid = data.shapes.map(([a, b, ra, rb, color]) => {
-    const p = project(points[a], c), q = project(points[b], c);
-    return [p[2] + q[2], p, q, ra * size(), rb * size(), color];
-  });
-  if (data.ball) {
-    const q = project(data.ball[now], c), r = data.radius * size();
-    const rim = data.touch[now] ? "#d62728" : "#222";
-    solid.push([2 * q[2], q, q, r + 2 * ratio, r + 2 * ratio, rim]);
-    solid.push([2 * q[2], q, q, r, r, "#e8e4da"]);
-  }
-  solid.sort((a, b) => a[0] - b[0]);
-  for (const shape of solid) shaded(...shape.slice(1));
   slider.value = now;
-  clock.textContent = (now / data.fps).toFixed(2) + " s of " +
+  element("clock").textContent = (now / data.fps).toFixed(2) + " s of " +
     ((frames - 1) / data.fps).toFixed(2) + " s";
 }
 let last = null;
 function loop(time) {
   // The first time of an animation may lie before the script's own.
   if (playing && last !== null)
-    frame = (frame + (time - last) / 1000 * data.fps) % frames;
-  last = time; draw(); requestAnimationFrame(loop);
+    frame = (frame + Math.max(time - last, 0) / 1000 * data.fps) % frames;
+  last = time;
+  if (playing || stale) draw();
+  stale = false;
+  requestAnimationFrame(loop);
 }
 function toggle() {
   playing = !playing; button.textContent = playing ? "pause" : "play";
 }
+function stop() { stale = true; if (playing) toggle(); }
 button.onclick = toggle;
-slider.oninput = () => { frame = +slider.value; if (playing) toggle(); };
+slider.oninput = () => { frame = +slider.value; stop(); };
+window.onresize = () => { stale = true; };
 window.onkeydown = e => {
+  const step = {ArrowLeft: -1, ArrowRight: 1}[e.code];
   if (e.code === "Space" && e.target !== button) { e.preventDefault(); toggle(); }
+  if (step && e.target !== slider) {
+    frame = (Math.floor(frame) + step + frames) % frames; stop();
+  }
 };
+canvas.onpointerdown = e => canvas.setPointerCapture(e.pointerId);
 canvas.onpointermove = e => {
   if (!e.buttons) return;
-  azimuth += e.movementX * 0.01;
-  elevation = Math.min(1.5, Math.max(0, elevation + e.movementY * 0.01));
+  azimuth -= e.movementX * 0.01; stale = true;
+  elevation = Math.min(1.5, Math.max(0.02, elevation + e.movementY * 0.01));
 };
-canvas.onwheel = e => {
-  e.preventDefault();
-  zoom = Math.min(6, Math.max(0.2, zoom * Math.exp(-e.deltaY / 600)));
-};
+canvas.addEventListener("wheel", e => {
+  e.preventDefault(); stale = true;
+  zoom = Math.min(8, Math.max(0.2, zoom * Math.exp(-e.deltaY / 600)));
+}, {passive: false});
 requestAnimationFrame(loop);
 </script></body></html>
 """
+# Where the light is, seen from the first view; as in GIFs.
+_LIGHT = np.array([-0.42, 0.78, 0.46])
 
 
-def page(
-    positions: np.ndarray,
-    parents: tuple[int, ...],
-    *,
-    fps: float,
-    names: tuple[str, ...] | None = None,
-    commanded: np.ndarray | None = None,
-    walked: np.ndarray | None = None,
-    ball: np.ndarray | None = None,
-    touch: np.ndarray | None = None,
-    radius: float = 0.11,
-    title: str = "",
-    caption: str = "",
-) -> str:
+def _floats(values: np.ndarray) -> str:
+    return base64.b64encode(np.asarray(values, "<f4").tobytes()).decode("ascii")
+
+
+def _pose(stage: Stage, motion: Motion) -> dict[str, str]:
+    """Root positions, and two unit columns per rotation as 16-bit integers."""
+    turns = np.asarray(motion.joint_rotation, float)
+    x = turns[..., :3] / np.linalg.norm(turns[..., :3], axis=-1, keepdims=True)
+    y = turns[..., 3:] - np.sum(x * turns[..., 3:], axis=-1, keepdims=True) * x
+    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
+    whole = np.round(32767 * np.concatenate([x, y], axis=-1)).astype("<i2")
+    packed = base64.b64encode(whole.tobytes()).decode("ascii")
+    return {"root": _floats(np.asarray(motion.root_position)), "turn": packed}
+
+
+def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
     """The page as text.
 
     Args:
-      positions: [F, J, 3] world positions, meters, y up.
-      names: Joint names, to find the head and color left and right; None for guesses
-        and gray.
-      commanded: [F, 2] commanded path (x, z), or None.
-      walked: [F, 2] walked path, or None.
-      ball: [F, 3] world position of a ball's center, or None.
-      touch: [F] whether something touches the ball (its rim is red then), or None.
-      radius: Radius of the ball, meters.
-      title: Above the picture; escaped, like the caption.
+      stage: From `stage.make_stage`.
+      title: Above the picture, in one line; escaped, like the caption.
       caption: Below it, small: the source of the data and its license.
-
-    Raises:
-      ValueError: if an array has a wrong shape or is not finite; names it.
     """
-    positions = drawing.check_motion(
-        positions, parents, fps=fps, paths={"commanded": commanded, "walked": walked}
+    body, ends = stage.body, stage.ends
+    low, high = ends.min(axis=(0, 2, 3)), ends.max(axis=(0, 2, 3))
+    targets = cameras.smooth(0.5 * (low + high), 0.5 * stage.fps)
+    away = np.linalg.norm(ends - targets[:, None, None], axis=-1)
+    many = len(ends) > 3
+    azimuth = np.deg2rad(cameras.toward(stage.walked))
+    elevation = np.deg2rad(28.0 if many else 16.0)
+    axes = cameras.view_axes(
+        azimuth=float(np.rad2deg(azimuth)), elevation=float(np.rad2deg(elevation))
     )
-    ball = drawing.check_ball(ball, len(positions))
-    touch = np.zeros(len(positions), bool) if touch is None else np.asarray(touch, bool)
-    if touch.shape != (len(positions),):
-        raise ValueError(f"touch is {touch.shape}, expected {(len(positions),)}")
-
-    def rounded(x: np.ndarray | None) -> list | None:
-        return None if x is None else np.round(np.asarray(x, float), 3).tolist()
-
-    body = bodies.build(positions, parents, names)
-    shapes = zip(body.ends.tolist(), rounded(body.radii), body.colors, strict=True)
+    shapes = zip(
+        body.joints.tolist(),
+        np.round(body.places, 4).tolist(),
+        np.round(body.radii, 4).tolist(),
+        body.colors,
+        strict=True,
+    )
+    paths = [("walked", drawing.WALKED, _floats(stage.walked))]
+    if stage.wanted is not None:
+        paths.insert(0, ("commanded", drawing.COMMANDED, _floats(stage.wanted)))
     data = {
-        "positions": rounded(positions),
-        "added": rounded(body.points[:, len(parents) :]),
-        "shapes": [[*ends, *radii, color] for ends, radii, color in shapes],
-        "fps": fps,
-        "commanded": rounded(commanded),
-        "walked": rounded(walked),
-        "ball": rounded(ball),
-        "touch": touch.tolist(),
-        "radius": radius,
+        "shape": ends.shape[:2],
+        "fps": stage.fps,
+        "parents": stage.skeleton.parents,
+        "offsets": np.round(np.asarray(stage.skeleton.offsets, float), 5).tolist(),
+        "capsules": [[*j, *p, *r, color] for j, p, r, color in shapes],
+        "motion": _pose(stage, stage.motion),
+        "ghost": None if stage.ghost is None else _pose(stage, stage.ghost),
+        "paths": paths,
+        "ball": None,
+        "targets": _floats(targets),
+        "reach": round(float((away + body.radii).max()), 4),
+        "size": round(float(np.ptp(ends[0, 0, ..., 1])), 3),
+        "azimuth": round(float(azimuth), 4),
+        "elevation": round(float(elevation), 4),
+        "light": (axes.T @ _LIGHT / np.linalg.norm(_LIGHT)).round(4).tolist(),
     }
+    if stage.ball is not None:
+        data["ball"] = {
+            "position": _floats(stage.ball.position),
+            "radius": stage.ball.radius,
+            "touching": [stage.ball.touching(f) for f in range(ends.shape[1])],
+        }
     # "</" would end the script element wherever it stands.
     text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
     filled = {
@@ -218,18 +440,12 @@ def page(
 
 
 def save_html(
-    path: str | Path,
-    positions: np.ndarray,
-    parents: tuple[int, ...],
-    *,
-    fps: float,
-    **options: Any,
+    path: str | Path, stage: Stage, *, title: str = "", caption: str = ""
 ) -> None:
-    """Writes the page; the options are those of `page`.
+    """Writes the page; see there.
 
     Raises:
-      ValueError: if an array has a wrong shape or is not finite; names it.
       OSError: if the file cannot be written.
     """
-    text = page(positions, parents, fps=fps, **options)
+    text = page(stage, title=title, caption=caption)
     drawing.check_writable(path).write_text(text, encoding="utf-8")

@@ -64,7 +64,7 @@ def test_a_rollout_is_a_motion_with_a_ball(invoke, trained, capsys):
     assert np.isfinite(numbers).all()
     with Image.open(out / "rollout.gif") as image:
         assert image.n_frames == 30
-    assert '"ball":[[' in (out / "rollout.html").read_text()
+    assert '"ball":{' in (out / "rollout.html").read_text()
     assert "from the root" in capsys.readouterr().out
 
 

@@ -1,20 +1,18 @@
 import time
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.viz import animation, camera
-from jaxmotion.viz import sketch as body
+from jaxmotion.motion.skeleton import Motion
+from jaxmotion.viz import animation, camera, stage
 from tests.viz import samples
 
 
-def save(path, positions=None, **changes):
-    made, walked = samples.circle()
-    positions = made if positions is None else positions
-    walked = None if len(positions) != len(walked) else walked
-    options = dict(fps=samples.FPS, names=samples.NAMES, walked=walked, size=160)
-    animation.save_gif(path, positions, samples.PARENTS, **(options | changes))
+def save(path, shown=None, **changes):
+    shown = samples.circle_stage() if shown is None else shown
+    animation.save_gif(path, shown, **(dict(size=160) | changes))
 
 
 def frames(path):
@@ -29,8 +27,8 @@ def frames(path):
 
 @pytest.mark.parametrize("every, fps", [(1, 30.0), (2, 30.0), (3, 60.0)])
 def test_count_size_and_duration_are_those_asked_for(tmp_path, every, fps):
-    positions, _ = samples.circle(31)
-    save(tmp_path / "a.gif", positions, every=every, fps=fps)
+    shown = samples.circle_stage(samples.circle(31, fps=fps)[0])
+    save(tmp_path / "a.gif", shown, every=every)
     pictures, durations, loop = frames(tmp_path / "a.gif")
     count = len(range(0, 31, every))
     assert pictures.shape == (count, 160, 160, 3)
@@ -41,17 +39,16 @@ def test_count_size_and_duration_are_those_asked_for(tmp_path, every, fps):
 
 
 def test_the_picture_changes_with_the_motion(tmp_path):
-    positions, _ = samples.circle()
-    save(tmp_path / "a.gif", positions, walked=None)
+    save(tmp_path / "a.gif")
     pictures, _, _ = frames(tmp_path / "a.gif")
     steps = np.mean(np.any(np.diff(pictures, axis=0) != 0, axis=-1), axis=(1, 2))
     assert steps.min() > 0.002
-    raised = positions.copy()
-    raised[:, 2, 1] += 0.5  # only the left hand, which is blue
-    save(tmp_path / "b.gif", raised, walked=None)
+    # Only the left hand, which is blue.
+    raised = samples.circle_stage(skeleton=samples.figure(raised=0.5))
+    save(tmp_path / "b.gif", raised)
     other, _, _ = frames(tmp_path / "b.gif")
     blue = lambda x: (x[..., 2] > x[..., 0] + 60) & (x[..., 2] > 120)  # noqa: E731
-    red = lambda x: (x[..., 0] > x[..., 2] + 80) & (x[..., 1] < 110)  # noqa: E731
+    red = lambda x: (x[..., 0] > x[..., 2] + 80) & (x[..., 1] < 75)  # noqa: E731
 
     def reach(picture):
         """Height of the hand over the foot, in lengths of the leg."""
@@ -61,23 +58,58 @@ def test_the_picture_changes_with_the_motion(tmp_path):
     assert reach(other[0]) > reach(pictures[0]) + 0.3, "higher on the picture"
 
 
-def test_paths_and_contacts_are_drawn(tmp_path):
-    positions, path = samples.circle()
-    green = lambda x: x[..., 1] > np.maximum(x[..., 0], x[..., 2]) + 20  # noqa: E731
+def green(pictures):
+    """Pixels per picture that are green."""
+    found = pictures[..., 1] > np.maximum(pictures[..., 0], pictures[..., 2]) + 20
+    return found.sum(axis=(1, 2))
+
+
+def test_the_wanted_path_and_touches_are_drawn(tmp_path):
+    _, path = samples.circle()
+    touch = np.zeros((len(path), 1), bool)
+    touch[::4] = True
+    place = np.stack([path[:, 0] + 0.5, 0 * path[:, 0] + 0.11, path[:, 1]], axis=-1)
+    ball = stage.Ball(position=place, touch=touch, joints=(3,), radius=0.11)
     counts = {}
-    contact = np.zeros((len(positions), 1), bool)
-    contact[::4] = True
     for name, options in {
-        "bare": dict(walked=None),
-        "paths": dict(commanded=path + 0.05),
-        "feet": dict(walked=None, feet=(3,), contact=contact),
+        "bare": {},
+        "path": dict(wanted=path + 0.05),
+        "touch": dict(ball=ball),
     }.items():
-        save(tmp_path / "a.gif", **options)
-        pictures, _, _ = frames(tmp_path / "a.gif")
-        counts[name] = green(pictures).sum(axis=(1, 2))
+        save(tmp_path / "a.gif", samples.circle_stage(**options))
+        counts[name] = green(frames(tmp_path / "a.gif")[0])
     assert counts["bare"].max() == 0
-    assert counts["paths"].min() > 10
-    assert np.all((counts["feet"] > 5) == contact[::2, 0])
+    assert counts["path"].min() > 10
+    assert np.all((counts["touch"] > 5) == touch[::2, 0])
+
+
+def test_a_ghost_is_pale_and_many_characters_are_set_apart(tmp_path):
+    motion, _ = samples.circle(2)
+    ahead = samples.circle(2, radius=1.5)[0]
+    # Under [characters, frames] both; both start in one place.
+    many = stage.make_stage(
+        samples.figure(),
+        Motion(
+            root_position=jnp.stack([motion.root_position] * 3),
+            joint_rotation=jnp.stack([motion.joint_rotation] * 3),
+            fps=samples.FPS,
+        ),
+    )
+    start = many.walked[:, 0]
+    away = np.linalg.norm(start[:, None] - start, axis=-1) + 9 * np.eye(3)
+    assert away.min() > 1.0
+    shown = []
+    for made in (
+        samples.circle_stage(motion),
+        samples.circle_stage(motion, ghost=ahead),
+        many,
+    ):
+        save(tmp_path / "a.gif", made)
+        first = frames(tmp_path / "a.gif")[0][0]
+        blue = first[..., 2] - first[..., 0]
+        shown.append([(blue > 60).any(), ((blue > 12) & (blue < 50)).sum()])
+    assert all(strong for strong, _ in shown)
+    assert shown[1][1] > shown[0][1] + 100, "pale blue where the ghost is"
 
 
 LONG = ("a title much longer than any picture is wide " * 5)[:200]
@@ -85,16 +117,9 @@ LONG = ("a title much longer than any picture is wide " * 5)[:200]
 
 @pytest.mark.parametrize("size", [100, 333, (480, 360)])
 def test_a_long_title_stays_in_one_line_on_the_picture(tmp_path, size):
-    positions, skeleton = samples.person(seconds=0.1)
+    shown = stage.make_stage(*samples.person(seconds=0.1))
     for title in (LONG, "W" * 200, "unbroken_$math_^" * 13, "two\nlines " * 20):
-        animation.save_gif(
-            tmp_path / "a.gif",
-            positions,
-            skeleton.parents,
-            fps=samples.FPS,
-            title=title,
-            size=size,
-        )
+        animation.save_gif(tmp_path / "a.gif", shown, title=title, size=size)
         picture = frames(tmp_path / "a.gif")[0][0]
         height, width = picture.shape[:2]
         ink = picture.sum(axis=-1) < 350
@@ -117,15 +142,20 @@ def test_text_is_shrunk_before_it_is_elided():
 
 @pytest.mark.parametrize("turn, elevation", [(0.0, 16.0), (1.2, 16.0), (-2.5, 40.0)])
 def test_the_whole_body_is_in_the_picture_in_all_frames(turn, elevation):
-    positions, skeleton = samples.person(turn=turn)
-    made = body.build(positions, skeleton.parents, skeleton.names)
+    shown = stage.make_stage(*samples.person(turn=turn))
+    positions, ends = shown.positions[0], shown.ends
     box = (16, 40, 464, 330)
     view = camera.follow(
-        made, fps=samples.FPS, azimuth=35.0, elevation=elevation, box=box
+        ends,
+        shown.body.radii,
+        fps=samples.FPS,
+        azimuth=35.0,
+        elevation=elevation,
+        box=box,
     )
     now = np.arange(len(positions))[:, None]
-    places = np.concatenate([made.points[:, made.ends.ravel()], positions], axis=1)
-    radii = np.concatenate([made.radii.ravel(), np.zeros(positions.shape[1])])
+    places = np.concatenate([ends[0].reshape(len(positions), -1, 3), positions], axis=1)
+    radii = np.concatenate([shown.body.radii.ravel(), np.zeros(positions.shape[1])])
     pixels, scale, _ = view.project(places, now)
     low, high = pixels - (radii * scale)[..., None], pixels + (radii * scale)[..., None]
     assert np.all(low >= [box[:2]]) and np.all(high <= [box[2:]])
@@ -147,12 +177,17 @@ def test_a_mean_over_time_keeps_a_straight_line():
 
 @pytest.mark.slow
 def test_the_ground_moves_under_the_character_and_stands_in_the_world(tmp_path):
-    positions, skeleton = samples.person(seconds=3.0, turn=0.0)
+    skeleton, motion = samples.person(seconds=3.0, turn=0.0)
     paths = {}
     for name, still in (("walk", False), ("still", True)):
-        shown = np.repeat(positions[:1], len(positions), 0) if still else positions
+        frame = np.zeros(90, int) if still else np.arange(90)
+        shown = Motion(
+            root_position=motion.root_position[frame],
+            joint_rotation=motion.joint_rotation[frame],
+            fps=samples.FPS,
+        )
         path = tmp_path / f"{name}.gif"
-        animation.save_gif(path, shown, skeleton.parents, fps=samples.FPS)
+        animation.save_gif(path, stage.make_stage(skeleton, shown))
         paths[name] = frames(path)[0][:, 250:, :100]  # beside the body
     assert len(paths["still"]) == 1, "equal pictures are one"
     changed = np.any(np.diff(paths["walk"], axis=0), axis=-1).mean(axis=(1, 2))
@@ -167,16 +202,11 @@ def test_the_ground_moves_under_the_character_and_stands_in_the_world(tmp_path):
 
 @pytest.mark.slow
 def test_eight_seconds_are_small_and_at_most_20_pictures_a_second(tmp_path):
-    positions, skeleton = samples.person(seconds=8.0)
-    walked = positions[:, 0, ::2]
+    skeleton, motion = samples.person(seconds=8.0)
+    wanted = motion.root_position[:, ::2] + 0.1
     animation.save_gif(
         tmp_path / "a.gif",
-        positions,
-        skeleton.parents,
-        fps=samples.FPS,
-        names=skeleton.names,
-        walked=walked,
-        commanded=walked + 0.1,
+        stage.make_stage(skeleton, motion, wanted=wanted),
         title="a walk",
         caption="data (license)",
     )
@@ -187,62 +217,32 @@ def test_eight_seconds_are_small_and_at_most_20_pictures_a_second(tmp_path):
 
 
 def test_a_caption_is_below_and_the_title_above(tmp_path):
-    positions, skeleton = samples.person(seconds=0.1)
+    shown = stage.make_stage(*samples.person(seconds=0.1))
     place = {}
     for name in ("title", "caption"):
-        text = {name: "data and its license " * 2}
-        path = tmp_path / "a.gif"
-        animation.save_gif(
-            path, positions, skeleton.parents, fps=samples.FPS, size=240, **text
-        )
-        ink = frames(tmp_path / "a.gif")[0][0][:, :70].sum(axis=-1) < 450
+        text = {name: "data and its license " * 4}
+        animation.save_gif(tmp_path / "a.gif", shown, size=240, **text)
+        ink = frames(tmp_path / "a.gif")[0][0][:, 180:235].sum(axis=-1) < 450
         place[name] = [bool(part.any()) for part in (ink[:24], ink[-16:])]
     assert place == {"title": [True, False], "caption": [False, True]}
 
 
 def test_a_single_frame_is_a_picture(tmp_path):
-    save(tmp_path / "a.gif", samples.circle(1)[0])
+    save(tmp_path / "a.gif", samples.circle_stage(samples.circle(1)[0]))
     assert frames(tmp_path / "a.gif")[0].shape[0] == 1
 
 
 def test_a_path_below_a_file_is_an_error_before_any_drawing(tmp_path):
     (tmp_path / "plain").write_text("")
-    many = np.repeat(samples.circle()[0], 2000, axis=0)
+    many = samples.circle_stage(samples.circle(20_000)[0])
     start = time.perf_counter()
     with pytest.raises(OSError, match=r"plain/a\.gif"):
         save(tmp_path / "plain" / "a.gif", many)
     assert time.perf_counter() - start < 5.0
 
 
-BAD = [
-    (
-        dict(positions=np.zeros((5, 3, 3))),
-        r"positions are \(5, 3, 3\).*\[frames, 4, 3\]",
-    ),
-    (dict(positions=np.zeros((5, 4))), r"positions are \(5, 4\)"),
-    (dict(positions=np.zeros((0, 4, 3))), "0 frames"),
-    (dict(fps=0.0), "0.0 fps"),
-    (dict(every=0), "every 0"),
-    (dict(size=10), "size 10"),
-    (dict(walked=np.zeros((5, 2))), r"walked path is \(5, 2\), expected \(12, 2\)"),
-    (dict(commanded=np.zeros((12, 3))), r"commanded path is \(12, 3\)"),
-    (dict(contact=np.zeros((12, 2), bool), feet=(3,)), r"contact is \(12, 2\)"),
-    (dict(contact=np.zeros((12, 1), bool)), "of feet None"),
-]
-
-
-@pytest.mark.parametrize("bad, message", BAD)
-def test_wrong_shapes_are_named(tmp_path, bad, message):
-    with pytest.raises(ValueError, match=message):
-        save(tmp_path / "a.gif", **bad)
+def test_wrong_options_are_named(tmp_path):
+    for bad, message in ((dict(every=0), "every 0"), (dict(size=10), "size 10")):
+        with pytest.raises(ValueError, match=message):
+            save(tmp_path / "a.gif", **bad)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_frame_that_is_not_finite_is_named(tmp_path):
-    positions, path = samples.circle()
-    positions[7, 1, 2] = np.nan
-    with pytest.raises(ValueError, match="positions: frame 7 is not finite"):
-        save(tmp_path / "a.gif", positions)
-    path[3] = np.inf
-    with pytest.raises(ValueError, match="walked: frame 3 is not finite"):
-        save(tmp_path / "a.gif", walked=path)

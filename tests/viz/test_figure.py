@@ -5,30 +5,30 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.viz import figure, plots
+from jaxmotion.viz import camera, figure, plots
 
 
 def test_the_axes_of_a_view():
     # Right, up and toward the viewer are orthonormal, and right-handed.
     for azimuth, elevation in [(0.0, 0.0), (35.0, 20.0), (200.0, 70.0)]:
-        axes = figure.view_axes(azimuth=azimuth, elevation=elevation)
+        axes = camera.view_axes(azimuth=azimuth, elevation=elevation)
         np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(axes) > 0
     # Straight ahead along -z; from above what is nearer is lower.
-    flat = figure.view_axes(azimuth=0.0, elevation=0.0)
+    flat = camera.view_axes(azimuth=0.0, elevation=0.0)
     np.testing.assert_allclose(flat, np.eye(3), atol=1e-12)
-    above = figure.view_axes(azimuth=0.0, elevation=90.0)
+    above = camera.view_axes(azimuth=0.0, elevation=90.0)
     np.testing.assert_allclose(above @ [0, 0, 1], [0, -1, 0], atol=1e-12)
     np.testing.assert_allclose(above @ [0, 1, 0], [0, 0, 1], atol=1e-12)
     # A camera turned by 90 degrees about +y stands on the +x axis.
-    side = figure.view_axes(azimuth=90.0, elevation=0.0)
+    side = camera.view_axes(azimuth=90.0, elevation=0.0)
     np.testing.assert_allclose(side @ [1, 0, 0], [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(side @ [0, 0, 1], [-1, 0, 0], atol=1e-12)
 
 
 def test_a_character_that_faces_the_viewer_has_its_left_on_the_right():
     left = np.array([0.3, 1.0, 0.0])  # facing +z, y up: left is +x
-    assert (figure.view_axes(azimuth=0.0, elevation=10.0) @ left)[0] > 0
+    assert (camera.view_axes(azimuth=0.0, elevation=10.0) @ left)[0] > 0
 
 
 def test_a_file_below_a_file_cannot_be_written(tmp_path):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxmotion.viz import html as page
-from jaxmotion.viz import sketch as body
+from jaxmotion.viz import stage
+from jaxmotion.viz.figure import LEFT
 from tests.viz import samples
 
 
@@ -34,14 +35,10 @@ class Reader(html.parser.HTMLParser):
             self.texts[tag] = self.texts.get(tag, "") + data
 
 
-def save(path, positions=None, **changes):
-    made, walked = samples.circle()
-    options = dict(
-        fps=samples.FPS, names=samples.NAMES, walked=walked, commanded=walked + 0.5
-    )
-    positions = made if positions is None else positions
-    page.save_html(path, positions, samples.PARENTS, **(options | changes))
-    return path.read_text(encoding="utf-8") if path.exists() else None
+def save(path, shown=None, **changes):
+    shown = shown or samples.circle_stage(wanted=samples.circle()[1] + 0.5)
+    page.save_html(path, shown, **changes)
+    return path.read_text(encoding="utf-8")
 
 
 def data_of(text):
@@ -49,24 +46,10 @@ def data_of(text):
     return json.loads(line.group(1))
 
 
-def test_the_page_holds_the_positions_to_a_millimeter(tmp_path):
-    positions, walked = samples.circle()
-    data = data_of(save(tmp_path / "a.html", positions))
-    np.testing.assert_allclose(data["positions"], positions, atol=5.001e-4)
-    np.testing.assert_allclose(data["walked"], walked, atol=5.001e-4)
-    np.testing.assert_allclose(data["commanded"], walked + 0.5, atol=5.001e-4)
-    # Three bones: gray, blue and red.
-    assert [shape[:2] for shape in data["shapes"]] == [[0, 1], [1, 2], [0, 3]]
-    assert data["fps"] == samples.FPS
-    assert len({shape[4] for shape in data["shapes"]}) == 3
-    longest = max(len(x) for x in re.findall(r"\.\d+", json.dumps(data["positions"])))
-    assert longest <= 4, "three decimals"
-
-
-def test_without_paths_there_are_none(tmp_path):
-    data = data_of(save(tmp_path / "a.html", walked=None, commanded=None, names=None))
-    assert data["walked"] is None and data["commanded"] is None
-    assert len({shape[4] for shape in data["shapes"]} - {body.SKIN}) == 1
+def test_without_a_wanted_path_there_is_none(tmp_path):
+    names = lambda text: [name for name, *_ in data_of(text)["paths"]]  # noqa: E731
+    assert names(save(tmp_path / "a.html", samples.circle_stage())) == ["walked"]
+    assert names(save(tmp_path / "a.html")) == ["commanded", "walked"]
 
 
 @pytest.mark.parametrize(
@@ -91,6 +74,7 @@ def test_a_title_is_text_whatever_it_says(tmp_path, title):
 
 def test_the_page_needs_no_network(tmp_path):
     text = save(tmp_path / "a.html", title="plain")
+    text = re.sub(r"^const data = .*;$", "", text, flags=re.M)  # base64 has slashes
     assert not re.search(r"https?:|//[a-z]|\bimport\b|fetch\(|XMLHttp|@import", text)
     for _, attributes in Reader(text).tags:
         assert not {"src", "href", "srcset", "action"} & set(attributes)
@@ -108,72 +92,68 @@ def test_the_script_is_javascript(tmp_path):
 
 BROWSER = """
 const drawn = [];
-let points = [];
-const fake = {
-  beginPath() { points = []; }, closePath() {}, clearRect() { drawn.length = 0; },
-  moveTo(x, y) { points.push([x, y]); }, lineTo(x, y) { points.push([x, y]); },
-  arc(x, y, r) { points.push([x, y, r]); },
-  fill() { drawn.push([this.fillStyle, points]); },
-  stroke() { drawn.push([this.strokeStyle, points]); }};
+const special = {getShaderParameter: () => true, getProgramParameter: () => true,
+  drawArrays: (mode, start, count) => drawn.push(count),
+  drawArraysInstanced: (mode, start, count, many) => drawn.push([many])};
+const fake = new Proxy(special, {get: (t, name) =>
+  t[name] ?? (/^[A-Z_0-9]+$/.test(name) ? 1 : () => ({}))});
 const parts = {};
-globalThis.document = {getElementById(id) { return parts[id] ??= {
-  clientWidth: 320, clientHeight: 320, getContext() { return fake; }}; }};
+globalThis.document = {
+  createElement: () => ({style: {}}),
+  getElementById: id => parts[id] ??= {clientWidth: 320, clientHeight: 240,
+    append() {}, addEventListener() {}, getContext: () => fake}};
 globalThis.window = globalThis;
 let next; globalThis.requestAnimationFrame = f => { next = f; };
-globalThis.performance = {now: () => 0};
+"""
+# Frame 3 is shown after 0.1 s at 30 fps; the first time may lie before the script's
+# own, as in real browsers.
+PLAY = """
+next(-16); next(84);
+const count = assemble(body, 3);
+console.log(JSON.stringify(
+  [drawn, parts.time.value, count, Array.from(shapes.slice(0, WIDTH * count))]));
 """
 
 
-def test_the_script_draws_every_bone_and_both_paths(tmp_path):
+def test_the_script_draws_the_same_body(tmp_path):
+    """The kinematics in the page give the capsules that Python computes."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed")
-    script = tmp_path / "a.js"
-    # The first time may lie before the script's own, as in real browsers.
-    play = (
-        "next(-16); next(84); console.log(JSON.stringify([drawn, parts.time.value]));"
+    skeleton, motion = samples.person(seconds=0.4)
+    ball = stage.Ball(
+        position=np.full((12, 3), 0.5),
+        touch=np.arange(12)[:, None] == 3,
+        joints=(4,),
+        radius=0.2,
     )
-    source = Reader(save(tmp_path / "a.html")).texts["script"]
-    script.write_text(BROWSER + source + play)
+    shown = stage.make_stage(
+        skeleton, motion, wanted=motion.root_position[:, ::2], ghost=motion, ball=ball
+    )
+    source = Reader(save(tmp_path / "a.html", shown)).texts["script"]
+    script = tmp_path / "a.js"
+    script.write_text(BROWSER + source + PLAY)
     done = subprocess.run([node, script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    drawn, shown = json.loads(done.stdout)
-    assert shown == 3, "frame 3 after 0.1 s at 30 fps"
-    of = lambda color: [points for found, points in drawn if found == color]  # noqa: E731
-    assert len(of("#dde4ec")) == 50, "every other of a hundred tiles"
-    for path in ("#2ca02c", "#ff7f0e"):
-        assert len(of(path)) == 1 and len(of(path)[0]) == 4, "what is walked so far"
-        assert len(of(path + "55")) == 1
-    skeleton = {
-        color: np.array(of(color)[0]) for color in (body.MIDDLE, body.LEFT, body.RIGHT)
-    }
-    assert all(bone.shape == (2, 3) for bone in skeleton.values())
-    # Ends and radius; up the page is smaller y.
-    spine, foot = skeleton[body.MIDDLE], skeleton[body.RIGHT]
-    assert spine[1, 1] < spine[0, 1] and foot[1, 1] > foot[0, 1]
-    assert all(
-        np.isfinite(bone).all() and bone[:, 2].min() > 0 for bone in skeleton.values()
-    )
+    drawn, frame, count, values = json.loads(done.stdout)
+    number = len(shown.body.colors)
+    assert frame == 3 and count == number + 2, "a ball, and a mark where it is touched"
+    values = np.array(values).reshape(count, 11)
+    ends = values[:number, :6].reshape(-1, 2, 3)
+    np.testing.assert_allclose(ends, shown.ends[0, 3], atol=1e-3)
+    np.testing.assert_allclose(values[:number, 6:8], shown.body.radii, atol=1e-4)
+    blue = [round(255 * x) for x in values[shown.body.colors.index(LEFT), 8:]]
+    assert "#" + "".join(f"{x:02x}" for x in blue) == LEFT
+    np.testing.assert_allclose(values[number, [0, 1, 2, 6]], [0.5, 0.5, 0.5, 0.2])
+    np.testing.assert_allclose(values[-1, :3], shown.positions[0, 3, 4], atol=1e-3)
+    # Shadow and bodies, twice the ghost; the ground, and three times a path.
+    last = drawn[len(drawn) // 2 :]
+    solid = [made[0] for made in last if isinstance(made, list)]
+    assert solid == [number + 2, number + 2, number, number]
+    assert [made for made in last if not isinstance(made, list)] == [4, 24, 8, 8]
 
 
 def test_a_path_below_a_file_is_an_error_that_names_it(tmp_path):
     (tmp_path / "plain").write_text("")
     with pytest.raises(OSError, match=r"plain/a\.html: cannot write here"):
         save(tmp_path / "plain" / "a.html")
-
-
-@pytest.mark.parametrize(
-    "bad, message",
-    [
-        (dict(positions=np.zeros((5, 3, 3))), r"positions are \(5, 3, 3\)"),
-        (dict(positions=np.zeros((0, 4, 3))), "0 frames"),
-        (dict(positions=np.full((12, 4, 3), np.nan)), "frame 0 is not finite"),
-        (dict(fps=-1.0), "-1.0 fps"),
-        (dict(walked=np.zeros((7, 2))), r"walked path is \(7, 2\), expected \(12, 2\)"),
-        (dict(commanded=np.zeros(12)), r"commanded path is \(12,\)"),
-    ],
-)
-def test_wrong_input_is_named_and_nothing_is_written(tmp_path, bad, message):
-    with pytest.raises(ValueError, match=message):
-        save(tmp_path / "a.html", **bad)
-    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,87 @@
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.viz import stage
+from tests.viz import samples
+
+
+def test_the_joints_are_those_of_the_kinematics():
+    skeleton, (motion, _) = samples.figure(), samples.circle()
+    shown = stage.make_stage(skeleton, motion)
+    expected = np.asarray(joint_positions(skeleton, motion))
+    np.testing.assert_allclose(shown.positions[0], expected, atol=1e-5)
+    np.testing.assert_allclose(shown.walked[0], expected[:, 0, ::2], atol=1e-6)
+    # A scaled rotation is the same rotation.
+    doubled = dataclasses.replace(motion, joint_rotation=2 * motion.joint_rotation)
+    same = stage.make_stage(skeleton, doubled)
+    np.testing.assert_allclose(same.positions, shown.positions, atol=1e-6)
+    assert shown.ghost_ends is None
+    ghost = stage.make_stage(skeleton, motion, ghost=motion).ghost_ends
+    np.testing.assert_allclose(ghost, shown.ends, atol=1e-9)
+
+
+def test_characters_keep_their_places_unless_they_overlap():
+    motion, path = samples.circle()
+    place = np.array([[0.0, 0, 0], [2.0, 0, 0]], np.float32)
+    many = Motion(
+        root_position=jnp.asarray(np.array(motion.root_position) + place[:, None]),
+        joint_rotation=jnp.stack([motion.joint_rotation] * 2),
+        fps=samples.FPS,
+    )
+    wanted = path + place[:, None, ::2]
+    for apart, expected in ((None, 2.0), (0.0, 2.0), (3.0, 5.0)):
+        shown = samples.circle_stage(many, wanted=wanted, apart=apart)
+        away = np.linalg.norm(shown.walked[0, 0] - shown.walked[1, 0])
+        np.testing.assert_allclose(away, expected, rtol=1e-5)
+        np.testing.assert_allclose(shown.wanted, shown.walked, atol=1e-5)
+
+
+def motion(shape=(12, 3), turns=None, **changes):
+    turns = (*shape[:-1], 4, 6) if turns is None else turns
+    made = Motion(root_position=jnp.zeros(shape), joint_rotation=jnp.ones(turns))
+    return dataclasses.replace(made, **changes)
+
+
+BALL = dict(position=np.zeros((12, 3)), joints=(3,), radius=0.1)
+BAD = [
+    (dict(motion=motion(turns=(12, 3, 6))), r"motion is \(12, 3\) and \(12, 3, 6\)"),
+    (dict(motion=motion((0, 3))), "0 frames"),
+    (dict(motion=motion(fps=0.0)), "0.0 fps"),
+    (
+        dict(wanted=np.zeros((5, 2))),
+        r"wanted path is \(1, 5, 2\), expected \(1, 12, 2\)",
+    ),
+    (dict(wanted=np.zeros((12, 3))), r"wanted path is \(1, 12, 3\)"),
+    (dict(ghost=motion((5, 3))), r"ghost is \(1, 5\) .*, expected \(1, 12\)"),
+    (
+        dict(ball=stage.Ball(**BALL, touch=np.zeros((12, 2), bool))),
+        r"touch is \(12, 2\), expected \(12, 1\)",
+    ),
+    (
+        dict(ball=stage.Ball(**BALL | dict(position=np.zeros((5, 3))))),
+        r"ball is \(5, 3\) beside 1 characters",
+    ),
+    (dict(sides=("left",)), "expected 4 of left, right, middle"),
+]
+
+
+@pytest.mark.parametrize("bad, message", BAD)
+def test_wrong_shapes_are_named(bad, message):
+    with pytest.raises(ValueError, match=message):
+        samples.circle_stage(**bad)
+
+
+def test_a_frame_that_is_not_finite_is_named():
+    made, path = samples.circle()
+    root = np.array(made.root_position)
+    root[7, 1] = np.nan
+    with pytest.raises(ValueError, match="motion: frame 7 is not finite"):
+        samples.circle_stage(dataclasses.replace(made, root_position=jnp.asarray(root)))
+    path = np.array(path)
+    path[3] = np.inf
+    with pytest.raises(ValueError, match="wanted path: frame 3 is not finite"):
+        samples.circle_stage(wanted=path)
