@@ -46,7 +46,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxmotion.control.rollout import Controller
-from jaxmotion.control.steering import Character, Method
+from jaxmotion.control.steering import Character, Method, Tuning
 from jaxmotion.motion.rotation import rot6d_from_matrix, safe_normalize
 from jaxmotion.motion.rotation_vector import to_matrix
 from jaxmotion.motion.skeleton import Motion, Skeleton, global_transforms
@@ -546,11 +546,17 @@ def _absorb(state: LockState) -> LockState:
 
 
 def locked(
-    controller: Controller, skeleton: Skeleton, *, fps: float, lock: FootLock
+    controller: Controller,
+    skeleton: Skeleton,
+    *,
+    fps: float,
+    lock: FootLock,
+    enabled: bool | Bool[Array, ""] = True,
 ) -> Controller:
     """A controller that displays its frames with locked feet.
 
-    Its state is a `LockedState`.
+    Its state is a `LockedState`. Where `enabled`, which may be traced, is False, it
+    displays frames as they come, and forgets what was locked.
     """
 
     def planner(plan: Any) -> Any:
@@ -570,6 +576,11 @@ def locked(
             fps=fps,
             lock=lock,
         )
+        if enabled is not True:
+            off = (init_lock(skeleton), frame.root_position, frame.joint_rotation)
+            feet, root, rotations = jax.tree.map(
+                lambda x, y: jnp.where(enabled, x, y), (feet, root, rotations), off
+            )
         frame = dataclasses.replace(frame, root_position=root, joint_rotation=rotations)
         if controller.shown is not None:
             inner = controller.shown(inner, frame)
@@ -590,11 +601,19 @@ class _Method:
     method: Method
     fps: float
     lock: FootLock
+    enabled: bool | Bool[Array, ""] = True
 
     def __call__(self, params: Any) -> Controller:
         inner, skeleton = params
-        controller = self.method(inner)
-        return locked(controller, skeleton, fps=self.fps, lock=self.lock)
+        options = dict(fps=self.fps, lock=self.lock, enabled=self.enabled)
+        return locked(self.method(inner), skeleton, **options)
+
+
+def _tuning(inner: Tuning, fps: float, lock: FootLock) -> Tuning:
+    def tuned(num_steps: int, scale: Any, *, locks: Any = True) -> Method:
+        return _Method(inner.method(num_steps, scale), fps, lock, locks)
+
+    return dataclasses.replace(inner, method=tuned, lockable=True)
 
 
 def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
@@ -618,11 +637,12 @@ def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
         every = jax.tree.map(lambda x: jnp.stack([x] * number), feet)
         return LockedState(inner=states, feet=every)
 
-    clip_starts = character.clip_starts
+    clip_starts, tuning = character.clip_starts, character.tuning
     return dataclasses.replace(
         character,
         params=(character.params, character.skeleton),
         method=_Method(character.method, character.fps, lock),
+        tuning=tuning and _tuning(tuning, character.fps, lock),
         starts=lambda labels, seed: with_feet(character.starts(labels, seed)),
         clip_starts=clip_starts
         and (lambda clips, labels, seed: with_feet(clip_starts(clips, labels, seed))),

@@ -101,6 +101,14 @@ def _batch_tick(
     controller: Controller, keys: Array, states: State, commands: Commands
 ) -> tuple[State, Frame]:
     need = jax.vmap(controller.plan_level)(states, commands)
+    states = _plan(controller, keys, states, commands, need)
+    return jax.vmap(controller.advance)(states, commands)
+
+
+def _plan(
+    controller: Controller, keys: Array, states: State, commands: Commands, need: Array
+) -> State:
+    """The most expensive plan that any needs, for all who need one."""
 
     def run(plan) -> Callable:
         def planned(keys: Array, states: State, commands: Commands) -> State:
@@ -110,8 +118,58 @@ def _batch_tick(
         return planned
 
     branches = [lambda k, s, c: s, *(run(plan) for plan in controller.plans)]
-    states = jax.lax.switch(jnp.max(need), branches, keys, states, commands)
-    return jax.vmap(controller.advance)(states, commands)
+    return jax.lax.switch(jnp.max(need), branches, keys, states, commands)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Crowd:
+    """Characters that share a budget of plans, between two ticks; batch axis first.
+
+    Attributes:
+      states: Their states.
+      told: The command that each follows; it may not yet have heard of the newest.
+      waited: Ticks that each waits for a plan.
+    """
+
+    states: State
+    told: Commands
+    waited: Int[Array, " characters"]
+
+
+def crowd_tick(
+    controller: Controller, key: Key, crowd: Crowd, commands: Commands, *, at_most: int
+) -> tuple[Crowd, Frame]:
+    """One tick of many characters, of whom at most so many plan: live use.
+
+    The others go on with the plan and the command that they have, until it is their
+    turn: who has waited longest comes first, then who has the lower number. So a
+    command that all get at once reaches them in a wave, and no tick takes longer than
+    its budget of plans.
+
+    Args:
+      controller: Its three functions.
+      key: Consumed; character c draws from `fold_in(key, c)`.
+      crowd: The characters.
+      commands: What the user wants of each now.
+      at_most: Plans in a tick, in 1..characters; static.
+
+    Returns:
+      The characters after the tick, and a frame of each.
+    """
+    need = jax.vmap(controller.plan_level)(crowd.states, commands)
+    waited = jnp.where(need > 0, crowd.waited + 1, 0)
+    _, chosen = jax.lax.top_k(waited, at_most)
+    keys = jax.vmap(lambda c: jax.random.fold_in(key, c))(chosen)
+    part = jax.tree.map(lambda x: x[chosen], (crowd.states, commands))
+    planned = _plan(controller, keys, *part, need[chosen])
+    put = lambda x, new: x.at[chosen].set(new)  # noqa: E731
+    states = jax.tree.map(put, crowd.states, planned)
+    heard = (need == 0).at[chosen].set(True)
+    told = _select(heard, commands, crowd.told)
+    states, frames = jax.vmap(controller.advance)(states, told)
+    waited = jnp.where(heard, 0, waited)
+    return Crowd(states=states, told=told, waited=waited), frames
 
 
 def rollout(

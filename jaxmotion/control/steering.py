@@ -28,6 +28,30 @@ Method = Callable[[Params], rollout.Controller]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Tuning:
+    """What can be changed about a character while it is steered.
+
+    Attributes:
+      method: `(num_steps, scale) -> method`, and `locks=` where `lockable`: whether
+        planted feet are locked. Scale and locks may be traced: others compile nothing.
+      num_steps: Numbers of diffusion steps that a plan may take; the last is the one
+        that the network was trained for.
+      scale: Scale of the system's guidance that the character has.
+      scales: The least and the largest that make sense.
+      patience: Ticks that a plan may come late, for it is longer than what is played
+        of it; 0 where every tick needs its own.
+      lockable: Whether the foot lock can be switched on and off.
+    """
+
+    method: Callable[..., Method]
+    num_steps: tuple[int, ...]
+    scale: float
+    scales: tuple[float, float]
+    patience: int
+    lockable: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Character:
     """What a system hands over to be steered.
 
@@ -38,6 +62,7 @@ class Character:
       source: The data that it was trained on, and their license.
       params: All arrays that `method` needs, not only a network's.
       method: Makes the controller.
+      tuning: What can be changed while it is steered; None for nothing.
       starts: `(labels, seed) -> states`, batch axis first, of characters at the origin
         that face +z; raises `ValueError` where it cannot.
       clip_starts: `(clips, labels, seed) -> states` in poses of recorded clips; None
@@ -55,6 +80,7 @@ class Character:
     starts: Callable[[np.ndarray, int], Any]
     clip_starts: Callable[[Any, np.ndarray, int], Any] | None = None
     exports: Callable[[rollout.Controller], dict[str, Exported]] = rollout.exports
+    tuning: Tuning | None = None
 
     def label(self, name: str) -> int:
         """Index of a label; raises `ValueError` that names those there are."""

@@ -258,6 +258,17 @@ def respace(schedule: Schedule, steps: tuple[int, ...]) -> Schedule:
     return _from_steps(-jnp.expm1(kept[1:] - kept[:-1]), kept[1:])
 
 
+def spread_steps(total: int, number: int) -> tuple[int, ...]:
+    """Steps for `respace`: evenly spread over 1..total, the last among them.
+
+    Raises:
+      ValueError: unless 1 <= number <= total.
+    """
+    if not 1 <= number <= total:
+        raise ValueError(f"{number} steps of {total}, expected 1 to {total}")
+    return tuple(-(-total * k // number) for k in range(1, number + 1))
+
+
 def _from_steps(
     beta: Float[Array, " steps"], log_alpha_bar: Float[Array, " steps"]
 ) -> Schedule:

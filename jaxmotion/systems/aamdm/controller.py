@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
-from jaxmotion.control.steering import Character
+from jaxmotion.control.steering import Character, Tuning
 from jaxmotion.diffusion import chain
 from jaxmotion.motion import features, ground, path_features, pose, spring
 from jaxmotion.motion.features import unpack
@@ -427,14 +427,20 @@ def load_character(
         run, "embedded", space, drafts=3, polishes=2
     )
     num_joints = run.skeleton.num_joints
+    method = Method(config=config, num_joints=num_joints, fps=run.train.fps, step=step)
     return Character(
         skeleton=run.skeleton,
         labels=(),
         fps=run.train.fps,
         source=run.source,
         params=(networks, space),
-        method=Method(
-            config=config, num_joints=num_joints, fps=run.train.fps, step=step
+        method=method,
+        tuning=Tuning(
+            method=lambda num_steps, scale: dataclasses.replace(method, scale=scale),
+            num_steps=(config.num_steps,),
+            scale=method.scale,
+            scales=(0.0, 4 * method.scale),
+            patience=0,
         ),
         starts=lambda labels, seed: start_states(
             run.held_out, space, len(labels), num_joints=num_joints, seed=seed

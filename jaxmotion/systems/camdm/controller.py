@@ -21,6 +21,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,10 +31,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame, as_displayed
 from jaxmotion.control.rollout import Controller
-from jaxmotion.control.steering import Character, check_labels
+from jaxmotion.control.steering import Character, Tuning, check_labels
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, schedule
+from jaxmotion.diffusion.schedule import spread_steps
 from jaxmotion.motion import features, spring, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.systems.camdm import model as camdm_model
@@ -419,6 +421,7 @@ def controller(
     control: Control | None = None,
     table: schedule.Schedule | None = None,
     step: chain.StepFactory = chain.ancestral_step,
+    steps: tuple[int, ...] | None = None,
 ) -> Controller:
     """The run-time of one character, for `rollout.tick` and `rollout.rollout`.
 
@@ -429,6 +432,7 @@ def controller(
       control: Constants; None for the defaults.
       table: Schedule; None for the cosine one of `config.num_steps`.
       step: Makes the chain's step; the default is the paper's.
+      steps: Steps of the schedule to visit, increasing; None for all.
 
     Returns:
       A controller whose frames are `Frame`s. Its second planner is the guided one.
@@ -439,7 +443,9 @@ def controller(
     control = Control() if control is None else control
     if not 1 <= control.apply <= config.future:
         raise ValueError(f"apply is {control.apply}, expected 1..{config.future}")
-    sample = camdm_model.sampler(params, config=config, table=table, step=step)
+    sample = camdm_model.sampler(
+        params, config=config, table=table, step=step, steps=steps
+    )
 
     def plan(guided: bool) -> Callable:
         return lambda key, state, command: replan(
@@ -470,11 +476,37 @@ class Method:
     config: camdm_model.Config
     control: Control | None = None
     step: chain.StepFactory = chain.ancestral_step
+    steps: tuple[int, ...] | None = None
 
     def __call__(self, params: tuple[Params, Skeleton]) -> Controller:
         """The controller."""
-        options = dict(config=self.config, control=self.control, step=self.step)
-        return controller(*params, **options)
+        return controller(
+            *params,
+            config=self.config,
+            control=self.control,
+            step=self.step,
+            steps=self.steps,
+        )
+
+
+def _tuning(method: Method) -> Tuning:
+    control = Control() if method.control is None else method.control
+    total = method.config.num_steps
+
+    def tuned(num_steps: int, scale: Any) -> Method:
+        return dataclasses.replace(
+            method,
+            control=dataclasses.replace(control, guidance_scale=scale),
+            steps=None if num_steps == total else spread_steps(total, num_steps),
+        )
+
+    return Tuning(
+        method=tuned,
+        num_steps=tuple(range(1, total + 1)),
+        scale=control.guidance_scale,
+        scales=(0.0, 2.0),
+        patience=method.config.future - control.apply,
+    )
 
 
 def character(
@@ -497,6 +529,8 @@ def character(
     if control is None and model.starts is not None:
         control = OWN_STARTS
 
+    method = Method(config=model.config, control=control, step=step)
+
     def clip_starts(clips: Clips, labels: np.ndarray, seed: int) -> CharacterState:
         own, field = camdm_model.fitting_clips(model, clips)
         return start_states(own, model, labels, field=field, seed=seed)
@@ -507,7 +541,8 @@ def character(
         fps=model.config.fps,
         source=model.source,
         params=(params, model.skeleton),
-        method=Method(config=model.config, control=control, step=step),
+        method=method,
+        tuning=_tuning(method),
         starts=lambda labels, seed: own_states(model, labels, seed=seed),
         clip_starts=clip_starts,
     )

@@ -270,6 +270,7 @@ def sampler(
     config: Config,
     table: schedule.Schedule | None = None,
     step: chain.StepFactory = chain.ancestral_step,
+    steps: tuple[int, ...] | None = None,
 ) -> Sample:
     """The sampler of plans, with everything that the steps share computed once.
 
@@ -282,6 +283,7 @@ def sampler(
       table: Schedule; None for the cosine one of `config.num_steps`.
       step: Makes the chain's step from the schedule and the denoiser; the default is
         the paper's.
+      steps: Steps of the schedule to visit, increasing; None for all.
 
     Returns:
       `sample(key, condition, *, scale=None) -> [future, features]`. With a scale, the
@@ -292,7 +294,8 @@ def sampler(
 
     def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
         del key  # deterministic
-        return net.apply({"params": params}, context, x_t, t, method="denoise")
+        told = t if steps is None else jnp.asarray(steps, jnp.int32)[t - 1]
+        return net.apply({"params": params}, context, x_t, told, method="denoise")
 
     def encode(condition: Condition):
         arguments = condition.arguments(config)
@@ -301,6 +304,8 @@ def sampler(
     def sample(key: Key, condition: Condition, *, scale=None) -> Array:
         noise_table = schedule.cosine_schedule(config.num_steps)
         noise_table = noise_table if table is None else table
+        if steps is not None:
+            noise_table = schedule.respace(noise_table, steps)
         context = encode(condition)
         if scale is None:
             denoiser = lambda k, x, t: denoise(k, x, t, context)  # noqa: E731

@@ -23,6 +23,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -32,9 +33,10 @@ from jaxtyping import Array, Int
 from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame, as_displayed
 from jaxmotion.control.rollout import Controller
-from jaxmotion.control.steering import Character, check_labels
+from jaxmotion.control.steering import Character, Tuning, check_labels
 from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.diffusion import chain
+from jaxmotion.diffusion.schedule import spread_steps
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import Skeleton
@@ -347,6 +349,7 @@ class Method:
       guided: Contact guidance; tuned for short trainings.
       control: Constants of the run-time; None for the defaults.
       step: Makes the step of both chains where they are not guided.
+      steps: Steps of the motion model's schedule to visit; None for all.
     """
 
     config: Config
@@ -354,6 +357,7 @@ class Method:
     guided: smgdiff_guidance.Guidance = smgdiff_guidance.TUNED
     control: Control | None = None
     step: chain.StepFactory = chain.ancestral_step
+    steps: tuple[int, ...] | None = None
 
     def __call__(self, params: tuple[Params, Params, Representation]) -> Controller:
         """The controller."""
@@ -366,11 +370,32 @@ class Method:
                 representation=representation,
                 guided=self.guided,
                 step=self.step,
+                steps=self.steps,
             ),
             representation=representation,
             config=self.config,
             control=self.control,
         )
+
+
+def _tuning(method: Method) -> Tuning:
+    total, guided = method.config.num_steps, method.guided
+    control = Control() if method.control is None else method.control
+
+    def tuned(num_steps: int, scale: Any) -> Method:
+        return dataclasses.replace(
+            method,
+            guided=dataclasses.replace(guided, rate=scale),
+            steps=None if num_steps == total else spread_steps(total, num_steps),
+        )
+
+    return Tuning(
+        method=tuned,
+        num_steps=tuple(range(max(guided.start + guided.end, 1), total + 1)),
+        scale=guided.rate,
+        scales=(0.0, 1.0),
+        patience=method.config.future - control.apply,
+    )
 
 
 def start_states(
@@ -431,12 +456,14 @@ def load_character(
     run = smgdiff_training.load_run(path)
     model, motion = smgdiff_training.load_stage(run, "motion_8")
     paths, path_params = smgdiff_training.load_stage(run, "paths_1")
+    method = Method(config=model.config, paths=paths.paths, step=step)
     return Character(
         skeleton=model.representation.skeleton,
         labels=model.labels,
         fps=model.config.fps,
         source=model.source,
         params=(motion, path_params, model.representation),
-        method=Method(config=model.config, paths=paths.paths, step=step),
+        method=method,
+        tuning=_tuning(method),
         starts=lambda labels, seed: start_states(run.train, model, labels, seed=seed),
     )

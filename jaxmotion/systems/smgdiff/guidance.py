@@ -149,6 +149,7 @@ def sampler(
     representation: Representation,
     guided: Guidance = Guidance(),
     step: chain.StepFactory = chain.ancestral_step,
+    steps: tuple[int, ...] | None = None,
 ) -> SamplePlan:
     """The sampler of plans; gradients are compiled into the guided segments only.
 
@@ -159,6 +160,7 @@ def sampler(
       guided: Where and how contact guidance acts.
       step: Makes the step of the unguided segments from the schedule and the denoiser;
         the default is the paper's.
+      steps: Steps of the schedule to visit, increasing; None for all.
 
     Returns:
       `sample(key, condition) -> [future, features]`.
@@ -166,16 +168,19 @@ def sampler(
     Raises:
       ValueError: if more steps are guided than there are.
     """
-    net, parts = network(config), segments(guided, config.num_steps)
+    number = config.num_steps if steps is None else len(steps)
+    net, parts = network(config), segments(guided, number)
     shape = (config.future, config.num_features)
 
     def sample(key: Key, condition: Condition) -> Array:
         table = schedule.cosine_schedule(config.num_steps)
+        table = table if steps is None else schedule.respace(table, steps)
         context = net.apply({"params": params}, *condition.arguments(), method="encode")
 
         def denoise(key: Key, x_t: Array, t: Array) -> Array:
             del key  # deterministic
-            return net.apply({"params": params}, context, x_t, t, method="denoise")
+            told = t if steps is None else jnp.asarray(steps, jnp.int32)[t - 1]
+            return net.apply({"params": params}, context, x_t, told, method="denoise")
 
         objective = contact_objective(
             condition.ball, representation=representation, guided=guided

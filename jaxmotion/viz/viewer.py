@@ -1,0 +1,626 @@
+"""A person steers characters: what held keys ask for, ticks at a fixed rate, recording.
+
+A `Session` holds one group of characters, which all browsers see, and which the browser
+that touched a key last steers. It ticks in a thread of its own, only while somebody
+looks. One compiled program serves a model, a number of characters and a number of
+diffusion steps: labels, speeds, the guidance scale and the foot lock are its arguments.
+Another program is compiled in a second thread, while the old one goes on.
+
+It knows neither a network protocol nor a file format: `viz.page` serves it.
+"""
+
+import dataclasses
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion.control import rollout
+from jaxmotion.control.steering import Character
+from jaxmotion.motion.skeleton import Motion, global_transforms
+from jaxmotion.motion.trajectory import Command
+from jaxmotion.viz import body as bodies
+
+ACTIONS = ("forward", "back", "left", "right", "run", "turn_left", "turn_right")
+MOST_CHARACTERS = 64
+SPEEDS = (0.3, 4.0)
+# Shift multiplies the speed; Q and E turn who stands by so much, radians per second.
+RUN, TURN = 2.0, math.radians(150.0)
+# Who runs at a target slows down to cover what is left in so many seconds, and stops
+# within so many meters; he starts again beyond the second distance.
+ARRIVE, NEAR, FAR = 0.7, 0.2, 0.45
+# What is told stays as it is until what is wanted differs by more, radians and m/s.
+HEADING_STEP, SPEED_STEP = math.radians(8.0), 0.15
+SPACING = 1.6
+LONGEST_TAKE = 600.0
+_CATCH_UP = 0.25
+_KEPT_PROGRAMS = 6
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What one person holds down.
+
+    Attributes:
+      held: Of `ACTIONS`.
+      azimuth: Where the camera looks, radians from +z toward +x.
+      target: Point (x, z) on the ground to go to, meters; keys come first.
+    """
+
+    held: frozenset[str] = frozenset()
+    azimuth: float = 0.0
+    target: tuple[float, float] | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Wish:
+    """What is asked of a character.
+
+    Attributes:
+      velocity: (x, z) m/s.
+      facing: (x, z), unit.
+    """
+
+    velocity: tuple[float, float] = (0.0, 0.0)
+    facing: tuple[float, float] = (0.0, 1.0)
+
+    @property
+    def speed(self) -> float:
+        return math.hypot(*self.velocity)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What the panel shows.
+
+    Attributes:
+      model: One of the session's.
+      label: Index.
+      speed: Without Shift, m/s.
+      num_steps: Diffusion steps of a plan.
+      scale: Guidance scale.
+      foot_lock: Whether planted feet are locked, where they can be.
+      characters: 1 to `MOST_CHARACTERS`.
+      paused: Whether time stands still.
+    """
+
+    model: str
+    label: int = 0
+    speed: float = 1.4
+    num_steps: int = 1
+    scale: float = 1.0
+    foot_lock: bool = True
+    characters: int = 1
+    paused: bool = False
+
+
+def wanted(
+    inputs: Inputs,
+    last: Wish,
+    *,
+    position: tuple[float, float],
+    speed: float,
+    seconds: float,
+) -> Wish:
+    """What held keys and the mouse ask for.
+
+    Directions are the camera's; who moves faces where he goes, and who stands keeps
+    facing where he did.
+
+    Args:
+      last: What was wanted a tick ago.
+      position: Of the character (x, z), meters.
+      speed: Without Shift, m/s.
+      seconds: Of a tick.
+    """
+    held = inputs.held
+    ahead = ("forward" in held) - ("back" in held)
+    aside = ("right" in held) - ("left" in held)
+    speed = speed * (RUN if "run" in held else 1.0)
+    if ahead or aside:
+        # To the right of who looks along +z lies -x.
+        angle = inputs.azimuth - math.atan2(aside, ahead)
+        return _go(angle, speed)
+    turn = ("turn_left" in held) - ("turn_right" in held)
+    if turn:
+        facing = math.atan2(*last.facing) + turn * TURN * seconds
+        return Wish(facing=(math.sin(facing), math.cos(facing)))
+    if inputs.target is not None:
+        x, z = inputs.target[0] - position[0], inputs.target[1] - position[1]
+        distance = math.hypot(x, z)
+        if distance > (NEAR if last.speed else FAR):
+            return _go(math.atan2(x, z), min(speed, distance / ARRIVE))
+    return Wish(facing=last.facing)
+
+
+def _go(angle: float, speed: float) -> Wish:
+    x, z = math.sin(angle), math.cos(angle)
+    return Wish(velocity=(speed * x, speed * z), facing=(x, z))
+
+
+def settled(told: Wish, wish: Wish, *, steady: bool) -> Wish:
+    """What to tell the character: every change of it costs a plan, so small ones wait.
+
+    Args:
+      told: What it was told last.
+      wish: What is wanted now.
+      steady: Whether that is what was wanted a tick ago: then it is told as it is.
+    """
+    stops = bool(told.speed) != bool(wish.speed)
+    turned = math.acos(
+        max(-1.0, min(1.0, sum(a * b for a, b in zip(told.facing, wish.facing))))
+    )
+    far = turned > HEADING_STEP or abs(told.speed - wish.speed) > SPEED_STEP
+    return wish if stops or far or steady else told
+
+
+def formation(number: int) -> np.ndarray:
+    """Places of characters beside the first one, (x, z) meters, in rows behind it."""
+    wide = math.ceil(math.sqrt(number))
+    order = sorted(range(wide), key=lambda i: abs(i - (wide - 1) // 2))
+    rows, columns = np.divmod(np.arange(number), wide)
+    across = np.array(order)[columns] - order[0]
+    return SPACING * np.stack([across, -rows], axis=-1).astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Shown:
+    """One tick, for whoever draws it.
+
+    Attributes:
+      engine: Number of the program that made it; another one may have another body.
+      tick: Counted from 0.
+      ends: [characters, capsules, 2, 3] of `Session.body`, world, meters.
+      roots: [characters, 3] world, meters.
+      ball: [characters, 3] world, meters; None in systems without.
+      told: What the first character was told.
+      planned: Characters that got a new plan.
+      milliseconds: That the tick took.
+    """
+
+    engine: int
+    tick: int
+    ends: np.ndarray
+    roots: np.ndarray
+    ball: np.ndarray | None
+    told: Wish
+    planned: int
+    milliseconds: float
+
+
+class Engine:
+    """The compiled tick of one model, number of characters and number of steps."""
+
+    def __init__(self, character: Character, *, num_steps: int, number: int) -> None:
+        """Compiles nothing yet."""
+        self.character, self.num_steps, self.number = character, num_steps, number
+        self.body = bodies.describe(character.skeleton)
+        tuning, skeleton = character.tuning, character.skeleton
+        patience = 0 if tuning is None else tuning.patience
+        at_most = number if not patience else math.ceil(number / patience)
+
+        # Parameters are an argument: the compiler's cache then keeps the program small.
+        def tick(params, seed, n, crowd, command, scale, locks) -> tuple:
+            method = character.method
+            if tuning is not None:
+                more = {"locks": locks} if tuning.lockable else {}
+                method = tuning.method(num_steps, scale, **more)
+            key = jax.random.fold_in(jax.random.key(seed), n)
+            commands = jax.tree.map(
+                lambda x: jnp.broadcast_to(x, (number, *x.shape)), command
+            )
+            crowd, frames = rollout.crowd_tick(
+                method(params), key, crowd, commands, at_most=at_most
+            )
+            poses = jax.vmap(lambda r, q: global_transforms(skeleton, r, q))(
+                frames.root_position, frames.joint_rotation
+            )
+            return crowd, (poses, frames.root_position, frames.joint_rotation), dict(
+                planned=jnp.sum(frames.planned),
+                ball=frames.extra.get("ball"),
+            )
+
+        self._tick = jax.jit(tick)
+
+    def start(self, label: int, seed: int) -> rollout.Crowd:
+        """Characters that have not been told anything."""
+        number = self.number
+        labels = label if self.character.labels else None
+        none = Command(
+            velocity=jnp.zeros((number, 2)),
+            facing=jnp.tile(jnp.array([0.0, 1.0]), (number, 1)),
+            label=jnp.full(number, -1, jnp.int32),
+        )
+        return rollout.Crowd(
+            states=self.character.start(number, labels=labels, seed=seed),
+            told=none,
+            waited=jnp.zeros(number, jnp.int32),
+        )
+
+    def step(
+        self, crowd: rollout.Crowd, wish: Wish, settings: Settings, *, seed: int, n: int
+    ) -> tuple[rollout.Crowd, Any, dict[str, Any]]:
+        """The next tick; nothing comes back to the host yet."""
+        command = Command(
+            velocity=np.array(wish.velocity, np.float32),
+            facing=np.array(wish.facing, np.float32),
+            label=np.int32(settings.label),
+        )
+        return self._tick(
+            self.character.params,
+            np.uint32(seed),
+            np.uint32(n),
+            crowd,
+            command,
+            np.float32(settings.scale),
+            np.bool_(settings.foot_lock),
+        )
+
+
+class Session:
+    """Characters that people steer. Methods may be called from any thread."""
+
+    def __init__(
+        self,
+        models: Mapping[str, Callable[[], Character]],
+        *,
+        settings: Settings | None = None,
+        foot_locks: Mapping[str, bool] | None = None,
+        seed: int = 0,
+        on_frame: Callable[[Shown], None] = lambda shown: None,
+        on_change: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Begins to load nothing yet: `run` does.
+
+        Args:
+          models: What loads each model that can be chosen, the first one first.
+          settings: To begin with, for the first model; None for its own.
+          foot_locks: Whether a model begins with locked feet; True where not given.
+          seed: Seeds starts and noise.
+          on_frame: Called with every tick, in the session's thread.
+          on_change: Called when `state` changed, in any thread.
+        """
+        self._models, self._seed = dict(models), seed
+        self._foot_locks = dict(foot_locks or {})
+        self._on_frame, self._on_change = on_frame, on_change
+        first = Settings(model=next(iter(models))) if settings is None else settings
+        self.settings, self._fresh = first, settings is None
+        self._inputs: dict[Any, Inputs] = {}
+        self._active: Any = None
+        self._lock, self._wake = threading.RLock(), threading.Event()
+        self._closed, self._steps, self._resets = False, 0, False
+        self._engine: Engine | None = None
+        self._next: Engine | None = None
+        self._programs: dict[tuple, Engine] = {}
+        self._loaded: dict[str, Character] = {}
+        self._builder: threading.Thread | None = None
+        self._crowd: rollout.Crowd | None = None
+        self._home = np.zeros((1, 2), np.float32)
+        self._leader = (0.0, 0.0)
+        self._wish, self._told = Wish(), Wish()
+        self._tick, self.engine_number = 0, 0
+        self._take: list[tuple[np.ndarray, np.ndarray]] | None = None
+        self.note = ""
+        self.take: Motion | None = None
+        self.take_skeleton: Any = None
+
+    # What people do.
+
+    def join(self, client: Any) -> None:
+        """Somebody looks; ticks while somebody does."""
+        with self._lock:
+            self._inputs[client] = Inputs()
+        self._wake.set()
+        self._on_change()
+
+    def leave(self, client: Any) -> None:
+        """Somebody left; what he held is let go."""
+        with self._lock:
+            self._inputs.pop(client, None)
+            if self._active == client:
+                self._active = None
+        self._on_change()
+
+    def steer(self, client: Any, inputs: Inputs) -> None:
+        """What somebody holds down now; who touched a key last steers."""
+        with self._lock:
+            before = self._inputs.get(client)
+            if before is None:
+                return
+            touched = (before.held, before.target) != (inputs.held, inputs.target)
+            self._inputs[client] = inputs
+            if touched or self._active is None:
+                self._active = client
+
+    def change(self, name: str, value: Any) -> None:
+        """Sets one of the settings.
+
+        Raises:
+          ValueError: if there is no such setting, or its value is out of range.
+        """
+        with self._lock:
+            new = changed(self.settings, name, value, self.state())
+            if name == "model":
+                # The number of steps, the label and the scale are another model's.
+                self._fresh = True
+            self.settings = new
+        self._wake.set()
+        self._on_change()
+
+    def reset(self) -> None:
+        """Begins anew at the origin."""
+        self._resets = True
+        self._wake.set()
+
+    def step(self) -> None:
+        """One tick of who is paused."""
+        self._steps += 1
+        self._wake.set()
+
+    def record(self) -> None:
+        """Begins to record the first character, or ends it and keeps the take."""
+        with self._lock:
+            if self._take is None:
+                self._take = []
+            else:
+                self._end_take()
+        self._on_change()
+
+    def _end_take(self) -> None:
+        frames, self._take = self._take, None
+        if frames and self._engine is not None:
+            root, rotation = (jnp.asarray(np.stack(x)) for x in zip(*frames))
+            character = self._engine.character
+            self.take = Motion(
+                root_position=root, joint_rotation=rotation, fps=character.fps
+            )
+            self.take_skeleton = character.skeleton
+
+    def close(self) -> None:
+        """Ends `run`."""
+        self._closed = True
+        self._wake.set()
+
+    # What people see.
+
+    @property
+    def body(self) -> bodies.Body | None:
+        """What is drawn; None until a model is loaded."""
+        return None if self._engine is None else self._engine.body
+
+    def state(self) -> dict[str, Any]:
+        """What the panel shows, as plain values."""
+        with self._lock:
+            engine, settings = self._engine, self.settings
+            character = None if engine is None else engine.character
+            tuning = None if character is None else character.tuning
+            return {
+                **dataclasses.asdict(settings),
+                "engine": self.engine_number,
+                "models": list(self._models),
+                "labels": [] if character is None else list(character.labels),
+                "fps": 0.0 if character is None else character.fps,
+                "source": "" if character is None else character.source,
+                "steps": [] if tuning is None else list(tuning.num_steps),
+                "scales": None if tuning is None else list(tuning.scales),
+                "lockable": tuning is not None and tuning.lockable,
+                "speeds": list(SPEEDS),
+                "most_characters": MOST_CHARACTERS,
+                "note": self.note,
+                "recording": self._take is not None,
+                "taken": 0.0 if self.take is None else _seconds(self.take),
+                "people": len(self._inputs),
+            }
+
+    # What happens.
+
+    def run(self) -> None:
+        """Ticks at the model's rate until `close`; for a thread."""
+        due = time.perf_counter()
+        while not self._closed:
+            self._build()
+            self._swap()
+            with self._lock:
+                idle = not self._inputs or (self.settings.paused and not self._steps)
+                idle = (idle and not self._resets) or self._engine is None
+            if idle:
+                self._wake.wait(0.1)
+                self._wake.clear()
+                due = time.perf_counter()
+                continue
+            self.tick()
+            due += 1.0 / self._engine.character.fps
+            late = time.perf_counter() - due
+            if late > _CATCH_UP:
+                due = time.perf_counter()
+            elif late < 0:
+                time.sleep(-late)
+
+    def tick(self) -> Shown:
+        """One tick of all characters, shown and recorded."""
+        begin = time.perf_counter()
+        engine = self._engine
+        with self._lock:
+            settings = self.settings
+            inputs = self._inputs.get(self._active, Inputs())
+            self._steps = max(self._steps - 1, 0)
+            if self._resets:
+                self._begin(engine, keep=False)
+        wish = wanted(
+            inputs,
+            self._wish,
+            position=self._leader,
+            speed=settings.speed,
+            seconds=1.0 / engine.character.fps,
+        )
+        self._told = settled(self._told, wish, steady=wish == self._wish)
+        self._wish = wish
+        self._crowd, made, more = engine.step(
+            self._crowd, self._told, settings, seed=self._seed, n=self._tick
+        )
+        (places, turns), roots, rotations = jax.tree.map(np.asarray, made)
+        ball = more["ball"]
+        shift = np.insert(self._home, 1, 0.0, axis=1)
+        roots = roots + shift
+        shown = Shown(
+            engine=self.engine_number,
+            tick=self._tick,
+            ends=engine.body.ends(places + shift[:, None], turns).astype(np.float32),
+            roots=roots,
+            ball=None if ball is None else np.asarray(ball) + shift,
+            told=self._told,
+            planned=int(more["planned"]),
+            milliseconds=(time.perf_counter() - begin) * 1e3,
+        )
+        self._leader = (float(roots[0, 0]), float(roots[0, 2]))
+        self._tick += 1
+        with self._lock:
+            if self._take is not None:
+                self._take.append((roots[0], rotations[0]))
+                if len(self._take) >= LONGEST_TAKE * engine.character.fps:
+                    self.record()
+        self._on_frame(shown)
+        return shown
+
+    def _begin(self, engine: Engine, *, keep: bool) -> None:
+        """Characters at their start; with `keep`, those there are go on."""
+        self._resets = False
+        new = engine.start(min(self.settings.label, _last(engine)), self._seed)
+        home = formation(engine.number)
+        if keep and self._crowd is not None:
+            old = len(self._home)
+            shared = min(old, engine.number)
+            put = lambda x, y: jnp.concatenate([x[:shared], y[shared:]])  # noqa: E731
+            new = jax.tree.map(put, self._crowd, new)
+            home[shared:] += np.array(self._leader, np.float32) - home[0]
+            home[:shared] = self._home[:shared]
+        else:
+            self._wish, self._told, self._leader = Wish(), Wish(), (0.0, 0.0)
+        self._crowd, self._home = new, home
+
+    def _wanted_engine(self) -> tuple:
+        return self.settings.model, self.settings.num_steps, self.settings.characters
+
+    def _build(self) -> None:
+        """Starts to make the program that the settings ask for, if there is none."""
+        with self._lock:
+            engine, wanted_engine = self._engine, self._wanted_engine()
+            fits = engine is not None and self._programs.get(wanted_engine) is engine
+            busy = self._builder is not None and self._builder.is_alive()
+            if (fits and not self._fresh) or busy or self._next is not None:
+                return
+            if self.note.startswith("error"):
+                return
+            self._builder = threading.Thread(target=self._make, daemon=True)
+            self._builder.start()
+
+    def _tell(self, note: str) -> None:
+        self.note = note
+        self._on_change()
+
+    def _make(self) -> None:
+        """In a thread: loads and compiles; what fails there is told, not raised."""
+        try:
+            self._next = self._program()
+            self._tell("")
+        except (OSError, ValueError) as error:
+            self._tell(f"error: {' '.join(str(error).split())}")
+        finally:
+            self._wake.set()
+
+    def _program(self) -> Engine:
+        name = self.settings.model
+        if name not in self._loaded:
+            self._tell(f"loading {name}")
+            self._loaded[name] = self._models[name]()
+        character, tuning = self._loaded[name], self._loaded[name].tuning
+        with self._lock:
+            if self._fresh:
+                self._fresh = False
+                self.settings = dataclasses.replace(
+                    self.settings,
+                    label=0,
+                    num_steps=1 if tuning is None else tuning.num_steps[-1],
+                    scale=1.0 if tuning is None else tuning.scale,
+                    foot_lock=self._foot_locks.get(name, True),
+                )
+            settings, key = self.settings, self._wanted_engine()
+        if key not in self._programs:
+            many = f"{key[2]} character{'s' * (key[2] > 1)}"
+            self._tell(f"compiling {name}: {many}, {key[1]} diffusion steps")
+            made = Engine(character, num_steps=key[1], number=key[2])
+            crowd = made.start(0, self._seed)
+            done = made.step(crowd, Wish(), settings, seed=0, n=0)
+            made.step(done[0], Wish(), settings, seed=0, n=1)
+            self._programs[key] = made
+            while len(self._programs) > _KEPT_PROGRAMS:
+                self._programs.pop(next(iter(self._programs)))
+        return self._programs[key]
+
+    def _swap(self) -> None:
+        with self._lock:
+            new, self._next = self._next, None
+            if new is None:
+                return
+            old, self._engine = self._engine, new
+            same = old is not None and old.character is new.character
+            if not same and self._take is not None:
+                self._engine = old
+                self._end_take()
+                self._engine = new
+            self.engine_number += 1
+            self._begin(new, keep=same)
+        self._on_change()
+
+
+def _last(engine: Engine) -> int:
+    return max(len(engine.character.labels) - 1, 0)
+
+
+def _seconds(motion: Motion) -> float:
+    return motion.root_position.shape[0] / motion.fps
+
+
+def changed(settings: Settings, name: str, value: Any, state: dict) -> Settings:
+    """Settings with one of them changed.
+
+    Args:
+      state: From `Session.state`: says what can be chosen.
+
+    Raises:
+      ValueError: names the setting, its value and what is expected.
+    """
+    ranges = {
+        "label": (0, max(len(state["labels"]) - 1, 0)),
+        "speed": SPEEDS,
+        "characters": (1, MOST_CHARACTERS),
+        "num_steps": (min(state["steps"], default=1), max(state["steps"], default=1)),
+        "scale": tuple(state["scales"] or (0.0, 0.0)),
+    }
+    kinds = {"label": int, "characters": int, "num_steps": int}
+    choices = {
+        "model": state["models"],
+        "foot_lock": [False, True],
+        "paused": [False, True],
+    }
+    if name in choices:
+        known = ", ".join(str(x) for x in choices[name])
+        right = any(type(value) is type(x) and value == x for x in choices[name])
+        expected = f"one of {known}"
+    elif name in ranges:
+        low, high = ranges[name]
+        kind = kinds.get(name, int | float)
+        right = isinstance(value, kind) and not isinstance(value, bool)
+        right = right and low <= value <= high
+        expected = f"{low:g} to {high:g}"
+    else:
+        known = ", ".join(sorted(choices | ranges))
+        raise ValueError(f"unknown setting {str(name)[:40]!r}, expected one of {known}")
+    if not right:
+        raise ValueError(f"{name} is {str(value)[:40]!r}, expected {expected}")
+    return dataclasses.replace(settings, **{name: value})
