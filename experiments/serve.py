@@ -7,13 +7,8 @@ Examples:
 """
 
 import asyncio
-import contextlib
 import dataclasses
 import gc
-import ipaddress
-import signal
-import socket
-import sys
 import time
 from pathlib import Path
 
@@ -48,38 +43,9 @@ class Config:
     seed: int = 0
 
 
-def is_local(host: str) -> bool:
-    """Whether only this machine reaches an address; False where it is not known."""
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
-
-
-def check_address(host: str, port: int) -> None:
-    """Raises if an address cannot be listened on; before minutes of compiling.
-
-    Raises:
-      OSError: names the address.
-    """
-    try:
-        found = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )
-        for family, kind, number, _, address in found:
-            with socket.socket(family, kind, number) as probe:
-                if sys.platform != "win32":
-                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                probe.bind(address)
-    except OSError as error:
-        raise OSError(f"cannot listen on {host}:{port}: {error.strerror}") from error
-
-
 async def listen(args: Config, characters: simulation.Simulation) -> None:
     """Serves until SIGINT or SIGTERM."""
-    stop = asyncio.Event()
-    if sys.platform != "win32":  # where Ctrl-C cancels this coroutine instead
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    stop = cli.until_stopped()
     server = Server(characters, limits=Limits(clients=args.max_clients), seed=args.seed)
     ready = lambda port: print(f"listening on {args.host}:{port}", flush=True)  # noqa: E731
     await server.serve(args.host, args.port, stop=stop, ready=ready)
@@ -100,14 +66,7 @@ def serve(args: Config) -> None:
       ValueError: if the model cannot be served.
     """
     cli.check(args)
-    if not is_local(args.host):
-        print(
-            f"warning: {args.host} may be reached from other machines, and there is no "
-            "authentication: whoever connects can steer characters",
-            file=sys.stderr,
-            flush=True,
-        )
-    check_address(args.host, args.port)
+    cli.check_address(args.host, args.port)
     characters = load(args.run, args.data)
     begin = time.perf_counter()
     cli.announce("compiling all that a tick may need", 60)

@@ -1,6 +1,11 @@
 """How a script starts and ends: options in range; one line for bad input."""
 
+import asyncio
+import contextlib
 import dataclasses
+import ipaddress
+import signal
+import socket
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -176,3 +181,47 @@ def start(main: Callable[[], None]) -> None:
         if str(stop):
             print(stop, file=sys.stderr)
         sys.exit(130)
+
+
+def is_local(host: str) -> bool:
+    """Whether only this machine reaches an address; False where it is not known."""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+def check_address(host: str, port: int) -> None:
+    """Raises if an address cannot be listened on; before minutes of compiling.
+
+    Warns where other machines may reach it.
+
+    Raises:
+      OSError: names the address.
+    """
+    if not is_local(host):
+        print(
+            f"warning: {host} may be reached from other machines, and there is no "
+            "authentication: whoever connects can steer characters",
+            file=sys.stderr,
+            flush=True,
+        )
+    try:
+        found = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
+        for family, kind, number, _, address in found:
+            with socket.socket(family, kind, number) as probe:
+                if sys.platform != "win32":
+                    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+    except OSError as error:
+        raise OSError(f"cannot listen on {host}:{port}: {error.strerror}") from error
+
+
+def until_stopped() -> asyncio.Event:
+    """What is set on SIGINT or SIGTERM; to be called in a running event loop."""
+    stop = asyncio.Event()
+    if sys.platform != "win32":  # where Ctrl-C cancels the caller instead
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    return stop

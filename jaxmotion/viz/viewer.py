@@ -152,10 +152,8 @@ def settled(told: Wish, wish: Wish, *, steady: bool) -> Wish:
       steady: Whether that is what was wanted a tick ago: then it is told as it is.
     """
     stops = bool(told.speed) != bool(wish.speed)
-    turned = math.acos(
-        max(-1.0, min(1.0, sum(a * b for a, b in zip(told.facing, wish.facing))))
-    )
-    far = turned > HEADING_STEP or abs(told.speed - wish.speed) > SPEED_STEP
+    turned = float(np.dot(told.facing, wish.facing)) < math.cos(HEADING_STEP)
+    far = turned or abs(told.speed - wish.speed) > SPEED_STEP
     return wish if stops or far or steady else told
 
 
@@ -220,9 +218,13 @@ class Engine:
             poses = jax.vmap(lambda r, q: global_transforms(skeleton, r, q))(
                 frames.root_position, frames.joint_rotation
             )
-            return crowd, (poses, frames.root_position, frames.joint_rotation), dict(
-                planned=jnp.sum(frames.planned),
-                ball=frames.extra.get("ball"),
+            return (
+                crowd,
+                (poses, frames.root_position, frames.joint_rotation),
+                dict(
+                    planned=jnp.sum(frames.planned),
+                    ball=frames.extra.get("ball"),
+                ),
             )
 
         self._tick = jax.jit(tick)
@@ -269,7 +271,7 @@ class Session:
         self,
         models: Mapping[str, Callable[[], Character]],
         *,
-        settings: Settings | None = None,
+        characters: int = 1,
         foot_locks: Mapping[str, bool] | None = None,
         seed: int = 0,
         on_frame: Callable[[Shown], None] = lambda shown: None,
@@ -279,17 +281,22 @@ class Session:
 
         Args:
           models: What loads each model that can be chosen, the first one first.
-          settings: To begin with, for the first model; None for its own.
+          characters: To begin with.
           foot_locks: Whether a model begins with locked feet; True where not given.
           seed: Seeds starts and noise.
           on_frame: Called with every tick, in the session's thread.
           on_change: Called when `state` changed, in any thread.
         """
+        if not 1 <= characters <= MOST_CHARACTERS:
+            raise ValueError(
+                f"{characters} characters, expected 1 to {MOST_CHARACTERS}"
+            )
         self._models, self._seed = dict(models), seed
         self._foot_locks = dict(foot_locks or {})
-        self._on_frame, self._on_change = on_frame, on_change
-        first = Settings(model=next(iter(models))) if settings is None else settings
-        self.settings, self._fresh = first, settings is None
+        self.on_frame, self.on_change = on_frame, on_change
+        self.settings = Settings(model=next(iter(models)), characters=characters)
+        # Whether the model's own settings are still to be taken over.
+        self._fresh = True
         self._inputs: dict[Any, Inputs] = {}
         self._active: Any = None
         self._lock, self._wake = threading.RLock(), threading.Event()
@@ -316,7 +323,7 @@ class Session:
         with self._lock:
             self._inputs[client] = Inputs()
         self._wake.set()
-        self._on_change()
+        self.on_change()
 
     def leave(self, client: Any) -> None:
         """Somebody left; what he held is let go."""
@@ -324,7 +331,7 @@ class Session:
             self._inputs.pop(client, None)
             if self._active == client:
                 self._active = None
-        self._on_change()
+        self.on_change()
 
     def steer(self, client: Any, inputs: Inputs) -> None:
         """What somebody holds down now; who touched a key last steers."""
@@ -349,8 +356,10 @@ class Session:
                 # The number of steps, the label and the scale are another model's.
                 self._fresh = True
             self.settings = new
+            if self.note.startswith("error"):
+                self.note = ""
         self._wake.set()
-        self._on_change()
+        self.on_change()
 
     def reset(self) -> None:
         """Begins anew at the origin."""
@@ -369,12 +378,14 @@ class Session:
                 self._take = []
             else:
                 self._end_take()
-        self._on_change()
+        self.on_change()
 
     def _end_take(self) -> None:
         frames, self._take = self._take, None
         if frames and self._engine is not None:
-            root, rotation = (jnp.asarray(np.stack(x)) for x in zip(*frames))
+            root, rotation = (
+                jnp.asarray(np.stack(x)) for x in zip(*frames, strict=True)
+            )
             character = self._engine.character
             self.take = Motion(
                 root_position=root, joint_rotation=rotation, fps=character.fps
@@ -393,6 +404,11 @@ class Session:
         """What is drawn; None until a model is loaded."""
         return None if self._engine is None else self._engine.body
 
+    @property
+    def fps(self) -> float:
+        """Ticks per second; 0 until a model is loaded."""
+        return 0.0 if self._engine is None else self._engine.character.fps
+
     def state(self) -> dict[str, Any]:
         """What the panel shows, as plain values."""
         with self._lock:
@@ -404,7 +420,7 @@ class Session:
                 "engine": self.engine_number,
                 "models": list(self._models),
                 "labels": [] if character is None else list(character.labels),
-                "fps": 0.0 if character is None else character.fps,
+                "fps": self.fps,
                 "source": "" if character is None else character.source,
                 "steps": [] if tuning is None else list(tuning.num_steps),
                 "scales": None if tuning is None else list(tuning.scales),
@@ -484,7 +500,7 @@ class Session:
                 self._take.append((roots[0], rotations[0]))
                 if len(self._take) >= LONGEST_TAKE * engine.character.fps:
                     self.record()
-        self._on_frame(shown)
+        self.on_frame(shown)
         return shown
 
     def _begin(self, engine: Engine, *, keep: bool) -> None:
@@ -521,7 +537,7 @@ class Session:
 
     def _tell(self, note: str) -> None:
         self.note = note
-        self._on_change()
+        self.on_change()
 
     def _make(self) -> None:
         """In a thread: loads and compiles; what fails there is told, not raised."""
@@ -575,7 +591,7 @@ class Session:
                 self._engine = new
             self.engine_number += 1
             self._begin(new, keep=same)
-        self._on_change()
+        self.on_change()
 
 
 def _last(engine: Engine) -> int:

@@ -39,7 +39,8 @@ MAY_IMPORT = {
         "data",
         "text",
     },
-    "viz": {"typing", "motion"},
+    # control: the live page (viewer.py).
+    "viz": {"typing", "motion", "control"},
     # Functions and shapes of whatever system; a graph's noise is an input.
     "export": {"typing", "files", "diffusion"},
     # The face composes what stands below it.
@@ -73,6 +74,7 @@ DOORS = {
     "torch": ("benchmarks/",),
     **dict.fromkeys(("jax2onnx", "onnx", "onnxruntime"), ("jaxmotion/export/",)),
     "tokenizers": ("jaxmotion/text/",),
+    "websockets": ("jaxmotion/viz/page.py",),
     "wordllama": ("jaxmotion/text/",),
 }
 

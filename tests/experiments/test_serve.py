@@ -640,7 +640,7 @@ def test_other_addresses_are_warned_of(script, monkeypatch, capsys, host, local)
         raise ValueError("here")
 
     monkeypatch.setattr(script, "load", stop)
-    monkeypatch.setattr(script, "check_address", lambda host, port: None)
+    monkeypatch.setattr(script.cli.socket, "getaddrinfo", lambda *args, **options: ())
     with pytest.raises(ValueError, match="here"):
         script.serve(script.Config(host=host))
     assert ("no authentication" in capsys.readouterr().err) is not local

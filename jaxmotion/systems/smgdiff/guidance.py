@@ -185,7 +185,7 @@ def sampler(
         objective = contact_objective(
             condition.ball, representation=representation, guided=guided
         )
-        steps = {
+        moves = {
             False: step(table, denoise),
             True: guidance.dsg_step(
                 table,
@@ -198,8 +198,9 @@ def sampler(
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, shape)
         for is_guided, start, stop in parts:
-            move = steps[is_guided]
-            x = chain.sample_from(move, key_chain, x, start=start, stop=stop)
+            x = chain.sample_from(
+                moves[is_guided], key_chain, x, start=start, stop=stop
+            )
         return x
 
     return sample

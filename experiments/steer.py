@@ -1,0 +1,111 @@
+"""Opens a page on which characters are steered: keys, mouse, and all settings.
+
+W A S D or the arrows walk, Shift runs, Q and E turn on the spot, 1 to 9 choose a style;
+a click or a drag on the ground sends the character there.
+
+Examples:
+  python experiments/steer.py
+  python experiments/steer.py --run runs/smgdiff --characters 4
+"""
+
+import asyncio
+import dataclasses
+import functools
+import time
+import webbrowser
+from pathlib import Path
+
+import jax
+import tyro
+
+import jaxmotion
+from jaxmotion import cli
+from jaxmotion.control.foot_lock import lock_feet
+from jaxmotion.control.steering import Character
+from jaxmotion.viz import page, viewer
+
+SHIPPED = ("locomotion", "walker")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """The command line.
+
+    Attributes:
+      run: Name of a shipped model, run folder of a system whose characters are
+        steered (CAMDM, AAMDM, SMGDiff), or file of `camdm.py export`. The shipped
+        models can be chosen on the page as well.
+      characters: To begin with, 1 to 64.
+      host: Address to listen on. Anyone who reaches it can steer: there is no
+        authentication.
+      port: Port to listen on; 0 for any that is free.
+      open: Open the page in a browser.
+      out: Folder for takes that are recorded.
+      cache: Folder where compiled programs are kept, for a faster next start.
+      seed: Seeds starts and noise.
+    """
+
+    run: str = "locomotion"
+    characters: int = 1
+    host: str = "127.0.0.1"
+    port: int = 8080
+    open: bool = True
+    out: Path = Path("runs/steer")
+    cache: Path = Path.home() / ".cache" / "jaxmotion"
+    seed: int = 0
+
+
+def load(run: str) -> Character:
+    """A model whose feet can be locked, if it has feet."""
+    character = jaxmotion.load(run, foot_lock=False)
+    return lock_feet(character) if character.skeleton.feet else character
+
+
+async def listen(args: Config, session: viewer.Session) -> None:
+    """Serves until SIGINT or SIGTERM."""
+
+    def ready(port: int) -> None:
+        host = f"[{args.host}]" if ":" in args.host else args.host
+        address = f"http://{host}:{port}"
+        print(f"steer at {address} (Ctrl-C ends)", flush=True)
+        if args.open:
+            webbrowser.open(address)
+
+    serve = page.Page(session, out=args.out, save=jaxmotion.save).serve
+    await serve(args.host, args.port, stop=cli.until_stopped(), ready=ready)
+
+
+def steer(args: Config) -> None:
+    """Loads the model, opens the page, and lets people steer.
+
+    Raises:
+      OSError: if the model cannot be read or the address not be listened on.
+      ValueError: if the model cannot be steered, or a package is missing.
+    """
+    cli.check(args)
+    page.websockets()
+    cli.check_address(args.host, args.port)
+    if not jax.config.jax_compilation_cache_dir:
+        jax.config.update("jax_compilation_cache_dir", str(args.cache))
+    begin = time.perf_counter()
+    first = load(args.run)
+    print(f"{args.run} loaded in {time.perf_counter() - begin:.0f} s", flush=True)
+    models = {args.run: lambda: first}
+    models |= {x: functools.partial(load, x) for x in SHIPPED if x != args.run}
+    session = viewer.Session(
+        models,
+        characters=args.characters,
+        # Runs begin with what the network makes, as `jaxmotion.load` has it.
+        foot_locks={args.run: args.run in SHIPPED},
+        seed=args.seed,
+    )
+    asyncio.run(listen(args, session))
+
+
+def main() -> None:
+    """Parses the command line and lets people steer."""
+    steer(tyro.cli(Config, description=__doc__))
+
+
+if __name__ == "__main__":
+    cli.start(main)

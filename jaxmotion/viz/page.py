@@ -1,0 +1,299 @@
+"""Serves a session to browsers: a page over HTTP, frames and inputs over a WebSocket.
+
+The page is one file without any other. The server sends it text (JSON: `state` whenever
+it changes, `body` whenever what is drawn does, `error` for input that was wrong) and a
+frame a tick as little-endian float32:
+
+    engine, tick, milliseconds, plans, characters, capsules, balls, fps,
+    told velocity (x, z), told facing (x, z), roots (x, z) of all characters,
+    capsule ends [characters, capsules, 2, 3], balls [balls, 3]
+
+The browser sends JSON: {"held": [...], "azimuth": radians, "target": [x, z] or null},
+{"set": {name: value}}, {"do": "reset" | "step" | "record"} or {"save": ".bvh"}.
+
+A browser that reads slowly gets fewer frames, the newest ones, and holds up nobody.
+Only pages from this very server may connect, so no other web site steers, and a name
+that someone points at this machine is not answered.
+"""
+
+import asyncio
+import json
+import math
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from jaxmotion.viz import viewer
+from jaxmotion.viz.viewer import Inputs, Session, Shown
+
+MOST_PEOPLE = 32
+SUFFIXES = (".bvh", ".glb", ".npz")
+_LOCAL = ("localhost", "127.0.0.1", "::1")
+_LARGEST_MESSAGE = 4096
+
+# Writes a take: (path, skeleton, motion).
+Save = Callable[[Path, Any, Any], None]
+
+
+def websockets() -> Any:
+    """The package, which the extra [viewer] brings.
+
+    Raises:
+      ValueError: if it is missing; says how to get it.
+    """
+    try:
+        import websockets.asyncio.server
+    except ImportError:
+        raise ValueError(
+            'the live page needs the package websockets: pip install -e ".[viewer]"'
+        ) from None
+    return websockets
+
+
+def frame_bytes(shown: Shown, fps: float) -> bytes:
+    """A tick as the page reads it; see the module's text."""
+    balls = np.zeros((0, 3)) if shown.ball is None else shown.ball
+    characters, capsules = shown.ends.shape[:2]
+    head = (
+        *(shown.engine, shown.tick, shown.milliseconds, shown.planned),
+        *(characters, capsules, len(balls), fps),
+        *shown.told.velocity,
+        *shown.told.facing,
+    )
+    parts = (head, shown.roots[:, ::2], shown.ends, balls)
+    return np.concatenate([np.ravel(x) for x in parts]).astype("<f4").tobytes()
+
+
+def read_message(text: str | bytes) -> dict[str, Any]:
+    """What a browser says, checked; `held`, `azimuth` and `target` become `inputs`.
+
+    Raises:
+      ValueError: names what is wrong.
+    """
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError("message is no JSON") from None
+    if not isinstance(value, dict):
+        raise ValueError("message is no JSON object")
+    if "held" not in value:
+        return value
+    held, azimuth, target = (value.get(k) for k in ("held", "azimuth", "target"))
+    if not isinstance(held, list) or not all(x in viewer.ACTIONS for x in held):
+        raise ValueError(f"held is wrong, expected some of {', '.join(viewer.ACTIONS)}")
+    point = [0.0, 0.0] if target is None else target
+    if not isinstance(point, list) or len(point) != 2:
+        raise ValueError("target is wrong, expected [x, z] or null")
+    numbers = [azimuth, *point]
+    if not all(
+        type(x) in (int, float) and math.isfinite(x) and abs(x) < 1e5 for x in numbers
+    ):
+        raise ValueError("azimuth or target is no finite number")
+    place = None if target is None else (float(target[0]), float(target[1]))
+    return {
+        "inputs": Inputs(held=frozenset(held), azimuth=float(azimuth), target=place)
+    }
+
+
+class Page:
+    """The session behind an address, until it is told to stop."""
+
+    def __init__(self, session: Session, *, out: Path, save: Save) -> None:
+        """Opens nothing yet.
+
+        Args:
+          session: What is steered; its `on_frame` and `on_change` become this page's.
+          out: Folder for takes.
+          save: Writes them.
+        """
+        self.session, self._out, self._save = session, out, save
+        self._html = Path(__file__).with_suffix(".html").read_bytes()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._clients: set[_Client] = set()
+        self._local = True
+        session.on_frame, session.on_change = self._on_frame, self._on_change
+
+    async def serve(
+        self, host: str, port: int, *, stop: asyncio.Event, ready: Callable[[int], None]
+    ) -> None:
+        """Serves until `stop` is set.
+
+        Args:
+          ready: Called with the port as soon as browsers can come.
+
+        Raises:
+          OSError: if the address cannot be listened on.
+          ValueError: if the package websockets is missing.
+        """
+        package = websockets()
+        self._loop, self._local = asyncio.get_running_loop(), host in _LOCAL
+        thread = threading.Thread(target=self.session.run, daemon=True)
+        async with package.asyncio.server.serve(
+            self._person,
+            host,
+            port,
+            process_request=self._request,
+            compression=None,
+            max_size=_LARGEST_MESSAGE,
+            server_header=None,
+            close_timeout=1,
+        ) as server:
+            thread.start()
+            ready(server.sockets[0].getsockname()[1])
+            await stop.wait()
+        self.session.close()
+        await asyncio.to_thread(thread.join, 5.0)
+
+    # From the session's threads.
+
+    def _on_frame(self, shown: Shown) -> None:
+        data = frame_bytes(shown, self.session.fps)
+        self._soon(self._publish, data)
+
+    def _on_change(self) -> None:
+        self._soon(self._publish, None)
+
+    def _soon(self, function: Callable, *arguments: Any) -> None:
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(function, *arguments)
+
+    # In the event loop.
+
+    def _publish(self, frame: bytes | None) -> None:
+        for client in self._clients:
+            if frame is None:
+                client.state_due = True
+            else:
+                client.frame = frame
+            client.news.set()
+
+    def _request(self, connection: Any, request: Any) -> Any:
+        """Answers all but the WebSocket's own request, or refuses it."""
+        host = request.headers.get("Host", "")
+        if self._local and urlsplit(f"//{host}").hostname not in _LOCAL:
+            return connection.respond(HTTPStatus.FORBIDDEN, "not this host\n")
+        path = urlsplit(request.path).path
+        if path == "/live":
+            origin = request.headers.get("Origin")
+            if origin is not None and urlsplit(origin).netloc != host:
+                return connection.respond(HTTPStatus.FORBIDDEN, "not this origin\n")
+            return None
+        if path == "/":
+            return self._answer(connection, self._html, "text/html; charset=utf-8")
+        name = path.removeprefix("/takes/")
+        if path != name and name == Path(name).name and (self._out / name).is_file():
+            data = (self._out / name).read_bytes()
+            return self._answer(connection, data, "application/octet-stream", name)
+        return connection.respond(HTTPStatus.NOT_FOUND, "no such page\n")
+
+    def _answer(self, connection: Any, data: bytes, kind: str, name: str = "") -> Any:
+        response = connection.respond(HTTPStatus.OK, "")
+        response.body = data
+        headers = response.headers
+        for key in ("Content-Type", "Content-Length"):
+            del headers[key]
+        headers["Content-Type"], headers["Content-Length"] = kind, str(len(data))
+        headers["Cache-Control"] = "no-store"
+        if name:
+            headers["Content-Disposition"] = f'attachment; filename="{name}"'
+        return response
+
+    async def _person(self, socket: Any) -> None:
+        """Life of a browser's connection."""
+        package = websockets()
+        if len(self._clients) >= MOST_PEOPLE:
+            await socket.close(1013, "busy")
+            return
+        client = _Client()
+        self._clients.add(client)
+        self.session.join(client)
+        sender = asyncio.create_task(self._send(socket, client))
+        try:
+            async for text in socket:
+                try:
+                    await self._obey(client, text)
+                except (ValueError, OSError) as error:
+                    client.errors = [" ".join(str(error).split())]
+                    client.news.set()
+        except package.exceptions.ConnectionClosed:
+            pass
+        finally:
+            sender.cancel()
+            self._clients.discard(client)
+            self.session.leave(client)
+
+    async def _send(self, socket: Any, client: "_Client") -> None:
+        """Sends what is new, and of frames the newest, as fast as they are read."""
+        body = -1
+        package = websockets()
+        try:
+            while True:
+                await client.news.wait()
+                client.news.clear()
+                if client.state_due:
+                    client.state_due = False
+                    state = self.session.state()
+                    if state["engine"] != body and self.session.body is not None:
+                        body = state["engine"]
+                        await socket.send(json.dumps({"body": self._body(body)}))
+                    await socket.send(json.dumps({"state": state}))
+                while client.errors:
+                    await socket.send(json.dumps({"error": client.errors.pop(0)}))
+                if client.saved:
+                    await socket.send(json.dumps({"saved": client.saved}))
+                    client.saved = ""
+                frame, client.frame = client.frame, b""
+                if frame:
+                    await socket.send(frame)
+        except package.exceptions.ConnectionClosed:
+            pass
+
+    def _body(self, engine: int) -> dict[str, Any]:
+        body = self.session.body
+        return {
+            "engine": engine,
+            "radii": np.round(body.radii, 4).tolist(),
+            "colors": list(body.colors),
+        }
+
+    async def _obey(self, client: "_Client", text: str | bytes) -> None:
+        message, session = read_message(text), self.session
+        if "inputs" in message:
+            session.steer(client, message["inputs"])
+        elif isinstance(message.get("set"), dict):
+            for name, value in message["set"].items():
+                session.change(name, value)
+        elif message.get("do") in ("reset", "step", "record"):
+            getattr(session, message["do"])()
+        elif message.get("save") in SUFFIXES:
+            path = await asyncio.to_thread(self._write, message["save"])
+            client.saved = path.name
+            client.news.set()
+        else:
+            raise ValueError("unknown message, expected held, set, do or save")
+
+    def _write(self, suffix: str) -> Path:
+        """Saves the take under the next free name."""
+        motion, skeleton = self.session.take, self.session.take_skeleton
+        if motion is None:
+            raise ValueError("nothing is recorded yet")
+        number = 1
+        while (path := self._out / f"take_{number:03d}{suffix}").exists():
+            number += 1
+        self._save(path, skeleton, motion)
+        return path
+
+
+class _Client:
+    """What a browser is yet to be sent."""
+
+    def __init__(self) -> None:
+        self.news, self.state_due = asyncio.Event(), True
+        self.frame, self.saved = b"", ""
+        self.errors: list[str] = []
+        self.news.set()
