@@ -203,15 +203,15 @@ class Engine:
         at_most = number if not patience else math.ceil(number / patience)
 
         # Parameters are an argument: the compiler's cache then keeps the program small.
-        def tick(params, seed, n, crowd, command, scale, locks) -> tuple:
+        def tick(params, seed, n, crowd, told, scale, locks) -> tuple:
             method = character.method
             if tuning is not None:
                 more = {"locks": locks} if tuning.lockable else {}
                 method = tuning.method(num_steps, scale, **more)
             key = jax.random.fold_in(jax.random.key(seed), n)
-            commands = jax.tree.map(
-                lambda x: jnp.broadcast_to(x, (number, *x.shape)), command
-            )
+            every = lambda x: jnp.broadcast_to(x, (number, *x.shape))  # noqa: E731
+            velocity, facing, label = map(every, told)
+            commands = Command(velocity=velocity, facing=facing, label=label)
             crowd, frames = rollout.crowd_tick(
                 method(params), key, crowd, commands, at_most=at_most
             )
@@ -222,7 +222,8 @@ class Engine:
                 crowd,
                 (poses, frames.root_position, frames.joint_rotation),
                 dict(
-                    planned=jnp.sum(frames.planned),
+                    # A frame of who still waits for his first plan is none of a plan.
+                    planned=jnp.sum(frames.planned & (crowd.waited == 0)),
                     ball=frames.extra.get("ball"),
                 ),
             )
@@ -248,17 +249,17 @@ class Engine:
         self, crowd: rollout.Crowd, wish: Wish, settings: Settings, *, seed: int, n: int
     ) -> tuple[rollout.Crowd, Any, dict[str, Any]]:
         """The next tick; nothing comes back to the host yet."""
-        command = Command(
-            velocity=np.array(wish.velocity, np.float32),
-            facing=np.array(wish.facing, np.float32),
-            label=np.int32(settings.label),
+        told = (
+            np.array(wish.velocity, np.float32),
+            np.array(wish.facing, np.float32),
+            np.int32(settings.label),
         )
         return self._tick(
             self.character.params,
             np.uint32(seed),
             np.uint32(n),
             crowd,
-            command,
+            told,
             np.float32(settings.scale),
             np.bool_(settings.foot_lock),
         )
@@ -639,4 +640,5 @@ def changed(settings: Settings, name: str, value: Any, state: dict) -> Settings:
         raise ValueError(f"unknown setting {str(name)[:40]!r}, expected one of {known}")
     if not right:
         raise ValueError(f"{name} is {str(value)[:40]!r}, expected {expected}")
+    value = float(value) if name in ("speed", "scale") else value
     return dataclasses.replace(settings, **{name: value})

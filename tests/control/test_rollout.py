@@ -7,7 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.control.rollout import Controller, rollout, tick
+from jaxmotion.control.rollout import (
+    Controller,
+    Crowd,
+    crowd_tick,
+    rollout,
+    tick,
+)
 
 CHARACTERS, TICKS = 6, 11
 
@@ -152,3 +158,34 @@ def test_commands_may_be_any_tree(commands):
     )
     np.testing.assert_array_equal(frames, vector)
     jax.tree.map(np.testing.assert_array_equal, states, run(commands)[0])
+
+
+def test_a_crowd_shares_its_plans(commands):
+    ran = []
+    controller = toy(ran)
+    program = jax.jit(
+        lambda key, crowd, command: crowd_tick(
+            controller, key, crowd, command, at_most=2
+        )
+    )
+    zero = jnp.zeros(CHARACTERS, jnp.int32)
+    crowd = Crowd(states=start(CHARACTERS), told=zero, waited=zero)
+    every = jnp.ones(CHARACTERS, jnp.int32)
+    plans = []
+    for i in range(4):
+        crowd, frame = program(jax.random.key(i), crowd, every)
+        plans.append(np.asarray(frame["plans"]))
+        heard = np.asarray(frame["command"])
+        # Who has not yet had a turn follows what he was told before.
+        np.testing.assert_array_equal(heard, plans[-1] > 0)
+    # Two in a tick: the first ones first, and then who has waited longest.
+    want = [[1, 1, 0, 0, 0, 0], [1, 1, 1, 1, 0, 0], [1] * 6, [2, 2, 1, 1, 1, 1]]
+    np.testing.assert_array_equal(plans, want)
+    np.testing.assert_array_equal(crowd.states[0], np.full(CHARACTERS, 4))
+    # The dear plan for one who asks for it, the cheap one beside it.
+    values = jnp.asarray([0, 0, 2, 0, 1, 0], jnp.int32)
+    crowd = Crowd(states=start(CHARACTERS), told=zero, waited=zero)
+    crowd, frame = program(jax.random.key(9), crowd, values)
+    value = np.asarray(frame["value"])
+    assert value[2] > 10 and 0 <= value[4] < 1 and (value[[0, 1, 3, 5]] == -1).all()
+    np.testing.assert_array_equal(crowd.waited, zero)

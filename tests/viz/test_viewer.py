@@ -1,0 +1,319 @@
+"""What held keys ask for, the session's ticks, and what it records."""
+
+import math
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from jaxmotion.viz import page, viewer
+from jaxmotion.viz.viewer import Inputs, Wish
+from tests.viz.strider import strider
+
+TICK = 1 / 30
+
+
+def ask(*held, azimuth=0.0, target=None, last=None, position=(0.0, 0.0), speed=1.0):
+    inputs = Inputs(held=frozenset(held), azimuth=azimuth, target=target)
+    last = Wish() if last is None else last
+    return viewer.wanted(inputs, last, position=position, speed=speed, seconds=TICK)
+
+
+@pytest.mark.parametrize(
+    ("held", "azimuth", "want"),
+    [
+        (("forward",), 0.0, (0, 1)),
+        (("back",), 0.0, (0, -1)),
+        # To the right of who looks along +z lies -x.
+        (("right",), 0.0, (-1, 0)),
+        (("left",), 0.0, (1, 0)),
+        (("forward",), math.pi / 2, (1, 0)),
+        (("right",), math.pi / 2, (0, 1)),
+        (("forward", "left"), 0.0, (math.sqrt(0.5), math.sqrt(0.5))),
+        (("forward", "back", "left"), 0.0, (1, 0)),
+    ],
+)
+def test_keys_walk_where_the_camera_looks(held, azimuth, want):
+    wish = ask(*held, azimuth=azimuth)
+    np.testing.assert_allclose(wish.velocity, want, atol=1e-9)
+    np.testing.assert_allclose(wish.facing, want, atol=1e-9)
+    twice = ask(*held, "run", azimuth=azimuth)
+    np.testing.assert_allclose(twice.velocity, viewer.RUN * np.array(want), atol=1e-9)
+
+
+def test_who_lets_go_stands_and_faces_where_he_went():
+    went = ask("left")
+    assert ask(last=went) == Wish(facing=went.facing)
+    assert ask("forward", "back", last=went) == Wish(facing=went.facing)
+    assert ask("run").speed == 0
+
+
+def test_turning_on_the_spot():
+    wish = Wish()
+    for _ in range(18):  # 0.6 s at 150 degrees per second
+        wish = ask("turn_left", last=wish)
+    assert wish.speed == 0
+    np.testing.assert_allclose(wish.facing, (1, 0), atol=1e-6)
+    # Who walks does not turn.
+    assert ask("forward", "turn_left") == ask("forward")
+
+
+def test_a_target_is_walked_to_and_kept():
+    far = ask(target=(0.0, 5.0), position=(0.0, 1.0))
+    np.testing.assert_allclose(far.velocity, (0, 1), atol=1e-9)
+    near = ask(target=(0.5, 0.0), last=far)
+    np.testing.assert_allclose(near.velocity, (0.5 / viewer.ARRIVE, 0), atol=1e-9)
+    assert ask(target=(0.1, 0.0), last=near).speed == 0
+    # Who stands does not start again for a hand's breadth.
+    assert ask(target=(0.3, 0.0)).speed == 0
+    assert ask(target=(0.5, 0.0)).speed > 0
+    assert ask("back", target=(0.0, 5.0)).velocity[1] < 0
+
+
+def test_small_changes_are_not_told():
+    told, steps = ask("forward"), []
+    for degrees in range(0, 28, 2):
+        wish = ask("forward", azimuth=math.radians(degrees))
+        new = viewer.settled(told, wish, steady=False)
+        steps.append(new is not told)
+        told = new
+    assert sum(steps) == 2
+    slow = Wish(velocity=(0.0, 0.95))
+    assert viewer.settled(told, told, steady=False) is told
+    assert viewer.settled(ask("forward"), slow, steady=False) != slow
+    assert viewer.settled(ask("forward"), slow, steady=True) == slow
+    assert viewer.settled(ask("forward"), Wish(), steady=False) == Wish()
+
+
+def test_a_formation_has_the_first_in_front_and_room():
+    for number in (1, 2, 7, 64):
+        places = viewer.formation(number)
+        assert places.shape == (number, 2) and not places[0].any()
+        assert places[:, 1].max() == 0
+        if number > 1:
+            gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
+            gaps[np.diag_indices(number)] = np.inf
+            assert gaps.min() > 1
+
+
+STATE = {"models": ["a", "b"], "labels": ["x", "y"], "steps": [1, 8], "scales": [0, 2]}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("label", 2, "label is '2', expected 0 to 1"),
+        ("label", 0.5, "expected 0 to 1"),
+        ("speed", float("nan"), "expected 0.3 to 4"),
+        ("speed", "fast", "expected 0.3 to 4"),
+        ("characters", 65, "expected 1 to 64"),
+        ("characters", True, "expected 1 to 64"),
+        ("model", "c", "expected one of a, b"),
+        ("model", ["a"], "expected one of a, b"),
+        ("paused", 1, "expected one of False, True"),
+        ("color", 1, "unknown setting 'color'"),
+    ],
+)
+def test_settings_out_of_range_are_refused(name, value, message):
+    settings = viewer.Settings(model="a")
+    with pytest.raises(ValueError, match=message):
+        viewer.changed(settings, name, value, STATE)
+
+
+def test_settings_in_range():
+    settings = viewer.Settings(model="a")
+    for name, value in (("label", 1), ("speed", 2), ("model", "b"), ("paused", True)):
+        settings = viewer.changed(settings, name, value, STATE)
+        assert getattr(settings, name) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "no JSON"),
+        ("[" * 5000, "no JSON"),
+        ("[1]", "no JSON object"),
+        ('{"held": ["fly"], "azimuth": 0, "target": null}', "held is wrong"),
+        ('{"held": [[]], "azimuth": 0, "target": null}', "held is wrong"),
+        ('{"held": [], "azimuth": NaN, "target": null}', "no finite number"),
+        ('{"held": [], "azimuth": 0, "target": [1]}', "target is wrong"),
+        ('{"held": [], "azimuth": 0, "target": [1, true]}', "no finite number"),
+        ('{"held": [], "target": null}', "no finite number"),
+    ],
+)
+def test_wrong_messages_are_refused(text, message):
+    with pytest.raises(ValueError, match=message):
+        page.read_message(text)
+
+
+def test_inputs_are_read():
+    text = '{"held": ["run", "left"], "azimuth": 1, "target": [2, -3.5]}'
+    want = Inputs(held=frozenset(("run", "left")), azimuth=1.0, target=(2.0, -3.5))
+    assert page.read_message(text) == {"inputs": want}
+    assert page.read_message('{"do": "reset"}') == {"do": "reset"}
+
+
+def test_a_frame_is_packed_as_the_page_reads_it():
+    shown = viewer.Shown(
+        engine=3,
+        tick=7,
+        ends=np.arange(24.0).reshape(2, 2, 2, 3),
+        roots=np.array([[1.0, 9, 2], [3, 9, 4]]),
+        ball=np.ones((2, 3)),
+        told=Wish(velocity=(0.5, 0.25)),
+        planned=1,
+        milliseconds=12.5,
+    )
+    data = np.frombuffer(page.frame_bytes(shown, 30.0), "<f4")
+    want = [3, 7, 12.5, 1, 2, 2, 2, 30, 0.5, 0.25, 0, 1, 1, 2, 3, 4]
+    np.testing.assert_array_equal(data[:16], want)
+    np.testing.assert_array_equal(data[16:40], np.arange(24))
+    np.testing.assert_array_equal(data[40:], np.ones(6))
+
+
+class Ticking:
+    """A session on a character without a network, ticked by hand."""
+
+    def __init__(self, **options):
+        self.character, self.traces = strider(**options)
+        self.shown = []
+        self.session = viewer.Session(
+            {"strider": lambda: self.character, "other": lambda: strider()[0]}
+        )
+        self.session.on_frame = self.shown.append
+        self.load()
+        self.session.join("me")
+
+    def load(self):
+        self.session._build()
+        self.session._builder.join()
+        self.session._swap()
+        assert self.session.note == ""
+
+    def tick(self, *held, times=1, **more):
+        self.session.steer("me", Inputs(held=frozenset(held), **more))
+        for _ in range(times):
+            self.session.tick()
+        return self.shown[-1]
+
+
+@pytest.mark.slow
+def test_a_session_walks_and_compiles_once():
+    it = Ticking()
+    assert it.session.state()["labels"] == ["calm", "crouch"]
+    start = it.tick(times=5).roots[0]
+    went = it.tick("forward", times=60).roots[0] - start
+    assert went[2] > 2 and abs(went[0]) < 0.05
+    traces = len(it.traces)
+    height = it.shown[-1].roots[0, 1]
+    for name, value in (("label", 1), ("speed", 2.0), ("scale", 1.3)):
+        it.session.change(name, value)
+        it.tick("left", "run", times=3)
+    assert it.shown[-1].roots[0, 1] < height - 0.1
+    assert len(it.traces) == traces
+    here = it.shown[-1].roots[0]
+    it.session.leave("me")  # with keys held down: they are let go
+    it.session.join("you")
+    for _ in range(60):
+        it.session.tick()
+    assert it.shown[-1].told.speed == 0
+    assert np.abs(it.shown[-1].roots[0] - it.shown[-2].roots[0]).max() < 1e-3
+    assert not np.allclose(here, it.shown[-1].roots[0])
+
+
+@pytest.mark.slow
+def test_more_characters_join_beside_the_first():
+    it = Ticking()
+    before = it.tick("forward", times=30).roots[0]
+    it.session.change("characters", 7)
+    it.load()
+    shown = it.tick("forward", times=1)
+    assert shown.roots.shape == (7, 3) and shown.engine == 2
+    assert np.abs(shown.roots[0] - before).max() < 0.1
+    gaps = np.linalg.norm(shown.roots[:, None] - shown.roots[None], axis=-1)
+    assert gaps[0].max() < 8
+    # A plan is due in every tick, and one character of seven gets it.
+    assert max(x.planned for x in it.shown[-1:]) <= 1
+    shown = it.tick("forward", times=60)
+    speeds = np.diff([x.roots[:, 2] for x in it.shown[-2:]], axis=0) * 30
+    np.testing.assert_allclose(speeds, 1.4, atol=0.1)
+    it.session.change("characters", 1)
+    it.load()
+    after = it.tick("forward", times=1).roots[0]
+    assert np.abs(after - shown.roots[0]).max() < 0.1
+    it.session.reset()
+    assert np.abs(it.tick().roots[0, ::2]).max() < 0.1
+
+
+@pytest.mark.slow
+def test_a_take_is_what_was_shown():
+    it = Ticking(ball=True)
+    it.tick("forward", times=10)
+    it.session.record()
+    it.tick("left", times=20)
+    assert it.session.state()["recording"]
+    it.session.record()
+    it.tick(times=5)
+    take = it.session.take
+    want = [x.roots[0] for x in it.shown[10:30]]
+    np.testing.assert_allclose(take.root_position, want, atol=1e-6)
+    assert take.fps == 30 and not it.session.state()["recording"]
+    assert it.shown[-1].ball.shape == (1, 3)
+    it.session.record()
+    it.tick(times=3)
+    it.session.change("model", "other")  # of another skeleton, perhaps: the take ends
+    it.load()
+    assert it.session.take.root_position.shape == (3, 3)
+    assert not it.session.state()["recording"]
+
+
+@pytest.mark.slow
+def test_a_model_that_cannot_be_loaded_is_told_and_another_one_goes_on():
+    def broken():
+        raise ValueError("no such\nmodel")
+
+    character = strider()[0]
+    session = viewer.Session({"one": lambda: character, "two": broken})
+    session._build()
+    session._builder.join()
+    session._swap()
+    session.change("model", "two")
+    session._build()
+    session._builder.join()
+    assert session.note == "error: no such model"
+    session.tick()
+    session._build()  # is not tried again and again
+    assert not session._builder.is_alive()
+    session.change("model", "one")
+    session._build()
+    session._builder.join()
+    assert session.note == ""
+
+
+@pytest.mark.slow
+def test_a_session_runs_only_while_somebody_looks():
+    shown = []
+    session = viewer.Session({"strider": lambda: strider()[0]})
+    session.on_frame = shown.append
+    thread = threading.Thread(target=session.run, daemon=True)
+    thread.start()
+    deadline = time.time() + 300
+    while session.body is None and time.time() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    assert not shown
+    session.join("me")
+    while len(shown) < 5 and time.time() < deadline:
+        time.sleep(0.05)
+    session.change("paused", True)
+    time.sleep(0.5)
+    count = len(shown)
+    session.step()
+    while len(shown) == count and time.time() < deadline:
+        time.sleep(0.05)
+    time.sleep(0.3)
+    assert len(shown) == count + 1
+    session.close()
+    thread.join(10)
+    assert not thread.is_alive()
