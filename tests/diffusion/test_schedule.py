@@ -479,3 +479,17 @@ def test_one_compile_for_all_steps():
 
     for t in (1, 2, 3):
         program(schedule.cosine_schedule(4), random(t), random(t + 1), jnp.array(t))
+
+
+def test_spread_steps_end_at_the_last():
+    assert schedule.spread_steps(8, 8) == tuple(range(1, 9))
+    assert schedule.spread_steps(8, 1) == (8,)
+    assert schedule.spread_steps(8, 3) == (3, 6, 8)
+    for total in (1, 7, 50):
+        for number in range(1, total + 1):
+            steps = schedule.spread_steps(total, number)
+            assert len(set(steps)) == number and steps[-1] == total
+            assert sorted(steps) == list(steps) and steps[0] >= 1
+    for number in (0, 9):
+        with pytest.raises(ValueError, match=f"{number} steps of 8, expected 1 to 8"):
+            schedule.spread_steps(8, number)
