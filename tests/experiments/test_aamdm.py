@@ -4,6 +4,7 @@ import functools
 import json
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -208,6 +209,7 @@ BAD = [
     ),
     ("evaluate --run {empty}", "{empty}"),
     ("evaluate --run {gone}", "{gone}"),
+    ("evaluate --run {begun}", "{begun}: no row was trained to its end"),
     ("evaluate --run {run} --rows amdm6", "unknown row 'amdm6'"),
     ("evaluate --run {run} --rows mvae", "mvae"),
     ("evaluate --run {run} --out {file}/below", "plain/below"),
@@ -228,7 +230,10 @@ def test_what_is_wrong_is_said_in_one_line(
     """`sys.exit` of a string prints it and exits with 1."""
     (tmp_path / "plain").write_text("")
     (tmp_path / "empty").mkdir()
+    begun = tmp_path / "begun"
+    shutil.copytree(trained, begun, ignore=shutil.ignore_patterns("T5", "lmm"))
     places = dict(
+        begun=begun,
         gone=tmp_path / "gone.npz",
         other=__file__,
         out=tmp_path / "out",
