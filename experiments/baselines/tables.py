@@ -40,6 +40,10 @@ def trained_rows(
                     f"row {name!r} was not trained: {error}"
                 ) from error
             print(f"{name}: not trained here, left out")
+    if not found:
+        raise ValueError(
+            f"{args.run}: no row was trained to its end; aamdm.py train goes on with it"
+        )
     return found
 
 
