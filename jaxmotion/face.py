@@ -26,6 +26,8 @@ from jaxmotion.control import courses, steering
 from jaxmotion.control.foot_lock import FootLock, lock_feet
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.steering import Character
+from jaxmotion.motion import anatomy
+from jaxmotion.motion.contact import foot_contacts
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.trajectory import Command, integrate_path
 from jaxmotion.systems import registry
@@ -245,12 +247,22 @@ def _save_html(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     html.save_html(path, _stage(skeleton, frames), title=path.stem)
 
 
+def _save_glb(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
+    from jaxmotion.export import gltf
+
+    gltf.save_glb(path, skeleton, _one(frames))
+
+
 def _save_npz(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     motion = _one(frames)
+    positions = joint_positions(skeleton, motion)
+    feet = positions[:, np.array(skeleton.feet, int)]
     arrays = dict(
         root_position=motion.root_position,
         joint_rotation=motion.joint_rotation,
-        joint_position=joint_positions(skeleton, motion),
+        joint_position=positions,
+        foot_contact=foot_contacts(jnp.concatenate([feet, feet[-1:]]), motion.fps)[:-1],
+        feet=[skeleton.names[foot] for foot in skeleton.feet],
         offsets=skeleton.offsets,
         parents=skeleton.parents,
         names=skeleton.names,
@@ -274,21 +286,37 @@ SAVERS: dict[str, Callable[[Path, Skeleton, Frame | Motion], None]] = {
     ".bvh": _save_bvh,
     ".csv": _save_csv,
     ".gif": _save_gif,
+    ".glb": _save_glb,
     ".html": _save_html,
     ".npz": _save_npz,
 }
 
 
-def save(path: str | Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
-    """Writes one character's motion in the format of the suffix.
+def save(
+    path: str | Path,
+    skeleton: Skeleton,
+    frames: Frame | Motion,
+    *,
+    t_pose: bool = False,
+    mixamo: bool = False,
+) -> None:
+    """Writes motion in the format of the suffix.
 
     .bvh rotations for animation tools; .csv world positions of all joints, meters;
-    .gif a moving picture; .html a page to turn and play; .npz arrays: root_position,
-    joint_rotation (6D, two columns), joint_position, and the skeleton.
+    .gif a moving picture; .glb a skinned body and its animation (meters, y up), for
+    engines, Blender and browsers; .html a page to turn and play; .npz arrays:
+    root_position, joint_rotation (6D, two columns), joint_position, foot_contact, and
+    the skeleton. Pictures take many characters, the others one, such as `frames[0]`.
+
+    Args:
+      t_pose: Rotations are against the T-pose instead of the skeleton's own zero pose;
+        in .glb they always are.
+      mixamo: Joints are named as Mixamo's characters have them.
 
     Raises:
       OSError: if the file cannot be written.
-      ValueError: if the suffix is unknown, or frames are not those of one character.
+      ValueError: if the suffix is unknown, frames are not those of one character, or
+        the skeleton has no arms and legs to be named.
     """
     path = Path(path)
     if path.suffix.lower() not in SAVERS:
@@ -296,6 +324,11 @@ def save(path: str | Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
             f"{path}: unknown suffix {path.suffix!r}, expected one of "
             f"{', '.join(SAVERS)}"
         )
+    if t_pose:
+        skeleton, frames = anatomy.as_t_pose(skeleton, _one(frames))
+    if mixamo:
+        names = anatomy.mixamo_names(skeleton)
+        skeleton = dataclasses.replace(skeleton, names=names)
     path.parent.mkdir(parents=True, exist_ok=True)
     SAVERS[path.suffix.lower()](path, skeleton, frames)
 

@@ -83,7 +83,7 @@ def test_a_run_starts_from_clips():
         made.start(clips=other)
 
 
-@pytest.mark.parametrize("suffix", ["bvh", "csv", "gif", "html", "npz"])
+@pytest.mark.parametrize("suffix", ["bvh", "csv", "gif", "glb", "html", "npz"])
 def test_each_suffix_is_written(model, frames, tmp_path, suffix):
     path = tmp_path / "deep" / f"walk.{suffix}"
     jm.save(path, model.skeleton, frames[0])
@@ -101,6 +101,7 @@ def test_each_suffix_is_written(model, frames, tmp_path, suffix):
             assert found["fps"] == 30.0
             np.testing.assert_array_equal(found["joint_position"], joints)
             assert found["names"].tolist() == list(model.skeleton.names)
+            assert found["foot_contact"].shape == (len(joints), len(found["feet"]))
     else:
         assert path.stat().st_size > 1000
 

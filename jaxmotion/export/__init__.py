@@ -1,1 +1,1 @@
-"""Functions that leave Python: as ONNX, as StableHLO, and what plays them."""
+"""What leaves Python: functions as ONNX and StableHLO, motions as glTF."""

@@ -10,9 +10,10 @@ bones all lie along x).
 import dataclasses
 import re
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton
 
 LEFT, RIGHT, MIDDLE = "left", "right", "middle"
 _SIDES = (
@@ -228,12 +229,19 @@ def _swing(start: np.ndarray, end: np.ndarray, half_turn: np.ndarray) -> np.ndar
 
 
 def t_pose(
-    skeleton: Skeleton, sides: tuple[str, ...] | None = None
+    skeleton: Skeleton,
+    sides: tuple[str, ...] | None = None,
+    motion: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The skeleton standing with its arms level to the sides, facing +z.
 
     The trunk, the feet's slope and what has no part in the pose stay as in the zero
     pose; a skeleton that is no person's stays so whole.
+
+    Args:
+      sides: See `find_anatomy`.
+      motion: World rotations [F, J, 3, 3]. Where the zero pose does not stand, nothing
+        else tells how arms are turned about themselves: the elbows bend ahead.
 
     Returns:
       Positions [J, 3], meters, the root at the origin; world rotations [J, 3, 3].
@@ -259,25 +267,141 @@ def t_pose(
         for number, arm in enumerate(found.arms):
             left = arm.side == LEFT or (arm.side == MIDDLE and number == 0)
             out = np.array([1.0 if left else -1.0, 0.0, 0.0])
-            chain = [*arm.before[-1:], arm.upper, arm.middle, arm.end, *arm.after[:1]]
-            for joint, child in zip(chain, chain[1:], strict=False):
+            joints = [*arm.before[-1:], arm.upper, arm.middle, arm.end, *arm.after[:1]]
+            for joint, child in zip(joints, joints[1:], strict=False):
                 bone = turn @ (places[child] - places[joint])
                 # A clavicle keeps its slope.
                 if joint not in arm.before or _unit(bone) @ out < 0.6:
                     wanted[joint] = (child, out)
-    turns, points = np.zeros((len(parents), 3, 3)), np.zeros((len(parents), 3))
+    turns = np.zeros((len(parents), 3, 3))
     for joint, parent in enumerate(parents):
-        if parent < 0:
-            turns[joint] = turn
-            continue
-        points[joint] = points[parent] + turns[parent] @ offsets[joint]
-        turns[joint] = turns[parent]
+        turns[joint] = turn if parent < 0 else turns[parent]
         if joint in wanted:
             child, direction = wanted[joint]
             bone = turns[joint] @ offsets[child]
             axis = np.array([0.0, 0.0, 1.0])
             turns[joint] = _swing(bone, direction, axis) @ turns[joint]
+    if motion is not None and not found.upright:
+        for arm in found.arms:
+            below = [j for j in range(len(parents)) if arm.upper in chain(parents, j)]
+            turns[below] = _elbow_turn(arm, wanted, turns, motion) @ turns[below]
+    points = np.zeros((len(parents), 3))
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            points[joint] = points[parent] + turns[parent] @ offsets[joint]
     return points, turns
+
+
+def _elbow_turn(
+    arm: Limb, wanted: dict, turns: np.ndarray, motion: np.ndarray
+) -> np.ndarray:
+    """Turns an arm about itself so that its elbow bends toward +z."""
+    upper, lower = (motion[:, j] @ turns[j].T for j in (arm.upper, arm.middle))
+    bend = np.swapaxes(upper, -1, -2) @ lower
+    skew = bend - np.swapaxes(bend, -1, -2)
+    hinge = 0.5 * np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1).mean(0)
+    out = wanted[arm.upper][1]
+    hinge = hinge - out * (hinge @ out)
+    if np.linalg.norm(hinge) < 0.05:  # hardly bent: nothing to go by
+        return np.eye(3)
+    return _swing(hinge, np.cross(out, [0.0, 0.0, 1.0]), out)
+
+
+def kinematics(skeleton: Skeleton, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """`skeleton.global_transforms` in NumPy: pictures and files compile nothing.
+
+    Args:
+      motion: [*batch, frames, ...].
+
+    Returns:
+      Positions [*batch, frames, J, 3], meters; rotations [*batch, frames, J, 3, 3].
+    """
+    turns = np.asarray(motion.joint_rotation, float)
+    offsets = np.asarray(skeleton.offsets, float)
+    x = turns[..., :3] / np.linalg.norm(turns[..., :3], axis=-1, keepdims=True)
+    y = turns[..., 3:] - np.sum(x * turns[..., 3:], axis=-1, keepdims=True) * x
+    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
+    rotations = np.stack([x, y, np.cross(x, y)], axis=-1)
+    positions = np.array(rotations[..., 0])
+    positions[..., 0, :] = motion.root_position
+    for joint, parent in enumerate(skeleton.parents[1:], 1):
+        above = rotations[..., parent, :, :]
+        positions[..., joint, :] = positions[..., parent, :] + above @ offsets[joint]
+        rotations[..., joint, :, :] = above @ rotations[..., joint, :, :]
+    return positions, rotations
+
+
+def as_t_pose(skeleton: Skeleton, motion: Motion) -> tuple[Skeleton, Motion]:
+    """The same positions on a skeleton whose zero pose is the T-pose.
+
+    All joints' axes are those of the world there: x left, y up, z ahead.
+
+    Args:
+      motion: [frames, ...] of one character.
+    """
+    _, world = kinematics(skeleton, motion)
+    points, turns = t_pose(skeleton, motion=world)
+    world = world @ np.swapaxes(turns, -1, -2)
+    above = [max(parent, 0) for parent in skeleton.parents]
+    local = np.swapaxes(world[:, above], -1, -2) @ world
+    local[:, 0] = world[:, 0]
+    columns = np.concatenate([local[..., 0], local[..., 1]], axis=-1)
+    offsets = points - points[above]
+    return (
+        dataclasses.replace(skeleton, offsets=jnp.asarray(offsets, jnp.float32)),
+        dataclasses.replace(motion, joint_rotation=jnp.asarray(columns, jnp.float32)),
+    )
+
+
+def mixamo_names(skeleton: Skeleton, prefix: str = "mixamorig:") -> tuple[str, ...]:
+    """Names of the joints as Mixamo's characters have them, which engines know.
+
+    Joints that those have not, such as fingers, keep their names.
+
+    Raises:
+      ValueError: if no trunk with arms and legs of two sides is found.
+    """
+    found = find_anatomy(skeleton)
+    sided = {limb.side for limb in (*found.arms, *found.legs)}
+    if len(found.arms) != 2 or len(found.legs) != 2 or MIDDLE in sided:
+        raise ValueError(
+            f"no two arms and two legs, left and right, among the joints "
+            f"{', '.join(skeleton.names)}"
+        )
+    names: dict[int, str] = {}
+    carrier = _carrier(skeleton, found.arms[0])
+    base, chest = (
+        found.trunk.index(_carrier(skeleton, limb))
+        for limb in (found.legs[0], found.arms[0])
+    )
+    names[found.trunk[base]] = "Hips"
+    number = lambda i: str(i) if i else ""  # noqa: E731
+    for i, joint in enumerate(found.trunk[base + 1 : chest + 1]):
+        names[joint] = "Spine" + number(i)
+    for i, joint in enumerate(found.trunk[chest + 1 :]):
+        names[joint] = "Neck" + number(i)
+    if found.has_head and found.trunk[-1] != carrier:
+        names[found.trunk[-1]] = "Head"
+    for limbs, words in (
+        (found.arms, ("Shoulder", "Arm", "ForeArm", "Hand")),
+        (found.legs, ("", "UpLeg", "Leg", "Foot")),
+    ):
+        for limb in limbs:
+            side = limb.side.capitalize()
+            joints = (*limb.before[-1:], limb.upper, limb.middle, limb.end)
+            for joint, word in zip(joints, words[-len(joints) :], strict=True):
+                names[joint] = side + word
+            if limbs is found.legs and limb.after:
+                names[limb.after[0]] = side + "ToeBase"
+    return tuple(
+        prefix + names[j] if j in names else name
+        for j, name in enumerate(skeleton.names)
+    )
+
+
+def _carrier(skeleton: Skeleton, limb: Limb) -> int:
+    """The joint of the trunk that a limb leaves."""
+    return skeleton.parents[limb.before[0] if limb.before else limb.upper]
 
 
 def _root_turn(found: Anatomy, places: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxmotion.motion.anatomy import kinematics
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.viz import body as bodies
 from jaxmotion.viz.body import Body
@@ -81,7 +82,7 @@ class Stage:
         """The same of the ghosts; None without."""
         if self.ghost is None:
             return None
-        return self.body.ends(*_kinematics(self.skeleton, self.ghost))
+        return self.body.ends(*kinematics(self.skeleton, self.ghost))
 
 
 def make_stage(
@@ -143,7 +144,7 @@ def make_stage(
             )
     place = _places(motion, apart)
     motion = _moved(motion, place)
-    positions, rotations = _kinematics(skeleton, motion)
+    positions, rotations = kinematics(skeleton, motion)
     return Stage(
         skeleton=skeleton,
         body=bodies.describe(skeleton, sides),
@@ -174,23 +175,6 @@ def _characters(skeleton: Skeleton, motion: Motion, what: str) -> Motion:
     return dataclasses.replace(
         motion, root_position=jnp.asarray(root), joint_rotation=jnp.asarray(turns)
     )
-
-
-def _kinematics(skeleton: Skeleton, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """`skeleton.global_transforms` in NumPy: a picture compiles nothing."""
-    turns = np.asarray(motion.joint_rotation, float)
-    offsets = np.asarray(skeleton.offsets, float)
-    x = turns[..., :3] / np.linalg.norm(turns[..., :3], axis=-1, keepdims=True)
-    y = turns[..., 3:] - np.sum(x * turns[..., 3:], axis=-1, keepdims=True) * x
-    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
-    rotations = np.stack([x, y, np.cross(x, y)], axis=-1)
-    positions = np.array(rotations[..., 0])
-    positions[..., 0, :] = motion.root_position
-    for joint, parent in enumerate(skeleton.parents[1:], 1):
-        above = rotations[..., parent, :, :]
-        positions[..., joint, :] = positions[..., parent, :] + above @ offsets[joint]
-        rotations[..., joint, :, :] = above @ rotations[..., joint, :, :]
-    return positions, rotations
 
 
 def _check_finite(what: str, values: np.ndarray) -> None:

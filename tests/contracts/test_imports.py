@@ -42,7 +42,8 @@ MAY_IMPORT = {
     # control: the live page (viewer.py).
     "viz": {"typing", "motion", "control"},
     # Functions and shapes of whatever system; a graph's noise is an input.
-    "export": {"typing", "files", "diffusion"},
+    # motion, viz: the skinned body of a .glb.
+    "export": {"typing", "files", "diffusion", "motion", "viz"},
     # The face composes what stands below it.
     "face.py": BASE
     | {"motion", "control", "data", "learning", "systems", "viz", "export"},

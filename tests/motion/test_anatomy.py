@@ -1,9 +1,11 @@
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxmotion.data.walker import walker_skeleton
 from jaxmotion.motion import anatomy
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.rotation import matrix_from_rot6d
+from jaxmotion.motion.skeleton import Motion, Skeleton
 
 # LaFAN1's convention: all bones along x, the zero pose is no pose of a person.
 BONES = (
@@ -97,3 +99,57 @@ def test_a_t_pose_stands_faces_ahead_and_keeps_the_bones():
                 np.testing.assert_allclose(places[j], places[parent] + bone, atol=1e-6)
     # A zero pose that is a T-pose stays as it is.
     np.testing.assert_allclose(anatomy.t_pose(walker_skeleton())[1], [np.eye(3)] * 22)
+
+
+def test_a_motion_against_the_t_pose_has_the_same_positions():
+    skeleton = along_x()
+    draw = np.random.default_rng(0)
+    motion = Motion(
+        root_position=jnp.asarray(draw.normal(size=(4, 3)), jnp.float32),
+        joint_rotation=jnp.asarray(draw.normal(size=(4, 20, 6)), jnp.float32),
+    )
+    changed, moved = anatomy.as_t_pose(skeleton, motion)
+    np.testing.assert_allclose(
+        anatomy.kinematics(changed, moved)[0],
+        anatomy.kinematics(skeleton, motion)[0],
+        atol=1e-5,
+    )
+    np.testing.assert_allclose(anatomy.t_pose(changed)[1], [np.eye(3)] * 20, atol=1e-3)
+
+
+def test_elbows_bend_ahead_in_the_t_pose():
+    """LaFAN1's zero pose does not tell how arms are turned; its motions do."""
+    skeleton = along_x()
+    columns = np.zeros((8, 20, 6), np.float32)
+    columns[..., 0] = columns[..., 4] = 1.0
+    bend = np.linspace(0.3, 1.2, 8)
+    for name, sign in (("LeftForeArm", 1), ("RightForeArm", -1)):
+        columns[:, skeleton.index(name), 0] = np.cos(bend)  # about an axis across x
+        columns[:, skeleton.index(name), 2] = sign * np.sin(bend)
+        columns[:, skeleton.index(name), 3:] = [0, 1, 0]
+    motion = Motion(
+        root_position=jnp.zeros((8, 3)), joint_rotation=jnp.asarray(columns)
+    )
+    _, moved = anatomy.as_t_pose(skeleton, motion)
+    for name, sign in (("LeftForeArm", -1.0), ("RightForeArm", 1.0)):
+        local = matrix_from_rot6d(moved.joint_rotation[:, skeleton.index(name)])
+        # About -y for the arm at +x: the forearm comes to +z.
+        np.testing.assert_allclose(local[:, 0, 2], sign * np.sin(bend), atol=1e-4)
+
+
+def test_joints_get_mixamo_names():
+    names = anatomy.mixamo_names(along_x(), prefix="")
+    changed = {"LeftToe": "LeftToeBase", "RightToe": "RightToeBase"}
+    expected = [changed.get(name, name) for name, _, _ in BONES]
+    assert list(names) == expected
+    walker = walker_skeleton()
+    odd = Skeleton(
+        offsets=walker.offsets,
+        parents=walker.parents,
+        names=tuple(f"b{j}" for j in range(22)),
+    )
+    assert anatomy.mixamo_names(odd) == tuple("mixamorig:" + n for n in walker.names)
+    with pytest.raises(ValueError, match="no two arms and two legs.*c"):
+        anatomy.mixamo_names(
+            Skeleton(offsets=jnp.zeros((2, 3)), parents=(-1, 0), names=("a", "c"))
+        )
