@@ -1,12 +1,18 @@
-"""Latency of one sample against the number of diffusion steps.
+"""Latency, memory and work of one sample against the number of diffusion steps.
+
+Writes step_counts.json, .csv, .md and .png.
 
 Examples:
+  python benchmarks/step_counts.py --steps 2 4 8
+  python benchmarks/step_counts.py --system camdm --sampler own ddim dpm_solver
   python benchmarks/step_counts.py --system camdm --steps 2 4 8 16 32 --batch 1 64
   python benchmarks/step_counts.py --system emdm --steps 1 5 10 20 50 --batch 1 32
   python benchmarks/step_counts.py --system smgdiff --guided
 """
 
 import dataclasses
+import itertools
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,40 +21,48 @@ import workload
 
 from jaxmotion import cli
 from jaxmotion.evaluation import timing
+from jaxmotion.networks import work
+from jaxmotion.systems import registry
 from jaxmotion.viz import plots
 
 COLUMNS = {
+    "system": "system",
+    "sampler": "sampler",
     "batch": "batch",
     "steps": "steps",
-    "guided": "guided",
+    "network_calls": "calls",
     "compile_s": "compile s",
     "p50_ms": "p50 ms",
     "p95_ms": "p95 ms",
     "runs": "runs",
     "frames_per_second": "frames/s",
-    "ms_per_frame": "ms/frame",
+    "real_time": "x real time",
+    "memory_mib": "MiB",
+    "gflop": "GFLOP",
+    "matmul_percent": "% of matmul",
 }
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config(suite.Settings):
-    """Compile time, p50 and p95 of one sample for several step counts and batches.
+    """Compile time, p50, p95, memory and FLOPs of one sample for several step counts.
 
     A sample is a plan, or EMDM's whole motion, or AAMDM's frame. Parameters are random:
-    they do not change the time. Each step count and batch is a program of its own,
-    compiled on purpose.
+    they do not change the time. Each system, sampler, step count and batch is a program
+    of its own, compiled on purpose.
 
     Attributes:
-      system: What to measure: camdm, aamdm, emdm or smgdiff.
-      steps: Diffusion steps.
+      system: What to measure: camdm, aamdm, emdm, smgdiff.
+      sampler: own (ancestral, or ddgan), ddim, or dpm_solver (not aamdm, emdm).
+      steps: Diffusion steps; aamdm drafts all but two, and polishes two.
       batch: Characters that are sampled together.
       arguments: Pass the parameters as arguments; without it they are constants of
         the program, as in deployment.
       chunk: Run batches of 16 and more in chunks of so many characters; 0 for all at
         once.
       frames_per_token: Frames of one token; 1 is the paper's network.
-      width: Channels of a token; None for 256, or 128 (emdm, the size that
-        experiments/emdm.py trains).
+      width: Channels of a token or hidden layer; None for 256, or 128 (emdm, the size
+        that experiments/emdm.py trains).
       guided: Measure SMGDiff's plans with contact guidance in the last two steps as
         well.
       paper: Measure EMDM's network of 12 layers and 1024 channels, one frame a token.
@@ -56,9 +70,10 @@ class Config(suite.Settings):
       limit: Seconds of timed calls of each program, at most.
     """
 
-    system: str = "camdm"
-    steps: tuple[int, ...] = (2, 4, 8, 16, 32)
-    batch: tuple[int, ...] = (1, 64)
+    system: tuple[str, ...] = tuple(registry.SYSTEMS)
+    sampler: tuple[str, ...] = ("own",)
+    steps: tuple[int, ...] = (2, 4, 8, 16)
+    batch: tuple[int, ...] = (1,)
     arguments: bool = False
     chunk: int = 4
     frames_per_token: int = 1
@@ -69,57 +84,120 @@ class Config(suite.Settings):
     limit: float = 25.0
 
 
-def case(args: Config, steps: int, batch: int, guided: bool) -> dict[str, Any]:
-    """Measures one step count and batch: a row of the report."""
+@dataclasses.dataclass(frozen=True)
+class Line:
+    """What a line of the plot has in common."""
+
+    system: str
+    sampler: str
+    batch: int
+    guided: bool
+
+    def __str__(self) -> str:
+        guided = " guided" if self.guided else ""
+        return f"{self.system} {self.sampler}{guided} batch={self.batch}"
+
+
+def make_lines(args: Config) -> list[Line]:
+    """What to measure, a number of steps each.
+
+    Raises:
+      ValueError: names the option, and what a system cannot take.
+    """
+    suite.at_least(args, steps=1, batch=1, chunk=0, runs=1)
+    if args.guided and "smgdiff" not in args.system:
+        raise ValueError(f"--guided is of smgdiff, not of {', '.join(args.system)}")
+    if args.guided and min(args.steps) < 2:
+        raise ValueError("--steps 1: expected 2 or more, --guided guides the last two")
+
+    def found() -> Iterator[Line]:
+        for system, name in itertools.product(args.system, args.sampler):
+            sampler = workload.sampler_of(system, name)
+            both = args.guided and system == "smgdiff"
+            for batch, guided in itertools.product(args.batch, (False, True)):
+                if both or not guided:
+                    yield Line(system, sampler, batch, guided)
+
+    return list(dict.fromkeys(found()))
+
+
+def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
+    """Measures one number of steps: a row of the report.
+
+    Args:
+      args: The settings.
+      line: What to measure.
+      steps: Diffusion steps.
+      rate: FLOP per second of this machine's matmul.
+    """
     sizes = workload.Sizes(
         steps=steps,
         width=args.width,
         frames_per_token=args.frames_per_token,
         paper=args.paper,
-        guided=guided,
+        guided=line.guided,
+        step=workload.STEPS[line.sampler],
     )
-    samples = workload.of(args.system, "samples")(sizes)
-    run, given = samples.program(batch, chunk=args.chunk, arguments=args.arguments)
+    samples = workload.of(line.system, "samples")(sizes)
+
+    def program() -> tuple:
+        return samples.program(line.batch, chunk=args.chunk, arguments=args.arguments)
+
+    # Two programs: one that has been traced would not be traced again.
+    run, given = program()
+    asked = work.count(run, *given)
+    run, given = program()
     found = timing.measure(run, *given, rounds=args.runs, limit_s=args.limit)
-    frames = batch * samples.frames
+    frames = line.batch * samples.frames
+    per_second = 1000 * frames / found.p50_ms
     return {
-        "batch": batch,
+        **dataclasses.asdict(line),
         "steps": steps,
-        "guided": guided,
+        "point": samples.point,
+        "network_calls": asked.network_calls // line.batch,
         **dataclasses.asdict(found),
-        "frames_per_second": 1000 * frames / found.p50_ms,
+        "frames_per_second": per_second,
         "ms_per_frame": found.p50_ms / frames,
+        "real_time": per_second / samples.fps / line.batch,
+        "gflop": asked.flops / 1e9,
+        "matmul_percent": 100 * asked.flops / (found.p50_ms / 1000) / rate,
     }
 
 
+def metrics_of(name: str, row: dict[str, Any]) -> list[suite.Metric]:
+    """Metrics of a row: its times, and its memory."""
+    memory = suite.Metric(f"{name} memory", row["memory_mib"], "MiB", tolerance=0.1)
+    return [*suite.time_metrics(name, row), memory]
+
+
 def main() -> None:
-    """Measures, writes the report and the plot."""
+    """Measures, writes the report, the table and the plot."""
     args = suite.parse(Config, __doc__)
-    suite.at_least(args, steps=1, batch=1, chunk=0, runs=1)
-    if args.guided and args.system != "smgdiff":
-        raise ValueError(f"--guided is of smgdiff, not of {args.system}")
-    rows, metrics, lines = [], [], {}
-    for batch in args.batch:
-        for guided in (False, True) if args.guided else (False,):
-            own = []
-            for steps in args.steps:
-                own.append(case(args, steps, batch, guided))
-                about = f"steps={steps} batch={batch}{' guided' if guided else ''}"
-                print(f"{about}: {own[-1]['p50_ms']:.4g} ms", flush=True)
-                metrics += suite.time_metrics(f"{args.system} {about}", own[-1])
-            lines[f"batch {batch}{', guided' if guided else ''}"] = tuple(
-                np.array([row[name] for row in own])
-                for name in ("steps", "p50_ms", "p95_ms")
-            )
-            rows += own
+    lines = make_lines(args)
+    rate = timing.matmul_rate()
+    print(f"matmul, float32: {rate / 1e9:.4g} GFLOP/s", flush=True)
+    rows, metrics, drawn = [], [], {}
+    for line in lines:
+        own = []
+        for steps in args.steps:
+            own.append(case(args, line, steps, rate))
+            about = f"{line} steps={steps}"
+            print(f"{about}: {own[-1]['p50_ms']:.4g} ms", flush=True)
+            metrics += metrics_of(about, own[-1])
+        drawn[str(line)] = tuple(
+            np.array([row[name] for row in own])
+            for name in ("steps", "p50_ms", "p95_ms")
+        )
+        rows += own
     suite.print_table(rows, COLUMNS)
+    suite.write_table(args.out / "step_counts", rows, COLUMNS)
     plots.plot_sweep(
         args.out / "step_counts.png",
-        lines,
+        drawn,
         xlabel="diffusion steps",
         ylabel="a batch of samples, ms (p50, whisker to p95)",
     )
-    suite.report("step_counts", metrics, args, rows=rows)
+    suite.report("step_counts", metrics, args, rows=rows, matmul_gflops=rate / 1e9)
 
 
 if __name__ == "__main__":

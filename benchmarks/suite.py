@@ -4,6 +4,7 @@ A report says how many calls a percentile comes from, and how busy other process
 the machine meanwhile: figures from a shared machine are no figures of the program.
 """
 
+import csv
 import dataclasses
 import datetime
 import importlib.metadata
@@ -153,16 +154,44 @@ def compare(metrics: list[Metric], baseline: Path) -> list[str]:
     return worse
 
 
-def print_table(rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
-    """Prints rows as a table; `columns` are the titles of the keys to print."""
-
+def _cells(rows: list[dict[str, Any]], columns: dict[str, str]) -> list[list[str]]:
     def cell(value: Any) -> str:
+        if value is None:
+            return "–"
         if isinstance(value, float):
             return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
         return str(value)
 
     lines = [list(columns.values())]
-    lines += [[cell(row[key]) for key in columns] for row in rows]
+    return lines + [[cell(row[key]) for key in columns] for row in rows]
+
+
+def write_table(
+    path: Path, rows: list[dict[str, Any]], columns: dict[str, str]
+) -> None:
+    """Writes rows as CSV, in full precision, and as Markdown.
+
+    Args:
+      path: Without a suffix.
+      rows: The table; None is an empty cell of the CSV, and a dash.
+      columns: Titles of the keys to write.
+
+    Raises:
+      OSError: if a file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_suffix(".csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    head, *lines = [f"| {' | '.join(line)} |" for line in _cells(rows, columns)]
+    text = "\n".join([head, "|---" * len(columns) + "|", *lines])
+    path.with_suffix(".md").write_text(text + "\n")
+
+
+def print_table(rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
+    """Prints rows as a table; `columns` are the titles of the keys to print."""
+    lines = _cells(rows, columns)
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for line in lines:
         print("  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)))
@@ -197,7 +226,7 @@ def report(
     path.write_text(json.dumps(value, indent=1))
     print(f"{here['cpu']}, {here['cores']} cores, jax {here['jax']}")
     # Memory is what it is on a busy machine, too.
-    timed = any(metric.unit != "GiB" for metric in metrics)
+    timed = any(metric.unit not in ("GiB", "MiB") for metric in metrics)
     if timed and (here["other_load"] or 0.0) > 0.1:
         print(
             f"Not idle: other processes used {here['other_load']} cores meanwhile, "

@@ -21,7 +21,7 @@ from jaxmotion.control import courses, rollout
 from jaxmotion.data import procedural, windows
 from jaxmotion.data.builders import smpl
 from jaxmotion.data.clips import Clips
-from jaxmotion.diffusion import schedule
+from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import training
 from jaxmotion.motion import pose, trajectory
 from jaxmotion.motion.features import Normalizer, unpack
@@ -55,6 +55,7 @@ class Sizes:
       frames_per_token: Frames of one token; 1 is the paper's network.
       paper: The published network where the system's own is smaller.
       guided: Plans with contact guidance.
+      step: Makes the chain's steps: a value of `STEPS`.
     """
 
     steps: int | None = None
@@ -62,6 +63,16 @@ class Sizes:
     frames_per_token: int = 1
     paper: bool = False
     guided: bool = False
+    step: chain.StepFactory = chain.ancestral_step
+
+
+# A denoising-diffusion GAN is sampled by ancestral steps whose denoiser is stochastic.
+STEPS: dict[str, chain.StepFactory] = {
+    "ancestral": chain.ancestral_step,
+    "ddgan": chain.ancestral_step,
+    "ddim": chain.ddim_step,
+    "dpm_solver": chain.dpm_solver_step,
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -73,12 +84,16 @@ class Samples:
       sampler: Makes `sample(key, condition)` of parameters.
       conditions: Conditions of a number of characters, batch axis first.
       frames: Frames of a sample.
+      fps: Frames per second of the motion.
+      point: Its name in a sweep of `experiments/step_sweep.py`, such as "8" or "2+3".
     """
 
     params: Params
     sampler: Callable[[Params], Callable[[Key, Any], jax.Array]]
     conditions: Callable[[int], Any]
     frames: int
+    fps: float
+    point: str
 
     def program(
         self, batch: int, *, chunk: int = 0, arguments: bool = False
@@ -146,12 +161,14 @@ class Workload:
 
     Attributes:
       samples: Samples of these sizes.
+      samplers: Names in `STEPS` of what it can be sampled by, its own first.
       rollouts: Rollouts of sizes, a run (or None), seconds, and whether characters
         change commands at different ticks.
       training: Training of sizes and a batch.
     """
 
     samples: Callable[[Sizes], Samples] | None = None
+    samplers: tuple[str, ...] = ("ancestral", "ddim", "dpm_solver")
     rollouts: Callable[[Sizes, Path | None, float, bool], Rollouts] | None = None
     training: Callable[[Sizes, int], Training] | None = None
 
@@ -174,6 +191,23 @@ def of(system: str, part: str) -> Any:
             f"--system {system}: no {part} to measure, expected one of {known}"
         )
     return found(system)
+
+
+def sampler_of(system: str, name: str) -> str:
+    """Name in `STEPS` of a sampler; "own" is the system's own.
+
+    Raises:
+      ValueError: if the system cannot take it.
+    """
+    known = of(system, "samplers")
+    if name == "own":
+        return known[0]
+    if name not in known:
+        raise ValueError(
+            f"--sampler {name}: not for {system}, expected one of own, "
+            f"{', '.join(known)}"
+        )
+    return name
 
 
 @functools.cache
@@ -229,9 +263,13 @@ def _camdm_samples(sizes: Sizes) -> Samples:
     config = camdm_config(sizes)
     return Samples(
         params=camdm_model.init(jax.random.key(0), config),
-        sampler=lambda params: camdm_model.sampler(params, config=config),
+        sampler=lambda params: camdm_model.sampler(
+            params, config=config, step=sizes.step
+        ),
         conditions=lambda batch: camdm_conditions(config, batch),
         frames=config.future,
+        fps=config.fps,
+        point=str(config.num_steps),
     )
 
 
@@ -320,12 +358,18 @@ def _camdm_training(sizes: Sizes, batch: int) -> Training:
 
 
 FPS = 60.0  # of AAMDM
+# DPM-Solver++ 2M draws a line through two predictions: with a latent drawn for each, it
+# would extrapolate noise.
+_GAN_SAMPLERS = ("ddgan", "ddim")
 
 
 def aamdm() -> Workload:
     """Single frames, free rollouts, and the training of the polisher."""
     return Workload(
-        samples=_aamdm_samples, rollouts=_aamdm_rollouts, training=_aamdm_training
+        samples=_aamdm_samples,
+        samplers=_GAN_SAMPLERS,
+        rollouts=_aamdm_rollouts,
+        training=_aamdm_training,
     )
 
 
@@ -344,11 +388,15 @@ def _aamdm_samples(sizes: Sizes) -> Samples:
     config = _aamdm_config(sizes)
     return Samples(
         params=aamdm_model.init(jax.random.key(0), config),
-        sampler=lambda params: aamdm_model.sampler(params, config=config),
+        sampler=lambda params: aamdm_model.sampler(
+            params, config=config, step=sizes.step
+        ),
         conditions=lambda batch: _normal(
             np.random.default_rng(0), batch, config.features
         ),
         frames=1,
+        fps=FPS,
+        point=f"{config.polishes}+{config.drafts}",
     )
 
 
@@ -524,7 +572,7 @@ def _aamdm_training(sizes: Sizes, batch: int) -> Training:
 
 def emdm() -> Workload:
     """Motions from actions, of HumanAct12's sizes."""
-    return Workload(samples=_emdm_samples)
+    return Workload(samples=_emdm_samples, samplers=_GAN_SAMPLERS)
 
 
 def _emdm_samples(sizes: Sizes) -> Samples:
@@ -547,9 +595,13 @@ def _emdm_samples(sizes: Sizes) -> Samples:
 
     return Samples(
         params=emdm_model.init(jax.random.key(0), config)["generator"],
-        sampler=lambda params: emdm_model.sampler(params, config=config),
+        sampler=lambda params: emdm_model.sampler(
+            params, config=config, step=sizes.step
+        ),
         conditions=conditions,
         frames=config.frames,
+        fps=15.0,
+        point=str(config.num_steps),
     )
 
 
@@ -607,8 +659,14 @@ def _smgdiff_samples(sizes: Sizes) -> Samples:
     return Samples(
         params=smgdiff_model.init(jax.random.key(0), config),
         sampler=lambda params: smgdiff_guidance.sampler(
-            params, config=config, representation=representation, guided=guided
+            params,
+            config=config,
+            representation=representation,
+            guided=guided,
+            step=sizes.step,
         ),
         conditions=conditions,
         frames=config.future,
+        fps=representation.fps,
+        point=str(config.num_steps),
     )

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -23,12 +24,36 @@ class Timing:
       p50_ms: Median of the timed calls, milliseconds.
       p95_ms: 95th percentile, milliseconds.
       runs: Timed calls.
+      memory_mib: What the program needs at its peak, as its compiler says: arguments,
+        results and what lies between, MiB. Constants of the program are not in it.
     """
 
     compile_s: float
     p50_ms: float
     p95_ms: float
     runs: int
+    memory_mib: float
+
+
+def peak_mib(program: Any) -> float:
+    """MiB of a compiled program's arguments, results and what lies between."""
+    found = program.memory_analysis()
+    parts = ("argument", "output", "temp")
+    return sum(getattr(found, f"{part}_size_in_bytes") for part in parts) / 2**20
+
+
+def matmul_rate(size: int = 1024, **options: Any) -> float:
+    """FLOP per second of a float32 product of square matrices, the machine's floor.
+
+    Args:
+      size: Rows and columns.
+      **options: As for `time_in_turn`.
+    """
+    x = jnp.ones((size, size), jnp.float32)
+    program, _ = compile_program(jax.jit(jnp.matmul), x, x)
+    options = {"rounds": 20, "limit_s": 5.0} | options
+    times = time_calls(lambda: program(x, x), **options)
+    return 2.0 * size**3 / (float(np.median(times)) / 1000)
 
 
 def compile_program(function: Callable, *arguments: Any) -> tuple[Callable, float]:
@@ -108,4 +133,4 @@ def measure(function: Callable, *arguments: Any, **options: Any) -> Timing:
     program, seconds = compile_program(function, *arguments)
     times = time_calls(lambda: program(*arguments), **options)
     p50, p95 = np.percentile(times, [50, 95])
-    return Timing(seconds, float(p50), float(p95), len(times))
+    return Timing(seconds, float(p50), float(p95), len(times), peak_mib(program))

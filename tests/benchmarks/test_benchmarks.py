@@ -1,5 +1,6 @@
 """The scripts at sizes that take seconds, and the arithmetic of their reports."""
 
+import csv
 import dataclasses
 import importlib
 import json
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.evaluation import timing
+from jaxmotion.networks import work
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
@@ -22,7 +24,8 @@ SMALL = ["--width", "16", "--runs", "2", "--limit", "1"]
 # Script -> arguments, and what its rows are told apart by.
 SCRIPTS = {
     "step_counts": (
-        [*SMALL, "--steps", "2", "--batch", "1", "16", "--frames-per-token", "5"],
+        [*SMALL, "--system", "camdm", "--steps", "2", "--batch", "1", "16"]
+        + ["--frames-per-token", "5"],
         [(1, 2), (16, 2)],
         ("batch", "steps"),
     ),
@@ -82,6 +85,85 @@ def test_scripts_write_what_they_measure(name, tmp_path):
     assert len({metric["name"] for metric in value["metrics"]}) == len(value["metrics"])
     if name == "step_counts":
         assert (tmp_path / "step_counts.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", ["camdm", "aamdm", "emdm", "smgdiff"])
+def test_a_step_is_a_network_call(load, system):
+    workload = load("workload")
+    for name in workload.of(system, "samplers"):
+        sizes = workload.Sizes(steps=3, width=16, step=workload.STEPS[name])
+        run, given = workload.of(system, "samples")(sizes).program(2)
+        found = work.count(run, *given)
+        assert found.network_calls == 2 * 3, name
+        assert found.flops > 0
+
+
+def test_step_counts_refuses_before_the_work(load):
+    module = load("step_counts")
+    refused = {
+        "--sampler dpm_solver: not for aamdm": dict(sampler=("ddim", "dpm_solver")),
+        "--guided is of smgdiff": dict(system=("camdm",), guided=True),
+        "--steps 1: expected 2": dict(guided=True, steps=(1, 2)),
+        "--batch 0": dict(batch=(0,)),
+        "unknown system 'nn'": dict(system=("nn",)),
+    }
+    for message, options in refused.items():
+        with pytest.raises(ValueError, match=message):
+            module.make_lines(module.Config(**options))
+    options = dict(system=("smgdiff", "emdm"), sampler=("own", "ddim", "ancestral"))
+    with pytest.raises(ValueError, match="ancestral: not for emdm"):
+        module.make_lines(module.Config(**options))
+    args = module.Config(system=("smgdiff",), guided=True, sampler=options["sampler"])
+    assert [str(line) for line in module.make_lines(args)] == [
+        "smgdiff ancestral batch=1",
+        "smgdiff ancestral guided batch=1",
+        "smgdiff ddim batch=1",
+        "smgdiff ddim guided batch=1",
+    ]
+
+
+def row_of(line, steps, **more):
+    """A row of step_counts.py that took a millisecond per step."""
+    return dataclasses.asdict(line) | dict(
+        steps=steps, point=str(steps), network_calls=steps, compile_s=1.0,
+        p50_ms=float(steps), p95_ms=2.0 * steps, runs=5, memory_mib=3.0,
+        frames_per_second=45e3 / steps, real_time=1.5e3 / steps, gflop=0.25 * steps,
+        matmul_percent=10.0,
+    ) | more  # fmt: skip
+
+
+def run_step_counts(load, monkeypatch, out, *options, **more):
+    """Runs step_counts.py with `row_of` for what would be measured."""
+    module = load("step_counts")
+    case = lambda args, line, steps, rate: row_of(line, steps, **more)  # noqa: E731
+    monkeypatch.setattr(module, "case", case)
+    monkeypatch.setattr(timing, "matmul_rate", lambda: 1e11)
+    arguments = [*map(str, options), "--out", str(out)]
+    monkeypatch.setattr(sys, "argv", ["step_counts.py", *arguments])
+    module.main()
+
+
+def test_step_counts_writes_its_tables(load, monkeypatch, tmp_path):
+    options = "--system", "emdm", "camdm", "--steps", 2, 4, "--sampler", "own", "ddim"
+    run_step_counts(load, monkeypatch, tmp_path, *options)
+    rows = list(csv.DictReader((tmp_path / "step_counts.csv").open()))
+    assert [(row["system"], row["sampler"], row["steps"]) for row in rows] == [
+        (system, sampler, steps)
+        for system, own in (("emdm", "ddgan"), ("camdm", "ancestral"))
+        for sampler in (own, "ddim")
+        for steps in "24"
+    ]
+    head, rule, first, *_ = (tmp_path / "step_counts.md").read_text().splitlines()
+    cells = lambda line: [x.strip() for x in line.strip("|").split("|")]  # noqa: E731
+    found = dict(zip(cells(head), cells(first), strict=True))
+    assert set(cells(rule)) == {"---"}
+    assert found["sampler"] == "ddgan" and found["frames/s"] == "22,500"
+    assert (tmp_path / "step_counts.png").read_bytes().startswith(b"\x89PNG")
+    value = json.loads((tmp_path / "step_counts.json").read_text())
+    assert value["matmul_gflops"] == 100
+    metrics = {metric["name"]: metric["value"] for metric in value["metrics"]}
+    assert metrics["emdm ddim batch=1 steps=4 p50"] == 4
 
 
 def test_phases_add_up(load):
