@@ -51,6 +51,13 @@ const body = poses(data.motion), ghost = poses(data.ghost);
 const targets = floats(data.targets), ball = data.ball;
 if (ball) ball.place = floats(ball.position);
 
+const canvas = element("view"), slider = element("time"), button = element("play");
+const gl = canvas.getContext("webgl2", {antialias: true, stencil: true, alpha: false});
+if (!gl) {
+  element("clock").textContent = "This browser has no WebGL 2: nothing can be drawn.";
+  throw new Error("no WebGL 2");
+}
+__CAPSULES__
 // World position (3) and rotation (9, three columns) of all joints.
 const world = new Float32Array(12 * joints);
 function kinematics(pose, character, frame) {
@@ -79,11 +86,6 @@ function place(joint, p, out, to) {
     + world[joint + 3 + i] * p[0] + world[joint + 6 + i] * p[1]
     + world[joint + 9 + i] * p[2];
 }
-function rgb(color) {
-  return [1, 3, 5].map(i => parseInt(color.slice(i, i + 2), 16) / 255);
-}
-// What is drawn of a capsule: both ends, both radii, color.
-const WIDTH = 11;
 const more = ball ? 1 + joints : 0;
 const shapes = new Float32Array(WIDTH * (characters * capsules + more));
 const colors = data.capsules.map(c => rgb(c[6]));
@@ -112,54 +114,7 @@ function assemble(pose, frame, paint) {
   return count;
 }
 
-const canvas = element("view"), slider = element("time"), button = element("play");
-const gl = canvas.getContext("webgl2", {antialias: true, stencil: true, alpha: false});
-if (!gl) {
-  element("clock").textContent = "This browser has no WebGL 2: nothing can be drawn.";
-  throw new Error("no WebGL 2");
-}
-function program(vertex, fragment) {
-  const made = gl.createProgram(), head = "#version 300 es\\nprecision highp float;\\n";
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex],
-                              [gl.FRAGMENT_SHADER, fragment]]) {
-    const part = gl.createShader(kind);
-    gl.shaderSource(part, head + text); gl.compileShader(part);
-    if (!gl.getShaderParameter(part, gl.COMPILE_STATUS))
-      throw new Error(gl.getShaderInfoLog(part));
-    gl.attachShader(made, part);
-  }
-  ["corner", "a", "b", "radii", "color"].forEach(
-    (name, i) => gl.bindAttribLocation(made, i, name));
-  gl.linkProgram(made);
-  return {made, at: name => gl.getUniformLocation(made, name)};
-}
-const solid = program(`
-in vec3 corner, a, b, color; in vec2 radii;  // corner: part of the arc, turn, end
-uniform mat4 view; uniform vec3 light; uniform bool shadow;
-out vec3 normal, paint;
-void main() {
-  float far = length(b - a), half_pi = 1.5707963;
-  vec3 z = far > 1e-5 ? (b - a) / far : vec3(0, 1, 0);
-  vec3 x = normalize(cross(z, abs(z.y) < 0.9 ? vec3(0, 1, 0) : vec3(1, 0, 0)));
-  vec3 y = cross(z, x);
-  float lean = asin(clamp((radii.x - radii.y) / max(far, 1e-5), -0.99, 0.99));
-  if (far <= 1e-5) lean = 0.0;
-  float angle = corner.z < 0.5 ? mix(-half_pi, lean, corner.x)
-                               : mix(lean, half_pi, corner.x);
-  normal = cos(angle) * (cos(corner.y) * x + sin(corner.y) * y) + sin(angle) * z;
-  vec3 p = mix(a, b, corner.z) + mix(radii.x, radii.y, corner.z) * normal;
-  if (shadow) p = vec3(p.xz - max(p.y, 0.0) / light.y * light.xz, 0.004).xzy;
-  paint = color;
-  gl_Position = view * vec4(p, 1);
-}`, `
-in vec3 normal, paint; uniform vec3 light; uniform float alpha; uniform bool shadow;
-out vec4 shown;
-void main() {
-  float v = clamp(0.42 + 0.62 * dot(normalize(normal), light), 0.0, 1.0);
-  vec3 c = v < 0.6 ? mix(0.52 * paint, paint, v / 0.6)
-                   : mix(paint, mix(paint, vec3(1), 0.38), (v - 0.6) / 0.4);
-  shown = shadow ? vec4(0.125, 0.15, 0.18, 0.3) : vec4(c, alpha);
-}`);
+const mesh = characters > 8 ? capsuleMesh(8, 2) : capsuleMesh(24, 6);
 const flat = program(`
 in vec3 corner; uniform mat4 view; uniform vec3 target; uniform float reach;
 out vec3 p;
@@ -177,34 +132,6 @@ void main() {
   float near = clamp(1.6 * (1.0 - length(p.xz - target.xz) / reach), 0.0, 1.0);
   shown = vec4(0.867, 0.894, 0.925, tile * near);
 }`);
-function upload(values) {
-  const made = gl.createBuffer();
-  gl.bindBuffer(gl.ARRAY_BUFFER, made);
-  gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-  return made;
-}
-function attribute(i, size, stride, offset, each) {
-  gl.enableVertexAttribArray(i);
-  gl.vertexAttribPointer(i, size, gl.FLOAT, false, 4 * stride, 4 * offset);
-  gl.vertexAttribDivisor(i, each);
-}
-// One capsule: rings of both ends.
-const [around, rings] = characters > 8 ? [8, 2] : [24, 6], mesh = [];
-for (const end of [0, 1]) for (let r = 0; r < rings + (end ? 0 : 1); r++)
-  for (let k = 0; k < around; k++) {
-    const bridge = !end && r == rings;
-    const corner = (i, j) => mesh.push(
-      bridge ? 1 - i : (r + i) / rings, 2 * Math.PI * (k + j) / around,
-      bridge ? i : end);
-    for (const [i, j] of [[0, 0], [0, 1], [1, 1], [0, 0], [1, 1], [1, 0]]) corner(i, j);
-  }
-const cornerCount = mesh.length / 3;
-const vao = gl.createVertexArray(), buffer = gl.createBuffer();
-gl.bindVertexArray(vao);
-upload(new Float32Array(mesh)); attribute(0, 3, 3, 0, 0);
-gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-[[1, 3, 0], [2, 3, 3], [3, 2, 6], [4, 3, 8]].forEach(
-  ([i, size, offset]) => attribute(i, size, WIDTH, offset, 1));
 const plane = gl.createVertexArray();
 gl.bindVertexArray(plane);
 upload(new Float32Array([-1, 0, -1, 1, 0, -1, -1, 0, 1, 1, 0, 1]));
@@ -284,36 +211,17 @@ function draw() {
     gl.uniform4f(flat.at("paint"), ...rgb(color), 1);
     gl.drawArrays(gl.TRIANGLE_STRIP, start, 2 * now + 2);
   }
-  gl.useProgram(solid.made);
-  gl.uniformMatrix4fv(solid.at("view"), false, view);
-  gl.uniform3fv(solid.at("light"), data.light);
-  gl.bindVertexArray(vao);
-  const cast = (shadow, alpha, count) => {
-    gl.uniform1i(solid.at("shadow"), shadow);
-    gl.uniform1f(solid.at("alpha"), alpha);
-    gl.drawArraysInstanced(gl.TRIANGLES, 0, cornerCount, count);
-  };
-  const bring = (pose, paint) => {
-    const count = assemble(pose, now, paint);
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-    gl.bufferData(gl.ARRAY_BUFFER, shapes, gl.DYNAMIC_DRAW);
-    return count;
-  };
-  const count = bring(body);
-  gl.enable(gl.STENCIL_TEST);  // each pixel once
-  gl.stencilFunc(gl.EQUAL, 0, 255);
-  gl.stencilOp(gl.KEEP, gl.KEEP, gl.INCR);
-  cast(1, 1, count);
-  gl.disable(gl.STENCIL_TEST);
-  gl.enable(gl.DEPTH_TEST);
-  gl.depthFunc(gl.LEQUAL);
-  cast(0, 1, count);
+  useCapsules(mesh, view, data.light);
+  const count = assemble(body, now);
+  bring(mesh, shapes);
+  drawCapsules(mesh, count);
   if (ghost) {
-    const pale = bring(ghost, rgb("#8fa3b8"));
+    const pale = assemble(ghost, now, rgb("#8fa3b8"));
+    bring(mesh, shapes);
     gl.colorMask(false, false, false, false);
-    cast(0, 1, pale);
+    cast(mesh, 0, 1, pale);
     gl.colorMask(true, true, true, true);
-    cast(0, 0.45, pale);
+    cast(mesh, 0, 0.45, pale);
   }
   slider.value = now;
   element("clock").textContent = (now / data.fps).toFixed(2) + " s of " +
@@ -356,6 +264,8 @@ canvas.addEventListener("wheel", e => {
 requestAnimationFrame(loop);
 </script></body></html>
 """
+# What the live page draws with as well.
+CAPSULES = Path(__file__).with_name("capsules.js").read_text(encoding="utf-8")
 # Where the light is, seen from the first view; as in GIFs.
 _LIGHT = np.array([-0.42, 0.78, 0.46])
 
@@ -432,10 +342,11 @@ def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
         "__TITLE__": escaping.escape(title),
         "__CAPTION__": escaping.escape(caption),
         "__DATA__": text,
+        "__CAPSULES__": CAPSULES,
     }
     # In one pass: a title may contain the name of the other slot.
     return re.sub(
-        "__TITLE__|__CAPTION__|__DATA__", lambda slot: filled[slot.group()], _PAGE
+        "__(TITLE|CAPTION|DATA|CAPSULES)__", lambda slot: filled[slot.group()], _PAGE
     )
 
 

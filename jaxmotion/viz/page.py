@@ -29,6 +29,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from jaxmotion.viz import viewer
+from jaxmotion.viz.html import CAPSULES
 from jaxmotion.viz.viewer import Inputs, Session, Shown
 
 MOST_PEOPLE = 32
@@ -112,7 +113,8 @@ class Page:
           save: Writes them.
         """
         self.session, self._out, self._save = session, out, save
-        self._html = Path(__file__).with_suffix(".html").read_bytes()
+        text = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
+        self._html = text.replace("__CAPSULES__", CAPSULES).encode()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._clients: set[_Client] = set()
         self._local = True
