@@ -103,8 +103,8 @@ def _is_key(value: Any) -> bool:
     return jax.dtypes.issubdtype(value.aval.dtype, jax.dtypes.prng_key)
 
 
-def _one(eqn: core.JaxprEqn, jaxpr: core.Jaxpr, values: list) -> list:
-    """The results of one equation."""
+def one_equation(eqn: core.JaxprEqn, jaxpr: core.Jaxpr, values: list) -> list:
+    """The results of one equation of a traced function."""
     known = [not isinstance(x, core.Literal) for x in eqn.invars]
     free = [x for x, yes in zip(eqn.invars, known, strict=True) if yes]
     alone = jaxpr.replace(
@@ -132,18 +132,18 @@ def _draw(traced: core.ClosedJaxpr, values: list) -> tuple[list, Tape]:
         known = not any(x is _UNKNOWN for x in given)
         match _role(eqn):
             case "plain":
-                found = _one(eqn, jaxpr, given) if known else found
+                found = one_equation(eqn, jaxpr, given) if known else found
             case "normal":
-                tape += _one(eqn, jaxpr, given)
+                tape += one_equation(eqn, jaxpr, given)
             case "keys":
                 if not known:
                     raise ValueError("a key depends on data: expected counters alone")
-                found = _one(eqn, jaxpr, given)
+                found = one_equation(eqn, jaxpr, given)
             case "call":
                 found, more = _draw(eqn.params["jaxpr"], given)
                 tape += more
             case "loop":
-                consts, carry, xs = _parts(eqn, given)
+                consts, carry, xs = loop_parts(eqn, given)
 
                 def body(_: None, xs: list, eqn=eqn, consts=consts, carry=carry):
                     rows = [_UNKNOWN if x is None else x for x in xs]
@@ -166,7 +166,7 @@ def _run(traced: core.ClosedJaxpr, values: list, tape: Iterator) -> list:
         given = [read(x) for x in eqn.invars]
         match _role(eqn):
             case "plain":
-                found = _one(eqn, jaxpr, given)
+                found = one_equation(eqn, jaxpr, given)
             case "normal":
                 found = [next(tape)]
             case "keys":
@@ -174,7 +174,7 @@ def _run(traced: core.ClosedJaxpr, values: list, tape: Iterator) -> list:
             case "call":
                 found = _run(eqn.params["jaxpr"], given, tape)
             case "loop":
-                consts, carry, xs = _parts(eqn, given)
+                consts, carry, xs = loop_parts(eqn, given)
 
                 def body(carry: list, row: tuple, eqn=eqn, consts=consts):
                     xs, noise = row
@@ -208,8 +208,8 @@ def _role(eqn: core.JaxprEqn) -> str:
     )
 
 
-def _parts(eqn: core.JaxprEqn, values: list) -> tuple[list, list, list]:
-    """Constants, carry and rows of a loop."""
+def loop_parts(eqn: core.JaxprEqn, values: list) -> tuple[list, list, list]:
+    """Constants, carry and rows of a loop's equation."""
     first = eqn.params["num_consts"]
     second = first + eqn.params["num_carry"]
     return values[:first], values[first:second], values[second:]

@@ -9,7 +9,12 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+from jax.extend import core
+
 from jaxmotion import files
+from jaxmotion.diffusion.noise import loop_parts, one_equation
 from jaxmotion.export.graph import Batch, Graph, Port
 
 SUFFIX = ".onnx"
@@ -58,12 +63,16 @@ def _converted(graph: Graph, *, inner: bool) -> Any:
     from onnx import helper
 
     own = "one." if inner else ""
+    structs = [port.struct() for port in graph.inputs]
+    # Before the converter sees it: it puts its own operations in the place of layers,
+    # and their gradients are others.
+    traced = jax.make_jaxpr(graph.run)(*structs)
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
         model = to_onnx(
-            graph.run,
-            [port.struct() for port in graph.inputs],
+            lambda *arrays: _forward(traced, list(arrays)),
+            structs,
             model_name=graph.name,
             input_names=[own + port.name for port in graph.inputs],
         )
@@ -79,6 +88,50 @@ def _converted(graph: Graph, *, inner: bool) -> Any:
         value.name = name
     _prune(model.graph)
     return model
+
+
+def _has_backward(traced: core.ClosedJaxpr) -> bool:
+    """Whether a loop in it runs backward, as a loop's gradient does."""
+    for eqn in traced.jaxpr.eqns:
+        inner = eqn.params.get("jaxpr")
+        if eqn.primitive.name == "scan" and eqn.params["reverse"]:
+            return True
+        if eqn.primitive.name in ("jit", "scan") and _has_backward(inner):
+            return True
+    return False
+
+
+def _forward(traced: core.ClosedJaxpr, values: list) -> list:
+    """The results, with loops that run backward run forward over turned rows.
+
+    ONNX can scan backward, the converter cannot.
+    """
+    if not _has_backward(traced):
+        return core.jaxpr_as_fun(traced)(*values)
+    jaxpr, given = traced.jaxpr, [*traced.consts, *values]
+    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], given, strict=True))
+    read = lambda x: x.val if isinstance(x, core.Literal) else env[x]  # noqa: E731
+    for eqn in jaxpr.eqns:
+        given, inner = [read(x) for x in eqn.invars], eqn.params.get("jaxpr")
+        if eqn.primitive.name == "jit":
+            found = _forward(inner, given)
+        elif eqn.primitive.name == "scan":
+            found = _scan(eqn, *loop_parts(eqn, given))
+        else:
+            found = one_equation(eqn, jaxpr, given)
+        env.update(zip(eqn.outvars, found, strict=True))
+    return [read(x) for x in jaxpr.outvars]
+
+
+def _scan(eqn: core.JaxprEqn, consts: list, carry: list, rows: list) -> list:
+    def body(carry: list, row: list) -> tuple[list, list]:
+        found = _forward(eqn.params["jaxpr"], [*consts, *carry, *row])
+        return found[: len(carry)], found[len(carry) :]
+
+    turn = lambda rows: [jnp.flip(x, 0) for x in rows]  # noqa: E731
+    turned = turn(rows) if eqn.params["reverse"] else rows
+    last, found = jax.lax.scan(body, carry, turned, length=eqn.params["length"])
+    return [*last, *(turn(found) if eqn.params["reverse"] else found)]
 
 
 def _prune(body: Any) -> set[str]:
