@@ -63,7 +63,7 @@ def play(folder: Path, about: dict, label: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def bvh(skeleton: dict, fps: float, roots: np.ndarray, rotations: np.ndarray) -> str:
-    """Text of a BVH file, in meters; angles about z, x and y."""
+    """Text of a BVH file, in centimeters; angles about z, x and y."""
     x, y = rotations[..., :3], rotations[..., 3:]  # columns of the matrices
     about_z = np.arctan2(-y[..., 0], y[..., 1])
     about_x = np.arcsin(np.clip(y[..., 2], -1, 1))
@@ -75,7 +75,7 @@ def bvh(skeleton: dict, fps: float, roots: np.ndarray, rotations: np.ndarray) ->
         order.append(j)
         is_root, offset = parents[j] < 0, skeleton["offsets"][j]
         place = "6 Xposition Yposition Zposition" if is_root else "3"
-        offset = " ".join(f"{0 if is_root else value:.6f}" for value in offset)
+        offset = " ".join(f"{0 if is_root else 100 * x:.4f}" for x in offset)
         lines.append(f"{pad}{'ROOT' if is_root else 'JOINT'} {skeleton['names'][j]}")
         lines.extend([f"{pad}{{", f"{pad}  OFFSET {offset}"])
         lines.append(f"{pad}  CHANNELS {place} Zrotation Xrotation Yrotation")
@@ -87,7 +87,7 @@ def bvh(skeleton: dict, fps: float, roots: np.ndarray, rotations: np.ndarray) ->
         lines.append(f"{pad}}}")
 
     joint(parents.index(-1), "")
-    rows = np.hstack([roots, angles[:, order].reshape(len(roots), -1)])
+    rows = np.hstack([100 * roots, angles[:, order].reshape(len(roots), -1)])
     lines += ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {1 / fps:.8f}"]
     lines += [" ".join(f"{value:.5f}" for value in row) for row in rows]
     return "\n".join(lines) + "\n"

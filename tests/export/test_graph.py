@@ -60,6 +60,7 @@ def test_a_graph_names_its_arrays_and_says_what_they_are():
     assert value["inputs"][1]["shape"] == [graph.ANY, 2]
 
 
+@pytest.mark.slow
 def test_a_graph_is_its_function():
     """Arrays in the order of the ports; the noise is the one the key would draw."""
     made = graph.make("move", MOVE, {"state": STATE, "speed": jnp.ones(2)})
@@ -71,6 +72,7 @@ def test_a_graph_is_its_function():
     assert count == same == 4
 
 
+@pytest.mark.slow
 def test_the_players_bvh_is_the_motion():
     """Read by the library, whose forward kinematics gives the same joints."""
     pytest.importorskip("onnxruntime")
@@ -80,7 +82,7 @@ def test_the_players_bvh_is_the_motion():
     skeleton = model_json.skeleton_to_json(tiny.skeleton())
     parts = (np.asarray(motion.root_position), np.asarray(motion.joint_rotation))
     text = player.bvh(skeleton, motion.fps, *parts)
-    read, found = bvh.motion_from_bvh(bvh_text.parse_bvh(text), unit=1.0)
+    read, found = bvh.motion_from_bvh(bvh_text.parse_bvh(text))
     assert read.names == tiny.NAMES and found.fps == motion.fps
     expected = joint_positions(tiny.skeleton(), motion)
     np.testing.assert_allclose(joint_positions(read, found), expected, atol=1e-4)
