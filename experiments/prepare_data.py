@@ -1,4 +1,4 @@
-"""Reads a published motion set, or generates one, into one npz file.
+"""Reads a published motion set or your own files, or generates one, into one npz file.
 
 The file holds clips, for ballplay and soccer_x with a ball, or for humanml3d and kit_ml
 feature vectors with captions.
@@ -12,6 +12,7 @@ Example:
   python experiments/prepare_data.py lafan1 --manual-dir raw/lafan1 --out data/l.npz
   python experiments/prepare_data.py kit_ml --manual-dir raw/KIT-ML --out data/k.npz
   python experiments/prepare_data.py ballplay --manual-dir raw/ballplay --out data/b.npz
+  python experiments/prepare_data.py bvh --manual-dir my_takes --out data/mine.npz
 """
 
 import dataclasses
@@ -30,8 +31,9 @@ from jaxmotion.data.builders import REGISTRY
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
 from jaxmotion.data.text_motion import TextMotions
 
-# "procedural" generates a styled walker.
-Source = Literal[*REGISTRY, "procedural"]
+# "procedural" generates a styled walker; "bvh" and "fbx" read your own files.
+Source = Literal[*REGISTRY, "procedural", "bvh", "fbx"]
+OWN = ("bvh", "fbx")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +41,8 @@ class Config:
     """What to read, and where to write it."""
 
     source: Annotated[Source, tyro.conf.Positional]
-    """The motion set; "procedural" generates a styled walker."""
+    """The motion set; "procedural" generates a styled walker; "bvh" and "fbx" read any
+    folder of such files of one skeleton, whose folders below it are the styles."""
     out: Path
     """File to write (.npz)."""
     manual_dir: Path | None = None
@@ -56,6 +59,22 @@ class Config:
     """Replace --out, and read the published files again."""
     seed: int = 0
     """Seed of the procedural walker."""
+    labels: Path | None = None
+    """bvh, fbx: a table of file,start,end,label (seconds; empty: from the beginning, to
+    the end); files that it does not name are left out."""
+    scale: float | None = None
+    """bvh, fbx: meters per unit of the files; by default detected, and printed."""
+    up: Literal["y", "z"] | None = None
+    """bvh, fbx: the axis that is up; by default detected, and printed."""
+    feet: tuple[str, ...] = ()
+    """bvh, fbx: joints whose contact with the ground counts, left before right; by
+    default the toes."""
+    all_joints: bool = False
+    """bvh, fbx: keep fingers and helpers too."""
+    tolerance: float = 0.01
+    """bvh, fbx: largest difference between two files' bones, meters."""
+    credit: str = ""
+    """bvh, fbx: name of the data and its license, which models and pictures cite."""
     cut_fps: float = 20.0
     """Frames per second by which the times of captions cut clips; the released loaders
     take 20 for kit_ml too, whose rate is 12.5."""
@@ -78,7 +97,22 @@ def check_config(config: Config) -> None:
             raise ValueError(f"--{option} should be in {low:g}..{high:g}, found {rate}")
     if not 0 <= config.seed < 2**32:
         raise ValueError(f"--seed should be in 0..2**32 - 1, found {config.seed}")
-    kind = "clips" if config.source == "procedural" else REGISTRY[config.source].kind
+    own = dict(
+        labels=config.labels,
+        scale=config.scale,
+        up=config.up,
+        feet=config.feet,
+        all_joints=config.all_joints,
+        credit=config.credit,
+    )
+    given = [name for name, value in own.items() if value]
+    if config.source not in OWN and given:
+        option = given[0].replace("_", "-")
+        raise ValueError(f"--{option} is for bvh and fbx, not for {config.source}")
+    if config.labels is not None and not config.labels.is_file():
+        raise FileNotFoundError(f"--labels: no file {config.labels}")
+    known = REGISTRY.get(config.source)
+    kind = "clips" if known is None else known.kind
     if kind != "clips" and (config.mirror or config.fps is not None):
         reason = {
             "texts": "is published with mirror images and at its own rate",
@@ -116,6 +150,32 @@ def read_published(config: Config) -> Clips | BallClips | TextMotions:
     if found.kind == "ball":
         return ball_base.ball_clips_from_source(builder)
     return base.clips_from_source(builder)
+
+
+def read_own(config: Config) -> Clips:
+    """A folder of files of one skeleton; prints what is detected."""
+    from jaxmotion.data import fbx, own
+    from jaxmotion.data.builders import base
+
+    read = own.read_bvh if config.source == "bvh" else fbx.read_fbx
+    table = None
+    if config.labels is not None:
+        text = base.read_text(str(config.labels), config.labels.read_bytes())
+        table = own.read_labels(str(config.labels), text)
+    found = base.read_files(config.manual_dir, (f".{config.source}",), unique=False)
+    clips, notes = own.clips_from_recordings(
+        (read(path, data) for path, data in found),
+        folder=str(config.manual_dir),
+        table=table,
+        scale=config.scale,
+        up=config.up,
+        feet=config.feet,
+        all_joints=config.all_joints,
+        tolerance=config.tolerance,
+        source=config.credit,
+    )
+    print("\n".join(notes))
+    return clips
 
 
 def at_rate(clips: Clips, fps: float) -> Clips:
@@ -202,6 +262,8 @@ def prepare(config: Config) -> None:
         from jaxmotion.data import procedural
 
         data = procedural.make_clips(seed=config.seed)
+    elif config.source in OWN:
+        data = read_own(config)
     else:
         found = REGISTRY[config.source]
         data, set_fps, mirrored = read_published(config), found.fps, found.mirrored

@@ -182,7 +182,10 @@ def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> An
     if set(named) == {MIDDLE} and upright and sides is None:
         named = _guess_sides(parents, places, arms, legs)
     made = [
-        tuple(dataclasses.replace(limb, side=named[limb.middle]) for limb in limbs)
+        _one_per_side(
+            [dataclasses.replace(limb, side=named[limb.middle]) for limb in limbs],
+            lengths,
+        )
         for limbs in (arms, legs)
     ]
     return Anatomy(
@@ -193,6 +196,18 @@ def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> An
         sides=named,
         upright=bool(upright),
     )
+
+
+def _one_per_side(limbs: list[Limb], lengths: np.ndarray) -> tuple[Limb, ...]:
+    """The longest limb of each side: a hood or a ribbon is none."""
+    if {LEFT, RIGHT} - {limb.side for limb in limbs}:
+        return tuple(limbs)
+    long = lambda limb: lengths[limb.middle] + lengths[limb.end]  # noqa: E731
+    best = [
+        max((limb for limb in limbs if limb.side == side), key=long)
+        for side in (LEFT, RIGHT)
+    ]
+    return tuple(limb for limb in limbs if limb in best)
 
 
 def _guess_sides(

@@ -68,6 +68,7 @@ DOORS = {
     "orbax": ("jaxmotion/learning/checkpoint.py",),
     "tensorflow_datasets": ("jaxmotion/data/builders/",),
     "scipy": ("jaxmotion/data/", "jaxmotion/evaluation/statistics.py"),
+    "ufbx": ("jaxmotion/data/fbx.py",),
     "matplotlib": ("jaxmotion/viz/",),
     "PIL": ("jaxmotion/viz/",),
     "tqdm": ("jaxmotion/learning/loop.py", "experiments/", "benchmarks/"),

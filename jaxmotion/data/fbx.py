@@ -1,0 +1,109 @@
+"""FBX files by ufbx: the joints of their animation in the file's world."""
+
+import numpy as np
+
+from jaxmotion.data.own import Recording
+
+_UPS = {2: "y", 4: "z"}  # ufbx.CoordinateAxis
+
+
+def _matrix(transform) -> np.ndarray:
+    """[4, 4] of translation, rotation and scale."""
+    t, q, s = transform.translation, transform.rotation, transform.scale
+    x, y, z, w = q.x, q.y, q.z, q.w
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = turn * [s.x, s.y, s.z], (t.x, t.y, t.z)
+    return found
+
+
+def read_fbx(name: str, data: bytes, *, fps: float = 30.0) -> Recording:
+    """The animation of an FBX file's bones; of several takes the longest.
+
+    Args:
+      fps: Frames per second to sample it at.
+
+    Raises:
+      ModuleNotFoundError: without the extra [fbx].
+      ValueError: if it is no FBX, or has no bones or no animation; names it.
+    """
+    try:
+        import ufbx
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError(
+            'FBX needs the package ufbx: pip install -e ".[fbx]"'
+        ) from None
+    try:
+        scene = ufbx.load_memory(data)
+    except Exception as error:
+        raise ValueError(f"{name}: no FBX file ({error})") from None
+    # All of its objects are held: those that are let go crash when asked for again.
+    held = [list(scene.nodes), list(scene.bones), list(scene.anim_stacks)]
+    nodes, stacks = held[0], held[2]
+    bones = [node for node in nodes if node.bone is not None]
+    if not bones:
+        raise ValueError(f"{name}: the FBX has no bones")
+    takes = [take for take in stacks if take.time_end > take.time_begin]
+    if not takes:
+        raise ValueError(f"{name}: the FBX has no animation")
+    take = max(takes, key=lambda take: take.time_end - take.time_begin)
+    animation = take.anim
+    # Bones of one tree, parents first; what is above (an armature) moves its root.
+    index = {node.element_id: i for i, node in enumerate(bones)}
+    upper = [node.parent for node in bones]
+    parents = [-1 if n is None else index.get(n.element_id, -1) for n in upper]
+    root = max(
+        (i for i, parent in enumerate(parents) if parent < 0),
+        key=lambda i: sum(_below(parents, i, j) for j in range(len(bones))),
+    )
+    order = sorted(
+        (j for j in range(len(bones)) if _below(parents, root, j)),
+        key=lambda j: (_depth(parents, j), j),
+    )
+    places = [order.index(parents[j]) if at else -1 for at, j in enumerate(order)]
+    above = []
+    node = bones[root].parent
+    while node is not None:
+        above.insert(0, node)
+        node = node.parent
+    count = int((take.time_end - take.time_begin) * fps + 1e-6) + 1
+    world = np.zeros((count, len(order), 4, 4))
+    for frame in range(count):
+        time = take.time_begin + frame / fps
+        base = np.eye(4)
+        for node in above:
+            base = base @ _matrix(ufbx.evaluate_transform(animation, node, time))
+        for at, j in enumerate(order):
+            local = _matrix(ufbx.evaluate_transform(animation, bones[j], time))
+            start = base if at == 0 else world[frame, places[at]]
+            world[frame, at] = start @ local
+    turns = world[..., :3, :3]
+    turns = turns / np.linalg.norm(turns, axis=-2, keepdims=True)
+    if (np.linalg.det(turns) < 0.9).any():
+        raise ValueError(f"{name}: bones are mirrored or sheared")
+    return Recording(
+        name=name,
+        names=tuple(bones[j].name for j in order),
+        parents=tuple(places),
+        positions=world[..., :3, 3],
+        rotations=turns,
+        fps=fps,
+        unit=float(scene.settings.unit_meters),
+        up=_UPS.get(int(scene.settings.axes.up)),
+    )
+
+
+def _depth(parents: list[int], joint: int) -> int:
+    return 0 if parents[joint] < 0 else 1 + _depth(parents, parents[joint])
+
+
+def _below(parents: list[int], top: int, joint: int) -> bool:
+    while joint >= 0 and joint != top:
+        joint = parents[joint]
+    return joint == top
