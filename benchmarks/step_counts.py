@@ -1,6 +1,7 @@
 """Latency, memory and work of one sample against the number of diffusion steps.
 
-Writes step_counts.json, .csv, .md and .png.
+Writes step_counts.json, .csv, .md and .png; with --quality also a Pareto plot of each
+system's quality against time, step_counts_<system>.png.
 
 Examples:
   python benchmarks/step_counts.py --steps 2 4 8
@@ -8,19 +9,21 @@ Examples:
   python benchmarks/step_counts.py --system camdm --steps 2 4 8 16 32 --batch 1 64
   python benchmarks/step_counts.py --system emdm --steps 1 5 10 20 50 --batch 1 32
   python benchmarks/step_counts.py --system smgdiff --guided
+  python benchmarks/step_counts.py --system camdm --quality runs/sweep_camdm/table.json
 """
 
 import dataclasses
 import itertools
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import suite
 import workload
 
-from jaxmotion import cli
-from jaxmotion.evaluation import timing
+from jaxmotion import cli, files
+from jaxmotion.evaluation import columns, timing
 from jaxmotion.networks import work
 from jaxmotion.systems import registry
 from jaxmotion.viz import plots
@@ -66,6 +69,8 @@ class Config(suite.Settings):
       guided: Measure SMGDiff's plans with contact guidance in the last two steps as
         well.
       paper: Measure EMDM's network of 12 layers and 1024 channels, one frame a token.
+      quality: Tables (table.json) of experiments/step_sweep.py, one a system: adds the
+        quality of its trained models to the rows of their steps and own sampler.
       runs: Timed calls of each program.
       limit: Seconds of timed calls of each program, at most.
     """
@@ -80,6 +85,7 @@ class Config(suite.Settings):
     width: int | None = None
     guided: bool = False
     paper: bool = False
+    quality: tuple[Path, ...] = ()
     runs: int = 50
     limit: float = 25.0
 
@@ -153,7 +159,6 @@ def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
     return {
         **dataclasses.asdict(line),
         "steps": steps,
-        "point": samples.point,
         "network_calls": asked.network_calls // line.batch,
         **dataclasses.asdict(found),
         "frames_per_second": per_second,
@@ -162,6 +167,86 @@ def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
         "gflop": asked.flops / 1e9,
         "matmul_percent": 100 * asked.flops / (found.p50_ms / 1000) / rate,
     }
+
+
+Quality = dict[tuple[str, int], dict[str, Any]]
+
+
+def read_quality(args: Config) -> Quality:
+    """Quality of trained models, by system and number of steps.
+
+    Returns:
+      Entries of rows: "quality", its ends, and "quality_column".
+
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if one is no table, or has nothing that is measured; names it.
+    """
+    found: Quality = {}
+    what = "expected table.json of experiments/step_sweep.py"
+    for path in args.quality:
+        table = files.read_object(path, what=what)
+        system, rows = table.get("system"), table.get("rows")
+        if system not in args.system or not isinstance(rows, dict):
+            raise ValueError(
+                f"--quality {path}: a table of system {system!r}: {what} of --system "
+                f"{', '.join(args.system)}"
+            )
+        bench = registry.get(system).bench
+        known = len(found)
+        for steps in args.steps:
+            (point,) = bench.points((workload.point_of(system, steps),))
+            cell = rows.get(point.row, {}).get(bench.quality)
+            if cell is None or cell.get("value") is None:
+                continue
+            if (system, steps) in found:
+                raise ValueError(f"--quality {path}: a second table of {system}")
+            ends = (cell.get(key) for key in ("low", "high"))
+            low, high = (cell["value"] if end is None else end for end in ends)
+            found[system, steps] = {
+                "quality": cell["value"],
+                "quality_low": low,
+                "quality_high": high,
+                "quality_column": columns.header(bench.quality),
+            }
+        if len(found) == known:
+            raise ValueError(
+                f"--quality {path}: no {bench.quality} of --steps "
+                f"{', '.join(map(str, args.steps))}, rows are {', '.join(rows)}"
+            )
+    return found
+
+
+def join(row: dict[str, Any], quality: Quality) -> dict[str, Any]:
+    """The row with its quality: None where it has none, as of other samplers."""
+    own = row["sampler"] == workload.sampler_of(row["system"], "own")
+    plain = own and not row["guided"]
+    empty = {"quality": None, "quality_column": None}
+    return row | (plain and quality.get((row["system"], row["steps"])) or empty)
+
+
+def draw_quality(args: Config, rows: list[dict[str, Any]]) -> None:
+    """Draws quality against time of each system that has any, at the smallest batch."""
+    for system in args.system:
+        own = [
+            row
+            for row in rows
+            if (row["system"], row["batch"]) == (system, min(args.batch))
+            and row["quality"] is not None
+        ]
+        if not own:
+            continue
+        ends = ("quality", "quality_low", "quality_high")
+        plots.write_pareto(
+            args.out / f"step_counts_{system}.png",
+            tuple(str(row["steps"]) for row in own),
+            np.array([[row["p50_ms"]] * 3 for row in own]),
+            np.array([[row[name] for name in ends] for row in own]),
+            references={},
+            xlabel=f"a batch of {min(args.batch)}: p50, ms",
+            ylabel=f"{own[0]['quality_column']} (lower is better)",
+            title=f"{system}: quality of the sweep's models, time of this benchmark",
+        )
 
 
 def metrics_of(name: str, row: dict[str, Any]) -> list[suite.Metric]:
@@ -173,14 +258,14 @@ def metrics_of(name: str, row: dict[str, Any]) -> list[suite.Metric]:
 def main() -> None:
     """Measures, writes the report, the table and the plot."""
     args = suite.parse(Config, __doc__)
-    lines = make_lines(args)
+    lines, quality = make_lines(args), read_quality(args)
     rate = timing.matmul_rate()
     print(f"matmul, float32: {rate / 1e9:.4g} GFLOP/s", flush=True)
     rows, metrics, drawn = [], [], {}
     for line in lines:
         own = []
         for steps in args.steps:
-            own.append(case(args, line, steps, rate))
+            own.append(join(case(args, line, steps, rate), quality))
             about = f"{line} steps={steps}"
             print(f"{about}: {own[-1]['p50_ms']:.4g} ms", flush=True)
             metrics += metrics_of(about, own[-1])
@@ -189,8 +274,12 @@ def main() -> None:
             for name in ("steps", "p50_ms", "p95_ms")
         )
         rows += own
-    suite.print_table(rows, COLUMNS)
-    suite.write_table(args.out / "step_counts", rows, COLUMNS)
+    titles = COLUMNS
+    if quality:
+        titles = titles | {"quality": "quality", "quality_column": "measured as"}
+        draw_quality(args, rows)
+    suite.print_table(rows, titles)
+    suite.write_table(args.out / "step_counts", rows, titles)
     plots.plot_sweep(
         args.out / "step_counts.png",
         drawn,

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import jax
+import numpy as np
 import tyro
 
 from jaxmotion import reporting
@@ -49,10 +50,13 @@ class Settings:
     Attributes:
       out: Folder of the report.
       gate: Report to compare with; exit status 1 if something is worse.
+      history: JSONL file to append every metric to, with commit and date, and to draw
+        as a picture beside it.
     """
 
     out: Path = Path("runs/benchmarks")
     gate: Path | None = None
+    history: Path | None = None
 
 
 S = TypeVar("S", bound=Settings)
@@ -75,6 +79,9 @@ def prepare(args: Settings) -> None:
     check_writable(args.out)
     if args.gate is not None:
         read_baseline(args.gate)
+    if args.history is not None:
+        check_writable(args.history.parent)
+        read_history(args.history)
 
 
 def at_least(args: Settings, **least: int) -> None:
@@ -233,10 +240,81 @@ def report(
             "so these times are too long."
         )
     print(f"wrote {path}")
+    if args.history is not None:
+        append_history(args.history, name, metrics, here)
     worse = [] if args.gate is None else compare(metrics, args.gate)
     if worse:
         print("worse than the baseline:", *worse, sep="\n  ")
         raise SystemExit(1)
+
+
+def read_history(path: Path) -> list[dict[str, Any]]:
+    """Entries of a history, oldest first; none if there is no file.
+
+    Raises:
+      ValueError: names the file and the line.
+    """
+    found = []
+    for i, line in enumerate(path.read_text().splitlines() if path.exists() else ()):
+        try:
+            entry = json.loads(line)
+            _ = [entry[key] for key in ("benchmark", "name", "commit", "date", "cpu")]
+            found.append(entry | {"value": float(entry["value"])})
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"{path}: line {i + 1}: {error!r}: expected a metric that --history "
+                "wrote"
+            ) from error
+    return found
+
+
+def append_history(
+    path: Path, name: str, metrics: list[Metric], here: dict[str, Any]
+) -> None:
+    """Appends a line per metric, and draws the medians of all runs on this processor.
+
+    Args:
+      path: The history; the picture is beside it.
+      name: Name of the benchmark.
+      metrics: What was measured.
+      here: The `environment`.
+    """
+    # matplotlib is slow to import, and only those who draw need it.
+    from jaxmotion.viz import plots
+
+    commit = reporting.git_commit()
+    same = {key: here[key] for key in ("date", "cpu", "cores", "device", "other_load")}
+    entries = [
+        {"benchmark": name, **dataclasses.asdict(metric), "commit": commit, **same}
+        for metric in metrics
+    ]
+    with path.open("a") as file:
+        file.writelines(json.dumps(entry) + "\n" for entry in entries)
+    values: dict[str, list[tuple[int, float]]] = {}
+    runs: dict[str, str] = {}
+    for entry in read_history(path):
+        known = entry["benchmark"], entry["cpu"]
+        if known != (name, here["cpu"]) or not entry["name"].endswith(" p50"):
+            continue
+        runs.setdefault(entry["date"], (entry["commit"] or "no commit")[:7])
+        places = values.setdefault(entry["name"].removesuffix(" p50"), [])
+        places.append((list(runs).index(entry["date"]), entry["value"]))
+    if not values:
+        return
+    lines = {
+        name: (*np.array([(run, value / found[0][1]) for run, value in found]).T, None)
+        for name, found in values.items()
+    }
+    picture = path.with_suffix(".png")
+    plots.plot_sweep(
+        picture,
+        lines,
+        xlabel="commit",
+        ylabel="p50 over the first run's",
+        log=False,
+        ticks=tuple(runs.values()),
+    )
+    print(f"wrote {path} and {picture}")
 
 
 def busy() -> tuple[float, float, float] | None:

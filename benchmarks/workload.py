@@ -85,7 +85,6 @@ class Samples:
       conditions: Conditions of a number of characters, batch axis first.
       frames: Frames of a sample.
       fps: Frames per second of the motion.
-      point: Its name in a sweep of `experiments/step_sweep.py`, such as "8" or "2+3".
     """
 
     params: Params
@@ -93,7 +92,6 @@ class Samples:
     conditions: Callable[[int], Any]
     frames: int
     fps: float
-    point: str
 
     def program(
         self, batch: int, *, chunk: int = 0, arguments: bool = False
@@ -210,6 +208,14 @@ def sampler_of(system: str, name: str) -> str:
     return name
 
 
+def point_of(system: str, steps: int) -> str:
+    """Name of a number of steps in a sweep of `experiments/step_sweep.py`."""
+    if system != "aamdm":
+        return str(steps)
+    config = _aamdm_config(Sizes(steps=steps))
+    return f"{config.polishes}+{config.drafts}"
+
+
 @functools.cache
 def make_clips() -> Clips:
     """Two minutes of the procedural walker, with labels "style"."""
@@ -269,7 +275,6 @@ def _camdm_samples(sizes: Sizes) -> Samples:
         conditions=lambda batch: camdm_conditions(config, batch),
         frames=config.future,
         fps=config.fps,
-        point=str(config.num_steps),
     )
 
 
@@ -396,7 +401,6 @@ def _aamdm_samples(sizes: Sizes) -> Samples:
         ),
         frames=1,
         fps=FPS,
-        point=f"{config.polishes}+{config.drafts}",
     )
 
 
@@ -601,7 +605,6 @@ def _emdm_samples(sizes: Sizes) -> Samples:
         conditions=conditions,
         frames=config.frames,
         fps=15.0,
-        point=str(config.num_steps),
     )
 
 
@@ -668,5 +671,4 @@ def _smgdiff_samples(sizes: Sizes) -> Samples:
         conditions=conditions,
         frames=config.future,
         fps=representation.fps,
-        point=str(config.num_steps),
     )

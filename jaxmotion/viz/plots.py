@@ -300,6 +300,7 @@ def plot_sweep(
     xlabel: str,
     ylabel: str,
     log: bool = True,
+    ticks: tuple[str, ...] = (),
 ) -> None:
     """Lines with upper whiskers, such as latency over the number of steps.
 
@@ -309,6 +310,7 @@ def plot_sweep(
       xlabel: Quantity and unit.
       ylabel: Quantity and unit.
       log: Logarithmic axes.
+      ticks: What stands below x = 0, 1, 2, ...; none for numbers.
 
     Raises:
       OSError: if the file cannot be written.
@@ -322,7 +324,9 @@ def plot_sweep(
     if log:
         axes.set_xscale("log", base=2)
         axes.set_yscale("log")
+    if ticks:
+        axes.set_xticks(range(len(ticks)), ticks, rotation=45, ha="right")
     axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(alpha=0.3, which="both")
-    axes.legend()
+    axes.legend(fontsize="small")
     drawing.savefig(path)

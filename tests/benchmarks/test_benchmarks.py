@@ -16,6 +16,7 @@ import pytest
 
 from jaxmotion.evaluation import timing
 from jaxmotion.networks import work
+from jaxmotion.systems import registry
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
@@ -126,7 +127,7 @@ def test_step_counts_refuses_before_the_work(load):
 def row_of(line, steps, **more):
     """A row of step_counts.py that took a millisecond per step."""
     return dataclasses.asdict(line) | dict(
-        steps=steps, point=str(steps), network_calls=steps, compile_s=1.0,
+        steps=steps, network_calls=steps, compile_s=1.0,
         p50_ms=float(steps), p95_ms=2.0 * steps, runs=5, memory_mib=3.0,
         frames_per_second=45e3 / steps, real_time=1.5e3 / steps, gflop=0.25 * steps,
         matmul_percent=10.0,
@@ -164,6 +165,58 @@ def test_step_counts_writes_its_tables(load, monkeypatch, tmp_path):
     assert value["matmul_gflops"] == 100
     metrics = {metric["name"]: metric["value"] for metric in value["metrics"]}
     assert metrics["emdm ddim batch=1 steps=4 p50"] == 4
+
+
+def write_sweep(path, system, column, rows):
+    cells = {"value": 0.5, "low": 0.4, "high": None, "samples": 20}
+    table = {"system": system, "rows": {row: {column: cells} for row in rows}}
+    path.write_text(json.dumps(table))
+    return path
+
+
+def test_quality_joins_a_sweep(load, monkeypatch, tmp_path):
+    column = registry.get("aamdm").bench.quality
+    table = write_sweep(
+        tmp_path / "table.json", "aamdm", column, ["2 polish + 3 draft"]
+    )
+    options = ["--system", "aamdm", "--steps", 5, 8, "--sampler", "own", "ddim"]
+    run_step_counts(load, monkeypatch, tmp_path, *options, "--quality", table)
+    value = json.loads((tmp_path / "step_counts.json").read_text())
+    assert [row["quality"] for row in value["rows"]] == [0.5, None, None, None]
+    assert value["rows"][0]["quality_high"] == 0.5
+    assert (tmp_path / "step_counts_aamdm.png").read_bytes().startswith(b"\x89PNG")
+    last = (tmp_path / "step_counts.md").read_text().splitlines()[-1]
+    assert last.endswith("| – | – |")
+
+
+def test_quality_refuses_other_tables(load, tmp_path):
+    module = load("step_counts")
+    column = registry.get("camdm").bench.quality
+    table = write_sweep(tmp_path / "table.json", "camdm", column, ["T = 8"])
+    with pytest.raises(ValueError, match=r"table\.json: no .* of --steps 2, 4.*T = 8"):
+        module.read_quality(module.Config(steps=(2, 4), quality=(table,)))
+    with pytest.raises(ValueError, match="second table of camdm"):
+        module.read_quality(module.Config(steps=(8,), quality=(table, table)))
+    with pytest.raises(ValueError, match="system 'camdm'.*--system emdm"):
+        module.read_quality(module.Config(system=("emdm",), quality=(table,)))
+    table.write_text("[]")
+    with pytest.raises(ValueError, match=r"table\.json.*step_sweep"):
+        module.read_quality(module.Config(quality=(table,)))
+
+
+def test_history_has_a_line_per_metric_and_a_picture(load, monkeypatch, tmp_path):
+    suite, history = load("suite"), tmp_path / "history.jsonl"
+    metrics = [suite.Metric("a p50", 2.0, "ms"), suite.Metric("a compile", 1.0, "s")]
+    monkeypatch.setattr(sys, "argv", ["x.py"])
+    for _ in range(2):
+        suite.report("x", metrics, Config(tmp_path, None, history), rows=[])
+    entries = suite.read_history(history)
+    assert [entry["name"] for entry in entries] == 2 * ["a p50", "a compile"]
+    assert all(entry["date"] and "commit" in entry for entry in entries)
+    assert (tmp_path / "history.png").read_bytes().startswith(b"\x89PNG")
+    history.write_text(history.read_text() + "{}\n")
+    with pytest.raises(ValueError, match=r"history\.jsonl: line 5.*--history"):
+        suite.prepare(Config(tmp_path, None, history))
 
 
 def test_phases_add_up(load):
@@ -228,7 +281,7 @@ def test_help_has_defaults_units_and_an_example(name, load, monkeypatch, capsys)
     assert "seconds" in printed.lower()
 
 
-Config = dataclasses.make_dataclass("Config", ["out", "gate"])
+Config = dataclasses.make_dataclass("Config", ["out", "gate", ("history", Path, None)])
 
 
 def test_gate(load, tmp_path, monkeypatch):
