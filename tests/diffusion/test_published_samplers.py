@@ -1,0 +1,92 @@
+"""DDIM and DPM-Solver++ against their implementation in diffusers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxmotion.diffusion import chain, schedule
+
+torch = pytest.importorskip("torch")
+diffusers = pytest.importorskip("diffusers")
+pytestmark = pytest.mark.slow
+TABLES = {
+    "vp": schedule.vp_schedule(40),
+    "cosine": schedule.cosine_schedule(40),
+}
+
+
+def denoise(key, x_t, t):
+    """A nonlinear prediction of x_0 that depends on the step."""
+    return jnp.tanh(0.7 * x_t + 0.02 * t)
+
+
+def published(kind, table, **options):
+    """A scheduler of the same table: its index i is our t - 1."""
+    scheduler = getattr(diffusers, kind)(
+        num_train_timesteps=table.num_steps,
+        trained_betas=np.asarray(table.beta[1:], np.float64),
+        prediction_type="sample",
+        **options,
+    )
+    # The same products of alphas: its own lose digits in float32.
+    scheduler.alphas_cumprod = torch.tensor(np.array(table.alpha_bar[1:]))
+    return scheduler
+
+
+def walk(scheduler, x):
+    x = torch.tensor(np.array(x))
+    for i in scheduler.timesteps:
+        x_0 = torch.tanh(0.7 * x + 0.02 * (int(i) + 1))
+        x = scheduler.step(x_0, i, x).prev_sample
+    return x.numpy()
+
+
+def ours(factory, table, x, every):
+    """Samples in steps every, 2 every, ..., T."""
+    steps = tuple(range(every, table.num_steps + 1, every))
+    told = jnp.array(steps, jnp.int32)
+    step = factory(
+        schedule.respace(table, steps), lambda k, x, t: denoise(k, x, told[t - 1])
+    )
+    return chain.sample_from(step, jax.random.key(0), x, start=len(steps))
+
+
+def start():
+    return 2.0 * jax.random.normal(jax.random.key(1), (64,))
+
+
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("name", TABLES)
+def test_ddim_is_the_published_one(name, every):
+    table = TABLES[name]
+    options = dict(clip_sample=False, steps_offset=every - 1)
+    scheduler = published("DDIMScheduler", table, **options)
+    scheduler.set_timesteps(table.num_steps // every)
+    found = ours(chain.ddim_step, table, start(), every)
+    np.testing.assert_allclose(found, walk(scheduler, start()), atol=2e-5)
+
+
+@pytest.mark.parametrize("t", [1, 2, 20, 40])
+def test_ddim_with_noise_is_the_published_one(t):
+    table, x, key = TABLES["vp"], start(), jax.random.key(2)
+    step = chain.ddim_step(table, denoise, eta=0.6)
+    scheduler = published("DDIMScheduler", table, clip_sample=False)
+    scheduler.set_timesteps(table.num_steps)
+    noise = jax.random.normal(jax.random.split(key)[1], x.shape)
+    tensors = [torch.tensor(np.array(z)) for z in (denoise(None, x, t), x, noise)]
+    x_0, x_t, noise = tensors
+    expected = scheduler.step(x_0, t - 1, x_t, eta=0.6, variance_noise=noise)
+    found = step(jax.random.clone(key), x, jnp.int32(t))
+    np.testing.assert_allclose(found, expected.prev_sample.numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("name", TABLES)
+def test_dpm_solver_is_the_published_one(name, every):
+    table = TABLES[name]
+    scheduler = published("DPMSolverMultistepScheduler", table, solver_order=2)
+    indices = range(table.num_steps - 1, -1, -every)
+    scheduler.set_timesteps(timesteps=list(indices))
+    found = ours(chain.dpm_solver_step, table, start(), every)
+    np.testing.assert_allclose(found, walk(scheduler, start()), atol=2e-5)
