@@ -73,6 +73,9 @@ class Config:
     """bvh, fbx: keep fingers and helpers too."""
     tolerance: float = 0.01
     """bvh, fbx: largest difference between two files' bones, meters."""
+    longest: float = 20.0
+    """bvh, fbx: longer takes become several clips, so that some can be held out,
+    seconds."""
     credit: str = ""
     """bvh, fbx: name of the data and its license, which models and pictures cite."""
     cut_fps: float = 20.0
@@ -172,6 +175,7 @@ def read_own(config: Config) -> Clips:
         feet=config.feet,
         all_joints=config.all_joints,
         tolerance=config.tolerance,
+        longest=config.longest,
         source=config.credit,
     )
     print("\n".join(notes))

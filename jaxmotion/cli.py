@@ -63,7 +63,7 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("learning_rate", "ddpm_rate", "discriminator_rate"), _RATE),
     **dict.fromkeys(("dropout", "ema"), Range(0, 1, (1,))),
     **dict.fromkeys(("fps", "cut_fps"), _FPS),
-    **dict.fromkeys(("seconds", "minutes", "limit"), _SPAN),
+    **dict.fromkeys(("seconds", "minutes", "limit", "longest"), _SPAN),
     **dict.fromkeys(("rate", "off_ball"), Range(0, 1)),
     **dict.fromkeys(("last_sigma", "max_distance", "scale", "tolerance"), _METERS),
     **dict.fromkeys(("scale", "amdm_scale", "recon"), Range(0, 10**6)),

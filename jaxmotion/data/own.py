@@ -253,6 +253,7 @@ def clips_from_recordings(
     feet: tuple[str, ...] = (),
     all_joints: bool = False,
     tolerance: float = 0.01,
+    longest: float = float("inf"),
     source: str = "",
 ) -> tuple[Clips, list[str]]:
     """Clips of one skeleton, the first file's, with labels "style" and "take".
@@ -267,6 +268,7 @@ def clips_from_recordings(
       all_joints: Keep fingers and helpers too.
       tolerance: Largest difference of a bone within a file, and from the first file's,
         whose bones all clips get, meters.
+      longest: Longer takes become several clips, so that some can be held out, seconds.
       source: What to cite, and its license.
 
     Returns:
@@ -337,21 +339,24 @@ def clips_from_recordings(
                     f"{recording.name}: a part from {start:g} s on, but the file ends "
                     f"at {seconds:.4g} s"
                 )
-            cut = slice(
-                round(start * motion.fps), round(min(end, seconds) * motion.fps)
-            )
-            motions.append(
-                dataclasses.replace(
-                    motion,
-                    root_position=motion.root_position[cut],
-                    joint_rotation=motion.joint_rotation[cut],
-                )
-            )
+            first, last = (round(x * motion.fps) for x in (start, min(end, seconds)))
+            pieces = max(int(np.ceil((last - first) / motion.fps / longest)), 1)
+            edges = np.linspace(first, last, pieces + 1).round().astype(int)
             inside = recording.name.removeprefix(folder).lstrip("/")
             take = inside.rsplit(".", 1)[0]
-            names.append(take if len(parts) == 1 else f"{take}_{number}")
-            styles.append(label)
-            takes.append(take)
+            name = take if len(parts) == 1 else f"{take}_{number}"
+            for piece in range(pieces):
+                cut = slice(edges[piece], edges[piece + 1])
+                motions.append(
+                    dataclasses.replace(
+                        motion,
+                        root_position=motion.root_position[cut],
+                        joint_rotation=motion.joint_rotation[cut],
+                    )
+                )
+                names.append(name if pieces == 1 else f"{name}-{piece}")
+                styles.append(label)
+                takes.append(take)
     for row in table or ():
         if row[0] not in seen:
             raise ValueError(f"the labels name a file {row[0]!r}, which is not there")

@@ -359,9 +359,9 @@ def save_gif(
     keys = [line[:2] for line in shown]
     keys += [] if stage.ghost is None else [("plan", _GHOST)]
     page = _page(title, caption, keys, width, height)
-    ends = stage.ends
+    ends, ghosts = stage.ends, stage.ghost_ends
     camera = cameras.follow(
-        ends,
+        ends if ghosts is None else np.concatenate([ends, ghosts]),
         stage.body.radii,
         fps=stage.fps,
         azimuth=cameras.toward(stage.walked) if azimuth is None else azimuth,
@@ -373,7 +373,7 @@ def save_gif(
         camera=camera,
         stage=stage,
         ends=ends,
-        ghosts=stage.ghost_ends,
+        ghosts=ghosts,
         paths=tuple((_on_ground(line), color) for _, color, line in shown),
     )
     palette = Image.new("P", (1, 1))

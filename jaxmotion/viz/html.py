@@ -294,9 +294,10 @@ def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
       caption: Below it, small: the source of the data and its license.
     """
     body, ends = stage.body, stage.ends
-    low, high = ends.min(axis=(0, 2, 3)), ends.max(axis=(0, 2, 3))
+    seen = ends if stage.ghost is None else np.concatenate([ends, stage.ghost_ends])
+    low, high = seen.min(axis=(0, 2, 3)), seen.max(axis=(0, 2, 3))
     targets = cameras.smooth(0.5 * (low + high), 0.5 * stage.fps)
-    away = np.linalg.norm(ends - targets[:, None, None], axis=-1)
+    away = np.linalg.norm(seen - targets[:, None, None], axis=-1)
     many = len(ends) > 3
     azimuth = np.deg2rad(cameras.toward(stage.walked))
     elevation = np.deg2rad(28.0 if many else 16.0)

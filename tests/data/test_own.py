@@ -99,6 +99,12 @@ def test_labels_from_a_table_cut_parts():
     ]
 
 
+def test_long_takes_become_several_clips():
+    clips, _ = own.clips_from_recordings(two()[:1], longest=0.3)
+    assert clips.clip_names == ("takes/a-0", "takes/a-1", "takes/a-2")
+    assert np.diff(np.asarray(clips.offsets)).tolist() == [7, 6, 7]
+
+
 def test_files_of_several_skeletons_are_refused():
     with pytest.raises(ValueError, match=r"b\.bvh: the bone to .* differs by 0\.\d+ m"):
         own.clips_from_recordings(two(bone=1.4))
