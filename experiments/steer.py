@@ -83,6 +83,11 @@ def steer(args: Config) -> None:
       ValueError: if the model cannot be steered, or a package is missing.
     """
     cli.check(args)
+    if args.characters > viewer.MOST_CHARACTERS:
+        raise ValueError(
+            f"--characters is {args.characters}, expected at most "
+            f"{viewer.MOST_CHARACTERS}"
+        )
     page.websockets()
     cli.check_address(args.host, args.port)
     if not jax.config.jax_compilation_cache_dir:

@@ -493,6 +493,23 @@ def test_a_table_sets_the_number_of_steps(params, situation):
     assert lengths == {2}
 
 
+@pytest.mark.slow
+def test_steps_of_the_table_are_visited_and_told(params, situation):
+    keys = jax.random.key(1)
+    steps = tuple(range(1, FACING.num_steps + 1))
+    sample = lambda **more: jax.jit(  # noqa: E731
+        camdm_model.sampler(params, config=FACING, **more)
+    )
+    # The checker of keys cannot follow constants into nested calls (jax 0.10).
+    with jax.debug_key_reuse(False):
+        whole = sample()(keys, situation)
+        np.testing.assert_allclose(
+            sample(steps=steps)(keys, situation), whole, atol=1e-4
+        )
+        short = sample(steps=steps[-1:])(keys, situation)
+    assert np.isfinite(short).all() and np.abs(short - whole).max() > 1e-3
+
+
 def test_parameters_as_constants_give_the_same_plan(params, situation):
     expected = plan_of(FACING)(params, jax.random.key(1), situation, 0.0)
     # The checker of keys cannot follow constants into nested calls (jax 0.10).
