@@ -143,8 +143,16 @@ def compare(metrics: list[Metric], baseline: Path) -> list[str]:
 
     Returns:
       One line for each.
+
+    Raises:
+      ValueError: if the baseline has none of the metrics.
     """
     known = read_baseline(baseline)
+    if not any(metric.name in known for metric in metrics):
+        raise ValueError(
+            f"--gate {baseline}: has none of the metrics measured here, expected a "
+            "report of this benchmark with the same settings"
+        )
     worse = []
     for metric in metrics:
         if metric.name not in known:

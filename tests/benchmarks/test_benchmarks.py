@@ -297,6 +297,8 @@ def test_gate(load, tmp_path, monkeypatch):
     new = suite.Metric("new", 1e9, "ms")
     assert suite.compare([value(time, 11.9), value(rate, 84.0), new], baseline) == []
     assert suite.compare([value(time, 1.0), value(rate, 1e4)], baseline) == []
+    with pytest.raises(ValueError, match=r"x\.json: has none of the metrics"):
+        suite.compare([new], baseline)
     (slow,) = suite.compare([value(time, 12.1), rate], baseline)
     assert "time: 12.1 ms, baseline 10" in slow
     (few,) = suite.compare([time, value(rate, 80.0)], baseline)
