@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.extend import core
 from jaxtyping import PyTree
 
@@ -77,8 +78,14 @@ def with_noise(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def _trace(function: Callable, args: tuple) -> tuple[core.ClosedJaxpr, Any]:
     """The traced function, and the structure of its result."""
-    traced, shapes = jax.make_jaxpr(function, return_shape=True)(_key(), *args)
-    return traced, jax.tree.structure(shapes)
+    structures = []
+
+    def flat(key: Key, *args: Any) -> list:
+        leaves, structure = jax.tree.flatten(function(key, *args))
+        structures.append(structure)
+        return leaves
+
+    return jax.make_jaxpr(flat)(_key(), *args), structures[0]
 
 
 def _key() -> jax.ShapeDtypeStruct:
@@ -161,7 +168,7 @@ def _run(traced: core.ClosedJaxpr, values: list, tape: Iterator) -> list:
     jaxpr = traced.jaxpr
     given = [*traced.consts, *values]
     env = dict(zip([*jaxpr.constvars, *jaxpr.invars], given, strict=True))
-    read = lambda x: x.val if isinstance(x, core.Literal) else env[x]  # noqa: E731
+    read = lambda x: _array(x) if isinstance(x, core.Literal) else env[x]  # noqa: E731
     for eqn in jaxpr.eqns:
         given = [read(x) for x in eqn.invars]
         match _role(eqn):
@@ -187,6 +194,10 @@ def _run(traced: core.ClosedJaxpr, values: list, tape: Iterator) -> list:
                 found = [*last, *ys]
         env.update(zip(eqn.outvars, found, strict=True))
     return [read(x) for x in jaxpr.outvars]
+
+
+def _array(literal: core.Literal) -> jax.Array:
+    return jnp.asarray(literal.val, literal.aval.dtype)
 
 
 def _role(eqn: core.JaxprEqn) -> str:

@@ -82,17 +82,19 @@ def make(name: str, exported: Exported, arguments: dict[str, Any]) -> Graph:
         draw = functools.partial(noise.draw_noise, function)
         given = {"noise": jax.eval_shape(draw, key, *given.values())} | given
         function = noise.with_noise(function)
-    results = jax.eval_shape(function, *given.values())
-    found = (results,) if len(exported.gives) == 1 else results
     tree = jax.tree.structure(tuple(given.values()))
+    outputs = []
 
     def run(*arrays: Any) -> tuple:
-        return tuple(jax.tree.leaves(function(*jax.tree.unflatten(tree, arrays))))
+        found = function(*jax.tree.unflatten(tree, arrays))
+        found = (found,) if len(exported.gives) == 1 else found
+        named = dict(zip(exported.gives, found, strict=True))
+        outputs.append(ports(named, before=OUT))
+        return tuple(jax.tree.leaves(found))
 
-    named = dict(zip(exported.gives, found, strict=True))
-    return Graph(
-        name=name, run=run, inputs=ports(given), outputs=ports(named, before=OUT)
-    )
+    inputs = ports(given)
+    jax.eval_shape(run, *(port.struct() for port in inputs))
+    return Graph(name=name, run=run, inputs=inputs, outputs=outputs[0])
 
 
 def ports(trees: dict[str, Any], *, before: str = "") -> tuple[Port, ...]:
