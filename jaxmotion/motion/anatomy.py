@@ -368,7 +368,7 @@ def as_t_pose(skeleton: Skeleton, motion: Motion) -> tuple[Skeleton, Motion]:
     )
 
 
-def mixamo_names(skeleton: Skeleton, prefix: str = "mixamorig:") -> tuple[str, ...]:
+def mixamo_names(skeleton: Skeleton, *, prefix: str = "mixamorig:") -> tuple[str, ...]:
     """Names of the joints as Mixamo's characters have them, which engines know.
 
     Joints that those have not, such as fingers, keep their names.
