@@ -42,7 +42,7 @@ def peak_mib(program: Any) -> float:
     return sum(getattr(found, f"{part}_size_in_bytes") for part in parts) / 2**20
 
 
-def matmul_rate(size: int = 1024, **options: Any) -> float:
+def matmul_rate(*, size: int = 1024, **options: Any) -> float:
     """FLOP per second of a float32 product of square matrices, the machine's floor.
 
     Args:
