@@ -47,7 +47,7 @@ class Train:
       contents: Use only clips of these contents; none: all clips.
       label: Field of the clips that is the style.
       labels: Use only clips of these styles; none: all.
-      held_out: Part of the clips kept for evaluation.
+      held_out: Part of the clips kept for evaluation, in (0, 1).
       held_out_clips: Keep these instead, by name.
       mirror: Add a mirrored copy of each.
       balance: Draw rare changes more often, up to 1.
