@@ -11,11 +11,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend import core
 
 from jaxmotion import files
 from jaxmotion.diffusion.noise import loop_parts, one_equation
-from jaxmotion.export.graph import Batch, Graph, Port
+from jaxmotion.export.graph import ANY, Batch, Graph, Port
 
 SUFFIX = ".onnx"
 _MISSING = (
@@ -28,6 +29,7 @@ def check() -> None:
     try:
         import jax2onnx  # noqa: F401
         import onnx  # noqa: F401
+        import onnxruntime  # noqa: F401
     except ImportError as error:
         raise ValueError(f"{_MISSING} ({error})") from None
 
@@ -43,7 +45,7 @@ def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
 
     Raises:
       OSError: if the file cannot be written.
-      ValueError: if packages are missing, or the function has no ONNX form.
+      ValueError: if packages are missing, or the function has no ONNX form that runs.
     """
     check()
     import onnx
@@ -53,8 +55,26 @@ def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
         model = _over_characters(model, graph, batch)
     model.producer_name = "jaxmotion"
     onnx.checker.check_model(model)
+    _try(model, graph, batch)
     with files.replacing(path) as file:
         file.write(model.SerializeToString())
+
+
+def _try(model: Any, graph: Graph, batch: Batch) -> None:
+    """Runs a model once: the checker takes shapes that do not fit for right."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    lead = () if batch is None else (2 if batch == ANY else batch,)
+    zeros = {x.name: np.zeros((*lead, *x.shape), x.dtype) for x in graph.inputs}
+    try:
+        data = model.SerializeToString()
+        session = onnxruntime.InferenceSession(data, options)
+        session.run(None, {x.name: zeros[x.name] for x in session.get_inputs()})
+    except Exception as error:  # of onnxruntime, which has many kinds
+        reason = str(error).strip().split("\n")[0]
+        raise ValueError(f"{graph.name!r} does not run as ONNX: {reason}") from error
 
 
 def _converted(graph: Graph, *, inner: bool) -> Any:

@@ -206,6 +206,13 @@ class Prefix(NamedTuple):
     value: Float[Array, "*batch tokens heads channels"]
 
 
+def row_of(
+    steps: Float[Array, "*stack rows width"], t: Int[Array, "*batch"]
+) -> Float[Array, "..."]:
+    """Rows of a table of steps: `steps[t]`, which stays one plain gather under vmap."""
+    return jnp.take(steps, t, axis=0, mode="clip")
+
+
 class TimeEmbedding(nn.Module):
     """Sinusoid of the step, then Linear, SiLU, Linear.
 

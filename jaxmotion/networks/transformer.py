@@ -215,7 +215,7 @@ class CamdmTransformer(nn.Module):
           Predicted features x_0.
         """
         batch, outputs = x_t.shape[:-2], self.num_outputs
-        step = jnp.broadcast_to(context.steps[t], (*batch, self.width))
+        step = jnp.broadcast_to(blocks.row_of(context.steps, t), (*batch, self.width))
         noisy = blocks.add_rows(
             self.embed_noisy(blocks.fold_frames(x_t, self.frames_per_token)),
             self.positions()[-outputs:],

@@ -170,7 +170,9 @@ class SingleTokenTransformer(_OneVectorCondition):
         Returns:
           Predicted features x_0.
         """
-        step = jnp.broadcast_to(context.steps[t], context.condition.shape)
+        step = jnp.broadcast_to(
+            blocks.row_of(context.steps, t), context.condition.shape
+        )
         first = (context.condition + step)[..., None, :]
         x = jnp.concatenate([first, self.embed_noisy(x_t)], axis=-2)
         positions = blocks.sinusoidal_positions(x.shape[-2], self.width)
@@ -213,7 +215,9 @@ class CamdmMlp(_OneVectorCondition):
           Predicted features x_0.
         """
         batch = x_t.shape[:-2]
-        step = jnp.broadcast_to(context.steps[t], context.condition.shape)
+        step = jnp.broadcast_to(
+            blocks.row_of(context.steps, t), context.condition.shape
+        )
         flat = x_t.reshape(*batch, -1)
         x = jnp.concatenate([flat, context.condition, step], axis=-1)
         x = self.embed_noisy(x)

@@ -176,7 +176,7 @@ class SequenceGenerator(nn.Module):
           Predicted features x_0.
         """
         batch = x_t.shape[:-2]
-        own = [jnp.broadcast_to(context.steps[t], (*batch, self.width))]
+        own = [jnp.broadcast_to(blocks.row_of(context.steps, t), (*batch, self.width))]
         if context.condition is not None:
             own.append(context.condition)
         if latent is not None:
