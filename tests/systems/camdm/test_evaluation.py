@@ -125,6 +125,7 @@ def test_walking_is_nearer_to_the_data_than_standing_and_noise_is_nearest():
         assert walking["rollouts"][column].value > 1.0
 
 
+@pytest.mark.slow
 def test_health_counts_who_stands_although_told_to_walk():
     assert evaluated("walking")[1]["health"] == dict(diverged=0, frozen=0, rollouts=4)
     assert evaluated("standing")[1]["health"] == dict(diverged=0, frozen=4, rollouts=4)
