@@ -115,8 +115,7 @@ def export(args: Config) -> None:
     if (args.model is None) == (args.run is None):
         raise ValueError("expected either --model or --run")
     writer = FORMATS[args.format]
-    if writer is onnx:
-        onnx.check()
+    writer.check()
     loop.check_writable(args.out)
     source = args.model if args.run is None else args.run
     system = None

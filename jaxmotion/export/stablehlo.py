@@ -3,9 +3,11 @@
     call = jax.export.deserialize(Path("plan.stablehlo").read_bytes()).call
     outputs = call(*inputs)  # in the order of the JSON
 
-Parameters are constants of the file, and nothing of this library is needed to load it.
+Parameters are constants of the file; to load it takes JAX and `flatbuffers`, nothing of
+this library.
 """
 
+import importlib.util
 from pathlib import Path
 
 import jax
@@ -19,6 +21,15 @@ SUFFIX = ".stablehlo"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 
+def check() -> None:
+    """Raises `ValueError` unless the package that `jax.export` needs is there."""
+    if importlib.util.find_spec("flatbuffers") is None:
+        raise ValueError(
+            "files of StableHLO need flatbuffers, which is not installed: "
+            'pip install -e ".[export]"'
+        )
+
+
 def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
     """Writes a graph, with its parameters in it.
 
@@ -30,7 +41,9 @@ def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
 
     Raises:
       OSError: if the file cannot be written.
+      ValueError: if the package is missing.
     """
+    check()
     lead = () if batch is None else (batch,)
     if batch == ANY:
         lead = jax.export.symbolic_shape(ANY)

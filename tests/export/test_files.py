@@ -173,6 +173,7 @@ print(json.dumps(sorted(name for name in sys.modules if name.startswith("jaxm"))
 @pytest.mark.slow
 @pytest.mark.parametrize("batch", [None, 2, graph.ANY])
 def test_stablehlo_in_a_process_without_the_library(tmp_path, batch):
+    pytest.importorskip("flatbuffers")
     made, state, commands = graphs()
     one = made["plan"]
     stablehlo.write(tmp_path / "plan.stablehlo", one, batch=batch)
