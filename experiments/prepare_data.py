@@ -100,6 +100,8 @@ def check_config(config: Config) -> None:
             raise ValueError(f"--{option} should be in {low:g}..{high:g}, found {rate}")
     if not 0 <= config.seed < 2**32:
         raise ValueError(f"--seed should be in 0..2**32 - 1, found {config.seed}")
+    if config.scale is not None and not config.scale > 0:
+        raise ValueError(f"--scale should be above 0, found {config.scale}")
     own = dict(
         labels=config.labels,
         scale=config.scale,

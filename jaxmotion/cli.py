@@ -50,9 +50,10 @@ _COUNT, _UPDATES, _SIZE = Range(1, 10**6), Range(1, 10**9), Range(1, 2**16)
 _RATE, _FPS = Range(0, 1, (0,)), Range(0, 1000, (0,))
 _PART, _SPAN = Range(0, 1, (0, 1)), Range(0, 86400, (0,))
 
+_METERS = Range(0, 1000, (0,))
+
 # Numbers of all scripts' options, by name. An option has None for its default, so that
 # 0 is a number like others: allowed only where the help says what it means.
-_METERS = Range(0, 1000, (0,))
 LIMITS: dict[str, Range] = {
     # Larger ones are not told apart: keys have 32 bits, and seeds are counted on.
     "seed": Range(0, 2**31 - 1),
@@ -65,7 +66,7 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("fps", "cut_fps"), _FPS),
     **dict.fromkeys(("seconds", "minutes", "limit", "longest"), _SPAN),
     **dict.fromkeys(("rate", "off_ball"), Range(0, 1)),
-    **dict.fromkeys(("last_sigma", "max_distance", "scale", "tolerance"), _METERS),
+    **dict.fromkeys(("last_sigma", "max_distance", "tolerance"), _METERS),
     **dict.fromkeys(("scale", "amdm_scale", "recon"), Range(0, 10**6)),
     **dict.fromkeys(("max_norm", "previous_noise"), Range(0, 10**6)),
     **dict.fromkeys(("speed", "speeds"), Range(0, 100)),

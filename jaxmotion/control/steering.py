@@ -3,10 +3,13 @@
 A system hands over a `Character`: how it starts, and a hashable method that makes a
 `rollout.Controller` of parameters. `steered_rollouts` is one compiled program per
 method and shape over all calls: parameters, states, commands and keys are arguments.
+
+Who steers by hand holds keys or points at the ground: `wanted` says what that asks for.
 """
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +28,15 @@ from jaxmotion.typing import Exported, Key, Params
 # Makes the controller of a character from arrays. Hashable, and equal to another of
 # equal settings: it is a static argument of the compiled program.
 Method = Callable[[Params], rollout.Controller]
+
+ACTIONS = ("forward", "back", "left", "right", "run", "turn_left", "turn_right")
+# Shift multiplies the speed; Q and E turn who stands by so much, radians per second.
+RUN, TURN = 2.0, math.radians(150.0)
+# Who runs at a target slows down to cover what is left in so many seconds, and stops
+# within so many meters; he starts again beyond the second distance.
+ARRIVE, NEAR, FAR = 0.7, 0.2, 0.45
+# What is told stays as it is until what is wanted differs by more, radians and m/s.
+HEADING_STEP, SPEED_STEP = math.radians(8.0), 0.15
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -239,3 +251,93 @@ def _rollouts(
     run = rollout.rollout
     more = dict(first=first, chunk=chunk, mesh=mesh)
     return run(method(params), key, states, commands, **more)[1]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What one person holds down.
+
+    Attributes:
+      held: Of `ACTIONS`.
+      azimuth: Where the camera looks, radians from +z toward +x.
+      target: Point (x, z) on the ground to go to, meters; keys come first.
+    """
+
+    held: frozenset[str] = frozenset()
+    azimuth: float = 0.0
+    target: tuple[float, float] | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Wish:
+    """What is asked of a character.
+
+    Attributes:
+      velocity: (x, z) m/s.
+      facing: (x, z), unit.
+    """
+
+    velocity: tuple[float, float] = (0.0, 0.0)
+    facing: tuple[float, float] = (0.0, 1.0)
+
+    @property
+    def speed(self) -> float:
+        return math.hypot(*self.velocity)
+
+
+def wanted(
+    inputs: Inputs,
+    last: Wish,
+    *,
+    position: tuple[float, float],
+    speed: float,
+    seconds: float,
+) -> Wish:
+    """What held keys and the mouse ask for.
+
+    Directions are the camera's; who moves faces where he goes, and who stands keeps
+    facing where he did.
+
+    Args:
+      last: What was wanted a tick ago.
+      position: Of the character (x, z), meters.
+      speed: Without Shift, m/s.
+      seconds: Of a tick.
+    """
+    held = inputs.held
+    ahead = ("forward" in held) - ("back" in held)
+    aside = ("right" in held) - ("left" in held)
+    speed = speed * (RUN if "run" in held else 1.0)
+    if ahead or aside:
+        # To the right of who looks along +z lies -x.
+        angle = inputs.azimuth - math.atan2(aside, ahead)
+        return _go(angle, speed)
+    turn = ("turn_left" in held) - ("turn_right" in held)
+    if turn:
+        facing = math.atan2(*last.facing) + turn * TURN * seconds
+        return Wish(facing=(math.sin(facing), math.cos(facing)))
+    if inputs.target is not None:
+        x, z = inputs.target[0] - position[0], inputs.target[1] - position[1]
+        distance = math.hypot(x, z)
+        if distance > (NEAR if last.speed else FAR):
+            return _go(math.atan2(x, z), min(speed, distance / ARRIVE))
+    return Wish(facing=last.facing)
+
+
+def _go(angle: float, speed: float) -> Wish:
+    x, z = math.sin(angle), math.cos(angle)
+    return Wish(velocity=(speed * x, speed * z), facing=(x, z))
+
+
+def settled(told: Wish, wish: Wish, *, steady: bool) -> Wish:
+    """What to tell the character: every change of it costs a plan, so small ones wait.
+
+    Args:
+      told: What it was told last.
+      wish: What is wanted now.
+      steady: Whether that is what was wanted a tick ago: then it is told as it is.
+    """
+    stops = bool(told.speed) != bool(wish.speed)
+    turned = float(np.dot(told.facing, wish.facing)) < math.cos(HEADING_STEP)
+    far = turned or abs(told.speed - wish.speed) > SPEED_STEP
+    return wish if stops or far or steady else told

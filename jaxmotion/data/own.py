@@ -8,6 +8,7 @@ twist helpers, props) is left out unless asked for.
 import csv
 import dataclasses
 import io
+import itertools
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 from typing import Literal
@@ -109,8 +110,7 @@ def _kept(recording: Recording, all_joints: bool) -> list[int]:
     found = anatomy.find_anatomy(recording.skeleton())
     if not found.legs:
         return list(range(len(recording.parents)))
-    leg = found.legs[0]
-    pelvis = recording.parents[leg.before[0] if leg.before else leg.upper]
+    pelvis = recording.parents[found.legs[0].first]
     limbs = {
         joint
         for limb in (*found.arms, *found.legs)
@@ -180,18 +180,66 @@ def _motion(recording: Recording, scale: float, up: str) -> Motion:
     """In meters, y up."""
     # x stays; z up becomes y up by a quarter turn about it.
     turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) if up == "z" else np.eye(3)
-    rotations = turn @ recording.rotations
-    above = [max(parent, 0) for parent in recording.parents]
-    local = np.swapaxes(rotations[:, above], -1, -2) @ rotations
-    local[:, 0] = rotations[:, 0]
-    columns = np.concatenate([local[..., 0], local[..., 1]], axis=-1)
+    root = scale * recording.positions[:, 0] @ turn.T
     return Motion(
-        root_position=jnp.asarray(
-            scale * recording.positions[:, 0] @ turn.T, jnp.float32
+        root_position=jnp.asarray(root, jnp.float32),
+        joint_rotation=anatomy.local_columns(
+            recording.parents, turn @ recording.rotations
         ),
-        joint_rotation=jnp.asarray(columns, jnp.float32),
         fps=recording.fps,
     )
+
+
+def _bones(part: Recording, scale: float, tolerance: float) -> np.ndarray:
+    """Offsets [J, 3] of a file, meters, which must not change within it."""
+    every = scale * part.offsets()
+    bones = every.mean(axis=0)
+    change = np.abs(every - bones).max(axis=(0, 2))
+    change[0] = 0.0
+    if change.max() > tolerance:
+        worst = int(change.argmax())
+        raise ValueError(
+            f"{part.name}: the bone to {part.names[worst]!r} changes by "
+            f"{change[worst]:.3g} m within the file, more than the tolerance of "
+            f"{tolerance:g} m"
+        )
+    return bones
+
+
+def _check_same(
+    part: Recording, bones: np.ndarray, first: Skeleton, file: str, tolerance: float
+) -> None:
+    """Raises unless a file has the skeleton of the first one."""
+    away = np.abs(bones - np.asarray(first.offsets)).max(axis=-1)
+    if away.max() > tolerance or part.parents != first.parents:
+        worst = int(away.argmax())
+        raise ValueError(
+            f"{part.name}: the bone to {part.names[worst]!r} differs by "
+            f"{away[worst]:.3g} m from the first file's ({file}), more than "
+            f"the tolerance of {tolerance:g} m: files of one skeleton are expected"
+        )
+
+
+def _pieces(
+    motion: Motion, file: str, start: float, end: float, longest: float
+) -> list[Motion]:
+    """A part of a file, seconds, in pieces of about one length."""
+    seconds = len(motion.root_position) / motion.fps
+    if start >= seconds:
+        raise ValueError(
+            f"{file}: a part from {start:g} s on, but the file ends at {seconds:.4g} s"
+        )
+    first, last = (round(x * motion.fps) for x in (start, min(end, seconds)))
+    count = max(int(np.ceil((last - first) / motion.fps / longest)), 1)
+    edges = np.linspace(first, last, count + 1).round().astype(int)
+    return [
+        dataclasses.replace(
+            motion,
+            root_position=motion.root_position[a:b],
+            joint_rotation=motion.joint_rotation[a:b],
+        )
+        for a, b in itertools.pairwise(edges)
+    ]
 
 
 def read_labels(name: str, text: str) -> list[tuple[str, float, float, str]]:
@@ -290,7 +338,6 @@ def clips_from_recordings(
         if not parts:
             continue
         if skeleton is None:
-            whole = len(recording.names)
             part = recording.part(_kept(recording, all_joints))
             joints = list(part.names)
             if scale is None:
@@ -299,64 +346,35 @@ def clips_from_recordings(
             if up is None:
                 up, why = _up(part)
                 notes.append(f"up       {up} ({why})")
-            notes.append(f"joints   {len(joints)} of {whole} are kept")
+            notes.append(f"joints   {len(joints)} of {len(recording.names)} are kept")
         missing = [name for name in joints if name not in recording.names]
         if missing:
             raise ValueError(
                 f"{recording.name}: no joint {missing[0]!r}, which the first file has "
-                f"({names[0] if names else ''}): files of one skeleton are expected"
+                f"({takes[0]}): files of one skeleton are expected"
             )
         part = recording.part([recording.names.index(name) for name in joints])
-        every = scale * part.offsets()
-        change = np.abs(every - every.mean(axis=0)).max(axis=(0, 2))
-        change[0] = 0.0
-        if change.max() > tolerance:
-            worst = int(change.argmax())
-            raise ValueError(
-                f"{recording.name}: the bone to {joints[worst]!r} changes by "
-                f"{change[worst]:.3g} m within the file, more than the tolerance of "
-                f"{tolerance:g} m"
-            )
+        bones = _bones(part, scale, tolerance)
         if skeleton is None:
             skeleton = Skeleton(
-                offsets=jnp.asarray(every.mean(axis=0), jnp.float32),
+                offsets=jnp.asarray(bones, jnp.float32),
                 parents=part.parents,
                 names=part.names,
             )
-        away = np.abs(every.mean(axis=0) - np.asarray(skeleton.offsets)).max(axis=-1)
-        if away.max() > tolerance or part.parents != skeleton.parents:
-            worst = int(away.argmax())
-            raise ValueError(
-                f"{recording.name}: the bone to {joints[worst]!r} differs by "
-                f"{away[worst]:.3g} m from the first file's ({names[0]}), more than "
-                f"the tolerance of {tolerance:g} m: files of one skeleton are expected"
-            )
+        else:
+            _check_same(part, bones, skeleton, takes[0], tolerance)
         motion = _motion(part, scale, up)
-        seconds = len(motion.root_position) / motion.fps
+        take = recording.name.removeprefix(folder).lstrip("/").rsplit(".", 1)[0]
         for number, (start, end, label) in enumerate(parts):
-            if start >= seconds:
-                raise ValueError(
-                    f"{recording.name}: a part from {start:g} s on, but the file ends "
-                    f"at {seconds:.4g} s"
-                )
-            first, last = (round(x * motion.fps) for x in (start, min(end, seconds)))
-            pieces = max(int(np.ceil((last - first) / motion.fps / longest)), 1)
-            edges = np.linspace(first, last, pieces + 1).round().astype(int)
-            inside = recording.name.removeprefix(folder).lstrip("/")
-            take = inside.rsplit(".", 1)[0]
+            pieces = _pieces(motion, recording.name, start, end, longest)
             name = take if len(parts) == 1 else f"{take}_{number}"
-            for piece in range(pieces):
-                cut = slice(edges[piece], edges[piece + 1])
-                motions.append(
-                    dataclasses.replace(
-                        motion,
-                        root_position=motion.root_position[cut],
-                        joint_rotation=motion.joint_rotation[cut],
-                    )
-                )
-                names.append(name if pieces == 1 else f"{name}-{piece}")
-                styles.append(label)
-                takes.append(take)
+            motions += pieces
+            if len(pieces) == 1:
+                names.append(name)
+            else:
+                names += [f"{name}-{piece}" for piece in range(len(pieces))]
+            styles += [label] * len(pieces)
+            takes += [take] * len(pieces)
     for row in table or ():
         if row[0] not in seen:
             raise ValueError(f"the labels name a file {row[0]!r}, which is not there")

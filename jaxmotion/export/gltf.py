@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxmotion import files
-from jaxmotion.motion.anatomy import as_t_pose
+from jaxmotion.motion.anatomy import as_t_pose, zero_pose
 from jaxmotion.motion.rotation import matrix_from_rot6d, quaternion_from_matrix
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.viz import body as bodies
@@ -127,16 +127,13 @@ def to_glb(skeleton: Skeleton, motion: Motion) -> bytes:
             raise ValueError(f"frame {frame} of {name} is not finite")
     # In the T-pose first: the body is made there.
     skeleton, motion = as_t_pose(skeleton, motion)
-    offsets = np.asarray(skeleton.offsets, float)
-    places = np.zeros_like(offsets)
-    for joint, parent in enumerate(skeleton.parents[1:], 1):
-        places[joint] = places[parent] + offsets[joint]
+    places, offsets = zero_pose(skeleton), np.array(skeleton.offsets, float)
     count = len(places)
     still = np.broadcast_to(np.eye(3), (count, 3, 3))
     body = bodies.describe(skeleton)
     ends = body.ends(places, still)
     lift = np.array([0.0, float((body.radii - ends[..., 1]).max()), 0.0])
-    places, ends, offsets = places + lift, ends + lift, offsets.copy()
+    places, ends = places + lift, ends + lift
     offsets[0] = lift
     buffer, colors = _Buffer(), sorted(set(body.colors))
     primitives = _primitives(body, ends, buffer, colors)

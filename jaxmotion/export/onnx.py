@@ -110,23 +110,33 @@ def _converted(graph: Graph, *, inner: bool) -> Any:
     return model
 
 
-def _has_backward(traced: core.ClosedJaxpr) -> bool:
-    """Whether a loop in it runs backward, as a loop's gradient does."""
-    for eqn in traced.jaxpr.eqns:
-        inner = eqn.params.get("jaxpr")
-        if eqn.primitive.name == "scan" and eqn.params["reverse"]:
-            return True
-        if eqn.primitive.name in ("jit", "scan") and _has_backward(inner):
-            return True
-    return False
+def _is_lost(eqn: core.JaxprEqn) -> bool:
+    """Whether the converter gets an equation wrong; gradients are full of such.
+
+    Of loops it ignores that they run backward, of products of two matrices that the
+    first one is turned.
+    """
+    if eqn.primitive.name == "dot_general":
+        (first, _), batch = eqn.params["dimension_numbers"]
+        return batch == ((), ()) and eqn.invars[0].aval.ndim == 2 and first == (0,)
+    return eqn.primitive.name == "scan" and eqn.params["reverse"]
+
+
+def _loses(traced: core.ClosedJaxpr) -> bool:
+    return any(
+        _is_lost(eqn)
+        or (eqn.primitive.name in ("jit", "scan") and _loses(eqn.params["jaxpr"]))
+        for eqn in traced.jaxpr.eqns
+    )
 
 
 def _forward(traced: core.ClosedJaxpr, values: list) -> list:
-    """The results, with loops that run backward run forward over turned rows.
+    """The results, without what the converter gets wrong.
 
-    ONNX can scan backward, the converter cannot.
+    Loops that run backward run forward over turned rows; matrices are turned before
+    their product.
     """
-    if not _has_backward(traced):
+    if not _loses(traced):
         return core.jaxpr_as_fun(traced)(*values)
     jaxpr, given = traced.jaxpr, [*traced.consts, *values]
     env = dict(zip([*jaxpr.constvars, *jaxpr.invars], given, strict=True))
@@ -137,6 +147,11 @@ def _forward(traced: core.ClosedJaxpr, values: list) -> list:
             found = _forward(inner, given)
         elif eqn.primitive.name == "scan":
             found = _scan(eqn, *loop_parts(eqn, given))
+        elif _is_lost(eqn):
+            (_, second), batch = eqn.params["dimension_numbers"]
+            axes = {"dimension_numbers": (((1,), second), batch)}
+            product = eqn.primitive.bind(given[0].T, given[1], **eqn.params | axes)
+            found = [product]
         else:
             found = one_equation(eqn, jaxpr, given)
         env.update(zip(eqn.outvars, found, strict=True))

@@ -12,6 +12,7 @@ import re
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxmotion.motion.skeleton import Motion, Skeleton
 
@@ -45,6 +46,11 @@ class Limb:
     end: int
     after: tuple[int, ...]
     side: str = MIDDLE
+
+    @property
+    def first(self) -> int:
+        """The joint that leaves the trunk."""
+        return (*self.before, self.upper)[0]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -84,8 +90,8 @@ def chain(parents: tuple[int, ...], joint: int) -> list[int]:
     return found[::-1]
 
 
-def _zero_pose(skeleton: Skeleton) -> np.ndarray:
-    """Joints [J, 3] where no joint is turned, from the root."""
+def zero_pose(skeleton: Skeleton) -> np.ndarray:
+    """Joints [J, 3] where no joint is turned, from the root, meters."""
     places = np.array(skeleton.offsets, float)
     places[0] = 0.0
     for joint, parent in enumerate(skeleton.parents):
@@ -162,7 +168,7 @@ def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> An
             f"sides are {sides}, expected {len(parents)} of {LEFT}, {RIGHT}, {MIDDLE}"
         )
     named = tuple(map(side_of, skeleton.names)) if sides is None else tuple(sides)
-    places = _zero_pose(skeleton)
+    places = zero_pose(skeleton)
     lengths = np.linalg.norm(np.asarray(skeleton.offsets, float), axis=-1)
     lengths[0] = 0.0
     head, has_head = find_head(parents, skeleton.names, named, places[:, 1])
@@ -219,22 +225,22 @@ def _guess_sides(
     left = np.array([ahead[2], 0.0, -ahead[0]])
     found = [MIDDLE] * len(parents)
     for limb in (*arms, *legs):
-        first = (*limb.before, limb.upper)[0]
-        away = float(left @ (places[limb.upper] - places[parents[first]]))
+        away = float(left @ (places[limb.upper] - places[parents[limb.first]]))
         if abs(away) > 1e-9:
             for joint in range(len(parents)):
-                if first in chain(parents, joint):
+                if limb.first in chain(parents, joint):
                     found[joint] = LEFT if away > 0 else RIGHT
     return tuple(found)
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
+def unit(vector: np.ndarray) -> np.ndarray:
+    """The direction of a vector; 0 of 0."""
     return vector / max(float(np.linalg.norm(vector)), 1e-9)
 
 
 def _swing(start: np.ndarray, end: np.ndarray, half_turn: np.ndarray) -> np.ndarray:
     """The smallest rotation between directions; about `half_turn` if they oppose."""
-    a, b = _unit(start), _unit(end)
+    a, b = unit(start), unit(end)
     if a @ b < -0.9:
         first = 2 * np.outer(half_turn, half_turn) - np.eye(3)
         return _swing(first @ a, b, half_turn) @ first
@@ -267,7 +273,7 @@ def t_pose(
     wanted: dict[int, tuple[int, np.ndarray]] = {}
     turn = np.eye(3)
     if found.legs:
-        places = _zero_pose(skeleton)
+        places = zero_pose(skeleton)
         turn = _root_turn(found, places)
         for leg in found.legs:
             wanted[leg.upper] = (leg.middle, np.array([0.0, -1.0, 0.0]))
@@ -286,7 +292,7 @@ def t_pose(
             for joint, child in zip(joints, joints[1:], strict=False):
                 bone = turn @ (places[child] - places[joint])
                 # A clavicle keeps its slope.
-                if joint not in arm.before or _unit(bone) @ out < 0.6:
+                if joint not in arm.before or unit(bone) @ out < 0.6:
                     wanted[joint] = (child, out)
     turns = np.zeros((len(parents), 3, 3))
     for joint, parent in enumerate(parents):
@@ -346,6 +352,17 @@ def kinematics(skeleton: Skeleton, motion: Motion) -> tuple[np.ndarray, np.ndarr
     return positions, rotations
 
 
+def local_columns(
+    parents: tuple[int, ...], rotations: np.ndarray
+) -> Float[Array, "frames joints 6"]:
+    """Rotations as a `Motion` has them, of world ones [F, J, 3, 3]."""
+    above = [max(parent, 0) for parent in parents]
+    local = np.swapaxes(rotations[:, above], -1, -2) @ rotations
+    local[:, 0] = rotations[:, 0]
+    columns = np.concatenate([local[..., 0], local[..., 1]], axis=-1)
+    return jnp.asarray(columns, jnp.float32)
+
+
 def as_t_pose(skeleton: Skeleton, motion: Motion) -> tuple[Skeleton, Motion]:
     """The same positions on a skeleton whose zero pose is the T-pose.
 
@@ -356,15 +373,11 @@ def as_t_pose(skeleton: Skeleton, motion: Motion) -> tuple[Skeleton, Motion]:
     """
     _, world = kinematics(skeleton, motion)
     points, turns = t_pose(skeleton, motion=world)
-    world = world @ np.swapaxes(turns, -1, -2)
-    above = [max(parent, 0) for parent in skeleton.parents]
-    local = np.swapaxes(world[:, above], -1, -2) @ world
-    local[:, 0] = world[:, 0]
-    columns = np.concatenate([local[..., 0], local[..., 1]], axis=-1)
-    offsets = points - points[above]
+    columns = local_columns(skeleton.parents, world @ np.swapaxes(turns, -1, -2))
+    offsets = points - points[[max(parent, 0) for parent in skeleton.parents]]
     return (
         dataclasses.replace(skeleton, offsets=jnp.asarray(offsets, jnp.float32)),
-        dataclasses.replace(motion, joint_rotation=jnp.asarray(columns, jnp.float32)),
+        dataclasses.replace(motion, joint_rotation=columns),
     )
 
 
@@ -384,9 +397,8 @@ def mixamo_names(skeleton: Skeleton, *, prefix: str = "mixamorig:") -> tuple[str
             f"{', '.join(skeleton.names)}"
         )
     names: dict[int, str] = {}
-    carrier = _carrier(skeleton, found.arms[0])
     base, chest = (
-        found.trunk.index(_carrier(skeleton, limb))
+        found.trunk.index(skeleton.parents[limb.first])
         for limb in (found.legs[0], found.arms[0])
     )
     names[found.trunk[base]] = "Hips"
@@ -395,7 +407,7 @@ def mixamo_names(skeleton: Skeleton, *, prefix: str = "mixamorig:") -> tuple[str
         names[joint] = "Spine" + number(i)
     for i, joint in enumerate(found.trunk[chest + 1 :]):
         names[joint] = "Neck" + number(i)
-    if found.has_head and found.trunk[-1] != carrier:
+    if found.has_head and found.trunk[-1] != found.trunk[chest]:
         names[found.trunk[-1]] = "Head"
     for limbs, words in (
         (found.arms, ("Shoulder", "Arm", "ForeArm", "Hand")),
@@ -414,11 +426,6 @@ def mixamo_names(skeleton: Skeleton, *, prefix: str = "mixamorig:") -> tuple[str
     )
 
 
-def _carrier(skeleton: Skeleton, limb: Limb) -> int:
-    """The joint of the trunk that a limb leaves."""
-    return skeleton.parents[limb.before[0] if limb.before else limb.upper]
-
-
 def _root_turn(found: Anatomy, places: np.ndarray) -> np.ndarray:
     """Turns the zero pose so that it stands and faces +z."""
     hips = {leg.side: places[leg.upper] for leg in found.legs}
@@ -428,8 +435,7 @@ def _root_turn(found: Anatomy, places: np.ndarray) -> np.ndarray:
         left = places[found.legs[0].upper] - places[found.legs[1].upper]
     else:
         return np.eye(3)
-    base = next(i for i in found.trunk if places[found.trunk[-1]] is not places[i])
-    up = places[found.trunk[-1]] - places[base]
-    up = np.array([0.0, 1.0, 0.0]) if found.upright else _unit(up)
-    left = _unit(left - up * (left @ up))
+    up = places[found.trunk[-1]] - places[found.trunk[0]]
+    up = np.array([0.0, 1.0, 0.0]) if found.upright else unit(up)
+    left = unit(left - up * (left @ up))
     return np.stack([left, up, np.cross(left, up)])

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmotion.motion import anatomy
-from jaxmotion.motion.anatomy import Anatomy, Limb
+from jaxmotion.motion.anatomy import Anatomy, Limb, unit
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.viz.figure import LEFT, MIDDLE, RIGHT
 
@@ -55,25 +55,6 @@ class Body:
         """
         turned = rotations[..., self.joints, :, :] @ self.places[..., None]
         return positions[..., self.joints, :] + turned[..., 0]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Mesh:
-    """Triangles that follow one joint rigidly.
-
-    Attributes:
-      joint: Its world transform is the mesh's.
-      vertices: [V, 3] in the joint's frame, meters.
-      normals: [V, 3].
-      faces: [T, 3] counterclockwise from outside.
-      color: Such as "#2878c8".
-    """
-
-    joint: int
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    color: str
 
 
 def capsule_mesh(
@@ -119,39 +100,6 @@ def capsule_mesh(
     faces = faces[np.linalg.norm(sides, axis=-1) > 1e-12]
     owner = np.repeat(owner, around)
     return vertices.reshape(-1, 3), normals.reshape(-1, 3), owner, faces
-
-
-def meshes(body: Body, skeleton: Skeleton, **detail: int) -> tuple[Mesh, ...]:
-    """The body as rigid meshes, one per joint and color, for viewers with instances.
-
-    A capsule between two joints that move against each other follows the first.
-
-    Args:
-      **detail: `around` and `rings` of `capsule_mesh`.
-    """
-    positions, rotations = anatomy.t_pose(skeleton)
-    ends = body.ends(positions, rotations)
-    parts: dict[tuple[int, str], list] = {}
-    for s, color in enumerate(body.colors):
-        joint = int(body.joints[s, 0])
-        local = (ends[s] - positions[joint]) @ rotations[joint]
-        made = capsule_mesh(local, body.radii[s], **detail)
-        parts.setdefault((joint, color), []).append(made)
-    found = []
-    for (joint, color), shapes in parts.items():
-        starts = np.cumsum([0, *(len(shape[0]) for shape in shapes)])
-        found.append(
-            Mesh(
-                joint=joint,
-                vertices=np.concatenate([shape[0] for shape in shapes]),
-                normals=np.concatenate([shape[1] for shape in shapes]),
-                faces=np.concatenate(
-                    [s[3] + start for s, start in zip(shapes, starts, strict=False)]
-                ),
-                color=color,
-            )
-        )
-    return tuple(found)
 
 
 class _Builder:
@@ -254,22 +202,11 @@ def describe(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> Body:
     return made.body()
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
-    return vector / max(float(np.linalg.norm(vector)), 1e-9)
-
-
-def _carrier(made: _Builder, arm: Limb) -> int:
-    """The joint of the trunk that an arm leaves."""
-    return made.parents[arm.before[0] if arm.before else arm.upper]
-
-
 def _add_trunk(made: _Builder, found: Anatomy) -> None:
     """Belly, chest, pelvis, flanks and shoulders."""
     trunk = found.trunk
-    pelvis = made.parents[
-        found.legs[0].before[0] if found.legs[0].before else found.legs[0].upper
-    ]
-    first = min(trunk.index(_carrier(made, arm)) for arm in found.arms)
+    pelvis = made.parents[found.legs[0].first]
+    first = min(trunk.index(made.parents[arm.first]) for arm in found.arms)
     for a, b in zip(trunk[:first], trunk[1 : first + 1], strict=True):
         if trunk.index(a) >= trunk.index(pelvis):
             made.capsule(a, b, 0.105, 0.105, MIDDLE)
@@ -308,7 +245,7 @@ def _add_leg(made: _Builder, leg: Limb, color: str) -> None:
         ball = made.point(ankle + (0.15 * _AHEAD - 0.05 * _UP) * made.s, leg.end)
     # The T-pose stands: the sole is level there.
     level = (made.points[ball] - ankle) * [1.0, 0.0, 1.0]
-    level = _unit(level) if np.linalg.norm(level) > 1e-6 else _AHEAD
+    level = unit(level) if np.linalg.norm(level) > 1e-6 else _AHEAD
     drop = max(ankle[1] - made.points[ball][1] - 0.008 * made.s, 0.0)
     heel = made.point(ankle - _UP * drop - level * 0.035 * made.s, leg.end)
     place = made.points[ball] + level * 0.055 * made.s - _UP * 0.003 * made.s
@@ -325,7 +262,7 @@ def _add_arm(made: _Builder, arm: Limb, color: str) -> None:
     made.capsule(arm.upper, arm.upper, 0.062, 0.062, color)
     made.capsule(arm.upper, arm.middle, 0.054, 0.041, color)
     made.capsule(arm.middle, arm.end, 0.042, 0.029, color)
-    along = _unit(made.joints[arm.end] - made.joints[arm.middle])
+    along = unit(made.joints[arm.end] - made.joints[arm.middle])
     knuckles = [j for j, parent in enumerate(made.parents) if parent == arm.end]
     if knuckles:
         place = np.mean([made.joints[j] for j in knuckles], axis=0)
@@ -341,14 +278,14 @@ def _add_arm(made: _Builder, arm: Limb, color: str) -> None:
 def _add_head(made: _Builder, found: Anatomy) -> None:
     trunk = found.trunk
     top = trunk[-1]
-    up = _unit(made.joints[top] - made.joints[trunk[-2]])
-    up = _unit(up + 1.5 * _UP) if up[1] > 0 else up
+    up = unit(made.joints[top] - made.joints[trunk[-2]])
+    up = unit(up + 1.5 * _UP) if up[1] > 0 else up
     base = made.joints[top] + up * (0.0 if found.has_head else 0.09 * made.s)
-    carriers = [trunk.index(_carrier(made, arm)) for arm in found.arms]
+    carriers = [trunk.index(made.parents[arm.first]) for arm in found.arms]
     above = min(carriers, default=len(trunk) - 2)
     for a, b in zip(trunk[above + 1 :], trunk[above + 2 :], strict=False):
         made.capsule(a, b, 0.06, 0.056, SKIN)
-    ahead = _unit(_AHEAD - up * (_AHEAD @ up))
+    ahead = unit(_AHEAD - up * (_AHEAD @ up))
     throat = made.point(base + (0.03 * up) * made.s, top)
     made.capsule(top, throat, 0.056, 0.054, SKIN)
     chin = made.point(base + (0.012 * up + 0.03 * ahead) * made.s, top)

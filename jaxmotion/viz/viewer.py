@@ -1,4 +1,4 @@
-"""A person steers characters: what held keys ask for, ticks at a fixed rate, recording.
+"""A person steers characters: ticks at a fixed rate, settings, recording.
 
 A `Session` holds one group of characters, which all browsers see, and which the browser
 that touched a key last steers. It ticks in a thread of its own, only while somebody
@@ -21,57 +21,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.control import rollout
-from jaxmotion.control.steering import Character
+from jaxmotion.control.steering import Character, Inputs, Wish, settled, wanted
 from jaxmotion.motion.skeleton import Motion, global_transforms
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.viz import body as bodies
 
-ACTIONS = ("forward", "back", "left", "right", "run", "turn_left", "turn_right")
 MOST_CHARACTERS = 64
 SPEEDS = (0.3, 4.0)
-# Shift multiplies the speed; Q and E turn who stands by so much, radians per second.
-RUN, TURN = 2.0, math.radians(150.0)
-# Who runs at a target slows down to cover what is left in so many seconds, and stops
-# within so many meters; he starts again beyond the second distance.
-ARRIVE, NEAR, FAR = 0.7, 0.2, 0.45
-# What is told stays as it is until what is wanted differs by more, radians and m/s.
-HEADING_STEP, SPEED_STEP = math.radians(8.0), 0.15
 SPACING = 1.6
 LONGEST_TAKE = 600.0
 _CATCH_UP = 0.25
 _KEPT_PROGRAMS = 6
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Inputs:
-    """What one person holds down.
-
-    Attributes:
-      held: Of `ACTIONS`.
-      azimuth: Where the camera looks, radians from +z toward +x.
-      target: Point (x, z) on the ground to go to, meters; keys come first.
-    """
-
-    held: frozenset[str] = frozenset()
-    azimuth: float = 0.0
-    target: tuple[float, float] | None = None
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Wish:
-    """What is asked of a character.
-
-    Attributes:
-      velocity: (x, z) m/s.
-      facing: (x, z), unit.
-    """
-
-    velocity: tuple[float, float] = (0.0, 0.0)
-    facing: tuple[float, float] = (0.0, 1.0)
-
-    @property
-    def speed(self) -> float:
-        return math.hypot(*self.velocity)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -97,64 +57,6 @@ class Settings:
     foot_lock: bool = True
     characters: int = 1
     paused: bool = False
-
-
-def wanted(
-    inputs: Inputs,
-    last: Wish,
-    *,
-    position: tuple[float, float],
-    speed: float,
-    seconds: float,
-) -> Wish:
-    """What held keys and the mouse ask for.
-
-    Directions are the camera's; who moves faces where he goes, and who stands keeps
-    facing where he did.
-
-    Args:
-      last: What was wanted a tick ago.
-      position: Of the character (x, z), meters.
-      speed: Without Shift, m/s.
-      seconds: Of a tick.
-    """
-    held = inputs.held
-    ahead = ("forward" in held) - ("back" in held)
-    aside = ("right" in held) - ("left" in held)
-    speed = speed * (RUN if "run" in held else 1.0)
-    if ahead or aside:
-        # To the right of who looks along +z lies -x.
-        angle = inputs.azimuth - math.atan2(aside, ahead)
-        return _go(angle, speed)
-    turn = ("turn_left" in held) - ("turn_right" in held)
-    if turn:
-        facing = math.atan2(*last.facing) + turn * TURN * seconds
-        return Wish(facing=(math.sin(facing), math.cos(facing)))
-    if inputs.target is not None:
-        x, z = inputs.target[0] - position[0], inputs.target[1] - position[1]
-        distance = math.hypot(x, z)
-        if distance > (NEAR if last.speed else FAR):
-            return _go(math.atan2(x, z), min(speed, distance / ARRIVE))
-    return Wish(facing=last.facing)
-
-
-def _go(angle: float, speed: float) -> Wish:
-    x, z = math.sin(angle), math.cos(angle)
-    return Wish(velocity=(speed * x, speed * z), facing=(x, z))
-
-
-def settled(told: Wish, wish: Wish, *, steady: bool) -> Wish:
-    """What to tell the character: every change of it costs a plan, so small ones wait.
-
-    Args:
-      told: What it was told last.
-      wish: What is wanted now.
-      steady: Whether that is what was wanted a tick ago: then it is told as it is.
-    """
-    stops = bool(told.speed) != bool(wish.speed)
-    turned = float(np.dot(told.facing, wish.facing)) < math.cos(HEADING_STEP)
-    far = turned or abs(told.speed - wish.speed) > SPEED_STEP
-    return wish if stops or far or steady else told
 
 
 def formation(number: int) -> np.ndarray:
@@ -378,16 +280,16 @@ class Session:
             if self._take is None:
                 self._take = []
             else:
-                self._end_take()
+                self._end_take(self._engine)
         self.on_change()
 
-    def _end_take(self) -> None:
+    def _end_take(self, engine: Engine | None) -> None:
         frames, self._take = self._take, None
-        if frames and self._engine is not None:
+        if frames:
             root, rotation = (
                 jnp.asarray(np.stack(x)) for x in zip(*frames, strict=True)
             )
-            character = self._engine.character
+            character = engine.character
             self.take = Motion(
                 root_position=root, joint_rotation=rotation, fps=character.fps
             )
@@ -587,9 +489,7 @@ class Session:
             old, self._engine = self._engine, new
             same = old is not None and old.character is new.character
             if not same and self._take is not None:
-                self._engine = old
-                self._end_take()
-                self._engine = new
+                self._end_take(old)
             self.engine_number += 1
             self._begin(new, keep=same)
         self.on_change()

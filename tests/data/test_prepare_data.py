@@ -129,6 +129,7 @@ def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
         ({"fps": 0.0}, ValueError, "--fps"),
         ({"fps": 1e300}, ValueError, "--fps should be in 0.001..100000, found 1e.300"),
         ({"seed": -1}, ValueError, "--seed should be in 0..2"),
+        ({"scale": 0.0}, ValueError, "--scale should be above 0, found 0.0"),
         ({"cut_fps": -1.0}, ValueError, "--cut-fps"),
     ]
     for change, error, message in cases:

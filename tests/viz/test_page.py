@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import jaxmotion
+from jaxmotion.control import steering
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.viz import page, viewer
@@ -228,7 +229,7 @@ def test_shift_runs_and_a_label_changes(tab, served):
     tab.keyboard.down("w")
     tab.keyboard.down("Shift")
     assert after_ticks(served, 20).told.speed == pytest.approx(
-        viewer.RUN * served.session.settings.speed
+        steering.RUN * served.session.settings.speed
     )
     tab.keyboard.up("Shift")
     assert after_ticks(served, 10).told.speed == pytest.approx(
@@ -250,7 +251,7 @@ def test_a_click_on_the_ground_is_a_target(tab, served):
     tab.wait_for_function("target", timeout=PATIENCE)
     target = tab.evaluate("target")
     at = after_ticks(served, 150).roots[0, ::2]
-    assert np.linalg.norm(at - target) < viewer.FAR
+    assert np.linalg.norm(at - target) < steering.FAR
 
 
 def test_a_take_is_saved_as_it_was_shown(tab, served):

@@ -7,8 +7,9 @@ import time
 import numpy as np
 import pytest
 
+from jaxmotion.control import steering
+from jaxmotion.control.steering import Inputs, Wish
 from jaxmotion.viz import page, viewer
-from jaxmotion.viz.viewer import Inputs, Wish
 from tests.viz.strider import strider
 
 TICK = 1 / 30
@@ -17,7 +18,7 @@ TICK = 1 / 30
 def ask(*held, azimuth=0.0, target=None, last=None, position=(0.0, 0.0), speed=1.0):
     inputs = Inputs(held=frozenset(held), azimuth=azimuth, target=target)
     last = Wish() if last is None else last
-    return viewer.wanted(inputs, last, position=position, speed=speed, seconds=TICK)
+    return steering.wanted(inputs, last, position=position, speed=speed, seconds=TICK)
 
 
 @pytest.mark.parametrize(
@@ -39,7 +40,7 @@ def test_keys_walk_where_the_camera_looks(held, azimuth, want):
     np.testing.assert_allclose(wish.velocity, want, atol=1e-9)
     np.testing.assert_allclose(wish.facing, want, atol=1e-9)
     twice = ask(*held, "run", azimuth=azimuth)
-    np.testing.assert_allclose(twice.velocity, viewer.RUN * np.array(want), atol=1e-9)
+    np.testing.assert_allclose(twice.velocity, steering.RUN * np.array(want), atol=1e-9)
 
 
 def test_who_lets_go_stands_and_faces_where_he_went():
@@ -63,7 +64,7 @@ def test_a_target_is_walked_to_and_kept():
     far = ask(target=(0.0, 5.0), position=(0.0, 1.0))
     np.testing.assert_allclose(far.velocity, (0, 1), atol=1e-9)
     near = ask(target=(0.5, 0.0), last=far)
-    np.testing.assert_allclose(near.velocity, (0.5 / viewer.ARRIVE, 0), atol=1e-9)
+    np.testing.assert_allclose(near.velocity, (0.5 / steering.ARRIVE, 0), atol=1e-9)
     assert ask(target=(0.1, 0.0), last=near).speed == 0
     # Who stands does not start again for a hand's breadth.
     assert ask(target=(0.3, 0.0)).speed == 0
@@ -75,15 +76,15 @@ def test_small_changes_are_not_told():
     told, steps = ask("forward"), []
     for degrees in range(0, 28, 2):
         wish = ask("forward", azimuth=math.radians(degrees))
-        new = viewer.settled(told, wish, steady=False)
+        new = steering.settled(told, wish, steady=False)
         steps.append(new is not told)
         told = new
     assert sum(steps) == 2
     slow = Wish(velocity=(0.0, 0.95))
-    assert viewer.settled(told, told, steady=False) is told
-    assert viewer.settled(ask("forward"), slow, steady=False) != slow
-    assert viewer.settled(ask("forward"), slow, steady=True) == slow
-    assert viewer.settled(ask("forward"), Wish(), steady=False) == Wish()
+    assert steering.settled(told, told, steady=False) is told
+    assert steering.settled(ask("forward"), slow, steady=False) != slow
+    assert steering.settled(ask("forward"), slow, steady=True) == slow
+    assert steering.settled(ask("forward"), Wish(), steady=False) == Wish()
 
 
 def test_a_formation_has_the_first_in_front_and_room():
