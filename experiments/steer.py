@@ -71,7 +71,9 @@ async def listen(args: Config, session: viewer.Session) -> None:
         if args.open:
             webbrowser.open(address)
 
-    serve = page.Page(session, out=args.out, save=jaxmotion.save).serve
+    serve = page.Page(
+        session, out=args.out, save=jaxmotion.save, is_local=cli.is_local
+    ).serve
     await serve(args.host, args.port, stop=cli.until_stopped(), ready=ready)
 
 

@@ -185,7 +185,7 @@ def start(main: Callable[[], None]) -> None:
         sys.exit(130)
 
 
-def is_local(host: str) -> bool:
+def is_local(host: str | None) -> bool:
     """Whether only this machine reaches an address; False where it is not known."""
     with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback

@@ -34,7 +34,6 @@ from jaxmotion.viz.viewer import Session, Shown
 
 MOST_PEOPLE = 32
 SUFFIXES = (".bvh", ".glb", ".npz")
-_LOCAL = ("localhost", "127.0.0.1", "::1")
 _LARGEST_MESSAGE = 4096
 
 # Writes a take: (path, skeleton, motion).
@@ -104,15 +103,24 @@ def read_message(text: str | bytes) -> dict[str, Any]:
 class Page:
     """The session behind an address, until it is told to stop."""
 
-    def __init__(self, session: Session, *, out: Path, save: Save) -> None:
+    def __init__(
+        self,
+        session: Session,
+        *,
+        out: Path,
+        save: Save,
+        is_local: Callable[[str | None], bool],
+    ) -> None:
         """Opens nothing yet.
 
         Args:
           session: What is steered; its `on_frame` and `on_change` become this page's.
           out: Folder for takes.
           save: Writes them.
+          is_local: Whether only this machine reaches a host.
         """
         self.session, self._out, self._save = session, out, save
+        self._is_local = is_local
         text = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
         self._html = text.replace("__CAPSULES__", CAPSULES).encode()
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -133,7 +141,7 @@ class Page:
           ValueError: if the package websockets is missing.
         """
         package = websockets()
-        self._loop, self._local = asyncio.get_running_loop(), host in _LOCAL
+        self._loop, self._local = asyncio.get_running_loop(), self._is_local(host)
         thread = threading.Thread(target=self.session.run, daemon=True)
         async with package.asyncio.server.serve(
             self._person,
@@ -177,7 +185,8 @@ class Page:
     def _request(self, connection: Any, request: Any) -> Any:
         """Answers all but the WebSocket's own request, or refuses it."""
         host = request.headers.get("Host", "")
-        if self._local and urlsplit(f"//{host}").hostname not in _LOCAL:
+        name = urlsplit(f"//{host}").hostname
+        if self._local and not self._is_local(name):
             return connection.respond(HTTPStatus.FORBIDDEN, "not this host\n")
         path = urlsplit(request.path).path
         if path == "/live":

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import jaxmotion
+from jaxmotion import cli
 from jaxmotion.control import steering
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.motion.skeleton import joint_positions
@@ -42,7 +43,9 @@ class Served:
         self.session = viewer.Session(
             {"strider": lambda: strider(**options)[0], "other": lambda: strider()[0]}
         )
-        self.page = page.Page(self.session, out=out, save=jaxmotion.save)
+        self.page = page.Page(
+            self.session, out=out, save=jaxmotion.save, is_local=cli.is_local
+        )
         publish = self.session.on_frame
 
         def keep(shown):
@@ -110,6 +113,7 @@ def test_what_is_served_and_what_not(served):
     for path in ("/takes/../page.py", "/takes/", "/favicon", "/takes/%2e%2e/x"):
         assert status(served.address + path)[0] == 404
     assert status(served.address, Host="example.org")[0] == 403
+    assert status(served.address, Host="127.0.0.2:80")[0] == 200
     with pytest.raises(Exception, match="403"), served.socket(origin="http://a.org"):
         pass
     html = status(served.address)[1].decode()
