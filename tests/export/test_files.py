@@ -146,6 +146,29 @@ def test_onnx_of_many_characters(tmp_path, batch):
 
 
 @pytest.mark.slow
+def test_onnx_of_gradients(tmp_path):
+    """Through a loop, which runs backward, and products, whose matrices turn."""
+    pytest.importorskip("jax2onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    square = jnp.asarray(np.random.default_rng(1).standard_normal((3, 3)), jnp.float32)
+
+    def value(x):
+        def step(place, row):
+            place = jnp.tanh(place + row)
+            return place, place * row
+
+        return jnp.sum(jax.lax.scan(step, x[0], square @ x)[1] ** 2)
+
+    slope = Exported(jax.grad(value), ("x",), ("y",))
+    one = graph.make("slope", slope, {"x": jnp.ones((3, 2))})
+    onnx.write(tmp_path / "slope.onnx", one)
+    session = runtime.InferenceSession(tmp_path / "slope.onnx")
+    x = np.random.default_rng(0).standard_normal((3, 2), np.float32)
+    (found,) = session.run(None, {"x": x})
+    np.testing.assert_allclose(found, one.run(x)[0], atol=1e-5)
+
+
+@pytest.mark.slow
 def test_what_onnx_lacks_is_one_line(tmp_path):
     pytest.importorskip("jax2onnx")
     called = lambda x: jax.pure_callback(np.sin, x, x)  # noqa: E731
