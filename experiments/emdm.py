@@ -50,6 +50,7 @@ class Train:
       frames: Longest motion; else 60, or 120 (texts).
       fps: Per second; else 15, or 20 (texts).
       held_out: Part of the clips kept for evaluation.
+      mirror: Add a mirrored copy of each training clip (actions).
       steps: Updates of each GAN.
       ddpm_steps: Updates of each diffusion model.
       batch: Motions an update.
@@ -87,6 +88,7 @@ class Train:
     frames: cli.Optional[int] = None
     fps: cli.Optional[float] = None
     held_out: float = 0.1
+    mirror: bool = False
     steps: int = 5000
     ddpm_steps: int = 7700
     batch: int = 32
@@ -220,6 +222,7 @@ def prepare(args: Train) -> emdm_training.Task:
         field=args.field,
         merge=emdm_data.merges(args.merge),
         least=args.least,
+        mirrored=args.mirror,
         **options,
     )
     print(

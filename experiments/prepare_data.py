@@ -13,7 +13,8 @@ Example:
   python experiments/prepare_data.py kit_ml --manual-dir raw/KIT-ML --out data/k.npz
   python experiments/prepare_data.py ballplay --manual-dir raw/ballplay --out data/b.npz
   python experiments/prepare_data.py bvh --manual-dir my_takes --out data/mine.npz
-"""
+  python experiments/prepare_data.py o3de_motion_matching --manual-dir raw/o3de --actions --out data/actions_o3de.npz
+"""  # noqa: E501
 
 import dataclasses
 import os
@@ -25,7 +26,7 @@ import numpy as np
 import tyro
 
 from jaxmotion import cli
-from jaxmotion.data import clips_io, mirror, resample, selection, text_motion
+from jaxmotion.data import actions, clips_io, mirror, resample, selection, text_motion
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips
 from jaxmotion.data.builders import REGISTRY
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
@@ -78,6 +79,10 @@ class Config:
     seconds."""
     credit: str = ""
     """bvh, fbx: name of the data and its license, which models and pictures cite."""
+    actions: bool = False
+    """Cut takes into stretches of 3 to 4 s in which a person walks, jogs, runs, turns,
+    crouches, jumps, pushes or stands, by rule (field "action"); for takes with styles
+    such as those of o3de_motion_matching."""
     cut_fps: float = 20.0
     """Frames per second by which the times of captions cut clips; the released loaders
     take 20 for kit_ml too, whose rate is 12.5."""
@@ -118,6 +123,10 @@ def check_config(config: Config) -> None:
         raise FileNotFoundError(f"--labels: no file {config.labels}")
     known = REGISTRY.get(config.source)
     kind = "clips" if known is None else known.kind
+    if kind != "clips" and config.actions:
+        raise ValueError(
+            f"{config.source} has no takes to cut: --actions does not apply"
+        )
     if kind != "clips" and (config.mirror or config.fps is not None):
         reason = {
             "texts": "is published with mirror images and at its own rate",
@@ -217,7 +226,17 @@ def describe(clips: Clips, path: Path) -> str:
         counts = np.bincount(np.asarray(clips.labels[field]), minlength=len(names))
         words = [f"{name} {n}" for name, n in zip(names, counts, strict=True)]
         lines.append(f"{field:8} {', '.join(words)}")
+    if actions.FIELD in dict(clips.label_names):
+        lines.append(f"seconds  {label_lengths(clips, actions.FIELD, 1.0)}")
     return "\n".join([*lines, f"written  {path}, {path.stat().st_size / 1e6:.1f} MB"])
+
+
+def label_lengths(clips: Clips, field: str, unit: float) -> str:
+    """Length of all clips of each label together, in units of so many seconds."""
+    names, lengths = clips.names(field), np.diff(np.asarray(clips.offsets))
+    seconds = np.bincount(np.asarray(clips.labels[field]), lengths, len(names))
+    sums = seconds / clips.fps / unit
+    return ", ".join(f"{name} {n:.2f}" for name, n in zip(names, sums, strict=True))
 
 
 def describe_ball(data: BallClips, path: Path) -> str:
@@ -236,11 +255,8 @@ def describe_ball(data: BallClips, path: Path) -> str:
         f"touches  in {100 * touch[:, 0].mean():.1f} % of frames; beginnings a minute: "
         f"{', '.join(words)}",
     ]
-    lengths = np.diff(np.asarray(clips.offsets)) / clips.fps / 60
-    for field, names in clips.label_names:
-        sums = np.bincount(np.asarray(clips.labels[field]), lengths, len(names))
-        words = [f"{name} {n:.2f}" for name, n in zip(names, sums, strict=True)]
-        lines.append(f"minutes  of each {field}: {', '.join(words)}")
+    for field, _ in clips.label_names:
+        lines.append(f"minutes  of each {field}: {label_lengths(clips, field, 60.0)}")
     return "\n".join([describe(clips, path), *lines])
 
 
@@ -281,6 +297,8 @@ def prepare(config: Config) -> None:
         print(describe_ball(data, config.out))
     else:
         clips = at_rate(data, config.fps or set_fps or data.fps)
+        if config.actions:
+            clips = actions.cut_actions(clips)
         if config.mirror and not mirrored:
             clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
         clips_io.save_clips(config.out, clips)

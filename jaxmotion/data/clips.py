@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 
 
 @jax.tree_util.register_dataclass
@@ -266,3 +266,28 @@ def take_clips(clips: Clips, indices: Sequence[int] | np.ndarray) -> Clips:
         },
         clip_names=tuple(clips.clip_names[i] for i in indices),
     )
+
+
+# Frames at a time.
+_BLOCK = 4096
+
+
+def all_joints(clips: Clips) -> Float[np.ndarray, "frames joints 3"]:
+    """World positions in all frames, block by block: one shape, compiled once."""
+    extra = -clips.num_frames % _BLOCK
+    root = np.pad(np.asarray(clips.root_position), ((0, extra), (0, 0)), "edge")
+    turns = np.asarray(clips.joint_rotation)
+    turns = np.pad(turns, ((0, extra), (0, 0), (0, 0)), "edge")
+    place = jax.jit(joint_positions)
+    found = [
+        place(
+            clips.skeleton,
+            Motion(
+                root_position=jnp.asarray(root[a : a + _BLOCK]),
+                joint_rotation=jnp.asarray(turns[a : a + _BLOCK]),
+                fps=clips.fps,
+            ),
+        )
+        for a in range(0, len(root), _BLOCK)
+    ]
+    return np.concatenate(found)[: clips.num_frames].astype(np.float64)

@@ -400,8 +400,9 @@ def dribble_clips(
         )
     position = [_on_ground(s.ball, people[n], settings.radius) for n, s in found]
     touch = [_touches(people[n], s, settings.radius) for n, s in found]
+    spans = [(number, segment.start, len(segment.ball)) for number, segment in found]
     return ball_clips(
-        _labeled(_stretches(clips, found), skill, seed),
+        _labeled(selection.cut(clips, spans), skill, seed),
         np.concatenate(position),
         np.concatenate(touch),
         joints=clips.skeleton.feet,
@@ -428,33 +429,6 @@ def _touches(
     toes = body.toes[segment.start : segment.start + frames]
     ball = _on_ground(segment.ball, body, radius)[:, None]
     return pushed & (np.linalg.norm(toes - ball, axis=-1) <= radius + TOUCH_MARGIN)
-
-
-def _clip_name(clips: Clips, number: int) -> str:
-    return clips.clip_names[number] if clips.clip_names else f"clip {number}"
-
-
-def _stretches(clips: Clips, found: list[tuple[int, Segment]]) -> Clips:
-    """The frames of the segments, each as one clip."""
-    owner = np.array([number for number, _ in found])
-    first = np.asarray(clips.offsets)[owner] + [s.start for _, s in found]
-    lengths = np.array([len(s.ball) for _, s in found])
-    frames = np.concatenate(
-        [np.arange(a, a + n) for a, n in zip(first, lengths, strict=True)]
-    )
-    return dataclasses.replace(
-        clips,
-        root_position=jnp.asarray(np.asarray(clips.root_position)[frames]),
-        joint_rotation=jnp.asarray(np.asarray(clips.joint_rotation)[frames]),
-        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
-        labels={
-            field: jnp.asarray(np.asarray(values)[owner])
-            for field, values in clips.labels.items()
-        },
-        clip_names=tuple(
-            f"{_clip_name(clips, n)}@{s.start}+{len(s.ball)}" for n, s in found
-        ),
-    )
 
 
 def _labeled(clips: Clips, skill: str, seed: int) -> Clips:

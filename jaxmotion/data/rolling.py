@@ -14,20 +14,17 @@ All of this is host code in float64.
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxmotion.data.clips import Clips
+from jaxmotion.data.clips import Clips, all_joints
 from jaxmotion.motion.contact import foot_contacts
-from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+from jaxmotion.motion.skeleton import Skeleton
 
 # Ball and legs that touch are this far apart at most, bone to ball: SMGDiff's rule is a
 # ball's radius and 5 cm.
 TOUCH_MARGIN = 0.05
-# Frames at a time.
-_BLOCK = 4096
 
 
 def start_speed(
@@ -140,7 +137,7 @@ def bodies(clips: Clips, *, thickness: float) -> list[Body]:
         short = int(np.diff(offsets).argmin())
         name = clips.clip_names[short] if clips.clip_names else f"clip {short}"
         raise ValueError(f"{name} has one frame, expected at least 2")
-    joints = _all_joints(clips)
+    joints = all_joints(clips)
     # All clips at once: one at a time would compile for every length.
     toes = jnp.asarray(joints[:, list(skeleton.feet)], jnp.float32)
     standing = np.array(foot_contacts(toes, clips.fps))
@@ -150,27 +147,6 @@ def bodies(clips: Clips, *, thickness: float) -> list[Body]:
         _body(skeleton, joints[a:b], standing[a:b], clips.fps, thickness)
         for a, b in zip(offsets[:-1], offsets[1:], strict=True)
     ]
-
-
-def _all_joints(clips: Clips) -> Float[np.ndarray, "frames joints 3"]:
-    """World positions in all frames, block by block: one shape, compiled once."""
-    extra = -clips.num_frames % _BLOCK
-    root = np.pad(np.asarray(clips.root_position), ((0, extra), (0, 0)), "edge")
-    turns = np.asarray(clips.joint_rotation)
-    turns = np.pad(turns, ((0, extra), (0, 0), (0, 0)), "edge")
-    place = jax.jit(joint_positions)
-    found = [
-        place(
-            clips.skeleton,
-            Motion(
-                root_position=jnp.asarray(root[a : a + _BLOCK]),
-                joint_rotation=jnp.asarray(turns[a : a + _BLOCK]),
-                fps=clips.fps,
-            ),
-        )
-        for a in range(0, len(root), _BLOCK)
-    ]
-    return np.concatenate(found)[: clips.num_frames].astype(np.float64)
 
 
 def _body(

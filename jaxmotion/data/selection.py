@@ -175,6 +175,35 @@ def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
     return take_clips(clips, train), take_clips(clips, rest)
 
 
+def cut(clips: Clips, spans: Sequence[tuple[int, int, int]]) -> Clips:
+    """Stretches of clips, each as one clip with its labels.
+
+    Args:
+      clips: The clips.
+      spans: Clip, first frame within it and number of frames of each stretch.
+
+    Returns:
+      The stretches in that order, named "<clip>@<first frame>+<frames>".
+    """
+    owner, starts, lengths = np.array(spans, np.int64).reshape(-1, 3).T
+    first = np.asarray(clips.offsets)[owner] + starts
+    frames = np.concatenate(
+        [np.arange(a, a + n) for a, n in zip(first, lengths, strict=True)]
+    )
+    names = clips.clip_names or [f"clip {i}" for i in range(clips.num_clips)]
+    return dataclasses.replace(
+        clips,
+        root_position=jnp.asarray(np.asarray(clips.root_position)[frames]),
+        joint_rotation=jnp.asarray(np.asarray(clips.joint_rotation)[frames]),
+        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
+        labels={
+            field: jnp.asarray(np.asarray(values)[owner])
+            for field, values in clips.labels.items()
+        },
+        clip_names=tuple(f"{names[i]}@{start}+{n}" for i, start, n in spans),
+    )
+
+
 def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
     """Concatenates several sets of clips of one skeleton.
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxmotion.data import captions, clips_io, resample, selection, text_motion
+from jaxmotion.data import captions, clips_io, mirror, resample, selection, text_motion
 from jaxmotion.data.clips import Clips
 from jaxmotion.data.text_motion import TextMotions
 from jaxmotion.learning import runs
@@ -216,6 +216,7 @@ def prepare(
     fps: float,
     frames: int,
     held_out: float,
+    mirrored: bool = False,
 ) -> ActionRun:
     """Makes the clips of a run folder, or loads those it has.
 
@@ -229,6 +230,7 @@ def prepare(
       fps: Frames per second.
       frames: Frames of a sample.
       held_out: Part of each action's clips to hold out.
+      mirrored: Whether mirrored training clips are added.
 
     Raises:
       OSError: if a file cannot be read.
@@ -241,6 +243,9 @@ def prepare(
         )
         print(f"{field}s left out: {', '.join(left_out) or 'none'}")
         parts = selection.split_clips(clips, fraction=held_out, seed=0, field=field)
+        if mirrored:
+            both = [parts[0], mirror.mirror_clips(parts[0])]
+            parts = (selection.concatenate(both), parts[1])
         return runs.Content(
             model={"actions": list(clips.names(field))},
             source=clips.source,
@@ -262,7 +267,7 @@ def prepare(
         fps=fps,
         frames=frames,
         held_out=held_out,
-    )
+    ) | ({"mirrored": True} if mirrored else {})
     return _decode(
         runs.begin(
             folder,
