@@ -171,6 +171,7 @@ def contacts(
     """Which toes are in contact now, given which were: thresholds with hysteresis."""
     begins = (speed < lock.begin_speed) & (height < lock.begin_height)
     goes_on = (speed < lock.end_speed) & (height < lock.end_height)
+    # No `jnp.where`: onnxruntime has none of booleans.
     return (was & goes_on) | (~was & begins)
 
 

@@ -35,17 +35,19 @@ def check() -> None:
 
 
 def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
-    """Writes a graph, with its parameters in it.
+    """Writes a graph as one file, which holds its parameters too.
+
+    It is checked and run once with zeros before it is written, so a file that is there
+    runs; an older one stays until then.
 
     Args:
-      path: The file.
-      graph: The graph.
       batch: None for one character, without an axis for it; a number of them, or
         `graph.ANY`, for a first axis of all arrays.
 
     Raises:
       OSError: if the file cannot be written.
-      ValueError: if packages are missing, or the function has no ONNX form that runs.
+      ValueError: if packages of the extra are missing, or the function has no ONNX form
+        that runs; says which operation.
     """
     check()
     import onnx

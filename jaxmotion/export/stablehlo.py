@@ -31,11 +31,9 @@ def check() -> None:
 
 
 def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
-    """Writes a graph, with its parameters in it.
+    """Writes a graph as one file for all platforms, which holds its parameters too.
 
     Args:
-      path: The file.
-      graph: The graph.
       batch: None for one character, without an axis for it; a number of them, or
         `graph.ANY`, for a first axis of all arrays.
 

@@ -106,3 +106,11 @@ function drawCapsules(mesh, count) {
   gl.depthFunc(gl.LEQUAL);
   cast(mesh, 0, 1, count);
 }
+// A pale body, after the others; depth first, so that it does not shine through itself.
+const PALE = rgb("#8fa3b8");
+function drawGhost(mesh, count) {
+  gl.colorMask(false, false, false, false);
+  cast(mesh, 0, 1, count);
+  gl.colorMask(true, true, true, true);
+  cast(mesh, 0, 0.45, count);
+}

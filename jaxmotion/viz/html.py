@@ -216,12 +216,9 @@ function draw() {
   bring(mesh, shapes);
   drawCapsules(mesh, count);
   if (ghost) {
-    const pale = assemble(ghost, now, rgb("#8fa3b8"));
+    const pale = assemble(ghost, now, PALE);
     bring(mesh, shapes);
-    gl.colorMask(false, false, false, false);
-    cast(mesh, 0, 1, pale);
-    gl.colorMask(true, true, true, true);
-    cast(mesh, 0, 0.45, pale);
+    drawGhost(mesh, pale);
   }
   slider.value = now;
   element("clock").textContent = (now / data.fps).toFixed(2) + " s of " +

@@ -5,8 +5,9 @@ it changes, `body` whenever what is drawn does, `error` for input that was wrong
 frame a tick as little-endian float32:
 
     engine, tick, milliseconds, plans, characters, capsules, balls, fps,
-    told velocity (x, z), told facing (x, z), roots (x, z) of all characters,
-    capsule ends [characters, capsules, 2, 3], balls [balls, 3]
+    told velocity (x, z), told facing (x, z), ticks of the shown plan,
+    roots (x, z) of all characters, capsule ends [characters, capsules, 2, 3],
+    balls [balls, 3], the plan's path (x, z), capsule ends at its end [capsules, 2, 3]
 
 The browser sends JSON: {"held": [...], "azimuth": radians, "target": [x, z] or null},
 {"set": {name: value}}, {"do": "reset" | "step" | "record"} or {"save": ".bvh"}.
@@ -58,14 +59,17 @@ def websockets() -> Any:
 def frame_bytes(shown: Shown, fps: float) -> bytes:
     """A tick as the page reads it; see the module's text."""
     balls = np.zeros((0, 3)) if shown.ball is None else shown.ball
+    path, ghost = ((), ()) if shown.plan is None else shown.plan
     characters, capsules = shown.ends.shape[:2]
     head = (
         *(shown.engine, shown.tick, shown.milliseconds, shown.planned),
         *(characters, capsules, len(balls), fps),
         *shown.told.velocity,
         *shown.told.facing,
+        len(path),
     )
-    parts = (head, shown.roots[:, ::2], shown.ends, balls)
+    path = np.reshape(path, (-1, 3))[:, ::2]
+    parts = (head, shown.roots[:, ::2], shown.ends, balls, path, ghost)
     return np.concatenate([np.ravel(x) for x in parts]).astype("<f4").tobytes()
 
 

@@ -46,6 +46,7 @@ class Settings:
       scale: Guidance scale.
       foot_lock: Whether planted feet are locked, where they can be.
       characters: 1 to `MOST_CHARACTERS`.
+      plan: Whether the rest of the first one's plan is shown.
       paused: Whether time stands still.
     """
 
@@ -56,6 +57,7 @@ class Settings:
     scale: float = 1.0
     foot_lock: bool = True
     characters: int = 1
+    plan: bool = False
     paused: bool = False
 
 
@@ -78,6 +80,8 @@ class Shown:
       ends: [characters, capsules, 2, 3] of `Session.body`, world, meters.
       roots: [characters, 3] world, meters.
       ball: [characters, 3] world, meters; None in systems without.
+      plan: Of the first character, if it is to be shown: the path of its root to the
+        plan's end [ticks, 3], and its capsules there [capsules, 2, 3].
       told: What the first character was told.
       planned: Characters that got a new plan.
       milliseconds: That the tick took.
@@ -88,6 +92,7 @@ class Shown:
     ends: np.ndarray
     roots: np.ndarray
     ball: np.ndarray | None
+    plan: tuple[np.ndarray, np.ndarray] | None
     told: Wish
     planned: int
     milliseconds: float
@@ -96,7 +101,14 @@ class Shown:
 class Engine:
     """The compiled tick of one model, number of characters and number of steps."""
 
-    def __init__(self, character: Character, *, num_steps: int, number: int) -> None:
+    def __init__(
+        self,
+        character: Character,
+        *,
+        num_steps: int,
+        number: int,
+        show_plan: bool = False,
+    ) -> None:
         """Compiles nothing yet."""
         self.character, self.num_steps, self.number = character, num_steps, number
         self.body = bodies.describe(character.skeleton)
@@ -114,19 +126,31 @@ class Engine:
             every = lambda x: jnp.broadcast_to(x, (number, *x.shape))  # noqa: E731
             velocity, facing, label = map(every, told)
             commands = Command(velocity=velocity, facing=facing, label=label)
+            controller = method(params)
             crowd, frames = rollout.crowd_tick(
-                method(params), key, crowd, commands, at_most=at_most
+                controller, key, crowd, commands, at_most=at_most
             )
-            poses = jax.vmap(lambda r, q: global_transforms(skeleton, r, q))(
-                frames.root_position, frames.joint_rotation
+            pose = lambda frame: global_transforms(  # noqa: E731
+                skeleton, frame.root_position, frame.joint_rotation
             )
+            plan = None
+            if show_plan and patience:  # what would be shown without another plan
+                first, command = jax.tree.map(lambda x: x[0], (crowd.states, commands))
+                _, ahead = jax.lax.scan(
+                    lambda state, _: controller.advance(state, command),
+                    first,
+                    length=patience,
+                )
+                end = jax.tree.map(lambda x: x[-1], ahead)
+                plan = ahead.root_position, pose(end)
             return (
                 crowd,
-                (poses, frames.root_position, frames.joint_rotation),
+                (jax.vmap(pose)(frames), frames.root_position, frames.joint_rotation),
                 dict(
                     # A frame of who still waits for his first plan is none of a plan.
                     planned=jnp.sum(frames.planned & (crowd.waited == 0)),
                     ball=frames.extra.get("ball"),
+                    plan=plan,
                 ),
             )
 
@@ -328,6 +352,7 @@ class Session:
                 "steps": [] if tuning is None else list(tuning.num_steps),
                 "scales": None if tuning is None else list(tuning.scales),
                 "lockable": tuning is not None and tuning.lockable,
+                "planning": tuning is not None and tuning.patience > 0,
                 "speeds": list(SPEEDS),
                 "most_characters": MOST_CHARACTERS,
                 "note": self.note,
@@ -383,15 +408,20 @@ class Session:
             self._crowd, self._told, settings, seed=self._seed, n=self._tick
         )
         (places, turns), roots, rotations = jax.tree.map(np.asarray, made)
-        ball = more["ball"]
+        ball, plan = more["ball"], more["plan"]
         shift = np.insert(self._home, 1, 0.0, axis=1)
         roots = roots + shift
+        if plan is not None:
+            path, (joints, turned) = jax.tree.map(np.asarray, plan)
+            ghost = engine.body.ends(joints + shift[0], turned)
+            plan = path + shift[0], ghost.astype(np.float32)
         shown = Shown(
             engine=self.engine_number,
             tick=self._tick,
             ends=engine.body.ends(places + shift[:, None], turns).astype(np.float32),
             roots=roots,
             ball=None if ball is None else np.asarray(ball) + shift,
+            plan=plan,
             told=self._told,
             planned=int(more["planned"]),
             milliseconds=(time.perf_counter() - begin) * 1e3,
@@ -423,7 +453,8 @@ class Session:
         self._crowd, self._home = new, home
 
     def _wanted_engine(self) -> tuple:
-        return self.settings.model, self.settings.num_steps, self.settings.characters
+        now = self.settings
+        return now.model, now.num_steps, now.characters, now.plan
 
     def _build(self) -> None:
         """Starts to make the program that the settings ask for, if there is none."""
@@ -472,7 +503,7 @@ class Session:
         if key not in self._programs:
             many = f"{key[2]} character{'s' * (key[2] > 1)}"
             self._tell(f"compiling {name}: {many}, {key[1]} diffusion steps")
-            made = Engine(character, num_steps=key[1], number=key[2])
+            made = Engine(character, num_steps=key[1], number=key[2], show_plan=key[3])
             crowd = made.start(0, self._seed)
             done = made.step(crowd, Wish(), settings, seed=0, n=0)
             made.step(done[0], Wish(), settings, seed=0, n=1)
@@ -523,6 +554,7 @@ def changed(settings: Settings, name: str, value: Any, state: dict) -> Settings:
     choices = {
         "model": state["models"],
         "foot_lock": [False, True],
+        "plan": [False, True],
         "paused": [False, True],
     }
     if name in choices:

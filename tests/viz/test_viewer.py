@@ -162,15 +162,18 @@ def test_a_frame_is_packed_as_the_page_reads_it():
         ends=np.arange(24.0).reshape(2, 2, 2, 3),
         roots=np.array([[1.0, 9, 2], [3, 9, 4]]),
         ball=np.ones((2, 3)),
+        plan=(np.arange(6).reshape(2, 3), np.arange(12).reshape(2, 2, 3)),
         told=Wish(velocity=(0.5, 0.25)),
         planned=1,
         milliseconds=12.5,
     )
     data = np.frombuffer(page.frame_bytes(shown, 30.0), "<f4")
-    want = [3, 7, 12.5, 1, 2, 2, 2, 30, 0.5, 0.25, 0, 1, 1, 2, 3, 4]
-    np.testing.assert_array_equal(data[:16], want)
-    np.testing.assert_array_equal(data[16:40], np.arange(24))
-    np.testing.assert_array_equal(data[40:], np.ones(6))
+    want = [3, 7, 12.5, 1, 2, 2, 2, 30, 0.5, 0.25, 0, 1, 2, 1, 2, 3, 4]
+    np.testing.assert_array_equal(data[:17], want)
+    np.testing.assert_array_equal(data[17:41], np.arange(24))
+    np.testing.assert_array_equal(data[41:47], np.ones(6))
+    np.testing.assert_array_equal(data[47:51], [0, 2, 3, 5])
+    np.testing.assert_array_equal(data[51:], np.arange(12))
 
 
 class Ticking:
@@ -267,6 +270,20 @@ def test_a_take_is_what_was_shown():
     it.load()
     assert it.session.take.root_position.shape == (3, 3)
     assert not it.session.state()["recording"]
+
+
+@pytest.mark.slow
+def test_the_plan_is_shown_to_its_end():
+    it = Ticking()
+    it.tick("forward", times=20)
+    assert it.shown[-1].plan is None and it.session.state()["planning"]
+    it.session.change("plan", True)
+    it.load()
+    path, ghost = it.tick("forward", times=1).plan
+    assert path.shape == (it.character.tuning.patience, 3)
+    it.tick("forward", times=len(path))
+    np.testing.assert_allclose(it.shown[-1].roots[0], path[-1], atol=1e-3)
+    np.testing.assert_allclose(it.shown[-1].ends[0], ghost, atol=1e-2)
 
 
 @pytest.mark.slow
