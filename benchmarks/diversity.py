@@ -9,11 +9,11 @@ Examples:
   python benchmarks/diversity.py --rollouts 64 256 1024 4096
   python benchmarks/diversity.py --rollouts 64 --guidance 0 0.5 1 1.5 --memory-gib 0.5
   python benchmarks/diversity.py --run runs/camdm8 --step-runs runs/camdm2 runs/camdm4
+  python benchmarks/diversity.py --run locomotion --seconds 0.5 --stream 1000000
 """
 
 import dataclasses
 import functools
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,8 +21,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import streams
 import suite
 import workload
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from jaxmotion import cli, files, reporting
@@ -30,6 +32,7 @@ from jaxmotion.control import courses, rollout, steering
 from jaxmotion.data import selection
 from jaxmotion.evaluation import diversity, table
 from jaxmotion.evaluators import style as style_evaluator
+from jaxmotion.learning import fingerprint
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import controller as camdm_controller
@@ -38,7 +41,6 @@ from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.typing import Key, Params
 
 WALKER = Path(__file__).parents[1] / "jaxmotion" / "assets" / "walker.npz"
-GIB = float(2**30)
 # More rollouts at a time leave a processor's cache, and are slower.
 CPU_CHUNK = 16
 COLUMNS = ("world_m", "pose_m", "diversity_m", "variance_m2")
@@ -57,8 +59,9 @@ class Config(suite.Settings):
       rollouts: Numbers of rollouts.
       sweep_rollouts: Rollouts of each row of the sweeps over steps and guidance; None
         for the largest number.
-      run: Model of CAMDM: an exported file of the procedural walker, or a run folder
-        of experiments/camdm.py (with the data it was trained on). None for the shipped
+      run: Model of CAMDM: a shipped one ("locomotion"), an exported file of the
+        procedural walker or with poses of its own, or a run folder of
+        experiments/camdm.py (with the data it was trained on). None for the shipped
         walker.
       step_runs: Further models, trained for other numbers of diffusion steps.
       steps: Diffusion steps. A chain of another length needs parameters trained for it:
@@ -67,7 +70,7 @@ class Config(suite.Settings):
         changes nothing. Less than 1 frees the motion from its past.
       style: Style; None for the model's first.
       course: Commands.
-      speed: Meters per second; None for the style's median.
+      speed: Meters per second; None for the style's median, or 1.2 without clips.
       seconds: Length of a rollout.
       every: Keep every so many frames, from the last one backwards.
       sets: Sets of rollouts, with seeds seed, seed + 1 and so on.
@@ -76,6 +79,11 @@ class Config(suite.Settings):
       memory_gib: Limit for each program: arguments, results and intermediate values.
       chunk: Rollouts at a time; None for as many as fit, but 16 on a CPU, whose cache
         more would not fit.
+      stream: So many rollouts of the first model instead of the table, in sets of the
+        largest of --rollouts, of which nothing but moments is kept:
+        diversity_stream.npz. What was stopped or killed goes on from there.
+      distributed: One of several processes, which share the rollouts: "auto", or
+        address, number, index.
     """
 
     rollouts: tuple[int, ...] = (64, 256, 1024)
@@ -94,6 +102,8 @@ class Config(suite.Settings):
     pairs: int = 2000
     memory_gib: float = 4.0
     chunk: int | None = None
+    stream: int | None = None
+    distributed: cli.Distributed = ()
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -153,11 +163,14 @@ def make_load(
       OSError: if the run or its clips cannot be read.
       ValueError: if the run is none, or has no such style or course.
     """
-    if not run.exists():
+    if not run.exists() and str(run) not in camdm_model.SHIPPED:
         raise ValueError(f"{run}: no such file or folder")
-    if run.is_file():
-        clips, field = workload.make_clips(), "style"
-        model, params = workload.walker_model(run)
+    clips, field = None, "style"
+    if not run.is_dir():
+        model, params = camdm_model.load(run)
+        if model.starts is None:
+            clips = workload.make_clips()
+            model, params = workload.walker_model(run)
     else:
         found = camdm_training.load_run(run)
         model, params, clips, field = (
@@ -167,12 +180,19 @@ def make_load(
             found.field,
         )
     label = steering.label_indices(model.labels, style)
-    speeds = np.asarray(selection.label_speeds(clips, field=field))[label]
-    speeds = speeds if speed is None else np.array([speed])
+    if speed is not None or clips is None:
+        speeds = np.array([1.2 if speed is None else speed])
+    else:
+        speeds = np.asarray(selection.label_speeds(clips, field=field))[label]
     commands = courses.course_batch(
         course, label, speeds, seconds=seconds, fps=model.config.fps
     )
-    states = camdm_controller.start_states(clips, model, label, field=field, seed=seed)
+    if clips is None:
+        states = camdm_controller.own_states(model, label, seed=seed)
+    else:
+        states = camdm_controller.start_states(
+            clips, model, label, field=field, seed=seed
+        )
     state, command = jax.tree.map(lambda x: x[0], (states, commands))
     return Load(
         name=run.name, model=model, params=params, state=state, commands=command
@@ -252,9 +272,14 @@ def one_rollout(
 
 
 def _function(load: Load, number: int, every: int, chunk: int) -> Callable:
-    """All rollouts: (params, key, guided, scale) -> Motions."""
+    """All rollouts: (params, key, guided, scale) -> Motions.
 
-    def roll(params: Params, key: Key, guided: Array, scale: Array) -> Motions:
+    Each device of all processes has its share of them, and all get the motions.
+    """
+
+    def roll(
+        rows: Array, params: Params, key: Key, guided: Array, scale: Array
+    ) -> Motions:
         # The scale is traced: one program serves all of them.
         control = dataclasses.replace(camdm_controller.Control(), guidance_scale=scale)
 
@@ -268,9 +293,23 @@ def _function(load: Load, number: int, every: int, chunk: int) -> Callable:
                 every=every,
             )
 
-        return jax.lax.map(one, jnp.arange(number), batch_size=chunk)
+        return jax.lax.map(one, rows, batch_size=chunk)
 
-    return jax.jit(roll)
+    def whole(*given: Any) -> Motions:
+        return roll(jnp.arange(number), *given)
+
+    if jax.device_count() == 1:
+        return jax.jit(whole)
+    mesh = Mesh(np.array(jax.devices()), ("rollouts",))
+    split, copy = PartitionSpec("rollouts"), PartitionSpec()
+    roll = jax.shard_map(
+        roll,
+        mesh=mesh,
+        in_specs=(split, *4 * (copy,)),
+        out_specs=split,
+        check_vma=False,
+    )
+    return jax.jit(whole, out_shardings=NamedSharding(mesh, copy))
 
 
 def fit_program(
@@ -289,13 +328,18 @@ def fit_program(
       ValueError: if it does not fit.
     """
     cap = CPU_CHUNK if jax.default_backend() == "cpu" else number
-    size = min(number, cap if chunk is None else chunk)
+    if number % jax.device_count():
+        raise ValueError(
+            f"--rollouts {number}: expected a multiple of the {jax.device_count()} "
+            "devices that share them"
+        )
+    size = min(number // jax.device_count(), cap if chunk is None else chunk)
 
     def compiled(size: int) -> Any:
         given = load.params, jax.random.key(0), jnp.int32(0), jnp.float32(1.0)
         return _function(load, number, every, size).lower(*given).compile()
 
-    program, needs = fit(compiled, size, limit=limit, shrink=chunk is None)
+    program, needs = suite.fit(compiled, size, limit=limit, shrink=chunk is None)
     ticks = load.commands.label.shape[0]
 
     def roll(key: Key, scale: float | None) -> Motions:
@@ -334,103 +378,6 @@ def _measure(key: Key, motions: Motions, num_pairs: int) -> dict[str, Array]:
     }
 
 
-def needs_of(compiled: Any, chunk: int) -> dict[str, int]:
-    """Bytes that a program needs by name, their total, and its chunk."""
-    found = compiled.memory_analysis()
-    parts = {
-        "arguments": found.argument_size_in_bytes,
-        "results": found.output_size_in_bytes,
-        "intermediate": found.temp_size_in_bytes,
-    }
-    return {"chunk": chunk, **parts, "total": sum(parts.values())}
-
-
-def next_chunk(needs: dict[str, int], limit: float) -> int:
-    """Fewer rollouts at a time that should fit, at most half as many.
-
-    What is not intermediate does not shrink with them.
-
-    Raises:
-      ValueError: if no number would fit.
-    """
-    chunk = needs["chunk"]
-    room = limit - needs["arguments"] - needs["results"]
-    if chunk == 1 or room <= 0:
-        need = needs["total"] if chunk == 1 else needs["total"] - needs["intermediate"]
-        raise ValueError(
-            f"--memory-gib {limit / GIB:g}: one rollout at a time needs "
-            f"{need / GIB:.3g} GiB or more, {needs['results'] / GIB:.3g} of it for "
-            "the frames that are kept: expected a higher limit, fewer or shorter "
-            "rollouts, or a larger --every"
-        )
-    fits = int(room / (needs["intermediate"] / chunk))
-    return max(1, min(chunk // 2, fits))
-
-
-def fit(
-    compiled: Callable[[int], Any], size: int, *, limit: float, shrink: bool
-) -> tuple[Any, dict[str, int]]:
-    """Compiles a program with the largest chunk that fits a limit.
-
-    The compiler is asked what a program needs; what does not fit is compiled again with
-    a smaller chunk.
-
-    Args:
-      compiled: Compiles the program for a chunk.
-      size: Chunk to begin with.
-      limit: Bytes.
-      shrink: Whether smaller chunks are allowed.
-
-    Raises:
-      ValueError: if it does not fit.
-    """
-    while True:
-        program = compiled(size)
-        needs = needs_of(program, size)
-        if needs["total"] <= limit:
-            return program, needs
-        if not shrink:
-            raise ValueError(
-                f"--chunk {size}: {needs['total'] / GIB:.3g} GiB, more than "
-                f"--memory-gib {limit / GIB:g}"
-            )
-        size = next_chunk(needs, limit)
-
-
-def describe(needs: dict[str, Any]) -> str:
-    """One line about what a program needs."""
-    parts = ", ".join(
-        f"{needs[name] / GIB:.3f} {name}"
-        for name in ("arguments", "results", "intermediate")
-    )
-    return (
-        f"{needs['model']}: {needs['chunk']} rollouts at a time, "
-        f"{needs['total'] / GIB:.3f} GiB ({parts})"
-    )
-
-
-def peak() -> dict[str, Any]:
-    """The most that was used at once, so far.
-
-    Returns:
-      Bytes, and of what: the accelerator, or the process where the device keeps no
-      account; 0 bytes where the system keeps none either.
-    """
-    stats = jax.devices()[0].memory_stats()
-    if stats and "peak_bytes_in_use" in stats:
-        return {"what": "peak of the device", "bytes": stats["peak_bytes_in_use"]}
-    try:
-        import resource
-    except ImportError:  # Windows
-        return {"what": "peak unknown", "bytes": 0}
-    used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    unit = 1 if sys.platform == "darwin" else 1024
-    return {
-        "what": "peak of the process, JAX and compiler included",
-        "bytes": used * unit,
-    }
-
-
 def check(args: Config) -> None:
     """Raises before any work if an argument makes no sense.
 
@@ -438,8 +385,9 @@ def check(args: Config) -> None:
       ValueError: names the option.
     """
     suite.at_least(
-        args, rollouts=2, sweep_rollouts=2, steps=1, every=1, sets=2, pairs=1, chunk=1
-    )
+        args, rollouts=2, sweep_rollouts=2, steps=1, every=1, sets=2, pairs=1, chunk=1,
+        stream=2,
+    )  # fmt: skip
     if args.course not in courses.COURSES:
         known = ", ".join(courses.COURSES)
         raise ValueError(f"--course {args.course}: there are {known}")
@@ -490,11 +438,11 @@ def sweep(
             load,
             number,
             every=args.every,
-            limit=args.memory_gib * GIB,
+            limit=args.memory_gib * suite.GIB,
             chunk=args.chunk,
         )
         needs.append({"model": load.name, **made.memory})
-        print(describe(needs[-1]), flush=True)
+        print(suite.describe(needs[-1]), flush=True)
         return made
 
     main = program(load, largest)
@@ -521,10 +469,62 @@ def sweep(
     return rows, needs
 
 
+def stream(args: Config, load: Load) -> streams.Stream:
+    """Very many rollouts: each set is rolled out, measured, and forgotten.
+
+    Set number s draws from `fold_in(key, s)`.
+    """
+    size, limit = max(args.rollouts), args.memory_gib * suite.GIB
+    program = fit_program(load, size, every=args.every, limit=limit, chunk=args.chunk)
+    told = ("style", "course", "speed", "seconds", "every", "seed", "pairs")
+    about = {name: suite.settings(args)[name] for name in told} | {
+        "set": size,
+        "chunk": program.memory["chunk"],
+        "devices": jax.device_count(),
+        "params": fingerprint.fingerprint(load.params),
+    }
+
+    def make(number: int) -> dict[str, np.ndarray]:
+        key = jax.random.fold_in(jax.random.key(args.seed), number)
+        key_roll, key_pairs = jax.random.split(key)
+        motions = program.roll(key_roll, None)
+        row = measure(key_pairs, motions, num_pairs=args.pairs)
+        columns = np.array([[row[name] for name in COLUMNS]])
+        return {"columns": columns, "world": motions.world, "pose": motions.pose}
+
+    path = args.out / "diversity_stream.npz"
+    total = -(-args.stream // size)
+    return streams.run(make, size=size, total=total, path=path, about=about)
+
+
+def report_stream(args: Config, found: streams.Stream) -> None:
+    """Prints a stream, draws how its intervals narrowed, and writes the report."""
+    columns, pose = found.spreads["columns"], found.spreads["pose"]
+    values, halves = columns.mean.tolist(), columns.half_width().tolist()
+    cells = {
+        name: table.Cell(value=x, low=x - half, high=x + half, samples=found.sets)
+        for name, x, half in zip(COLUMNS, values, halves, strict=True)
+    }
+    rows = {f"{pose.count} rollouts": cells}
+    whole = float(np.mean(pose.variance.sum(axis=-1)))
+    rate = pose.count / found.seconds
+    print(
+        table.to_markdown(rows),
+        f"variance_m2 of all rollouts as one set: {whole:.6g}",
+        f"{found.seconds:.0f} s, {rate:,.0f} rollouts/s; {streams.memory(found)}",
+        sep="\n",
+    )
+    streams.draw(args.out / "diversity_stream.png", found, COLUMNS)
+    metric = suite.Metric("stream", rate, "rollouts/s", "higher")
+    more = dict(variance_m2=whole, seconds=found.seconds, sets=found.sets)
+    suite.report("diversity_stream", [metric], args, rows=table.to_json(rows), **more)
+
+
 def main() -> None:
     """Measures, prints the table and writes the report."""
     args = suite.parse(Config, __doc__)
     check(args)
+    cli.join_processes(args.distributed)
     options = dict(
         style=args.style,
         course=args.course,
@@ -533,16 +533,24 @@ def main() -> None:
         seed=args.seed,
     )
     load = make_load(args.run or WALKER, **options)
+    if args.stream is not None:
+        found = stream(args, load)
+        if jax.process_index() == 0:
+            report_stream(args, found)
+        return
     others = [make_load(run, **options) for run in args.step_runs]
     for other in others:
         check_same(load, other)
     rows, needs = sweep(args, load, others)
+    if jax.process_index():
+        return
     text = table.to_markdown(rows)
-    used = peak()
-    print(text, f"{used['what']}: {used['bytes'] / GIB:.2f} GiB", sep="\n")
+    used = suite.peak()
+    print(text, f"{used['what']}: {used['bytes'] / suite.GIB:.2f} GiB", sep="\n")
     files.write_text(args.out / "diversity.md", text + "\n")
     metrics = [
-        suite.Metric(f"memory {x['model']}", x["total"] / GIB, "GiB") for x in needs
+        suite.Metric(f"memory {x['model']}", x["total"] / suite.GIB, "GiB")
+        for x in needs
     ]
     suite.report(
         "diversity",

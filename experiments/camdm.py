@@ -70,6 +70,7 @@ class Train:
       frame_kernel: Frames of a last convolution.
       diffusion_steps: Steps T of the diffusion.
       devices: Devices to split each batch over.
+      distributed: One of several processes: "auto", or address, number, index.
       seed: Seeds everything random.
       override: Go on with other settings than before.
     """
@@ -104,6 +105,7 @@ class Train:
     frame_kernel: cli.Optional[int] = None
     diffusion_steps: int = 8
     devices: int = 1
+    distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False
 
@@ -117,6 +119,7 @@ def sizes_of(args: Train) -> dict[str, Any]:
 
 def train(args: Train) -> None:
     """Trains, with checkpoints."""
+    cli.join_processes(args.distributed)
     loop.check_writable(args.out)
     sizes = sizes_of(args)
     given = camdm_training.FITTING[args.preset] | cli.given(runs.Budget, args)

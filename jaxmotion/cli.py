@@ -11,8 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import jax
 import tyro
 from jax.errors import JaxRuntimeError
+from jax.experimental import multihost_utils
 
 from jaxmotion.learning.loop import TrainingDiverged, check_writable
 
@@ -21,6 +23,8 @@ Value = TypeVar("Value")
 # An option that may be left out, and several names: in one line of the help.
 Optional = Annotated[Value | None, tyro.conf.arg(metavar="X", help_behavior_hint="")]
 Names = Annotated[tuple[str, ...], tyro.conf.arg(metavar="...")]
+# See `join_processes`.
+Distributed = Annotated[tuple[str, ...], tyro.conf.arg(metavar="...")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,6 +156,46 @@ def out_folder(args: Any, name: str) -> Path:
     out = args.out or args.run / name
     check_writable(out)
     return out
+
+
+def join_processes(distributed: tuple[str, ...]) -> None:
+    """Joins the processes of one run, on one or several hosts; before all else of JAX.
+
+    From then on the devices of all of them are JAX's, each process runs the same
+    program, and the first one writes.
+
+    Args:
+      distributed: None for one process; "auto" where SLURM, Open MPI, Kubernetes or a
+        TPU pod tells JAX all; otherwise the first process's address, such as
+        "10.0.0.1:1234", the number of processes, and which one this is, from 0.
+
+    Raises:
+      ValueError: if it is none of these, or the others are not found.
+    """
+    given: dict[str, Any] = {}
+    match distributed:
+        case ():
+            return
+        case ("auto",):
+            pass
+        case (str(address), number, index) if (number + index).isdigit():
+            given = dict(
+                coordinator_address=address,
+                num_processes=int(number),
+                process_id=int(index),
+            )
+        case _:
+            raise ValueError(
+                f"--distributed {' '.join(distributed)}: expected auto, or an address "
+                "with a port, the number of processes, and which one this is"
+            )
+    try:
+        jax.distributed.initialize(**given)
+        # They are together now; later one may be minutes behind another's compiler,
+        # where connections between them would not wait so long.
+        multihost_utils.sync_global_devices("joined")
+    except (RuntimeError, ValueError, TypeError) as error:
+        raise ValueError(f"--distributed {' '.join(distributed)}: {error}") from error
 
 
 def announce(what: str, seconds: int) -> None:

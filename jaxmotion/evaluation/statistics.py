@@ -1,4 +1,4 @@
-"""Confidence intervals for tables."""
+"""Confidence intervals for tables, and moments of samples that come in parts."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -39,6 +39,50 @@ def confidence_interval(
     mean, error = float(jnp.mean(samples)), float(jnp.std(samples, ddof=1))
     half = scipy.stats.t.ppf(0.5 + level / 2, count - 1) * error / count**0.5
     return Interval(estimate=mean, low=mean - half, high=mean + half)
+
+
+class Spread(NamedTuple):
+    """What is kept of samples that are gone; in float64.
+
+    Attributes:
+      count: Samples seen.
+      mean: Their mean.
+      squares: Sum of their squared deviations from it.
+    """
+
+    count: int
+    mean: np.ndarray
+    squares: np.ndarray
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Unbiased; not a number for fewer than two samples."""
+        if self.count < 2:
+            return np.full_like(self.mean, np.nan)
+        return self.squares / (self.count - 1)
+
+    def half_width(self, level: float = 0.95) -> np.ndarray:
+        """Half the confidence interval of the mean by Student's t."""
+        t = scipy.stats.t.ppf(0.5 + level / 2, max(self.count - 1, 1))
+        return t * np.sqrt(self.variance / self.count)
+
+
+def spread(samples: Array | np.ndarray) -> Spread:
+    """Mean and squared deviations of samples, the first axis."""
+    values = np.asarray(samples, np.float64)
+    mean = values.mean(axis=0)
+    return Spread(len(values), mean, np.square(values - mean).sum(axis=0))
+
+
+def merge(a: Spread, b: Spread) -> Spread:
+    """That of the samples of both, without cancellation.
+
+    Source: Chan, Golub and LeVeque 1979, "Updating Formulae and a Pairwise Algorithm".
+    """
+    count, gap = a.count + b.count, b.mean - a.mean
+    mean = a.mean + gap * (b.count / count)
+    squares = a.squares + b.squares + gap * gap * (a.count * b.count / count)
+    return Spread(count, mean, squares)
 
 
 def bootstrap_interval(

@@ -1,7 +1,9 @@
 """The host's side of a training: chunks, progress, checkpoints, and when to stop.
 
 All arithmetic is in the compiled chunk (`training.train_chunk`); this loop starts it,
-looks at the losses it returns, and writes checkpoints between chunks.
+looks at the losses it returns, and writes checkpoints between chunks. In a run of
+several processes all run it, on the same losses; the first one alone prints and writes,
+and Orbax divides the checkpoints among them.
 """
 
 import contextlib
@@ -18,6 +20,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 from tqdm import tqdm
 
 from jaxmotion import files
@@ -188,16 +191,31 @@ def _save(folder: Path, step: int, state: Any, config: dict[str, Any]) -> None:
 class _Pieces:
     """How many updates to run before the bar moves: what takes about a second."""
 
-    def __init__(self):
-        self.size = 1
+    def __init__(self, chunk: int):
+        # Of several processes each must run the same pieces, whatever its clock says.
+        self.alone = jax.process_count() == 1
+        self.size = 1 if self.alone else chunk
         self.first = True
 
     def note(self, count: int, seconds: float) -> None:
         """Takes in how long the last piece took."""
-        if not self.first:  # whose time is the compiler's
+        if self.alone and not self.first:  # whose time is the compiler's
             fitting = count / max(seconds, 1e-3)
             self.size = int(np.clip(fitting, 1, 4 * self.size))
         self.first = False
+
+
+def _any_process(stop: bool, pieces: int) -> bool:
+    """Whether any process is to stop: by Ctrl-C, or SIGTERM where there are several.
+
+    Args:
+      stop: Whether this one is.
+      pieces: How often all of them have asked.
+    """
+    if jax.process_count() == 1:
+        return stop
+    anyone = multihost_utils.process_allgather(np.array(stop)).any()
+    return bool(anyone) or multihost_utils.reached_preemption_sync_point(pieces)
 
 
 def train(
@@ -241,13 +259,22 @@ def train(
         )
     losses = loop.folder / "losses.jsonl"
     losses.parent.mkdir(parents=True, exist_ok=True)
-    _forget_lost_steps(losses, done)
+    first = jax.process_index() == 0
+    if first:
+        _forget_lost_steps(losses, done)
     if done >= loop.num_steps:
         return state
-    stop, pieces = False, _Pieces()
+    stop, asked, pieces = False, 0, _Pieces(loop.chunk)
     began = time.perf_counter()
-    print(COMPILING, file=sys.stderr, flush=True)
-    bar = tqdm(total=loop.num_steps, initial=done, unit="step", smoothing=0.1)
+    if first:
+        print(COMPILING, file=sys.stderr, flush=True)
+    bar = tqdm(
+        total=loop.num_steps,
+        initial=done,
+        unit="step",
+        smoothing=0.1,
+        disable=not first,
+    )
     with bar, _held_interrupt() as interrupts:
         while done < loop.num_steps and not stop:
             start, made, infos = time.perf_counter(), 0, []
@@ -262,7 +289,7 @@ def train(
                 check_finite(infos[-1], done + made + 1, checkpoints)
                 made += count
                 bar.update(count)
-                if pieces.first:
+                if pieces.first and first:
                     seconds = time.perf_counter() - began
                     bar.write(f"first step after {seconds:.0f} s", file=sys.stderr)
                 pieces.note(count, time.perf_counter() - before)
@@ -272,9 +299,11 @@ def train(
                 for name in infos[0]
             }
             rate = length / (time.perf_counter() - start)
-            _append(losses, {"step": done, **means, "steps_per_second": rate})
+            if first:
+                _append(losses, {"step": done, **means, "steps_per_second": rate})
             bar.set_postfix({name: f"{means[name]:.4f}" for name in loop.show})
-            stop = bool(interrupts)
+            asked += 1
+            stop = _any_process(bool(interrupts), asked)
             if done % loop.save_every == 0 or done >= loop.num_steps or stop:
                 _save(checkpoints, done, state, loop.config)
     if stop and done < loop.num_steps:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from jax.experimental import multihost_utils
 
 from jaxmotion import files
 from jaxmotion.learning import checkpoint, fingerprint, loop, model_json, training
@@ -117,7 +118,8 @@ def begin(
 ) -> Run:
     """Makes a run folder, or loads the one that is there.
 
-    A start that is killed leaves no config.json, so nothing that looks whole.
+    A start that is killed leaves no config.json, so nothing that looks whole. Of
+    several processes the first one writes; all of them must see the folder.
 
     Args:
       folder: Where.
@@ -139,12 +141,28 @@ def begin(
     path = folder / _CONFIG
     if path.exists():
         _check_same(path, _read(folder, system), data, settings)
-        return load(folder, system=system)
+    else:
+        _make(folder, system, data, settings, make)
+    multihost_utils.sync_global_devices(f"{folder} is there")
+    return load(folder, system=system)
+
+
+def _make(
+    folder: Path,
+    system: str,
+    data: Sequence[Path],
+    settings: dict[str, Any],
+    make: Callable[[], Content],
+) -> None:
+    """Writes a new run folder."""
     for one in data:
         if not one.is_file():
             raise FileNotFoundError(f"no clips file {str(one)!r}: {files.CLIPS_MAKER}")
     prints = [fingerprint.file_fingerprint(one) for one in data]
+    # By every process, so that bad input ends all of them, each with its line.
     content = make()
+    if jax.process_index():
+        return
     for name, write in content.files.items():
         write(folder / "data" / name)
     value = {
@@ -162,8 +180,7 @@ def begin(
         "versions": versions(),
         "command": " ".join(["python", *sys.argv]),
     }
-    files.write_text(path, json.dumps(value, indent=1))
-    return load(folder, system=system)
+    files.write_text(folder / _CONFIG, json.dumps(value, indent=1))
 
 
 def _check_same(
@@ -294,7 +311,7 @@ class Budget:
       final: Rate at the end of the decay, as a fraction of the peak.
       max_norm: Gradients are clipped to this global norm; 0 for no clipping.
       ema: Decay per update of the parameters' moving average; 0 for no average.
-      devices: Split each batch over so many.
+      devices: Split each batch over so many; a run of several processes takes all.
       chunk: Updates of one compiled call, at most.
       save_every: Updates between checkpoints.
       seed: Seeds parameters and batches.
@@ -320,6 +337,11 @@ class Budget:
         if self.devices > 1 and self.devices > jax.device_count():
             raise ValueError(
                 f"devices is {self.devices}, {jax.device_count()} are there"
+            )
+        if jax.process_count() > 1 and self.batch % jax.device_count():
+            raise ValueError(
+                f"batch is {self.batch}, expected a multiple of the "
+                f"{jax.device_count()} devices of {jax.process_count()} processes"
             )
 
 
@@ -476,14 +498,15 @@ def fit(
         budget does not override them, or more steps; names the fields.
       TrainingDiverged: if a loss is not finite.
     """
+    several = jax.process_count() > 1
+    devices = jax.device_count() if several else budget.devices
+    mesh = jax.make_mesh((devices,), ("data",)) if devices > 1 else None
+    state = training.replicate(state, mesh)
     own = {k: v for k, v in dataclasses.asdict(budget).items() if k not in _FREE}
     how = own | {"files": run.files} | (settings or {})
     if checkpoint.latest_step(run.checkpoints(stage)) is not None:
         _check_resumed(run, stage, model, how, budget)
         state = checkpoint.restore(run.checkpoints(stage), state)
-    mesh = None
-    if budget.devices > 1:
-        mesh = jax.make_mesh((budget.devices,), ("data",))
     chunk = min(budget.steps, budget.chunk)
     lengths = loop.Loop(
         num_steps=budget.steps,
@@ -497,7 +520,7 @@ def fit(
         key = jax.random.fold_in(jax.random.key(budget.seed), 1)
     return loop.train(
         training.train_chunk(update, sample_batch, num_steps=chunk, mesh=mesh),
-        training.replicate(state, mesh),
+        state,
         key,
         training.replicate(data, mesh),
         loop=lengths,

@@ -87,7 +87,7 @@ def test_measures_of_a_known_set(load):
 
 
 def test_chunks_shrink_to_the_limit(load):
-    memory = load("diversity")
+    memory = load("suite")
     needs = dict(chunk=64, arguments=10, results=20, intermediate=6400, total=6430)
     assert memory.next_chunk(needs, 3230.0) == 32
     assert memory.next_chunk(needs, 530.0) == 5
@@ -102,7 +102,7 @@ def test_chunks_shrink_to_the_limit(load):
 
 def test_the_program_that_fits_is_found(load):
     """For a program that holds `chunk` matrices at a time."""
-    memory = load("diversity")
+    memory = load("suite")
     tried = []
 
     def compiled(size):
