@@ -1,16 +1,21 @@
-"""Frames per second of whole steered rollouts.
+"""Frames per second of whole steered rollouts; how many characters run in real time.
 
-Example:
+Examples:
   python benchmarks/rollout_batch.py --system camdm --characters 1 16 256
   python benchmarks/rollout_batch.py --characters 64 --chunks 1 4 16 0 --staggered
   python benchmarks/rollout_batch.py --system aamdm --characters 1 64 4096
+  python benchmarks/rollout_batch.py --characters 1 16 256 4096 65536 --seconds 0.5
+      --width 128 --frames-per-token 5
 """
 
 import dataclasses
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import suite
 import workload
@@ -18,10 +23,13 @@ import workload
 from jaxmotion import cli
 from jaxmotion.control import rollout
 from jaxmotion.evaluation import timing
+from jaxmotion.networks import work
+from jaxmotion.viz import plots
 
 COLUMNS = {
     "characters": "characters",
     "chunk": "chunk",
+    "calls": "calls",
     "traces": "traces",
     "compile_s": "compile s",
     "p50_ms": "p50 ms",
@@ -30,6 +38,10 @@ COLUMNS = {
     "plans": "plans each",
     "frames_per_second": "frames/s",
     "realtime": "x real time",
+    "per_core": "frames/s/core",
+    "characters_per_core": "characters/core",
+    "bound_per_core": "bound",
+    "memory_mib": "MiB",
 }
 
 
@@ -39,7 +51,11 @@ class Config(suite.Settings):
 
     All seconds and characters of a rollout are one compiled program ("traces" counts
     how often it was traced). Frames per second are those of all characters together;
-    "x real time" is how much faster than its clock each character runs.
+    "x real time" is how much faster than its clock each character runs;
+    "characters/core" are so many that one core (or accelerator) runs in real time, and
+    "bound" how many it would be if it only multiplied the networks' matrices, at the
+    rate of a 1024 x 1024 float32 matmul timed here. Both grow if plans are used longer.
+    Crowds that would need too much memory run in smaller chunks, or in several calls.
 
     Attributes:
       system: What to measure: camdm steers the procedural walker by plans of 45
@@ -60,7 +76,8 @@ class Config(suite.Settings):
       width: Width of random networks: channels of a token (CAMDM) or of a hidden layer
         (AAMDM); None for 256.
       runs: Timed rollouts of each size.
-      limit: Seconds of timed rollouts of each size, at most, but three rollouts.
+      limit: Seconds of timed rollouts of each size, at most, but one rollout.
+      memory_gib: Limit for the program of each size.
     """
 
     system: str = "camdm"
@@ -74,45 +91,165 @@ class Config(suite.Settings):
     width: int | None = None
     runs: int = 50
     limit: float = 30.0
+    memory_gib: float = 4.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Program:
+    """The rollout of a crowd, or of a part of it that fits the memory.
+
+    Attributes:
+      run: `run(first)` rolls out the part that begins with that character.
+      ticks: Ticks of a rollout.
+      chunk: Characters at a time.
+      calls: Parts of the crowd.
+      traces: How often it was traced.
+      compile_s: Seconds to compile it.
+      needs: Bytes, see `suite.needs_of`.
+    """
+
+    run: Callable[[int], Any]
+    ticks: int
+    chunk: int
+    calls: int
+    traces: int
+    compile_s: float
+    needs: dict[str, int]
+
+
+def compiled(
+    args: Config, load: workload.Rollouts, number: int, chunk: int, calls: int
+) -> Program:
+    """Compiles the rollout of one of so many parts of a crowd."""
+    traces: list[int] = []
+    states, commands = load.start(number // calls)
+
+    def roll(params, key, first, states, commands):
+        traces.append(1)
+        return rollout.rollout(
+            load.controller(params), key, states, commands, first=first, chunk=chunk
+        )
+
+    key, given = jax.random.key(0), (states, commands)
+    if args.arguments:
+        function, head = jax.jit(roll), (load.params, key)
+    else:
+        function, head = jax.jit(lambda *rest: roll(load.params, *rest)), (key,)
+    first = jnp.int32(0)
+    run, seconds = timing.compile_program(function, *head, first, *given)
+    return Program(
+        run=lambda first: run(*head, jnp.int32(first), *given),
+        ticks=commands.label.shape[1],
+        chunk=chunk,
+        calls=calls,
+        traces=len(traces),
+        compile_s=seconds,
+        needs=suite.needs_of(run, chunk),
+    )
+
+
+def fitting(
+    args: Config, load: workload.Rollouts, number: int, chunk: int | None
+) -> Program:
+    """The program with the largest chunk, and the fewest parts, that fits the memory.
+
+    Raises:
+      ValueError: if one character does not fit.
+    """
+    size, calls, limit = chunk or number, 1, args.memory_gib * suite.GIB
+    while True:
+        program = compiled(args, load, number, size, calls)
+        needs = program.needs
+        if needs["total"] <= limit:
+            return program
+        part = number // calls
+        if needs["intermediate"] > limit / 2 and size % 2 == 0:
+            size //= 2
+        elif part % 2 == 0:
+            calls, size = 2 * calls, min(size, part // 2)
+        else:
+            need = needs["total"] / suite.GIB
+            raise ValueError(
+                f"--memory-gib {args.memory_gib:g}: {part} characters need {need:.3g} "
+                "GiB: expected a higher limit, or a number that can be halved"
+            )
+
+
+def plan_flops(load: workload.Rollouts) -> int:
+    """FLOPs of one plan of one character, by the cheapest planner."""
+    states, commands = load.start(1)
+    state, command = jax.tree.map(lambda x: x[0], (states, commands))
+    plan = load.controller(load.params).plans[0]
+    now = jax.tree.map(lambda x: x[0], command)
+    return work.count(plan, jax.random.key(0), state, now).flops
+
+
+def processors() -> int:
+    """Accelerators, or cores that this process may use."""
+    if jax.default_backend() != "cpu":
+        return jax.device_count()
+    known = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
 
 
 def case(
-    args: Config, load: workload.Rollouts, number: int, chunk: int | None
+    args: Config,
+    load: workload.Rollouts,
+    number: int,
+    chunk: int | None,
+    floor: tuple[float, int],
 ) -> dict[str, Any]:
-    """Measures one number of characters and one chunk (None for all): a row."""
-    traces: list[int] = []
+    """Measures one number of characters and one chunk (None for all): a row.
 
-    def roll(params, key, states, commands):
-        traces.append(1)
-        return rollout.rollout(
-            load.controller(params), key, states, commands, chunk=chunk
-        )
+    Args:
+      args: The settings.
+      load: What is rolled out.
+      number: Characters.
+      chunk: Characters at a time, at most.
+      floor: FLOP per second of a matmul, and FLOPs of a plan.
+    """
+    program = fitting(args, load, number, chunk)
+    calls, part = program.calls, number // program.calls
 
-    states, commands = load.start(number)
-    given = (jax.random.key(0), states, commands)
-    if args.arguments:
-        function, given = jax.jit(roll), (load.params, *given)
-    else:
-        function = jax.jit(lambda *rest: roll(load.params, *rest))
-    run, compile_s = timing.compile_program(function, *given)
+    def run() -> Any:
+        for i in range(calls):
+            frames = jax.block_until_ready(program.run(i * part))[1]
+        return frames
+
     times = timing.time_calls(
-        lambda: run(*given), rounds=args.runs, limit_s=args.limit, warmup=1, least=3
+        run, rounds=args.runs, limit_s=args.limit, warmup=1, least=1
     )
-    _, frames = run(*given)
+    plans = load.plans(program.run(0)[1]) / part
     p50, p95 = np.percentile(times, [50, 95])
-    rate = 1000 * number * commands.label.shape[1] / p50
+    rate = 1000 * number * program.ticks / p50
+    cores, seconds = processors(), program.ticks / load.fps
     return {
         "characters": number,
-        "chunk": chunk or number,
-        "traces": len(traces),
-        "compile_s": compile_s,
+        "chunk": program.chunk,
+        "calls": calls,
+        "traces": program.traces,
+        "compile_s": program.compile_s,
         "p50_ms": float(p50),
         "p95_ms": float(p95),
         "runs": len(times),
-        "plans": load.plans(frames) / number,
+        "plans": plans,
         "frames_per_second": float(rate),
         "realtime": float(rate / number / load.fps),
+        "per_core": float(rate / cores),
+        "characters_per_core": float(rate / load.fps / cores),
+        "bound_per_core": floor[0] / (plans * floor[1] / seconds) / cores,
+        "memory_mib": program.needs["total"] / 2**20,
     }
+
+
+def slope(rows: list[dict[str, Any]]) -> float | None:
+    """Exponent e of time ~ characters^e, by least squares over the logarithms.
+
+    Returns:
+      1 where cost grows as the crowd; None for one number of characters.
+    """
+    x, y = (np.log([row[name] for row in rows]) for name in ("characters", "p50_ms"))
+    return float(np.polyfit(x, y, 1)[0]) if np.ptp(x) else None
 
 
 def chunks_of(number: int, chunks: tuple[int, ...]) -> list[int | None]:
@@ -143,9 +280,11 @@ def main() -> None:
     load = make(sizes, args.run, args.seconds, args.staggered)
     chunks = (load.chunk,) if args.chunks is None else args.chunks
     cases = [(n, chunk) for n in args.characters for chunk in chunks_of(n, chunks)]
+    floor = timing.matmul_rate(), plan_flops(load)
+    print(f"matmul: {floor[0] / 1e9:.4g} GFLOP/s; a plan: {floor[1] / 1e9:.4g} GFLOP")
     rows, metrics = [], []
     for number, chunk in cases:
-        row = case(args, load, number, chunk)
+        row = case(args, load, number, chunk, floor)
         rows.append(row)
         name = f"{args.system} characters={number} chunk={row['chunk']}"
         metrics += suite.time_metrics(name, row)
@@ -154,6 +293,17 @@ def main() -> None:
         )
         print(f"{number} characters: {row['frames_per_second']:,.0f} frames/s")
     suite.print_table(rows, COLUMNS)
+    suite.write_table(args.out / "rollout_batch", rows, COLUMNS)
+    steep = slope(rows)
+    if steep is not None:
+        print(f"time grows as characters^{steep:.3f}")
+        table = np.array([(row["characters"], row["p50_ms"]) for row in rows])
+        plots.plot_sweep(
+            args.out / "rollout_batch.png",
+            {args.system: (*table.T, None)},
+            xlabel="characters",
+            ylabel=f"{args.seconds:g} s of motion, ms (p50)",
+        )
     alone = [row["frames_per_second"] for row in rows if row["characters"] == 1]
     loops = {}
     for name, rate in load.loops(args.limit).items():
@@ -168,7 +318,8 @@ def main() -> None:
             loops[f"ratio, {name}"] = alone[0] / rate
             text += f"; as one program {alone[0] / rate:.1f} times as many"
         print(text)
-    more = {"python_loops": loops} if loops else {}
+    more = {"slope": steep, "matmul_gflops": floor[0] / 1e9, "plan_flops": floor[1]}
+    more |= {"python_loops": loops} if loops else {}
     suite.report("rollout_batch", metrics, args, rows=rows, **more)
 
 

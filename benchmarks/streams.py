@@ -1,8 +1,8 @@
 """Very many samples in sets, of which nothing but moments is kept.
 
 Memory is constant; what is stopped or killed goes on where it last wrote, at most
-`SAVE_S` seconds before. Sets are merged in their order, so that a stream that was killed
-ends with the same moments, to the bit, as one that was not.
+`SAVE_S` seconds before. Sets are merged in their order, so that a stream that was
+killed ends with the same moments, to the bit, as one that was not.
 """
 
 import dataclasses

@@ -64,3 +64,10 @@ def test_mistakes_of_the_program_are_not_hidden():
 
 def test_a_script_that_ends_well_returns():
     assert cli.start(lambda: None) is None
+
+
+@pytest.mark.parametrize("words", [("all",), ("host:1", "2"), ("host:1", "2", "x")])
+def test_processes_that_cannot_be_joined_are_refused(words):
+    assert cli.join_processes(()) is None
+    with pytest.raises(ValueError, match="--distributed .*: expected auto, or an ad"):
+        cli.join_processes(words)

@@ -51,17 +51,17 @@ class Spread(NamedTuple):
     """
 
     count: int
-    mean: np.ndarray
-    squares: np.ndarray
+    mean: np.ndarray | np.float64
+    squares: np.ndarray | np.float64
 
     @property
-    def variance(self) -> np.ndarray:
+    def variance(self) -> np.ndarray | np.float64:
         """Unbiased; not a number for fewer than two samples."""
         if self.count < 2:
             return np.full_like(self.mean, np.nan)
         return self.squares / (self.count - 1)
 
-    def half_width(self, level: float = 0.95) -> np.ndarray:
+    def half_width(self, level: float = 0.95) -> np.ndarray | np.float64:
         """Half the confidence interval of the mean by Student's t."""
         t = scipy.stats.t.ppf(0.5 + level / 2, max(self.count - 1, 1))
         return t * np.sqrt(self.variance / self.count)

@@ -1,3 +1,5 @@
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,3 +46,18 @@ def test_bad_input_is_refused():
         statistics.confidence_interval(jnp.zeros(1))
     with pytest.raises(ValueError, match="1 samples, expected at least 2"):
         statistics.bootstrap_interval(np.zeros(1), np.mean, seed=0)
+
+
+def test_moments_of_parts_are_those_of_the_whole():
+    """Far from zero, where sums of squares would lose all digits in float32."""
+    rng = np.random.default_rng(3)
+    x = (1e4 + rng.normal(size=(1000, 2, 3))).astype(np.float32)
+    parts = [statistics.spread(part) for part in np.split(x, [1, 10, 400])]
+    found = functools.reduce(statistics.merge, parts)
+    whole = x.astype(np.float64)
+    assert found.count == 1000 and np.isnan(parts[0].variance).all()
+    np.testing.assert_allclose(found.mean, whole.mean(0), rtol=1e-14)
+    np.testing.assert_allclose(found.variance, whole.var(0, ddof=1), rtol=1e-9)
+    one = statistics.spread(whole[:, 0, 0])
+    ends = scipy.stats.t.interval(0.9, 999, one.mean, np.sqrt(one.variance / 1000))
+    np.testing.assert_allclose(one.half_width(0.9), np.ptp(ends) / 2)
