@@ -50,6 +50,30 @@ class Multistep:
         return self.step(key, state, t)
 
 
+def respaced(make: StepFactory, steps: tuple[int, ...] | None) -> StepFactory:
+    """A factory of steps that visit only some steps of the schedule it is given.
+
+    Args:
+      make: The factory.
+      steps: Steps to visit, as for `schedule.respace`; None for all.
+
+    Returns:
+      The factory. Its steps count 1..len(steps); the denoiser, trained on the given
+      schedule, is told that schedule's own step.
+    """
+    if steps is None:
+        return make
+
+    def make_respaced(schedule: Schedule, denoise: Denoiser) -> Step:
+        own = jnp.asarray(steps, jnp.int32)
+        return make(
+            _schedule.respace(schedule, steps),
+            lambda key, x_t, t: denoise(key, x_t, own[t - 1]),
+        )
+
+    return make_respaced
+
+
 def reverse_chain(
     step: Step,
     key: Key,

@@ -232,7 +232,7 @@ def respace(schedule: Schedule, steps: tuple[int, ...]) -> Schedule:
 
     Step k of the result is step `steps[k - 1]` of the given schedule: alpha_bar is
     kept there and beta spans the gap. A network trained on the given schedule must be
-    told the old step: `lambda key, x, t: denoise(key, x, jnp.array(steps)[t - 1])`.
+    told the old step, as `chain.respaced` does.
 
     Args:
       schedule: Table of T steps.

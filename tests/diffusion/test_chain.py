@@ -369,6 +369,29 @@ def test_dpm_solver_begins_as_ddim_and_ends_with_the_prediction():
     )
 
 
+def test_a_respaced_chain_tells_the_denoiser_the_schedules_own_steps():
+    table = schedule.cosine_schedule(T)
+    x, told = random(2), (8, 5, 2)
+    found = chain.sample_from(
+        chain.respaced(chain.ddim_step, told[::-1])(table, tanh_denoiser),
+        jax.random.key(0),
+        x,
+        start=3,
+    )
+    alpha_bar = np.asarray(table.alpha_bar, np.float64)
+    x = np.asarray(x, np.float64)
+    for t, below in zip(told, (5, 2, 0), strict=True):
+        x_0 = np.tanh(1.3 * x + 0.1 * t)
+        noise = (x - np.sqrt(alpha_bar[t]) * x_0) / np.sqrt(1.0 - alpha_bar[t])
+        x = np.sqrt(alpha_bar[below]) * x_0 + np.sqrt(1.0 - alpha_bar[below]) * noise
+    np.testing.assert_allclose(found, x, atol=2e-6)
+
+
+def test_a_respaced_chain_of_all_steps_is_the_chain():
+    make = chain.ancestral_step
+    assert chain.respaced(make, None) is make
+
+
 def test_a_cut_chain_keeps_the_history_that_it_walks():
     table = schedule.cosine_schedule(T)
     solver = chain.dpm_solver_step(table, tanh_denoiser)

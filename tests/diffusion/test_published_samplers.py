@@ -45,10 +45,7 @@ def walk(scheduler, x):
 def ours(factory, table, x, every):
     """Samples in steps every, 2 every, ..., T."""
     steps = tuple(range(every, table.num_steps + 1, every))
-    told = jnp.array(steps, jnp.int32)
-    step = factory(
-        schedule.respace(table, steps), lambda k, x, t: denoise(k, x, told[t - 1])
-    )
+    step = chain.respaced(factory, steps)(table, denoise)
     return chain.sample_from(step, jax.random.key(0), x, start=len(steps))
 
 

@@ -294,8 +294,7 @@ def sampler(
 
     def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
         del key  # deterministic
-        told = t if steps is None else jnp.asarray(steps, jnp.int32)[t - 1]
-        return net.apply({"params": params}, context, x_t, told, method="denoise")
+        return net.apply({"params": params}, context, x_t, t, method="denoise")
 
     def encode(condition: Condition):
         arguments = condition.arguments(config)
@@ -304,8 +303,6 @@ def sampler(
     def sample(key: Key, condition: Condition, *, scale=None) -> Array:
         noise_table = schedule.cosine_schedule(config.num_steps)
         noise_table = noise_table if table is None else table
-        if steps is not None:
-            noise_table = schedule.respace(noise_table, steps)
         context = encode(condition)
         if scale is None:
             denoiser = lambda k, x, t: denoise(k, x, t, context)  # noqa: E731
@@ -314,10 +311,10 @@ def sampler(
             null = encode(dataclasses.replace(condition, keep_past=off))
             denoiser = guidance.classifier_free(denoise, context, null, scale)
         return chain.sample(
-            step(noise_table, denoiser),
+            chain.respaced(step, steps)(noise_table, denoiser),
             key,
             (config.future, config.num_features),
-            num_steps=noise_table.num_steps,
+            num_steps=noise_table.num_steps if steps is None else len(steps),
         )
 
     return sample

@@ -292,9 +292,8 @@ def sampler(
     net = generator(config)
 
     def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
-        told = t if steps is None else jnp.asarray(steps, jnp.int32)[t - 1]
         latent = jax.random.normal(key, (config.latent,)) if config.latent else None
-        arguments = context, x_t, told, latent
+        arguments = context, x_t, t, latent
         return net.apply({"params": params}, *arguments, method="denoise")
 
     def encode(condition: Condition):
@@ -304,7 +303,6 @@ def sampler(
 
     def sample(key: Key, condition: Condition, *, scale=None) -> Array:
         table = config.table()
-        table = table if steps is None else schedule.respace(table, steps)
         denoiser: Denoiser = lambda k, x, t: denoise(k, x, t, context)  # noqa: E731
         context = encode(condition)
         if scale is not None:
@@ -312,8 +310,8 @@ def sampler(
             null = encode(dataclasses.replace(condition, keep=off))
             denoiser = guidance.classifier_free(denoise, context, null, scale)
         shape = (config.frames, config.features)
-        return chain.sample(
-            step(table, denoiser), key, shape, num_steps=table.num_steps
-        )
+        number = table.num_steps if steps is None else len(steps)
+        walk = chain.respaced(step, steps)(table, denoiser)
+        return chain.sample(walk, key, shape, num_steps=number)
 
     return sample

@@ -8,6 +8,7 @@ Source: SMGDiff, section 3.3, eq. 10-15 and table 4.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax
@@ -174,26 +175,24 @@ def sampler(
 
     def sample(key: Key, condition: Condition) -> Array:
         table = schedule.cosine_schedule(config.num_steps)
-        table = table if steps is None else schedule.respace(table, steps)
         context = net.apply({"params": params}, *condition.arguments(), method="encode")
 
         def denoise(key: Key, x_t: Array, t: Array) -> Array:
             del key  # deterministic
-            told = t if steps is None else jnp.asarray(steps, jnp.int32)[t - 1]
-            return net.apply({"params": params}, context, x_t, told, method="denoise")
+            return net.apply({"params": params}, context, x_t, t, method="denoise")
 
         objective = contact_objective(
             condition.ball, representation=representation, guided=guided
         )
+        toward_contact = functools.partial(
+            guidance.dsg_step,
+            objective=objective,
+            rate=guided.rate,
+            last_sigma=guided.last_sigma,
+        )
         moves = {
-            False: step(table, denoise),
-            True: guidance.dsg_step(
-                table,
-                denoise,
-                objective,
-                rate=guided.rate,
-                last_sigma=guided.last_sigma,
-            ),
+            is_guided: chain.respaced(make, steps)(table, denoise)
+            for is_guided, make in ((False, step), (True, toward_contact))
         }
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, shape)
