@@ -138,14 +138,20 @@ def to_markdown(rows: dict[str, ByFrame], *, places: str = "by frame") -> str:
     """One table: a line per row and column, a column per place.
 
     Args:
-      rows: As `by_frame` returns them.
+      rows: As `by_frame` returns them; a place without frames (NaN) is a dash.
       places: What the places are.
     """
+
+    def text(x: float) -> str:
+        if not math.isfinite(x):
+            return "–"
+        return f"{x:.0f}" if abs(x) >= 10 else f"{x:.2f}"
+
     number = max(len(values) for row in rows.values() for values in row.values())
     lines = [f"| {places} | " + " | ".join(map(str, range(number))) + " |"]
     lines.append("|---" * (number + 1) + "|")
     for name, row in rows.items():
         for column, values in row.items():
-            texts = (f"{x:.0f}" if abs(x) >= 10 else f"{x:.2f}" for x in values)
-            lines.append(f"| {name}, {columns.header(column)} | {' | '.join(texts)} |")
+            texts = " | ".join(map(text, values))
+            lines.append(f"| {name}, {columns.header(column)} | {texts} |")
     return "\n".join(lines)

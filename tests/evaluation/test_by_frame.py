@@ -82,3 +82,8 @@ def test_sums_of_parts_add_up_to_those_of_the_whole():
     own = np.asarray(place) == 2
     expected = (np.asarray(values) * weights)[own].sum(), np.asarray(weights)[own].sum()
     np.testing.assert_allclose(whole[:, 2], expected, rtol=1e-4)
+
+
+def test_a_place_without_frames_is_a_dash():
+    rows = {"row": {"jerk": np.array([12.3, 1.5, np.nan])}}
+    assert by_frame.to_markdown(rows).endswith("| 12 | 1.50 | – |")
