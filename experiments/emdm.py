@@ -1,4 +1,4 @@
-"""EMDM and what it is compared with: train, evaluate, sample.
+"""EMDM and what it is compared with: train, evaluate, sample, export.
 
 Examples:
   python experiments/prepare_data.py bandai_namco/1 --manual-dir path/to/zips --out data/bandai1.npz
@@ -22,10 +22,11 @@ from jaxmotion import cli, reporting
 from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluators import frozen
 from jaxmotion.evaluators.text_motion import Padding
-from jaxmotion.learning import loop, runs
+from jaxmotion.learning import checkpoint, loop, runs
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import evaluation as emdm_evaluation
 from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import sampler as emdm_sampler
 from jaxmotion.systems.emdm import scoring as emdm_scoring
 from jaxmotion.systems.emdm import text as emdm_text
 from jaxmotion.systems.emdm import training as emdm_training
@@ -353,10 +354,35 @@ def import_weights(args: Import) -> None:
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write a row of actions, averaged and as float16, as one small npz file.
+
+    Example: python experiments/emdm.py export --run runs/emdm_action --out actions.npz
+
+    Attributes:
+      run: Run folder of `train`.
+      row: Which model.
+      out: File to write, for `jaxmotion.load`.
+    """
+
+    run: Path = Path("runs/emdm_action")
+    row: str = "emdm"
+    out: Path = Path("actions.npz")
+
+
+def export(args: Export) -> None:
+    """Writes the file."""
+    model, params = emdm_sampler.load(args.run, row=args.row)
+    checkpoint.export_params(args.out, params, emdm_sampler.to_json(model))
+    print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
+
+
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Sample, tyro.conf.subcommand("sample")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]
 )
 
@@ -364,7 +390,7 @@ Command = (
 def main() -> None:
     """Parses the command line and runs the command."""
     args = cli.check(tyro.cli(Command, description=__doc__))
-    run = {Train: train, Evaluate: evaluate, Sample: sample}
+    run = {Train: train, Evaluate: evaluate, Sample: sample, Export: export}
     (run | {Import: import_weights})[type(args)](args)
 
 

@@ -1,8 +1,8 @@
 """Real-time motion diffusion in JAX: four published systems on one functional core.
 
 The face is a handful of functions: `load` a model, `start` characters, give them
-`commands`, `rollout`, and `save` or `show` what they do. Everything they are made of is
-public: `from jaxmotion.diffusion import chain`.
+`commands`, `rollout`, or `sample` whole motions, and `save` or `show` what they do.
+Everything they are made of is public: `from jaxmotion.diffusion import chain`.
 """
 
 from jaxmotion import (
@@ -16,7 +16,7 @@ from jaxmotion import (
     networks,
     systems,
 )
-from jaxmotion.face import commands, load, rollout, save, show
+from jaxmotion.face import commands, load, rollout, sample, save, show
 
 __version__ = "0.1.0"
 
@@ -32,6 +32,7 @@ __all__ = [
     "motion",
     "networks",
     "rollout",
+    "sample",
     "save",
     "show",
     "systems",

@@ -1,10 +1,14 @@
-"""The library in a few lines: load, start, command, roll out, save, show.
+"""The library in a few lines: load, start, command, roll out, sample, save, show.
 
     model = jm.load("locomotion")
     states = model.start(256)
     commands = jm.commands("figure_eight", model, 256, seconds=10.0, speed=1.4)
     frames = jm.rollout(model, jax.random.key(0), states, commands)
     jm.save("walk.gif", model.skeleton, frames[0])
+
+    model = jm.load("actions")
+    motions = jm.sample(model, jax.random.key(0), "jump", 256)
+    jm.save("jump.gif", model.skeleton, motions[0])
 
 Only composes what stands below it, and checks what it is given with one clear line.
 What is slow to import (Flax, Orbax, matplotlib) is imported by those who need it.
@@ -22,9 +26,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxmotion import files
-from jaxmotion.control import courses, steering
+from jaxmotion.control import courses, sampling, steering
 from jaxmotion.control.foot_lock import FootLock, lock_feet
 from jaxmotion.control.frame import Frame
+from jaxmotion.control.sampling import Sampler
 from jaxmotion.control.steering import Character
 from jaxmotion.motion import anatomy
 from jaxmotion.motion.contact import foot_contacts
@@ -34,55 +39,62 @@ from jaxmotion.systems import registry
 from jaxmotion.typing import Key
 from jaxmotion.viz.stage import Ball, Stage, make_stage
 
-ASSETS = Path(__file__).with_name("assets")
 # Characters at a time on a CPU, where one large batch falls out of the cache.
 _CPU_CHUNK = 4
 
 
 def load(
     source: str | Path, *, foot_lock: FootLock | bool | None = None, **options: Any
-) -> Character:
-    """A model to be steered.
+) -> Any:
+    """A model to be steered, or to be sampled.
 
     Args:
-      source: Name of a shipped model ("locomotion", "walker"), a run folder of a
-        steerable system, or a file of `experiments/camdm.py export`.
+      source: Name of a shipped model (one of `files.SHIPPED`), a run folder, or a file
+        of a system's `export`.
       foot_lock: Settings of the lock that keeps planted feet in place; True for the
-        defaults, False for none. None: on for shipped models, off for runs and files,
-        whose frames are then what the network makes.
-      **options: For the system's `controller.load_character`: `step` makes another step
-        of the chain, such as `diffusion.chain.ddim_step`; CAMDM has `control` as well.
+        defaults, False for none. None: on for shipped models that are steered, off for
+        runs and files, whose frames are then what the network makes.
+      **options: For the system's `load_character` or `load_sampler`: `step` makes
+        another step of the chain, such as `diffusion.chain.ddim_step`; CAMDM has
+        `control` as well, EMDM `scale` and `row`.
 
     Returns:
-      The character: its skeleton, labels, rate, source and licence; `start` makes
-      states.
+      A `control.steering.Character` for `rollout`, whose `start` makes states; of EMDM,
+      which makes whole motions of actions, a `control.sampling.Sampler` for `sample`.
+      Either has `skeleton`, `labels`, `fps`, `source` and `license`.
 
     Raises:
       OSError: if a file cannot be read.
-      ValueError: if there is no such model, or its system is not steered.
+      ValueError: if there is no such model, or it is of no system that is known.
     """
     path = Path(source)
     is_shipped = not path.exists()
     if is_shipped:
-        shipped = sorted(file.stem for file in ASSETS.glob("*.npz"))
-        if str(source) not in shipped:
+        if str(source) not in files.SHIPPED:
             raise ValueError(
                 f"{source}: no such file or folder, and no shipped model "
-                f"({', '.join(shipped)})"
+                f"({', '.join(files.SHIPPED)})"
             )
-        path = ASSETS / f"{source}.npz"
+        path = files.SHIPPED[str(source)]
     found = registry.SYSTEMS.get(_system(path))
-    known = [system.name for system in registry.SYSTEMS.values() if system.steerable]
-    if found is None or not found.steerable:
+    if found is None:
         raise ValueError(
-            f"{path}: field 'system' is {_system(path)!r}, expected one that is "
-            f"steered ({', '.join(known)})"
+            f"{path}: field 'system' is {_system(path)!r}, expected one of "
+            f"{', '.join(registry.SYSTEMS)}"
         )
-    character = found.room("controller").load_character(path, **options)
-    wanted = is_shipped if foot_lock is None else foot_lock
-    if wanted is False:
-        return character
-    return lock_feet(character, wanted if isinstance(wanted, FootLock) else None)
+    if found.steerable:
+        model = found.room("controller").load_character(path, **options)
+        wanted = is_shipped if foot_lock is None else foot_lock
+        if wanted is not False:
+            given = wanted if isinstance(wanted, FootLock) else None
+            model = lock_feet(model, given)
+    elif foot_lock:
+        raise ValueError(f"{source} is sampled, not steered: it has no foot lock")
+    else:
+        model = found.room("sampler").load_sampler(path, **options)
+    if is_shipped:
+        model = dataclasses.replace(model, license=files.SHIPPED_LICENSE)
+    return model
 
 
 def _system(path: Path) -> Any:
@@ -185,14 +197,50 @@ def rollout(
       Frames [characters, ticks, ...]; `frames[0].motion` is the first one's motion.
 
     Raises:
-      ValueError: if states and commands are of different numbers of characters, or a
-        label is none of the model's.
+      ValueError: if the model is not steered, states and commands are of different
+        numbers of characters, or a label is none of the model's.
     """
+    if not isinstance(model, Character):
+        raise ValueError("this model makes whole motions: expected `sample`")
     if chunk is None and jax.default_backend() == "cpu":
         chunk = _CPU_CHUNK
     return steering.steered_rollouts(
         model, key, states, commands, chunk=chunk, mesh=mesh
     )
+
+
+def sample(
+    model: Sampler,
+    key: Key,
+    labels: Any = None,
+    number: int | None = None,
+    *,
+    chunk: int | None = None,
+) -> Motion:
+    """Whole motions: one program, compiled once per shape.
+
+    Args:
+      model: From `load`.
+      key: Consumed. Motion i draws from `fold_in(key, i)`, however many there are.
+      labels: Name or index of an action for all motions, or one for each; None for the
+        first.
+      number: Motions; None for one per label that is given, or one.
+      chunk: Motions to make at a time, at most; None for what suits the processor.
+
+    Returns:
+      Motions [number, frames, ...] that begin at the origin facing +z; `motions[0]` is
+      the first.
+
+    Raises:
+      ValueError: if the model is steered, a label is unknown, or numbers do not agree.
+    """
+    if not isinstance(model, Sampler):
+        raise ValueError("this model is steered: expected `rollout`, not `sample`")
+    found = steering.label_indices(model.labels, labels, number)
+    if chunk is None:
+        on_cpu = jax.default_backend() == "cpu"
+        chunk = _CPU_CHUNK if on_cpu else len(found)
+    return sampling.sample_motions(model, key, found, chunk=chunk)
 
 
 def _one(frames: Frame | Motion) -> Motion:

@@ -10,6 +10,7 @@ import os
 import stat
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -18,6 +19,12 @@ import numpy as np
 # motions shrinks about 4 times, still frames 20 times; bombs go up to 1,000 times.
 FREE_BYTES = 256 * 2**20
 FREE_RATIO = 50
+# Models that come with the package, by name; each has a card beside it.
+SHIPPED = {
+    path.stem: path for path in sorted(Path(__file__).with_name("assets").glob("*.npz"))
+}
+# License of their weights.
+SHIPPED_LICENSE = "Apache-2.0"
 # What makes a file of clips, for messages about one that is missing.
 CLIPS_MAKER = (
     "`experiments/prepare_data.py` makes it, or `experiments/dribble.py` with a ball"

@@ -72,6 +72,7 @@ class Character:
       labels: Names of the styles or skills; none where commands have no label.
       fps: Ticks per second.
       source: The data that it was trained on, and their license.
+      license: License of the weights; None where nobody gave one.
       params: All arrays that `method` needs, not only a network's.
       method: Makes the controller.
       tuning: What can be changed while it is steered; None for nothing.
@@ -87,6 +88,7 @@ class Character:
     labels: tuple[str, ...]
     fps: float
     source: str
+    license: str | None = None
     params: Params
     method: Method
     starts: Callable[[np.ndarray, int], Any]

@@ -13,8 +13,10 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
-from jaxmotion.motion.skeleton import Skeleton, check_skeleton
+from jaxmotion.motion.features import Normalizer
+from jaxmotion.motion.skeleton import MAX_METERS, Skeleton, check_skeleton
 
 
 def decode(
@@ -170,6 +172,89 @@ def names_from_json(value: Any) -> tuple[str, ...]:
     if not right or len(set(value)) < len(value):
         raise ValueError(f"{value!r:.60}, expected a list of different names")
     return tuple(value)
+
+
+def numbers_from_json(
+    name: str, value: Any, *, least: float, size: int | None = None
+) -> list[int | float]:
+    """A list of finite numbers.
+
+    Raises:
+      ValueError: if it is none, a number is less than `least` or above 1e6, or there
+        are not `size` of them; names it.
+    """
+    if not isinstance(value, list):
+        raise ValueError(f"{name} is {value!r:.60}, expected a list of numbers")
+    for x in value:
+        right = isinstance(x, int | float) and not isinstance(x, bool)
+        if not (right and least <= x <= 1e6):
+            raise ValueError(f"{name} has {x!r:.60}, expected {least:g} to 1e+06")
+    if size is not None and len(value) != size:
+        raise ValueError(f"{name} has {len(value)} numbers, expected {size}")
+    return value
+
+
+def normalizer_to_json(normalizer: Normalizer) -> dict[str, Any]:
+    """JSON of a normalizer: its "mean" and "std"."""
+    return {
+        name: np.asarray(getattr(normalizer, name), np.float64).tolist()
+        for name in ("mean", "std")
+    }
+
+
+def normalizer_from_json(value: Any, *, size: int) -> Normalizer:
+    """Inverse of `normalizer_to_json`; other fields are left out.
+
+    Raises:
+      KeyError: if a field is missing.
+      ValueError: if one is not so many numbers; says what is wrong.
+    """
+    # A feature that never varies has a tiny deviation, but not none.
+    made = {
+        name: numbers_from_json(name, value[name], least=least, size=size)
+        for name, least in (("mean", -1e6), ("std", 1e-12))
+    }
+    return Normalizer(**{k: jnp.asarray(x, jnp.float32) for k, x in made.items()})
+
+
+def arrays_to_json(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """JSON of named arrays, to five places: poses to start from."""
+    return {
+        name: np.asarray(array, np.float64).round(5).tolist()
+        for name, array in arrays.items()
+    }
+
+
+def arrays_from_json(
+    value: Any, *, lead: tuple[int, ...], shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, Array]:
+    """Inverse of `arrays_to_json` for poses to start from.
+
+    Args:
+      value: The JSON object.
+      lead: Leading axes of all arrays; the next axis is the number of poses, one or
+        more, the same for all.
+      shapes: The axes after that, by name.
+
+    Raises:
+      ValueError: if an array is missing, of another shape or not of finite numbers.
+    """
+    try:
+        found = {name: np.asarray(value[name], np.float64) for name in shapes}
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"is wrong: {error}") from None
+    first = next(iter(found.values()))
+    number = first.shape[len(lead)] if first.ndim > len(lead) else 0
+    expected = {name: (*lead, number, *shape) for name, shape in shapes.items()}
+    if number < 1 or {k: x.shape for k, x in found.items()} != expected:
+        raise ValueError(
+            f"has shapes {' and '.join(str(x.shape) for x in found.values())}, "
+            f"expected {' and '.join(map(str, expected.values()))} of at least one "
+            "start per label"
+        )
+    if not all((np.abs(x) <= MAX_METERS).all() for x in found.values()):
+        raise ValueError(f"has numbers that are not within {MAX_METERS:g}")
+    return {name: jnp.asarray(x, jnp.float32) for name, x in found.items()}
 
 
 def differences(

@@ -80,6 +80,13 @@ class Motion:
     joint_rotation: Float[Array, "*batch frames joints 6"]
     fps: float = jax.tree.static(default=30.0)
 
+    # Indexed, never looped over: `jnp.stack(motion)` should raise.
+    __iter__ = None
+
+    def __getitem__(self, index: int | slice | Array | tuple) -> "Motion":
+        """The motion at an index of the leading axes, such as `motions[0]`."""
+        return jax.tree.map(lambda x: x[index], self)
+
 
 def check_parents(parents: tuple[int, ...]) -> None:
     """Raises unless every parent precedes its joint and only joint 0 is a root.

@@ -1,9 +1,10 @@
 """The systems, a record each: what experiments, benchmarks and serving ask.
 
 A system is a package of this folder with rooms of agreed names: "model" always,
-"training" where it is trained here, "controller" where it is steered, "evaluation"
-where numbers of steps are compared. A record imports a room when it is asked for
-something in it, so that this module is cheap to import and knows no more than names.
+"training" where it is trained here, "controller" where it is steered, else "sampler",
+"evaluation" where numbers of steps are compared. A record imports a room when it is
+asked for something in it, so that this module is cheap to import and knows no more than
+names.
 """
 
 import dataclasses
@@ -24,7 +25,9 @@ class System:
       title: As its paper writes it.
       paper: Authors, venue and number of the paper.
       steerable: Whether its room "controller" has `load_character(path)`, which makes a
-        `control.steering.Character` of a run folder or an exported file.
+        `control.steering.Character` of a run folder or an exported file; if not, its
+        room "sampler" has `load_sampler(path)`, which makes a
+        `control.sampling.Sampler`.
       swept: Whether its room "evaluation" has `BENCH`, which a sweep over numbers of
         steps asks.
     """

@@ -20,15 +20,15 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmotion import files
 from jaxmotion.data import selection
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.motion import features, rotation, trajectory
-from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.networks import transformer
 from jaxmotion.systems.camdm import network as camdm_network
 from jaxmotion.typing import Key, Params
@@ -358,40 +358,28 @@ def to_json(model: Model) -> dict[str, Any]:
         "source": model.source,
     }
     if model.starts is not None:
-        value["starts"] = {
-            name: np.asarray(getattr(model.starts, name), np.float64).round(5).tolist()
-            for name in ("root_position", "joint_rotation")
-        }
+        value["starts"] = model_json.arrays_to_json(
+            {
+                "root_position": model.starts.root_position,
+                "joint_rotation": model.starts.joint_rotation,
+            }
+        )
     return value
 
 
 def _starts_from_json(value: Any, config: Config, where: str) -> Motion | None:
     if value is None:
         return None
+    frames = {"root_position": (3,), "joint_rotation": (config.num_joints, 6)}
     try:
-        root, joints = (
-            np.asarray(value[name], np.float64)
-            for name in ("root_position", "joint_rotation")
+        found = model_json.arrays_from_json(
+            value,
+            lead=(config.num_labels,),
+            shapes={name: (config.past, *shape) for name, shape in frames.items()},
         )
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{where}: field 'starts' is wrong: {error}") from None
-    number = root.shape[1] if root.ndim > 1 else 0
-    lead = (config.num_labels, number, config.past)
-    expected = ((*lead, 3), (*lead, config.num_joints, 6))
-    if number < 1 or (root.shape, joints.shape) != expected:
-        raise ValueError(
-            f"{where}: field 'starts' has shapes {root.shape} and {joints.shape}, "
-            f"expected {expected[0]} and {expected[1]} of at least one start per label"
-        )
-    if not all((np.abs(x) <= MAX_METERS).all() for x in (root, joints)):
-        raise ValueError(
-            f"{where}: field 'starts' has numbers that are not within {MAX_METERS:g}"
-        )
-    return Motion(
-        root_position=jnp.asarray(root, jnp.float32),
-        joint_rotation=jnp.asarray(joints, jnp.float32),
-        fps=config.fps,
-    )
+    except ValueError as error:
+        raise ValueError(f"{where}: field 'starts' {error}") from None
+    return Motion(**found, fps=config.fps)
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
@@ -486,13 +474,6 @@ def fitting_clips(model: Model, clips: Clips) -> tuple[Clips, str]:
     )
 
 
-# Models that come with the package, by name; each has a card beside it.
-SHIPPED = {
-    path.stem: path
-    for path in sorted((Path(__file__).parents[2] / "assets").glob("*.npz"))
-}
-
-
 def load(folder: str | Path) -> tuple[Model, Params]:
     """Model and averaged parameters (EMA) of a run folder or an exported file.
 
@@ -507,7 +488,7 @@ def load(folder: str | Path) -> tuple[Model, Params]:
     """
     path = Path(folder)
     if not path.exists():
-        path = SHIPPED.get(str(folder), path)
+        path = files.SHIPPED.get(str(folder), path)
     if path.is_file():
         params, value = checkpoint.import_params(path)
         model = from_json(value, where=str(path))

@@ -17,12 +17,10 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.learning import model_json
 from jaxmotion.motion import rotation
-from jaxmotion.motion.features import Normalizer
 from jaxmotion.motion.trajectory import Trajectory
 from jaxmotion.networks import transformer
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
@@ -202,15 +200,13 @@ def to_json(model: Model) -> dict[str, Any]:
       A JSON object.
     """
     features = model.representation
-    numbers = lambda x: np.asarray(x, np.float64).tolist()  # noqa: E731
     return {
         "system": SYSTEM,
         "config": dataclasses.asdict(model.config),
         "paths": dataclasses.asdict(model.paths),
         "representation": {
             "skeleton": model_json.skeleton_to_json(features.skeleton),
-            "mean": numbers(features.normalizer.mean),
-            "std": numbers(features.normalizer.std),
+            **model_json.normalizer_to_json(features.normalizer),
             "joints": list(features.joints),
             "fps": features.fps,
             "radius": features.radius,
@@ -221,17 +217,6 @@ def to_json(model: Model) -> dict[str, Any]:
         "speeds": list(model.speeds),
         "source": model.source,
     }
-
-
-def _numbers(name: str, value: Any, *, least: float) -> list[int | float]:
-    """A list of finite numbers; raises if it is none."""
-    if not isinstance(value, list):
-        raise ValueError(f"{name} is {value!r:.60}, expected a list of numbers")
-    for x in value:
-        right = isinstance(x, int | float) and not isinstance(x, bool)
-        if not (right and least <= x <= 1e6):
-            raise ValueError(f"{name} has {x!r:.60}, expected {least:g} to 1e+06")
-    return value
 
 
 def _representation(value: Any) -> Representation:
@@ -245,19 +230,13 @@ def _representation(value: Any) -> Representation:
             f"joints is {joints!r:.60}, expected numbers below {skeleton.num_joints}"
         )
     size = feature_layout(skeleton, tuple(joints)).size
-    # A feature that never varies has a tiny deviation, but not none.
-    for name, least in (("mean", -1e6), ("std", 1e-12)):
-        if len(_numbers(name, value[name], least=least)) != size:
-            raise ValueError(f"{name} has {len(value[name])} numbers, expected {size}")
+    normalizer = model_json.normalizer_from_json(value, size=size)
     scalars = ("fps", "radius", "reach", "contact_speed")
     for name in scalars:
-        _numbers(name, [value[name]], least=1e-6)
+        model_json.numbers_from_json(name, [value[name]], least=1e-6)
     return Representation(
         skeleton=skeleton,
-        normalizer=Normalizer(
-            mean=jnp.asarray(value["mean"], jnp.float32),
-            std=jnp.asarray(value["std"], jnp.float32),
-        ),
+        normalizer=normalizer,
         joints=tuple(joints),
         **{name: float(value[name]) for name in scalars},
     )
@@ -285,7 +264,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         "paths": lambda x: model_json.config_from_json(smgdiff_trajectory.Config, x),
         "representation": _representation,
         "labels": model_json.names_from_json,
-        "speeds": lambda x: tuple(_numbers("speed", x, least=0.0)),
+        "speeds": lambda x: tuple(model_json.numbers_from_json("speed", x, least=0.0)),
         "source": lambda x: model_json.names_from_json([x])[0],
     }
     made = model_json.decode(value, where, parts)

@@ -1,0 +1,188 @@
+"""EMDM's motions of actions as a model to be sampled: from a run folder or one file."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxmotion.control.sampling import Sampler
+from jaxmotion.diffusion import chain
+from jaxmotion.learning import checkpoint, model_json
+from jaxmotion.motion.skeleton import Motion
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import features as emdm_features
+from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import training as emdm_training
+from jaxmotion.systems.emdm.features import Representation
+from jaxmotion.typing import Key, Params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Model:
+    """Everything but the generator's parameters.
+
+    Attributes:
+      config: The method.
+      representation: What features mean.
+      labels: Names of the actions.
+      source: The data, and their license.
+    """
+
+    config: emdm_model.Config
+    representation: Representation
+    labels: tuple[str, ...]
+    source: str
+
+
+def to_json(model: Model) -> dict[str, Any]:
+    """JSON of a model."""
+    features = model.representation
+    return {
+        "system": emdm_training.SYSTEM,
+        "config": dataclasses.asdict(model.config),
+        "representation": {
+            "skeleton": model_json.skeleton_to_json(features.skeleton),
+            **model_json.normalizer_to_json(features.normalizer),
+            "fps": features.fps,
+        },
+        "labels": list(model.labels),
+        "source": model.source,
+    }
+
+
+def _representation(value: Any) -> Representation:
+    if not isinstance(value, dict):
+        raise ValueError(f"a JSON {type(value).__name__}, expected an object")
+    skeleton = model_json.skeleton_from_json(value["skeleton"])
+    size = 6 * (skeleton.num_joints + 1)
+    model_json.numbers_from_json("fps", [value["fps"]], least=1e-3)
+    return Representation(
+        skeleton=skeleton,
+        normalizer=model_json.normalizer_from_json(value, size=size),
+        fps=float(value["fps"]),
+    )
+
+
+def from_json(value: dict[str, Any], *, where: str) -> Model:
+    """Inverse of `to_json`.
+
+    Args:
+      value: The JSON object.
+      where: The file, for error messages.
+
+    Raises:
+      ValueError: names the file and the field that is missing or wrong.
+    """
+    if value.get("system") != emdm_training.SYSTEM:
+        raise ValueError(
+            f"{where}: field 'system' is {value.get('system')!r}, expected "
+            f"{emdm_training.SYSTEM!r}"
+        )
+    parts = {
+        "config": lambda x: model_json.config_from_json(emdm_model.Config, x),
+        "representation": _representation,
+        "labels": model_json.names_from_json,
+        "source": lambda x: model_json.names_from_json([x])[0],
+    }
+    model = Model(**model_json.decode(value, where, parts))
+    _check(model, where)
+    return model
+
+
+def _check(model: Model, where: str) -> None:
+    """Raises unless a model's parts fit together, and it makes motions of actions."""
+    config = model.config
+    for name, found, expected in (
+        ("condition", config.condition, "action"),
+        ("condition_size", config.condition_size, len(model.labels)),
+        ("features", config.features, model.representation.num_features),
+    ):
+        if found != expected:
+            raise ValueError(
+                f"{where}: field 'config.{name}' is {found!r}, expected {expected!r}"
+            )
+
+
+def load(path: Path, *, row: str = "emdm") -> tuple[Model, Params]:
+    """Model and averaged parameters of a run folder or an exported file.
+
+    Args:
+      path: Run folder of `experiments/emdm.py train`, or file of its `export`.
+      row: Which model of a run folder.
+
+    Raises:
+      CheckpointError: if the row was not trained, or the file is damaged.
+      OSError: if a file cannot be read.
+      ValueError: if it is of another system, or makes no motions of actions.
+    """
+    if path.is_file():
+        params, value = checkpoint.import_params(path)
+        model = from_json(value, where=str(path))
+        like = jax.eval_shape(lambda: emdm_model.init(jax.random.key(0), model.config))
+        checkpoint.check_params(path, params, like["generator"])
+        return model, params
+    run = emdm_data.load_run(path)
+    params, config = emdm_training.load_row(run.record, row)
+    model = Model(
+        config=config,
+        representation=run.representation,
+        labels=run.actions,
+        source=run.clips.source,
+    )
+    _check(model, str(run.record.config))
+    return model, params
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Method:
+    """What makes motions of `(generator's parameters, representation)`; hashable."""
+
+    config: emdm_model.Config
+    scale: float | None = None
+    step: chain.StepFactory = chain.ancestral_step
+
+    def __call__(
+        self, params: tuple[Params, Representation]
+    ) -> Callable[[Key, Array], Motion]:
+        """`(key, label) -> motion`."""
+        generator, representation = params
+        sample = emdm_model.sampler(generator, config=self.config, step=self.step)
+
+        def make(key: Key, label: Array) -> Motion:
+            condition = emdm_model.Condition(
+                vector=jax.nn.one_hot(label, self.config.condition_size),
+                keep=jnp.ones((), bool),
+                mask=jnp.ones(self.config.frames, bool),
+            )
+            x = sample(key, condition, scale=self.scale)
+            return emdm_features.to_motion(x, representation)
+
+        return make
+
+
+def load_sampler(
+    path: Path,
+    *,
+    step: chain.StepFactory = chain.ancestral_step,
+    scale: float | None = None,
+    row: str = "emdm",
+) -> Sampler:
+    """The sampler of a run folder or an exported file; see `load`.
+
+    `step` makes the chain's step, and `scale` is that of classifier-free guidance; None
+    for none, as the paper has it for actions.
+    """
+    model, params = load(path, row=row)
+    return Sampler(
+        skeleton=model.representation.skeleton,
+        labels=model.labels,
+        fps=model.representation.fps,
+        frames=model.config.frames,
+        source=model.source,
+        params=(params, model.representation),
+        method=Method(config=model.config, scale=scale, step=step),
+    )
