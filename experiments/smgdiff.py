@@ -1,4 +1,4 @@
-"""SMGDiff, a soccer player with a ball: train, evaluate, roll out.
+"""SMGDiff, a soccer player with a ball: train, evaluate, roll out, export.
 
 Examples:
   python experiments/dribble.py --data data/bandai1.npz data/bandai2.npz --out data/dribble.npz
@@ -21,8 +21,9 @@ from jaxmotion import cli, reporting
 from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluation.table import Rows
 from jaxmotion.evaluators import frozen
-from jaxmotion.learning import loop, runs
+from jaxmotion.learning import checkpoint, loop, runs
 from jaxmotion.motion.skeleton import joint_positions
+from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import model as smgdiff_model
@@ -285,17 +286,45 @@ def rollout(args: Rollout) -> None:
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write a run's player, averaged and as float16, as one small npz file.
+
+    Example: python experiments/smgdiff.py export --run runs/smgdiff --out dribble.npz
+
+    Attributes:
+      run: Run folder of `train` with the stages motion_8 and paths_1.
+      out: File to write, for `jaxmotion.load`.
+      starts: Starts per skill, in which the model itself stands.
+    """
+
+    run: Path = Path("runs/smgdiff")
+    out: Path = Path("dribble.npz")
+    starts: int = 4
+
+
+def export(args: Export) -> None:
+    """Writes the file."""
+    cli.announce("compiling the rollouts that starts are taken from", 60)
+    _, model, params = smgdiff_controller.load_run(args.run)
+    starts = smgdiff_controller.own_starts(args.run, number=args.starts)
+    model = dataclasses.replace(model, starts=starts)
+    checkpoint.export_params(args.out, params, smgdiff_model.to_json(model))
+    print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
+
+
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
 )
 
 
 def main() -> None:
     """Parses the command line and runs the command."""
     args = cli.check(tyro.cli(Command, description=__doc__))
-    run = {Train: train, Evaluate: evaluate, Rollout: rollout}
+    run = {Train: train, Evaluate: evaluate, Rollout: rollout, Export: export}
     run[type(args)](args)
 
 

@@ -19,9 +19,9 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array
 
-from jaxmotion.control import rollout
+from jaxmotion.control import courses, rollout
 from jaxmotion.control.frame import Frame
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.typing import Exported, Key, Params
 
@@ -236,6 +236,65 @@ def steered_rollouts(
         chunk=chunk,
         mesh=mesh,
     )
+
+
+def calmest(
+    character: Character,
+    states: Any,
+    labels: np.ndarray,
+    *,
+    number: int,
+    past: int,
+    seconds: float = 12.0,
+    seed: int = 0,
+) -> tuple[Any, Frame]:
+    """Characters that were told to stand, of which those that move least in the end.
+
+    What a shipped model starts from, so that no recorded frame is in its file.
+
+    Args:
+      character: What moves them.
+      states: From which they begin.
+      labels: Label of each.
+      number: Characters to keep.
+      past: Frames at the end that count.
+      seconds: How long they stand.
+      seed: Seeds the noise.
+
+    Returns:
+      Their last states, and their last frames [number, past, ...].
+
+    Raises:
+      ValueError: if fewer characters begin.
+    """
+    if not 1 <= number <= len(labels):
+        raise ValueError(f"starts is {number}, expected 1 to {len(labels)}")
+    commands = courses.course_batch(
+        "straight",
+        labels,
+        np.full(len(labels), 0.0),
+        seconds=seconds,
+        fps=character.fps,
+    )
+    states, frames = _stand(
+        character.params,
+        jax.random.key(seed),
+        states,
+        commands,
+        method=character.method,
+    )
+    frames = frames[:, -past:]
+    positions = joint_positions(character.skeleton, frames.motion)
+    unrest = jnp.mean(jnp.abs(jnp.diff(positions, axis=1)), axis=(1, 2, 3))
+    kept = jnp.argsort(unrest)[:number]
+    return jax.tree.map(lambda x: x[kept], (states, frames))
+
+
+@functools.partial(jax.jit, static_argnames="method")
+def _stand(
+    params: Params, key: Key, states: Any, commands: Command, *, method: Method
+) -> tuple[Any, Frame]:
+    return rollout.rollout(method(params), key, states, commands, chunk=4)
 
 
 @functools.partial(jax.jit, static_argnames=("method", "chunk", "mesh"))

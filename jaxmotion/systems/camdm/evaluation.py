@@ -27,7 +27,7 @@ from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
 from jaxmotion.evaluators.style import StyleEvaluator
 from jaxmotion.motion import trajectory
-from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
@@ -133,37 +133,23 @@ def own_starts(run: Run, *, number: int, seed: int = 0) -> Motion:
     Raises:
       ValueError: if a style has no clip to begin with.
     """
-    model, many = run.model, 16
-    if not 1 <= number <= many:
-        raise ValueError(f"starts is {number}, expected 1 to {many}")
-    found = []
+    model, found = run.model, []
+    character = camdm_controller.character(run.params, model)
     for label in range(len(model.labels)):
-        labels = np.full(many, label)
-        commands = courses.course_batch(
-            "straight",
-            labels,
-            np.full(len(labels), 0.0),
-            seconds=12.0,
-            fps=model.config.fps,
-        )
+        labels = np.full(16, label)
         states = camdm_controller.start_states(
             run.train, model, labels, field=run.field, seed=seed
         )
-        frames = steering.steered_rollouts(
-            camdm_controller.character(run.params, model),
-            jax.random.key(seed),
+        _, frames = steering.calmest(
+            character,
             states,
-            commands,
-            chunk=4,
+            labels,
+            number=number,
+            past=model.config.past,
+            seed=seed,
         )
-        past = frames[:, -model.config.past :].motion
-        positions = joint_positions(model.skeleton, past)
-        unrest = jnp.mean(jnp.abs(jnp.diff(positions, axis=1)), axis=(1, 2, 3))
-        calmest = jnp.argsort(unrest)[:number]
-        motions = jax.tree.map(lambda x, i=calmest: x[i], past)
-        found.append(
-            jax.vmap(lambda m: camdm_controller.at_origin(model.skeleton, m))(motions)
-        )
+        at_origin = functools.partial(camdm_controller.at_origin, model.skeleton)
+        found.append(jax.vmap(at_origin)(frames.motion))
     return jax.tree.map(lambda *x: jnp.stack(x), *found)
 
 

@@ -33,7 +33,7 @@ from jaxtyping import Array, Int
 from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame, as_displayed
 from jaxmotion.control.rollout import Controller
-from jaxmotion.control.steering import Character, Tuning, check_labels
+from jaxmotion.control.steering import Character, Tuning, calmest, check_labels
 from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.diffusion import chain
 from jaxmotion.diffusion.schedule import spread_steps
@@ -42,6 +42,7 @@ from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import model as smgdiff_model
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff import training as smgdiff_training
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
@@ -441,13 +442,33 @@ def start_states(
     return state(scenes)
 
 
-def load_character(
-    path: Path, *, step: chain.StepFactory = chain.ancestral_step
-) -> Character:
-    """The player of a run folder: 8 steps of motion, 1 of paths.
+def own_states(model: Model, labels: np.ndarray, *, seed: int) -> PlayerState:
+    """States of players that start with the model's own frames of their skill.
 
-    It starts in frames that the run was trained on, and frames show its ball. `step`
-    makes the step of the unguided parts of the chain; the default is the paper's.
+    Args:
+      model: A model with `starts`.
+      labels: Skill of each player.
+      seed: Seeds the choice of frames.
+
+    Returns:
+      States, batch axis first.
+
+    Raises:
+      ValueError: if the model has no frames of its own, or no such skill.
+    """
+    if model.starts is None:
+        raise ValueError("the model has no frames to start from")
+    check_labels(labels, model.labels)
+    number = model.starts.ball.shape[1]
+    which = np.random.default_rng(seed).integers(number, size=len(labels))
+    chosen = jax.tree.map(lambda x: x[labels, which], model.starts)
+    skeleton = model.representation.skeleton
+    start = functools.partial(init_state, skeleton, config=model.config)
+    return jax.jit(jax.vmap(start))(chosen)
+
+
+def load_run(path: Path) -> tuple[smgdiff_training.Run, Model, dict[str, Params]]:
+    """A run folder, and its model of 8 steps of motion and 1 of paths.
 
     Raises:
       CheckpointError: if a stage was not trained.
@@ -456,14 +477,71 @@ def load_character(
     run = smgdiff_training.load_run(path)
     model, motion = smgdiff_training.load_stage(run, "motion_8")
     paths, path_params = smgdiff_training.load_stage(run, "paths_1")
-    method = Method(config=model.config, paths=paths.paths, step=step)
+    model = dataclasses.replace(model, paths=paths.paths)
+    return run, model, {"motion": motion, "paths": path_params}
+
+
+def own_starts(path: Path, *, number: int, seed: int = 0) -> Scene:
+    """Frames in which the players of a run stand: a start without a recorded frame.
+
+    Players of each skill stand for twelve seconds; of sixteen the calmest are taken.
+
+    Args:
+      path: The run folder.
+      number: Starts per skill, 1 to 16.
+      seed: Seeds the recorded frames that they begin with, and the noise.
+
+    Returns:
+      `Model.starts`.
+    """
+    run, model, _ = load_run(path)
+    character, skeleton = load_character(path), model.representation.skeleton
+
+    @jax.vmap
+    def local(frames: Frame) -> Scene:
+        scene = Scene(motion=frames.motion, **frames.extra)
+        frame = smgdiff_scene.plan_frame(skeleton, scene.motion)
+        return smgdiff_scene.to_frame(scene, frame)
+
+    found = []
+    for label in range(len(model.labels)):
+        labels = np.full(16, label)
+        states = start_states(run.train, model, labels, seed=seed)
+        past = model.config.past
+        _, frames = calmest(
+            character, states, labels, number=number, past=past, seed=seed
+        )
+        found.append(local(frames))
+    return jax.tree.map(lambda *x: jnp.stack(x), *found)
+
+
+def load_character(
+    path: Path, *, step: chain.StepFactory = chain.ancestral_step
+) -> Character:
+    """The player of a run folder or an exported file; frames show its ball.
+
+    It starts in the model's own frames where it has some, else in frames that the run
+    was trained on. `step` makes the step of the unguided parts of the chain; the
+    default is the paper's.
+
+    Raises:
+      CheckpointError: if a stage was not trained, or the file is damaged.
+      ValueError: if it is of another system.
+    """
+    if path.is_file():
+        model, params = smgdiff_model.import_file(path)
+        starts = functools.partial(own_states, model)
+    else:
+        run, model, params = load_run(path)
+        starts = functools.partial(start_states, run.train, model)
+    method = Method(config=model.config, paths=model.paths, step=step)
     return Character(
         skeleton=model.representation.skeleton,
         labels=model.labels,
         fps=model.config.fps,
         source=model.source,
-        params=(motion, path_params, model.representation),
+        params=(params["motion"], params["paths"], model.representation),
         method=method,
         tuning=_tuning(method),
-        starts=lambda labels, seed: start_states(run.train, model, labels, seed=seed),
+        starts=lambda labels, seed: starts(labels, seed=seed),
     )

@@ -13,14 +13,17 @@ Source: SMGDiff, section 3; sizes, which its missing supplement has, are CAMDM's
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxmotion.learning import model_json
+from jaxmotion.learning import checkpoint, model_json
 from jaxmotion.motion import rotation
+from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.motion.trajectory import Trajectory
 from jaxmotion.networks import transformer
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
@@ -180,6 +183,9 @@ class Model:
       labels: Names of the skills.
       speeds: Median speed of the root in each skill, meters per second.
       source: The data, and its license.
+      starts: Frames to start from, [labels, number, past, ...], of players at the
+        origin that face +z; None where they start from clips. A shipped model has its
+        own, which it made itself.
     """
 
     config: Config
@@ -188,6 +194,7 @@ class Model:
     labels: tuple[str, ...]
     speeds: tuple[float, ...]
     source: str
+    starts: Scene | None = None
 
 
 def to_json(model: Model) -> dict[str, Any]:
@@ -200,7 +207,7 @@ def to_json(model: Model) -> dict[str, Any]:
       A JSON object.
     """
     features = model.representation
-    return {
+    value = {
         "system": SYSTEM,
         "config": dataclasses.asdict(model.config),
         "paths": dataclasses.asdict(model.paths),
@@ -217,6 +224,39 @@ def to_json(model: Model) -> dict[str, Any]:
         "speeds": list(model.speeds),
         "source": model.source,
     }
+    if model.starts is not None:
+        motion = model.starts.motion
+        value["starts"] = model_json.arrays_to_json(
+            {
+                "root_position": motion.root_position,
+                "joint_rotation": motion.joint_rotation,
+                "ball": model.starts.ball,
+                "touch": model.starts.touch,
+            }
+        )
+    return value
+
+
+def _starts_from_json(value: Any, model: Model, where: str) -> Scene | None:
+    if value is None:
+        return None
+    features, past = model.representation, model.config.past
+    frames = {
+        "root_position": (3,),
+        "joint_rotation": (features.skeleton.num_joints, 6),
+        "ball": (3,),
+        "touch": (len(features.joints),),
+    }
+    try:
+        found = model_json.arrays_from_json(
+            value,
+            lead=(len(model.labels),),
+            shapes={name: (past, *shape) for name, shape in frames.items()},
+        )
+    except ValueError as error:
+        raise ValueError(f"{where}: field 'starts' {error}") from None
+    ball, touch = found.pop("ball"), found.pop("touch")
+    return Scene(motion=Motion(**found, fps=model.config.fps), ball=ball, touch=touch)
 
 
 def _representation(value: Any) -> Representation:
@@ -278,4 +318,25 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
     ):
         if found != expected:
             raise ValueError(f"{where}: field {name!r} is {found}, expected {expected}")
-    return model
+    starts = _starts_from_json(value.get("starts"), model, where)
+    return dataclasses.replace(model, starts=starts)
+
+
+def import_file(path: Path) -> tuple[Model, dict[str, Params]]:
+    """Model and parameters, of "motion" and of "paths", of an exported file.
+
+    Raises:
+      CheckpointError: if it is damaged or no such file.
+      ValueError: if it is of another system.
+    """
+    params, value = checkpoint.import_params(path)
+    model = from_json(value, where=str(path))
+    key = jax.random.key(0)
+    like = jax.eval_shape(
+        lambda: {
+            "motion": init(key, model.config),
+            "paths": smgdiff_trajectory.init(key, model.paths),
+        }
+    )
+    checkpoint.check_params(path, params, like)
+    return model, params
