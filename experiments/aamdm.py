@@ -23,6 +23,7 @@ from jaxmotion.learning import loop, runs
 from jaxmotion.systems import registry
 from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
+from jaxmotion.systems.aamdm import stored as aamdm_stored
 from jaxmotion.systems.aamdm import training as aamdm_training
 
 
@@ -245,17 +246,50 @@ def rollout(args: Rollout) -> None:
     )
 
 
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write the character of the row "aamdm", as float16, as one small npz file.
+
+    Example: python experiments/aamdm.py export --run runs/aamdm --out aamdm.npz
+
+    Attributes:
+      out: File to write, for `jaxmotion.load`.
+      starts: Poses that the model itself stands in, with which characters start.
+      noise_half_life: As of `evaluate`; the file's characters have it.
+    """
+
+    run: Path = Path("runs/aamdm")
+    out: Path = Path("aamdm.npz")
+    starts: int = 4
+    noise_half_life: float = 0.0
+
+
+def export(args: Export) -> None:
+    """Writes the file."""
+    cli.announce("compiling the rollout that starts are taken from", 40)
+    _, model, networks = aamdm_controller.load_run(
+        args.run, noise_half_life=args.noise_half_life
+    )
+    starts = aamdm_controller.own_starts(
+        args.run, number=args.starts, noise_half_life=args.noise_half_life
+    )
+    model = dataclasses.replace(model, starts=starts)
+    aamdm_stored.export(args.out, model, networks)
+    print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
+
+
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
 )
 
 
 def main() -> None:
     """Parses the command line and runs the command."""
     args = cli.check(tyro.cli(Command, description=__doc__))
-    run = {Train: train, Evaluate: evaluate, Rollout: rollout}
+    run = {Train: train, Evaluate: evaluate, Rollout: rollout, Export: export}
     run[type(args)](args)
 
 

@@ -32,13 +32,14 @@ from jaxtyping import Array, Float
 
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.rollout import Controller
-from jaxmotion.control.steering import Character, Tuning
+from jaxmotion.control.steering import Character, Tuning, calmest
 from jaxmotion.diffusion import chain
 from jaxmotion.motion import features, ground, path_features, pose, spring
 from jaxmotion.motion.features import unpack
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
+from jaxmotion.systems.aamdm import stored as aamdm_stored
 from jaxmotion.systems.aamdm import training as aamdm_training
 from jaxmotion.systems.aamdm.data import PoseData
 from jaxmotion.systems.aamdm.embedding import PATH
@@ -409,13 +410,43 @@ def start_states(
     return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen], noise)
 
 
-def load_character(
-    path: Path, *, step: chain.StepFactory = chain.ancestral_step
-) -> Character:
-    """The character of a run folder: 3 drafts and 2 polishes in the embedded space.
+def own_states(
+    model: aamdm_stored.Model, number: int, *, seed: int, memory: Memory | None = None
+) -> CharacterState:
+    """Characters in frames that the model made itself, at the origin and facing +z.
 
-    It starts in held-out poses. Commands have no labels. `step` makes the chain's step;
-    the default is the paper's.
+    Args:
+      model: A model with starts.
+      number: Characters.
+      seed: Seeds the choice of frames, and the noise that is remembered.
+      memory: How noise is remembered, if it is.
+
+    Returns:
+      States, batch axis first.
+    """
+    space, joints = model.space, model.skeleton.num_joints
+    chosen = np.random.default_rng(seed).integers(0, len(model.starts), number)
+    steps = 0 if memory is None else memory.num_steps
+    noise = jax.random.normal(jax.random.key(seed), (number, steps, space.num_features))
+
+    def state(frame: Array, noise: Array) -> CharacterState:
+        vector = aamdm_space.to_poses(space, frame)
+        parts = unpack(pose.pose_layout(joints), vector)
+        return CharacterState(
+            frame=frame,
+            bone=PlanarFrame(origin=jnp.zeros(2), facing=jnp.array([0.0, 1.0])),
+            velocity=parts["root_velocity"][::2],
+            turn_rate=parts["root_angular_velocity"][1],
+            noise=noise,
+        )
+
+    return jax.jit(jax.vmap(state))(model.starts[chosen], noise)
+
+
+def load_run(
+    path: Path, *, noise_half_life: float = 0.0
+) -> tuple[aamdm_training.Run, aamdm_stored.Model, Params]:
+    """A run folder, its model, and networks: 3 drafts and 2 polishes, embedded.
 
     Raises:
       CheckpointError: if a stage was not trained.
@@ -426,24 +457,101 @@ def load_character(
     networks, config = aamdm_training.load_networks(
         run, "embedded", space, drafts=3, polishes=2
     )
-    num_joints = run.skeleton.num_joints
-    method = Method(config=config, num_joints=num_joints, fps=run.train.fps, step=step)
-    return Character(
+    model = aamdm_stored.Model(
+        config=config,
         skeleton=run.skeleton,
-        labels=(),
-        fps=run.train.fps,
+        space=space,
         source=run.source,
+        noise_half_life=noise_half_life,
+    )
+    return run, model, networks
+
+
+def own_starts(
+    path: Path, *, number: int, noise_half_life: float = 0.0, seed: int = 0
+) -> Float[Array, "number channels"]:
+    """Frames in which the characters of a run stand: a start without a recorded one.
+
+    Characters stand for twelve seconds; of sixteen the calmest are taken.
+
+    Args:
+      path: The run folder.
+      number: Starts, 1 to 16.
+      noise_half_life: As `load_character` takes it.
+      seed: Seeds the held-out poses that they begin with, and the noise.
+
+    Returns:
+      `Model.starts`.
+    """
+    character = load_character(path, noise_half_life=noise_half_life)
+    labels = np.zeros(16, int)
+    states, _ = calmest(
+        character,
+        character.starts(labels, seed),
+        labels,
+        number=number,
+        past=20,
+        seed=seed,
+    )
+    return states.frame
+
+
+def load_character(
+    path: Path,
+    *,
+    step: chain.StepFactory = chain.ancestral_step,
+    noise_half_life: float | None = None,
+) -> Character:
+    """The character of a run folder or an exported file.
+
+    It starts in the model's own frames where it has some, else in held-out poses.
+    Commands have no labels.
+
+    Args:
+      path: Where it is.
+      step: Makes the chain's step; the default is the paper's.
+      noise_half_life: Seconds in which the noise of the posteriors is forgotten; 0 to
+        draw it anew in every frame (paper). None for what the model was exported with,
+        0 for a run folder.
+
+    Raises:
+      CheckpointError: if a stage was not trained, or the file is damaged.
+      ValueError: if it is of another system.
+    """
+    if path.is_file():
+        model, networks = aamdm_stored.load(path)
+        starts = functools.partial(own_states, model)
+    else:
+        run, model, networks = load_run(path)
+        joints = run.skeleton.num_joints
+        starts = functools.partial(
+            start_states, run.held_out, model.space, num_joints=joints
+        )
+    space, fps = model.space, model.autoencoder.config.fps
+    half_life = model.noise_half_life if noise_half_life is None else noise_half_life
+    memory = None
+    if half_life:
+        memory = Memory(num_steps=model.config.num_steps, half_life=half_life)
+    num_joints = model.skeleton.num_joints
+    method = Method(
+        config=model.config, num_joints=num_joints, fps=fps, memory=memory, step=step
+    )
+    return Character(
+        skeleton=model.skeleton,
+        labels=(),
+        fps=fps,
+        source=model.source,
         params=(networks, space),
         method=method,
         tuning=Tuning(
             method=lambda num_steps, scale: dataclasses.replace(method, scale=scale),
-            num_steps=(config.num_steps,),
+            num_steps=(model.config.num_steps,),
             scale=method.scale,
             scales=(0.0, 4 * method.scale),
             patience=0,
         ),
-        starts=lambda labels, seed: start_states(
-            run.held_out, space, len(labels), num_joints=num_joints, seed=seed
+        starts=lambda labels, seed: starts(
+            number=len(labels), seed=seed, memory=memory
         ),
         exports=exports,
     )
