@@ -175,7 +175,7 @@ def _segments(
 
 
 def rollout(
-    model: Character,
+    model: Character | Sampler,
     key: Key,
     states: Any,
     commands: Command,
@@ -210,7 +210,7 @@ def rollout(
 
 
 def sample(
-    model: Sampler,
+    model: Sampler | Character,
     key: Key,
     labels: Any = None,
     number: int | None = None,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxmotion as jm
+from jaxmotion import files
 from jaxmotion.control import steering
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.diffusion import chain
@@ -145,9 +146,24 @@ def test_wrong_input_is_one_clear_line(model, frames, call, message):
     assert "\n" not in str(found.value)
 
 
-def test_a_system_that_is_not_steered_is_named(tmp_path):
-    (tmp_path / "config.json").write_text('{"system": "emdm"}')
-    with pytest.raises(ValueError, match="'emdm', expected one that is steered"):
+@pytest.mark.parametrize("name", files.SHIPPED)
+def test_shipped_models_say_what_they_are(name):
+    """Each has a card that states its license, and is at most 6 MB."""
+    model, path = jm.load(name), files.SHIPPED[name]
+    assert model.license == "Apache-2.0" and model.source and model.fps >= 20
+    card = path.with_suffix(".md").read_text()
+    assert card.startswith(f"# {path.name}") and "Apache-2.0" in card
+    assert path.stat().st_size <= 6e6
+
+
+def test_a_steered_model_is_not_sampled(model):
+    with pytest.raises(ValueError, match="expected `rollout`"):
+        jm.sample(model, jax.random.key(0))
+
+
+def test_a_system_that_nobody_knows_is_named(tmp_path):
+    (tmp_path / "config.json").write_text('{"system": "mdm"}')
+    with pytest.raises(ValueError, match="'mdm', expected one of camdm, aamdm"):
         jm.load(tmp_path)
 
 

@@ -142,9 +142,8 @@ def load(path: Path) -> tuple[Model, Params]:
 
 def _init(config: aamdm_model.Config, embedding: aamdm_embedding.Config) -> Params:
     """Parameters of a file's shapes."""
-    key = jax.random.key(0)
-    found = aamdm_model.init(key, config)
-    decoder = aamdm_embedding.init(key, embedding)["decoder"]
+    found = aamdm_model.init(jax.random.key(0), config)
+    decoder = aamdm_embedding.init(jax.random.key(1), embedding)["decoder"]
     return {name: found[name] for name in _NETWORKS} | {"decoder": decoder}
 
 

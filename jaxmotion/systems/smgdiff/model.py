@@ -331,11 +331,10 @@ def import_file(path: Path) -> tuple[Model, dict[str, Params]]:
     """
     params, value = checkpoint.import_params(path)
     model = from_json(value, where=str(path))
-    key = jax.random.key(0)
     like = jax.eval_shape(
         lambda: {
-            "motion": init(key, model.config),
-            "paths": smgdiff_trajectory.init(key, model.paths),
+            "motion": init(jax.random.key(0), model.config),
+            "paths": smgdiff_trajectory.init(jax.random.key(1), model.paths),
         }
     )
     checkpoint.check_params(path, params, like)

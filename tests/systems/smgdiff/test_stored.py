@@ -1,6 +1,7 @@
 """A SMGDiff model as JSON."""
 
 import copy
+import dataclasses
 import json
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import model as smgdiff_model
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
@@ -45,6 +47,23 @@ def test_a_model_comes_back(model):
         )
     assert found.representation.joints == (2, 4)
     assert found.representation.skeleton.names == tiny.NAMES
+
+
+def test_starts_come_back(model):
+    scenes = [[ball_walker.scene(10, speed=s)] * 3 for s in (0.6, 0.0)]
+    rows = [jax.tree.map(lambda *x: jnp.stack(x), *row) for row in scenes]
+    starts = jax.tree.map(lambda *x: jnp.stack(x), *rows)
+    whole = dataclasses.replace(model, starts=starts)
+    value = json.loads(json.dumps(smgdiff_model.to_json(whole)))
+    found = smgdiff_model.from_json(value, where="here").starts
+    assert found.motion.fps == model.config.fps
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(starts), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    value["starts"]["ball"][0][0].pop()
+    with pytest.raises(ValueError, match="here: field 'starts' is wrong"):
+        smgdiff_model.from_json(value, where="here")
+    states = smgdiff_controller.own_states(whole, np.array([0, 1, 1]), seed=0)
+    np.testing.assert_allclose(states.past.ball[2], starts.ball[1, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize(
