@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import dataclasses
 import ipaddress
+import os
 import signal
 import socket
 import sys
@@ -216,12 +217,19 @@ def start(main: Callable[[], None]) -> None:
 
     Raises:
       SystemExit: with one line and status 1 after bad input, a training that diverged,
-        or a device without enough memory; with status 130 after Ctrl-C.
+        a device without enough memory, or another process that died; with status 130
+        after Ctrl-C.
     """
     try:
         main()
     except (OSError, ValueError, TrainingDiverged, JaxRuntimeError) as error:
-        sys.exit(f"error: {' '.join(str(error).split())}")
+        text = f"error: {' '.join(str(error).split())}"
+        if not jax.distributed.is_initialized():
+            sys.exit(text)
+        where = f"process {jax.process_index()} of {jax.process_count()}"
+        print(f"{where}: {text}", file=sys.stderr, flush=True)
+        # At once: to leave in order is to wait minutes for who may be dead.
+        os._exit(1)
     except KeyboardInterrupt as stop:
         # Its text, if there is one, says where the state was saved.
         if str(stop):
