@@ -10,14 +10,17 @@ Examples:
   python benchmarks/step_counts.py --system emdm --steps 1 5 10 20 50 --batch 1 32
   python benchmarks/step_counts.py --system smgdiff --guided
   python benchmarks/step_counts.py --system camdm --quality runs/sweep_camdm/table.json
+  python benchmarks/step_counts.py --precision float32 tf32 bfloat16 --batch 1 64
 """
 
+import contextlib
 import dataclasses
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import jax
 import numpy as np
 import suite
 import workload
@@ -32,6 +35,7 @@ COLUMNS = {
     "system": "system",
     "sampler": "sampler",
     "batch": "batch",
+    "precision": "precision",
     "steps": "steps",
     "network_calls": "calls",
     "compile_s": "compile s",
@@ -43,6 +47,14 @@ COLUMNS = {
     "memory_mib": "MiB",
     "gflop": "GFLOP",
     "matmul_percent": "% of matmul",
+    "difference": "difference",
+}
+Precision = Literal["float32", "tf32", "bfloat16"]
+# What matrix products multiply; all of them add in float32.
+ALGORITHMS: dict[Precision, str] = {
+    "float32": "F32_F32_F32",
+    "tf32": "TF32_TF32_F32",
+    "bfloat16": "BF16_BF16_F32",
 }
 
 
@@ -59,6 +71,10 @@ class Config(suite.Settings):
       sampler: own (ancestral, or ddgan), ddim, or dpm_solver (not aamdm, emdm).
       steps: Diffusion steps; aamdm drafts all but two, and polishes two.
       batch: Characters that are sampled together.
+      precision: What matrix products multiply. "difference" is the largest one of a
+        sample to float32's, in deviations of that sample. A CPU refuses tf32, and
+        multiplies bfloat16 as float32.
+      devices: Split each batch over so many.
       arguments: Pass the parameters as arguments; without it they are constants of
         the program, as in deployment.
       chunk: Run batches of 16 and more in chunks of so many characters; 0 for all at
@@ -79,6 +95,8 @@ class Config(suite.Settings):
     sampler: tuple[str, ...] = ("own",)
     steps: tuple[int, ...] = (2, 4, 8, 16)
     batch: tuple[int, ...] = (1,)
+    precision: tuple[Precision, ...] = ("float32",)
+    devices: int = 1
     arguments: bool = False
     chunk: int = 4
     frames_per_token: int = 1
@@ -98,10 +116,12 @@ class Line:
     sampler: str
     batch: int
     guided: bool
+    precision: Precision = "float32"
 
     def __str__(self) -> str:
         guided = " guided" if self.guided else ""
-        return f"{self.system} {self.sampler}{guided} batch={self.batch}"
+        name = "" if self.precision == "float32" else f" {self.precision}"
+        return f"{self.system} {self.sampler}{guided}{name} batch={self.batch}"
 
 
 def make_lines(args: Config) -> list[Line]:
@@ -110,7 +130,14 @@ def make_lines(args: Config) -> list[Line]:
     Raises:
       ValueError: names the option, and what a system cannot take.
     """
-    suite.at_least(args, steps=1, batch=1, chunk=0, runs=1)
+    suite.at_least(args, steps=1, batch=1, chunk=0, runs=1, devices=1)
+    if args.devices > len(jax.devices()):
+        raise ValueError(f"--devices {args.devices}: {len(jax.devices())} are there")
+    for batch in args.batch:
+        if batch % args.devices:
+            raise ValueError(
+                f"--batch {batch}: expected a multiple of --devices {args.devices}"
+            )
     if args.guided and "smgdiff" not in args.system:
         raise ValueError(f"--guided is of smgdiff, not of {', '.join(args.system)}")
     if args.guided and min(args.steps) < 2:
@@ -120,11 +147,20 @@ def make_lines(args: Config) -> list[Line]:
         for system, name in itertools.product(args.system, args.sampler):
             sampler = workload.sampler_of(system, name)
             both = args.guided and system == "smgdiff"
-            for batch, guided in itertools.product(args.batch, (False, True)):
+            for batch, guided, precision in itertools.product(
+                args.batch, (False, True), args.precision
+            ):
                 if both or not guided:
-                    yield Line(system, sampler, batch, guided)
+                    yield Line(system, sampler, batch, guided, precision)
 
     return list(dict.fromkeys(found()))
+
+
+def matmul_of(precision: Precision) -> contextlib.AbstractContextManager:
+    """Within it, matrix products of what is traced are of this precision."""
+    if jax.default_backend() == "cpu" and precision == "float32":
+        return contextlib.nullcontext()  # its own, and fastest
+    return jax.default_matmul_precision(ALGORITHMS[precision])
 
 
 def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
@@ -147,25 +183,40 @@ def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
     samples = workload.of(line.system, "samples")(sizes)
 
     def program() -> tuple:
-        return samples.program(line.batch, chunk=args.chunk, arguments=args.arguments)
+        return samples.program(
+            line.batch, chunk=args.chunk, arguments=args.arguments, devices=args.devices
+        )
+
+    def sample(precision: Precision) -> np.ndarray:
+        run, given = program()
+        with matmul_of(precision):
+            return np.asarray(run(*given))
 
     # Two programs: one that has been traced would not be traced again.
     run, given = program()
     asked = work.count(run, *given)
     run, given = program()
-    found = timing.measure(run, *given, rounds=args.runs, limit_s=args.limit)
+    with matmul_of(line.precision):
+        found = timing.measure(run, *given, rounds=args.runs, limit_s=args.limit)
+    difference = None
+    if line.precision != "float32":
+        exact = sample("float32")
+        gap = np.abs(sample(line.precision) - exact).max()
+        difference = float(gap / exact.std())
     frames = line.batch * samples.frames
     per_second = 1000 * frames / found.p50_ms
     return {
         **dataclasses.asdict(line),
         "steps": steps,
-        "network_calls": asked.network_calls // line.batch,
+        # The trace has one device's share.
+        "network_calls": args.devices * asked.network_calls // line.batch,
         **dataclasses.asdict(found),
         "frames_per_second": per_second,
         "ms_per_frame": found.p50_ms / frames,
         "real_time": per_second / samples.fps / line.batch,
-        "gflop": asked.flops / 1e9,
+        "gflop": args.devices * asked.flops / 1e9,
         "matmul_percent": 100 * asked.flops / (found.p50_ms / 1000) / rate,
+        "difference": difference,
     }
 
 
@@ -220,7 +271,7 @@ def read_quality(args: Config) -> Quality:
 def join(row: dict[str, Any], quality: Quality) -> dict[str, Any]:
     """The row with its quality: None where it has none, as of other samplers."""
     own = row["sampler"] == workload.sampler_of(row["system"], "own")
-    plain = own and not row["guided"]
+    plain = own and not row["guided"] and row["precision"] == "float32"
     empty = {"quality": None, "quality_column": None}
     return row | (plain and quality.get((row["system"], row["steps"])) or empty)
 

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
 from jaxmotion.control import courses, rollout
 from jaxmotion.data import procedural, windows
@@ -94,7 +95,12 @@ class Samples:
     fps: float
 
     def program(
-        self, batch: int, *, chunk: int = 0, arguments: bool = False
+        self,
+        batch: int,
+        *,
+        chunk: int = 0,
+        arguments: bool = False,
+        devices: int = 1,
     ) -> tuple[Callable, tuple]:
         """One batch of samples as a jitted function, and its arguments.
 
@@ -102,17 +108,28 @@ class Samples:
           batch: Characters; 1 is the program of one character, not a batch of one.
           chunk: Characters at a time in batches of 16 and more; 0 for all at once.
           arguments: Whether the parameters are arguments, not constants.
+          devices: Devices that share the batch; must divide it.
         """
+        share = batch // devices
 
         def samples(params: Params, keys: Key, conditions: Any) -> jax.Array:
             sample = self.sampler(params)
             if batch == 1:
                 return sample(keys[0], jax.tree.map(lambda x: x[0], conditions))
-            if not chunk or batch < 16:
+            if not chunk or share < 16:
                 return jax.vmap(sample)(keys, conditions)
             xs = keys, conditions
             return jax.lax.map(lambda x: sample(*x), xs, batch_size=chunk)
 
+        if devices > 1:
+            split, copy = PartitionSpec("characters"), PartitionSpec()
+            samples = jax.shard_map(
+                samples,
+                mesh=Mesh(np.array(jax.devices()[:devices]), ("characters",)),
+                in_specs=(copy, split, split),
+                out_specs=split,
+                check_vma=False,
+            )
         given = jax.random.split(jax.random.key(1), batch), self.conditions(batch)
         if arguments:
             return jax.jit(samples), (self.params, *given)

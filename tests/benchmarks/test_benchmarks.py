@@ -107,6 +107,7 @@ def test_step_counts_refuses_before_the_work(load):
         "--guided is of smgdiff": dict(system=("camdm",), guided=True),
         "--steps 1: expected 2": dict(guided=True, steps=(1, 2)),
         "--batch 0": dict(batch=(0,)),
+        "--devices 9: . are there": dict(devices=9),
         "unknown system 'nn'": dict(system=("nn",)),
     }
     for message, options in refused.items():
@@ -130,7 +131,7 @@ def row_of(line, steps, **more):
         steps=steps, network_calls=steps, compile_s=1.0,
         p50_ms=float(steps), p95_ms=2.0 * steps, runs=5, memory_mib=3.0,
         frames_per_second=45e3 / steps, real_time=1.5e3 / steps, gflop=0.25 * steps,
-        matmul_percent=10.0,
+        matmul_percent=10.0, difference=None,
     ) | more  # fmt: skip
 
 

@@ -61,3 +61,18 @@ def test_slope_of_a_crowd(load):
     rows = [dict(characters=n, p50_ms=3.0 * n**0.8) for n in (1, 16, 65536)]
     assert load("rollout_batch").slope(rows) == pytest.approx(0.8)
     assert load("rollout_batch").slope(rows[:1]) is None
+
+
+def test_gpu_names_what_failed_and_goes_on(load, monkeypatch, tmp_path, capsys):
+    gpu = load("gpu")
+    rows = [dict(steps=10, batch=1, p50_ms=2.0)]
+    emdm = dict(part="emdm", seconds=1.0, end="ran", metrics=[], rows=rows)
+    late = dict(part="aamdm", seconds=9.0, end="late", metrics=[], rows=[])
+    monkeypatch.setattr(gpu, "run_part", lambda args, name: late)
+    assert [one["met"] for one in gpu.aims([emdm, late])] == [None, None, True]
+    options = ["gpu.py", "--parts", "aamdm", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", options)
+    with pytest.raises(SystemExit) as stop:
+        gpu.main()
+    assert stop.value.code == 1 and "late" in capsys.readouterr().out
+    assert json.loads((tmp_path / "gpu.json").read_text())["rows"][0]["end"] == "late"
