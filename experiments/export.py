@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 import jaxmotion as jm
-from jaxmotion import cli, files
+from jaxmotion import cli, face, files
 from jaxmotion.export import graph, onnx, stablehlo
 from jaxmotion.learning import loop, model_json, runs
 from jaxmotion.systems import registry
@@ -49,7 +49,7 @@ class Config:
 
     Attributes:
       model: Name of a shipped model.
-      run: Run folder of any system, or a file of camdm.py export, in its place.
+      run: Run folder of any system, or an exported file, in its place.
       out: Folder to write to.
       format: onnx or stablehlo.
       batch: one (arrays have no axis for characters), a number, or any.
@@ -118,15 +118,13 @@ def export(args: Config) -> None:
     writer.check()
     loop.check_writable(args.out)
     source = args.model if args.run is None else args.run
+    path = files.SHIPPED.get(args.model) if args.run is None else args.run
     system = None
-    if args.run is not None and not args.run.is_file():
-        config = files.read_object(
-            args.run / "config.json", what="expected a run folder"
-        )
-        system = registry.get(str(config.get("system")))
+    if path is not None:
+        system = registry.get(str(face.system_of(path)))
     if system is not None and not system.steerable:
         functions, condition, facts = system.room("evaluation").exports(
-            args.run, row=args.row, scale=args.scale
+            path, row=args.row, scale=args.scale
         )
         arguments, starts = {"condition": condition}, {}
     else:

@@ -19,12 +19,17 @@ import jax
 import tyro
 
 import jaxmotion
-from jaxmotion import cli
+from jaxmotion import cli, files
 from jaxmotion.control.foot_lock import lock_feet
 from jaxmotion.control.steering import Character
 from jaxmotion.viz import page, viewer
 
-SHIPPED = ("locomotion", "walker")
+# Those that are steered.
+SHIPPED = tuple(
+    name
+    for name in ("locomotion", "locomotion_fast", "walker", "dribble")
+    if name in files.SHIPPED
+)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -76,10 +76,10 @@ def load(
                 f"({', '.join(files.SHIPPED)})"
             )
         path = files.SHIPPED[str(source)]
-    found = registry.SYSTEMS.get(_system(path))
+    found = registry.SYSTEMS.get(system_of(path))
     if found is None:
         raise ValueError(
-            f"{path}: field 'system' is {_system(path)!r}, expected one of "
+            f"{path}: field 'system' is {system_of(path)!r}, expected one of "
             f"{', '.join(registry.SYSTEMS)}"
         )
     if found.steerable:
@@ -97,8 +97,8 @@ def load(
     return model
 
 
-def _system(path: Path) -> Any:
-    """What a run folder or an exported file says that it is."""
+def system_of(path: Path) -> Any:
+    """What a run folder or an exported file says that it is of."""
     if path.is_file():
         from jaxmotion.learning import checkpoint
 

@@ -22,6 +22,7 @@ from jaxmotion.systems.emdm import action_evaluation, text_evaluation
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import features as emdm_features
 from jaxmotion.systems.emdm import model as emdm_model
+from jaxmotion.systems.emdm import sampler as emdm_sampler
 from jaxmotion.systems.emdm import text as emdm_text
 from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.emdm.scoring import Many, RowScorer, Settings
@@ -201,8 +202,8 @@ def exports(
     """What can leave Python: "sample", from a condition to a motion.
 
     Args:
-      folder: The run folder.
-      row: Which model.
+      folder: The run folder, or an exported file.
+      row: Which model of a run folder.
       scale: Guidance; None for the paper's.
 
     Returns:
@@ -212,9 +213,13 @@ def exports(
       CheckpointError: if the row was not trained.
       ValueError: if it is no run folder of EMDM, or there is no such row.
     """
-    record = runs.load(folder, system=emdm_training.SYSTEM)
     emdm_training.check_rows((row,))
-    params, config = emdm_training.load_row(record, row)
+    if folder.is_file():
+        model, params = emdm_sampler.load(folder)
+        config = model.config
+    else:
+        record = runs.load(folder, system=emdm_training.SYSTEM)
+        params, config = emdm_training.load_row(record, row)
     sample = emdm_training.row_sampler(params, config, row)
     scale = emdm_training.guidance_scale(scale, task=config.condition)
     vector = jnp.zeros((1, config.condition_size))
@@ -224,14 +229,19 @@ def exports(
         decode, gives = (lambda x: emdm_text.joints(run, x)), "joints"
         facts = {"fps": run.motions.fps, "source": run.motions.source}
     else:
-        run = emdm_data.load_run(folder)
-        decode = lambda x: emdm_features.to_motion(x, run.representation)  # noqa: E731
+        if folder.is_file():
+            features, source, labels = model.representation, model.source, model.labels
+        else:
+            run = emdm_data.load_run(folder)
+            features, source = run.representation, run.clips.source
+            labels = run.actions if config.condition == "action" else ()
+        decode = lambda x: emdm_features.to_motion(x, features)  # noqa: E731
         gives = "motion"
         facts = {
-            "fps": run.representation.fps,
-            "source": run.clips.source,
-            "labels": list(run.actions) if config.condition == "action" else [],
-            "skeleton": model_json.skeleton_to_json(run.clips.skeleton),
+            "fps": features.fps,
+            "source": source,
+            "labels": list(labels),
+            "skeleton": model_json.skeleton_to_json(features.skeleton),
         }
 
     def made(key: Key, condition: emdm_model.Condition) -> Any:
