@@ -341,7 +341,7 @@ def peak() -> dict[str, Any]:
       Bytes, and of what: the accelerator, or the process where the device keeps no
       account; 0 bytes where the system keeps none either.
     """
-    stats = jax.devices()[0].memory_stats()
+    stats = jax.local_devices()[0].memory_stats()
     if stats and "peak_bytes_in_use" in stats:
         return {"what": "peak of the device", "bytes": stats["peak_bytes_in_use"]}
     try:
