@@ -1,34 +1,41 @@
-"""One plan: ours against the same network built from torch.nn.TransformerEncoder.
+"""One sample of each system: ours against PyTorch, torch.compile, and onnxruntime.
 
-Same parameters, same condition, same number of threads, measured in turn in one run.
-The PyTorch side runs as the released code does, every token in every step. Needs torch
-(`pip install -e ".[parity]"`).
+Same parameters, same conditions, same number of threads, measured in turn in one run,
+for a number of characters at a time. A sample is a plan of CAMDM or SMGDiff (without
+contact guidance), a motion of EMDM, or a frame of AAMDM. The PyTorch side runs as the
+released code does, every token in every step; onnxruntime runs our own sampler as
+`experiments/export.py` writes it, several characters one after the other. Needs torch
+(`pip install -e ".[parity]"`), and for onnxruntime `".[export]"`.
 
-Example:
+Examples:
   python benchmarks/peers.py
   python benchmarks/peers.py --threads 1
+  python benchmarks/peers.py --system camdm smgdiff emdm aamdm --batch 1 64 --limit 9
 """
 
 import dataclasses
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import suite
 import workload
 
 from jaxmotion import cli
+from jaxmotion.diffusion import noise
 from jaxmotion.evaluation import timing
-from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.export import graph, onnx
+from jaxmotion.typing import Exported
 
 try:
     import torch
-    import torch_camdm
+    import torch_peers
 except ModuleNotFoundError as error:
     raise SystemExit(
         f'error: peers.py needs {error.name}: pip install -e ".[parity]"'
@@ -36,8 +43,13 @@ except ModuleNotFoundError as error:
 
 EAGER = "torch eager"
 OURS = "ours, constants"
+COMPILED = "torch.compile"
+ONNX = "onnxruntime"
 COLUMNS = {
+    "system": "system",
+    "batch": "batch",
     "name": "",
+    "rounds": "rounds",
     "p50_ms": "p50 ms",
     "p95_ms": "p95 ms",
     "ratio": "/ eager",
@@ -48,15 +60,18 @@ COLUMNS = {
 }
 # Cores of other processes up to which wall clock times of several threads count.
 IDLE = 0.15
+# Whose encoder PyTorch can fuse, if the batch comes first.
+FUSED = ("camdm", "smgdiff")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config(suite.Settings):
-    """Milliseconds of one plan at batch 1, and ratios to PyTorch in eager mode.
+    """Milliseconds of a batch of samples, and ratios to PyTorch in eager mode.
 
     Rows: ours with the parameters as arguments and as constants of the program; PyTorch
-    eager as the released code lays it out (tokens first), with the batch first (which
-    lets PyTorch use its fused inference kernels), and through torch.compile.
+    eager as the released code lays it out (tokens first), for CAMDM's network also with
+    the batch first (which lets PyTorch use its fused inference kernels), and through
+    torch.compile, which compiles the network for each batch; our graph in onnxruntime.
 
     A ratio is the median over the rounds of ours / eager in the same round; its spread
     is from the 25th to the 75th percentile. It is compared by wall clock, on an idle
@@ -65,19 +80,33 @@ class Config(suite.Settings):
     compared by processor time, which hardly depends on the neighbors.
 
     Attributes:
-      steps: Diffusion steps.
-      threads: Threads (and cores) of both.
+      system: What to measure: camdm, smgdiff, emdm, aamdm.
+      batch: Characters that are sampled together.
+      steps: Diffusion steps; None for the paper's.
+      width: Channels of a token or hidden layer; None for the system's own.
+      paper: EMDM's published network, of 12 layers and 1024 channels, in the place of
+        the one that experiments/emdm.py trains (4 layers, 128 channels, 4 frames a
+        token).
+      threads: Threads (and cores) of all.
       rounds: Timed rounds; each runs every row once.
-      limit: Seconds of rounds, at most, but five rounds.
+      limit: Seconds of rounds of a system and a batch, at most, but one round.
+      row_limit: Seconds of one call; a row that would take longer, judged by the batch
+        before, is left out. 0 for no limit.
       compile_limit: Seconds that torch.compile may take; 0 to leave it out.
-      target: Greatest ratio of "ours, constants" that passes; exit status 1 beyond
-        it, and 2 where the machine was too busy to tell. 0 for no target.
+      target: Greatest ratio of "ours, constants" that passes for one plan of CAMDM;
+        exit status 1 beyond it, and 2 where the machine was too busy to tell. 0 for no
+        target.
     """
 
-    steps: int = 8
+    system: tuple[str, ...] = ("camdm",)
+    batch: tuple[int, ...] = (1,)
+    steps: int | None = None
+    width: int | None = None
+    paper: bool = False
     threads: int = 2
     rounds: int = 100
     limit: float = 120.0
+    row_limit: float = 60.0
     compile_limit: int = 60
     target: float = 0.65
 
@@ -95,25 +124,23 @@ def use_cores(number: int) -> int:
     return len(cores)
 
 
-def our_calls(
-    config: camdm_model.Config, params: Any, given: tuple
-) -> dict[str, Callable]:
-    """Compiled plans: parameters as arguments, and as constants."""
-    free = jax.jit(lambda p, k, c: camdm_model.sampler(p, config=config)(k, c))
-    bound = jax.jit(lambda k, c: camdm_model.sampler(params, config=config)(k, c))
-    free, _ = timing.compile_program(free, params, *given)
-    bound, _ = timing.compile_program(bound, *given)
-    return {
-        "ours, arguments": lambda: free(params, *given),
-        OURS: lambda: bound(*given),
-    }
+def our_call(samples: workload.Samples, batch: int, *, arguments: bool) -> Callable:
+    """Our compiled samples: parameters as arguments, or as constants."""
+    program, given = samples.program(batch, chunk=samples.chunk, arguments=arguments)
+    program, _ = timing.compile_program(program, *given)
+    return lambda: program(*given)
+
+
+def torch_call(
+    peer: torch_peers.Peer, batch: int, given: tuple[torch.Tensor, ...]
+) -> Callable:
+    """PyTorch's samples, warm."""
+    torch_peers.forward(peer, batch, given)
+    return torch_peers.plan_call(peer, batch, given)
 
 
 def compiled_call(
-    net: torch.nn.Module,
-    config: camdm_model.Config,
-    condition: camdm_model.Condition,
-    limit: int,
+    peer: torch_peers.Peer, batch: int, given: tuple[torch.Tensor, ...], limit: int
 ) -> tuple[Callable | None, str]:
     """The same through torch.compile, if that works within `limit` seconds.
 
@@ -124,13 +151,13 @@ def compiled_call(
     def stop(*_: Any) -> None:
         raise TimeoutError(f"not done within {limit} s")
 
+    # Else it would make the next batch's size a variable of one slower program.
+    torch._dynamo.reset()
     start = time.perf_counter()
     old = signal.signal(signal.SIGALRM, stop)
     signal.alarm(limit)
     try:
-        call = torch_camdm.plan_call(torch.compile(net), config, condition)
-        call()
-        call()
+        call = torch_call(torch_peers.compiled(peer), batch, given)
     except Exception as error:  # whatever a compiler raises: the rest still counts
         return None, f"torch.compile: {type(error).__name__}: {error}".split("\n")[0]
     finally:
@@ -139,24 +166,101 @@ def compiled_call(
     return call, f"torch.compile took {time.perf_counter() - start:.0f} s"
 
 
-def largest_difference(
-    config: camdm_model.Config,
-    params: Any,
-    net: torch.nn.Module,
-    condition: camdm_model.Condition,
-) -> float:
-    """Largest absolute difference of the two forward passes, at the last step."""
-    given = condition.arguments(config)
-    x_t = np.ones((config.future, config.num_features), np.float32)
-    t = config.num_steps
-    ours = jax.jit(camdm_model.network(config).apply)(
-        {"params": params}, x_t, jnp.int32(t), *given
-    )
-    theirs = [torch.from_numpy(np.array(x)[None]) for x in given[:4]]
-    theirs[3] = theirs[3].long()
+def first(tree: Any) -> Any:
+    """The first character's."""
+    return jax.tree.map(lambda x: x[0], tree)
+
+
+@dataclasses.dataclass(frozen=True)
+class Player:
+    """Our sampler in onnxruntime: for one character, and in a loop over several."""
+
+    graph: graph.Graph
+    one: Any
+    any: Any
+
+    def run(self, tape: Any, conditions: Any) -> np.ndarray:
+        """Samples from given noise, batch axis first."""
+        arrays = [np.asarray(x) for x in jax.tree.leaves((tape, conditions))]
+        batch = arrays[0].shape[0]
+        if batch == 1:
+            arrays = [x[0] for x in arrays]
+        names = [port.name for port in self.graph.inputs]
+        session = self.one if batch == 1 else self.any
+        # Inputs that the result does not depend on may be gone.
+        known = {x.name for x in session.get_inputs()}
+        feed = dict(zip(names, arrays, strict=True))
+        (found,) = session.run(None, {k: v for k, v in feed.items() if k in known})
+        return found[None] if batch == 1 else found
+
+    def call(self, batch: int, conditions: Any) -> Callable[[], np.ndarray]:
+        """A batch of samples, with its own noise drawn in the call as ours is."""
+        rng = np.random.default_rng(0)
+        shapes = [
+            (batch, *port.shape)
+            for port in self.graph.inputs
+            if port.name.startswith("noise")
+        ]
+
+        def call() -> np.ndarray:
+            tape = [rng.standard_normal(shape, np.float32) for shape in shapes]
+            return self.run(tape, conditions)
+
+        return call
+
+
+def make_player(
+    samples: workload.Samples, *, threads: int, several: bool
+) -> tuple[Player | None, str]:
+    """Our sampler in onnxruntime, if its packages are there.
+
+    Returns:
+      The player, or None; and what happened, in words.
+    """
+    begun = time.perf_counter()
+    try:
+        onnx.check()
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
+        # Its threads would else wait for more work while the next row runs.
+        options.add_session_config_entry("session.force_spinning_stop", "1")
+        sample = Exported(
+            samples.sampler(samples.params), ("key", "condition"), ("sample",)
+        )
+        made = graph.make("sample", sample, {"condition": first(samples.conditions(1))})
+        sessions = []
+        with tempfile.TemporaryDirectory() as folder:
+            for batch in (None, graph.ANY)[: 1 + several]:
+                path = Path(folder) / f"sample{onnx.SUFFIX}"
+                onnx.write(path, made, batch=batch)
+                session = onnxruntime.InferenceSession(path.read_bytes(), options)
+                sessions.append(session)
+    except ValueError as error:
+        return None, f"onnxruntime: left out: {error}"
+    player = Player(made, sessions[0], sessions[-1])
+    return player, f"onnxruntime: graphs took {time.perf_counter() - begun:.0f} s"
+
+
+def largest_differences(
+    samples: workload.Samples,
+    peer: torch_peers.Peer,
+    given: tuple[torch.Tensor, ...],
+    player: Player | None,
+) -> dict[str, float]:
+    """Largest absolute differences from our sample, made from the same noise."""
+    sample, conditions = samples.sampler(samples.params), samples.conditions(1)
+    tape = noise.draw_noise(sample, jax.random.key(2), first(conditions))
+    ours = jax.jit(noise.with_noise(sample))(tape, first(conditions))
+    tape = jax.tree.map(lambda x: x[None], tape)
     with torch.inference_mode():
-        found = net(torch.from_numpy(x_t)[None], torch.tensor([t]), *theirs)
-    return float(np.abs(np.asarray(ours) - found[0].numpy()).max())
+        theirs = torch_peers.sample(peer, *torch_peers.from_tape(tape), given)
+    found = {EAGER: theirs.numpy()}
+    if player is not None:
+        found[ONNX] = player.run(tape, conditions)
+    difference = lambda x: float(np.abs(x[0] - np.asarray(ours)).max())  # noqa: E731
+    return {name: difference(value) for name, value in found.items()}
 
 
 def rows_of(times: dict[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -180,6 +284,12 @@ def rows_of(times: dict[str, np.ndarray]) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def faster(rows: list[dict[str, Any]]) -> list[str]:
+    """What is faster than the faster of our two rows."""
+    ours = min(row["p50_ms"] for row in rows if row["name"].startswith("ours"))
+    return [row["name"] for row in rows if row["p50_ms"] < ours]
 
 
 def check_target(
@@ -211,48 +321,124 @@ def check_target(
         raise SystemExit(1)
 
 
+def calls_of(
+    system: str,
+    samples: workload.Samples,
+    peers: dict[str, torch_peers.Peer],
+    player: Player | None,
+    *,
+    batch: int,
+    skip: tuple[str, ...],
+    compile_limit: int,
+) -> tuple[dict[str, Callable], str]:
+    """The rows of a batch but those to skip; and what happened to torch.compile."""
+    conditions = samples.conditions(batch)
+    given = torch_peers.given_of(system, samples.config, conditions)
+    calls, note = {}, "torch.compile: left out"
+    for name, arguments in (("ours, arguments", True), (OURS, False)):
+        calls[name] = our_call(samples, batch, arguments=arguments)
+    for name, peer in peers.items():
+        if name not in skip:
+            calls[name] = torch_call(peer, batch, given)
+    if compile_limit and COMPILED not in skip:
+        call, note = compiled_call(peers[EAGER], batch, given, compile_limit)
+        if call is not None:
+            calls[COMPILED] = call
+    if player is not None and ONNX not in skip:
+        calls[ONNX] = player.call(batch, conditions)
+    return calls, note
+
+
+def measure(
+    system: str, args: Config, *, threads: int
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Rows of a system, and what else there is to say of them."""
+    sizes = workload.Sizes(
+        steps=args.steps, width=args.width, paper=args.paper and system == "emdm"
+    )
+    samples = workload.of(system, "samples")(sizes)
+    layouts = {EAGER: False} | (
+        {f"{EAGER}, batch first": True} if system in FUSED else {}
+    )
+    peers = {
+        name: torch_peers.make(
+            system, samples.config, samples.params, batch_first=layout
+        )
+        for name, layout in layouts.items()
+    }
+    player, note = make_player(samples, threads=threads, several=max(args.batch) > 1)
+    given = torch_peers.given_of(system, samples.config, samples.conditions(1))
+    differences = largest_differences(samples, peers[EAGER], given, player)
+    text = ", ".join(f"{name} {value:.1e}" for name, value in differences.items())
+    print(f"{system}: samples from one noise differ from ours by {text}; {note}")
+    rows, notes = [], [note]
+    before: dict[str, float] = {}
+    for batch in sorted(args.batch):
+        # Milliseconds to be expected, by the batch before.
+        factor = batch / max((row["batch"] for row in rows), default=batch)
+        expected = {name: factor * value for name, value in before.items()}
+        skip = tuple(
+            name
+            for name, value in expected.items()
+            if args.row_limit and value > 1000 * args.row_limit
+            if name != EAGER and not name.startswith("ours")
+        )
+        if skip:
+            text = f"more than --row-limit {args.row_limit:g} s a call"
+            print(f"{system}, batch {batch}: {', '.join(skip)} left out: {text}")
+        calls, note = calls_of(
+            system,
+            samples,
+            peers,
+            player,
+            batch=batch,
+            skip=skip,
+            compile_limit=args.compile_limit,
+        )
+        notes.append(f"batch {batch}: {note}")
+        total = sum(expected.get(name, 0.0) for name in calls)
+        since = suite.busy()
+        times = timing.time_in_turn(
+            calls,
+            rounds=args.rounds,
+            # No call is the first of its network any more.
+            warmup=0 if total > 250 * args.limit else 3,
+            limit_s=args.limit,
+            least=1,
+        )
+        load = suite.other_load(since)
+        found = rows_of(times)
+        before = {row["name"]: row["p50_ms"] for row in found}
+        found = [dict(system=system, batch=batch, load=load) | row for row in found]
+        rows += found
+        print(f"{system}, batch {batch}: {threads} threads; {note}", flush=True)
+        suite.print_table(found, COLUMNS)
+        if faster(found):
+            print(f"faster than ours: {', '.join(faster(found))}")
+    return rows, {"largest_differences": differences, "notes": notes}
+
+
 def main() -> None:
     """Measures, writes the report, and checks the target."""
     args = suite.parse(Config, __doc__)
-    suite.at_least(args, steps=1, threads=1, rounds=1)
+    suite.at_least(args, batch=1, steps=1, threads=1, rounds=1)
+    for system in args.system:
+        workload.of(system, "samples")
     threads = use_cores(args.threads)
     torch.set_num_threads(threads)
-    config = workload.camdm_config(workload.Sizes(steps=args.steps))
-    params = camdm_model.init(jax.random.key(0), config)
-    condition = jax.tree.map(lambda x: x[0], workload.camdm_conditions(config, 1))
-    nets = [
-        torch_camdm.load(torch_camdm.TorchCamdm(config, batch_first=first), params)
-        for first in (False, True)
-    ]
-    difference = largest_difference(config, params, nets[0], condition)
-
-    calls = our_calls(config, params, (jax.random.key(1), condition))
-    calls[EAGER] = torch_camdm.plan_call(nets[0], config, condition)
-    calls["torch eager, batch first"] = torch_camdm.plan_call(
-        nets[1], config, condition
-    )
-    note = "torch.compile: left out"
-    if args.compile_limit:
-        call, note = compiled_call(nets[0], config, condition, args.compile_limit)
-        if call is not None:
-            calls["torch.compile"] = call
-    since = suite.busy()
-    times = timing.time_in_turn(calls, rounds=args.rounds, warmup=3, limit_s=args.limit)
-    load = suite.other_load(since)
-
-    rows = rows_of(times)
-    print(
-        f"One plan of {args.steps} steps, batch 1, {threads} threads, "
-        f"{rows[0]['rounds']} rounds; forward passes differ by {difference:.1e}; {note}"
-    )
-    suite.print_table(rows, COLUMNS)
+    rows, about = [], {}
+    for system in dict.fromkeys(args.system):
+        found, about[system] = measure(system, args, threads=threads)
+        rows += found
     metrics = []
     for row in rows:
+        name = f"{row['system']} batch {row['batch']} {row['name']}"
         metrics += [
-            suite.Metric(f"{row['name']} p50", row["p50_ms"], "ms"),
-            suite.Metric(f"{row['name']} ratio", row["ratio"], "of eager"),
-            suite.Metric(f"{row['name']} cpu ratio", row["cpu_ratio"], "of eager"),
+            suite.Metric(f"{name} p50", row["p50_ms"], "ms"),
+            suite.Metric(f"{name} ratio", row["ratio"], "of eager"),
+            suite.Metric(f"{name} cpu ratio", row["cpu_ratio"], "of eager"),
         ]
+    suite.write_table(args.out / "peers", rows, COLUMNS)
     suite.report(
         "peers",
         metrics,
@@ -260,13 +446,12 @@ def main() -> None:
         rows=rows,
         threads=threads,
         torch=torch.__version__,
-        torch_compile=note,
-        largest_difference=difference,
-        other_load_of_rounds=load,
+        systems=about,
     )
-    if args.target:
-        ours = next(row for row in rows if row["name"] == OURS)
-        check_target(ours, args.target, threads=threads, load=load)
+    for row in rows:
+        if args.target and (row["system"], row["batch"]) == ("camdm", 1):
+            if row["name"] == OURS:
+                check_target(row, args.target, threads=threads, load=row["load"])
 
 
 if __name__ == "__main__":

@@ -86,6 +86,8 @@ class Samples:
       conditions: Conditions of a number of characters, batch axis first.
       frames: Frames of a sample.
       fps: Frames per second of the motion.
+      config: The method.
+      chunk: Samples at a time that was fastest on two cores; 0 for all.
     """
 
     params: Params
@@ -93,6 +95,8 @@ class Samples:
     conditions: Callable[[int], Any]
     frames: int
     fps: float
+    config: Any
+    chunk: int = 4
 
     def program(
         self,
@@ -292,6 +296,7 @@ def _camdm_samples(sizes: Sizes) -> Samples:
         conditions=lambda batch: camdm_conditions(config, batch),
         frames=config.future,
         fps=config.fps,
+        config=config,
     )
 
 
@@ -418,6 +423,8 @@ def _aamdm_samples(sizes: Sizes) -> Samples:
         ),
         frames=1,
         fps=FPS,
+        config=config,
+        chunk=0,
     )
 
 
@@ -622,6 +629,7 @@ def _emdm_samples(sizes: Sizes) -> Samples:
         conditions=conditions,
         frames=config.frames,
         fps=15.0,
+        config=config,
     )
 
 
@@ -688,4 +696,5 @@ def _smgdiff_samples(sizes: Sizes) -> Samples:
         conditions=conditions,
         frames=config.future,
         fps=representation.fps,
+        config=config,
     )

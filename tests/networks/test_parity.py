@@ -1,5 +1,6 @@
 """The network and its sampler against PyTorch's own encoder, with the same weights."""
 
+import dataclasses
 import functools
 
 import jax
@@ -7,14 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import noise, schedule
+from jaxmotion.diffusion import noise
 from jaxmotion.motion import trajectory
 from jaxmotion.networks import blocks
+from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.camdm import model as camdm_model
+from jaxmotion.systems.emdm import model as emdm_model
 from tests import tiny
 
 torch = pytest.importorskip("torch")
-from benchmarks import torch_camdm  # noqa: E402
+from benchmarks import torch_peers  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -29,23 +32,22 @@ def parameters():
 
 @functools.cache
 def peer(batch_first=False):
-    net = torch_camdm.TorchCamdm(CONFIG, batch_first=batch_first)
-    return torch_camdm.load(net, parameters())
+    return torch_peers.make("camdm", CONFIG, parameters(), batch_first=batch_first)
 
 
-def conditions():
+def conditions(config=CONFIG):
     rng = np.random.default_rng(0)
     normal = lambda *shape: jnp.asarray(  # noqa: E731
         rng.normal(size=(BATCH, *shape)), jnp.float32
     )
-    angle = rng.uniform(0, 2 * np.pi, (BATCH, CONFIG.future))
+    angle = rng.uniform(0, 2 * np.pi, (BATCH, config.future))
     facing = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
     return camdm_model.Condition(
-        past=normal(CONFIG.past, CONFIG.num_features),
+        past=normal(config.past, config.num_features),
         trajectory=trajectory.Trajectory(
-            position=normal(CONFIG.future, 2), facing=jnp.asarray(facing, jnp.float32)
+            position=normal(config.future, 2), facing=jnp.asarray(facing, jnp.float32)
         ),
-        label=jnp.array([0, 7, 99]),
+        label=jnp.array([0, 7, 99]) % config.num_labels,
         keep_past=jnp.ones(BATCH, bool),
     )
 
@@ -57,7 +59,7 @@ def as_torch(arguments):
 
 def test_as_many_parameters():
     ours = sum(x.size for x in jax.tree.leaves(parameters()))
-    theirs = sum(x.numel() for x in peer().parameters())
+    theirs = sum(x.numel() for x in peer().nets[0].parameters())
     assert ours == theirs == 3_439_260
 
 
@@ -71,9 +73,11 @@ def test_forward_pass(batch_first):
         {"params": parameters()}, x_t, jnp.asarray(t), *arguments
     )
     with torch.inference_mode():
-        theirs = peer(batch_first)(
-            torch.from_numpy(x_t), torch.from_numpy(t), *as_torch(arguments)
-        ).numpy()
+        theirs = (
+            peer(batch_first)
+            .nets[0](torch.from_numpy(x_t), torch.from_numpy(t), *as_torch(arguments))
+            .numpy()
+        )
     assert theirs.std() > 0.1
     np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
@@ -86,16 +90,64 @@ def test_sampler():
     draw = functools.partial(noise.draw_noise, plan)
     tapes = jax.vmap(draw)(keys, condition)
     ours = jax.jit(jax.vmap(noise.with_noise(plan)))(tapes, condition)
-    start, (steps,) = tapes  # of steps T to 1; the peer takes them from 1 to T
-    given_noise = np.concatenate([start[None], jnp.swapaxes(steps, 0, 1)[::-1]])
-    beta = schedule.cosine_schedule(CONFIG.num_steps).beta
-    table = torch_camdm.posterior_table(np.asarray(beta))
     with torch.inference_mode():
-        given = as_torch(condition.arguments(CONFIG))
-        theirs = torch_camdm.sample(
-            peer(), table, torch.from_numpy(given_noise), given
-        ).numpy()
-    np.testing.assert_allclose(ours, theirs, atol=2e-5)
+        given = torch_peers.given_of("camdm", CONFIG, condition)
+        theirs = torch_peers.sample(peer(), *torch_peers.from_tape(tapes), given)
+    np.testing.assert_allclose(ours, theirs.numpy(), atol=2e-5)
+
+
+TINY_EMDM = dict(
+    features=6,
+    frames=8,
+    condition_size=3,
+    latent=4,
+    width=16,
+    depth=2,
+    heads=2,
+    hidden=24,
+)
+TINY = {
+    "camdm": tiny.config(num_steps=3),
+    "emdm": emdm_model.Config(num_steps=3, **TINY_EMDM),
+    "emdm, ours": emdm_model.Config(
+        num_steps=3, norm="pre", frames_per_token=4, **TINY_EMDM
+    ),
+    "emdm, texts": emdm_model.Config(num_steps=3, condition="text", **TINY_EMDM),
+    "aamdm": aamdm_model.Config(features=5, latent=4, width=32, depth=3),
+}
+
+
+@pytest.mark.parametrize("name", TINY)
+def test_whole_loop_of_every_peer(name):
+    """Random parameters, biases too; latents and noise are those of our sampler."""
+    config, system = TINY[name], name.partition(",")[0]
+    model = {"camdm": camdm_model, "emdm": emdm_model, "aamdm": aamdm_model}[system]
+    params = tiny.random_params(model.init, config, seed=1)
+    params = params["generator"] if system == "emdm" else params
+    rng = np.random.default_rng(0)
+    if system == "camdm":
+        condition = conditions(config)
+    elif system == "emdm":
+        vectors = jnp.asarray(rng.normal(size=(BATCH, 3)), jnp.float32)
+        condition = emdm_model.make_condition(vectors, config=config)
+    else:
+        condition = jnp.asarray(rng.normal(size=(BATCH, 5)), jnp.float32)
+    sample = model.sampler(params, config=config)
+    keys = jax.random.split(jax.random.key(2), BATCH)
+    tapes = jax.vmap(functools.partial(noise.draw_noise, sample))(keys, condition)
+    ours = jax.jit(jax.vmap(noise.with_noise(sample)))(tapes, condition)
+    peer = torch_peers.make(system, config, params)
+    with torch.inference_mode():
+        given = torch_peers.given_of(system, config, condition)
+        theirs = torch_peers.sample(peer, *torch_peers.from_tape(tapes), given)
+    assert theirs.std() > 0.1
+    np.testing.assert_allclose(ours, theirs.numpy(), atol=1e-5)
+
+
+def test_peer_refuses_what_it_has_not():
+    config = dataclasses.replace(TINY["emdm"], token_margin=1)
+    with pytest.raises(ValueError, match="token_margin is 1: the peer has 0"):
+        torch_peers.make("emdm", config, {})
 
 
 def test_gelu_is_that_of_float64():
