@@ -10,7 +10,7 @@ released code does, every token in every step; onnxruntime runs our own sampler 
 Examples:
   python benchmarks/peers.py
   python benchmarks/peers.py --threads 1
-  python benchmarks/peers.py --system camdm smgdiff emdm aamdm --batch 1 64 --limit 9
+  python benchmarks/peers.py --system aamdm emdm --batch 1 64 256 --limit 9
 """
 
 import dataclasses

@@ -345,12 +345,34 @@ def test_time_in_turn_moves_the_order_on():
     assert all(values.shape == (5, 2) for values in times.values())
 
 
+@pytest.mark.slow
+def test_peers_compute_the_same(tmp_path):
+    """Frames of AAMDM, one and three; onnxruntime is there or is said to be missing."""
+    pytest.importorskip("torch")
+    options = ["--system", "aamdm", "--batch", "1", "3", "--width", "32"]
+    options += ["--rounds", "2", "--compile-limit", "0", "--target", "0"]
+    printed = run_script("peers", *options, "--out", tmp_path)
+    report = json.loads((tmp_path / "peers.json").read_text())
+    found = {(row["batch"], row["name"]) for row in report["rows"]}
+    names = {"ours, arguments", "ours, constants", "torch eager"}
+    different = report["systems"]["aamdm"]["largest_differences"]
+    if "onnxruntime" in different:
+        names.add("onnxruntime")
+    else:
+        assert printed.count("onnxruntime: left out") == 1
+    assert found == {(batch, name) for batch in (1, 3) for name in names}
+    assert max(different.values()) < 1e-5
+    assert (tmp_path / "peers.md").exists()
+
+
 def test_ratios_are_of_the_same_round(load):
     pytest.importorskip("torch")
     peers = load("peers")
     eager = np.array([[10.0, 8.0], [100.0, 80.0], [20.0, 16.0]])
     rows = peers.rows_of({peers.OURS: eager * [0.5, 0.75], peers.EAGER: eager})
     ours = rows[0]
+    assert peers.faster(rows) == []
+    assert peers.faster([ours | {"p50_ms": 30.0}, rows[1]]) == [peers.EAGER]
     assert ours["ratio"] == pytest.approx(0.5)
     assert ours["cpu_ratio"] == pytest.approx(0.75)
     assert ours["p50_ms"] == pytest.approx(10.0)
