@@ -139,6 +139,10 @@ def torch_call(
     return torch_peers.plan_call(peer, batch, given)
 
 
+class TooLate(BaseException):
+    """Not an `Exception`: compilers catch those, and go on."""
+
+
 def compiled_call(
     peer: torch_peers.Peer, batch: int, given: tuple[torch.Tensor, ...], limit: int
 ) -> tuple[Callable | None, str]:
@@ -149,7 +153,7 @@ def compiled_call(
     """
 
     def stop(*_: Any) -> None:
-        raise TimeoutError(f"not done within {limit} s")
+        raise TooLate(f"not done within {limit} s")
 
     # Else it would make the next batch's size a variable of one slower program.
     torch._dynamo.reset()
@@ -158,7 +162,7 @@ def compiled_call(
     signal.alarm(limit)
     try:
         call = torch_call(torch_peers.compiled(peer), batch, given)
-    except Exception as error:  # whatever a compiler raises: the rest still counts
+    except (Exception, TooLate) as error:  # whatever it is: the rest still counts
         return None, f"torch.compile: {type(error).__name__}: {error}".split("\n")[0]
     finally:
         signal.alarm(0)
