@@ -188,7 +188,7 @@ class Player:
         arrays = [np.asarray(x) for x in jax.tree.leaves((tape, conditions))]
         batch = arrays[0].shape[0]
         if batch == 1:
-            arrays = [x[0] for x in arrays]
+            arrays = [np.asarray(x[0]) for x in arrays]
         names = [port.name for port in self.graph.inputs]
         session = self.one if batch == 1 else self.any
         # Inputs that the result does not depend on may be gone.
@@ -224,12 +224,6 @@ def make_player(
     begun = time.perf_counter()
     try:
         onnx.check()
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-        # Its threads would else wait for more work while the next row runs.
-        options.add_session_config_entry("session.force_spinning_stop", "1")
         sample = Exported(
             samples.sampler(samples.params), ("key", "condition"), ("sample",)
         )
@@ -239,8 +233,7 @@ def make_player(
             for batch in (None, graph.ANY)[: 1 + several]:
                 path = Path(folder) / f"sample{onnx.SUFFIX}"
                 onnx.write(path, made, batch=batch)
-                session = onnxruntime.InferenceSession(path.read_bytes(), options)
-                sessions.append(session)
+                sessions.append(onnx.open_session(path.read_bytes(), threads=threads))
     except ValueError as error:
         return None, f"onnxruntime: left out: {error}"
     player = Player(made, sessions[0], sessions[-1])

@@ -62,17 +62,29 @@ def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
         file.write(model.SerializeToString())
 
 
-def _try(model: Any, graph: Graph, batch: Batch) -> None:
-    """Runs a model once: the checker takes shapes that do not fit for right."""
+def open_session(model: bytes, *, threads: int = 0) -> Any:
+    """An `onnxruntime.InferenceSession` of a file's content.
+
+    Args:
+      model: The content.
+      threads: Threads of one operation; 0 leaves their number to onnxruntime. They do
+        not wait for more work between calls, as that takes cores from other work.
+    """
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
+    options.intra_op_num_threads = threads
+    options.add_session_config_entry("session.force_spinning_stop", "1")
+    return onnxruntime.InferenceSession(model, options)
+
+
+def _try(model: Any, graph: Graph, batch: Batch) -> None:
+    """Runs a model once: the checker takes shapes that do not fit for right."""
     lead = () if batch is None else (2 if batch == ANY else batch,)
     zeros = {x.name: np.zeros((*lead, *x.shape), x.dtype) for x in graph.inputs}
     try:
-        data = model.SerializeToString()
-        session = onnxruntime.InferenceSession(data, options)
+        session = open_session(model.SerializeToString())
         session.run(None, {x.name: zeros[x.name] for x in session.get_inputs()})
     except Exception as error:  # of onnxruntime, which has many kinds
         reason = str(error).strip().split("\n")[0]
