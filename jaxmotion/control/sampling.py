@@ -53,12 +53,12 @@ class Sampler:
 
 
 def sample_motions(
-    sampler: Sampler, key: Key, labels: Int[np.ndarray, " motions"], *, chunk: int
+    model: Sampler, key: Key, labels: Int[np.ndarray, " motions"], *, chunk: int
 ) -> Motion:
     """Motions from the ground's origin that begin facing +z, as one compiled program.
 
     Args:
-      sampler: What makes them.
+      model: What makes them.
       key: Consumed. Motion i draws from `fold_in(key, i)`, however many there are.
       labels: Index of each motion's label.
       chunk: Motions to make at a time, at most.
@@ -67,14 +67,14 @@ def sample_motions(
       Motions [motions, frames, ...].
 
     Raises:
-      ValueError: if a label is none of the sampler's.
+      ValueError: if a label is none of the model's.
     """
-    found = label_indices(sampler.labels, labels)
+    found = label_indices(model.labels, labels)
     return _motions(
-        sampler.params,
+        model.params,
         key,
         jnp.asarray(found, jnp.int32),
-        method=sampler.method,
+        method=model.method,
         chunk=min(chunk, len(found)),
     )
 

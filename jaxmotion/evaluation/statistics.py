@@ -61,7 +61,7 @@ class Spread(NamedTuple):
             return np.full_like(self.mean, np.nan)
         return self.squares / (self.count - 1)
 
-    def half_width(self, level: float = 0.95) -> np.ndarray | np.float64:
+    def half_width(self, *, level: float = 0.95) -> np.ndarray | np.float64:
         """Half the confidence interval of the mean by Student's t."""
         t = scipy.stats.t.ppf(0.5 + level / 2, max(self.count - 1, 1))
         return t * np.sqrt(self.variance / self.count)

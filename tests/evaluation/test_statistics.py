@@ -60,4 +60,4 @@ def test_moments_of_parts_are_those_of_the_whole():
     np.testing.assert_allclose(found.variance, whole.var(0, ddof=1), rtol=1e-9)
     one = statistics.spread(whole[:, 0, 0])
     ends = scipy.stats.t.interval(0.9, 999, one.mean, np.sqrt(one.variance / 1000))
-    np.testing.assert_allclose(one.half_width(0.9), np.ptp(ends) / 2)
+    np.testing.assert_allclose(one.half_width(level=0.9), np.ptp(ends) / 2)
