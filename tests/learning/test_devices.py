@@ -1,13 +1,18 @@
-"""Eight virtual devices, and two processes, give what one device gives."""
+"""Eight virtual devices, and several processes, give what one device gives."""
 
 import os
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from jaxmotion.data import clips_io
+from jaxmotion.learning import checkpoint, loop
+from tests import tiny
 
 pytestmark = pytest.mark.slow
 
@@ -58,10 +63,86 @@ def test_eight_devices_train_and_roll_out_as_one(single, tmp_path):
     compare(tmp_path / "mesh.npz", single)
 
 
-def test_two_processes_train_as_one(single, tmp_path):
+def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+        return probe.getsockname()[1]
+
+
+TRAIN = (
+    "experiments/camdm.py train --held-out 0.5 --contents --network mlp --width 16 "
+    "--depth 1 --batch 8 --warmup 1 --diffusion-steps 2 --chunk 5 --save-every 10 "
+)
+
+
+def start_training(folder, out, steps, processes, more=""):
+    """Starts the processes of one training."""
+    environment = os.environ | {
+        "JAX_PLATFORMS": "cpu",
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    }
+    port = free_port()
+
+    def one(index):
+        line = f"{TRAIN} --data {folder}/clips.npz --out {out} --steps {steps} {more}"
+        if processes > 1:
+            line += f" --distributed 127.0.0.1:{port} {processes} {index}"
+        return subprocess.Popen(
+            [sys.executable, *line.split()],
+            cwd=ROOT,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    return [one(index) for index in range(processes)]
+
+
+def losses_of(out):
+    return [row["loss"] for row in loop.read_losses(out / "motion" / "losses.jsonl")]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """A folder with clips, and a training of 20 steps by one process."""
+    folder = tmp_path_factory.mktemp("alone")
+    clips_io.save_clips(folder / "clips.npz", tiny.clips())
+    finish(*start_training(folder, folder / "run", 20, 1))
+    return folder
+
+
+@pytest.mark.parametrize("processes", [2, 4])
+def test_processes_of_the_script_train_as_one(alone, tmp_path, processes):
+    for process in start_training(alone, tmp_path, 20, processes):
+        finish(process)
+    found = losses_of(tmp_path)
+    assert len(found) == 4
+    np.testing.assert_allclose(found, losses_of(alone / "run"), rtol=1e-5)
+
+
+def test_a_killed_process_ends_the_run_and_it_resumes(alone, tmp_path):
+    first, second = start_training(alone, tmp_path, 10**6, 2)
+    folder = tmp_path / "motion" / "checkpoints"
+    try:
+        while not (folder / "10").is_dir():
+            assert first.poll() is None and second.poll() is None
+            time.sleep(0.2)
+        second.kill()
+        _, errors = first.communicate(timeout=120)
+    finally:
+        first.kill()
+        second.kill()
+    assert first.returncode == 1
+    assert errors.splitlines()[-1].startswith("process 0 of 2: error: "), errors
+    done = checkpoint.latest_step(folder)
+    for process in start_training(alone, tmp_path, done + 5, 2, "--override"):
+        finish(process)
+    assert checkpoint.latest_step(folder) == done + 5
+
+
+def test_two_processes_train_as_one(single, tmp_path):
+    port = free_port()
     processes = [start("process", tmp_path / f"{i}.npz", port, i) for i in range(2)]
     try:
         for process in processes:
