@@ -18,6 +18,7 @@ from serving.server import Limits, Server
 
 import jaxmotion
 from jaxmotion import cli
+from jaxmotion.control import steering
 from jaxmotion.data import clips_io
 
 
@@ -55,7 +56,8 @@ async def listen(args: Config, characters: simulation.Simulation) -> None:
 def load(run: str, data: Path | None) -> simulation.Simulation:
     """A model's characters; of clips only what a start needs is kept."""
     clips = None if data is None else clips_io.load_clips(data)
-    return simulation.Characters(jaxmotion.load(run), clips=clips)
+    character = steering.steered(jaxmotion.load(run), run)
+    return simulation.Characters(character, clips=clips)
 
 
 def serve(args: Config) -> None:

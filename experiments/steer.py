@@ -21,7 +21,7 @@ import tyro
 import jaxmotion
 from jaxmotion import cli, files
 from jaxmotion.control.foot_lock import lock_feet
-from jaxmotion.control.steering import Character
+from jaxmotion.control.steering import Character, steered
 from jaxmotion.viz import page, viewer
 
 # Those that are steered.
@@ -62,7 +62,7 @@ class Config:
 
 def load(run: str) -> Character:
     """A model whose feet can be locked, if it has feet."""
-    character = jaxmotion.load(run, foot_lock=False)
+    character = steered(jaxmotion.load(run, foot_lock=False), run)
     return lock_feet(character) if character.skeleton.feet else character
 
 

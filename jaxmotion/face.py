@@ -200,12 +200,11 @@ def rollout(
       ValueError: if the model is not steered, states and commands are of different
         numbers of characters, or a label is none of the model's.
     """
-    if not isinstance(model, Character):
-        raise ValueError("this model makes whole motions: expected `sample`")
+    character = steering.steered(model)
     if chunk is None and jax.default_backend() == "cpu":
         chunk = _CPU_CHUNK
     return steering.steered_rollouts(
-        model, key, states, commands, chunk=chunk, mesh=mesh
+        character, key, states, commands, chunk=chunk, mesh=mesh
     )
 
 

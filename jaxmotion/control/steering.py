@@ -132,6 +132,19 @@ class Character:
         return self.clip_starts(clips, found, seed)
 
 
+def steered(model: Any, what: str = "this model") -> Character:
+    """The model, which must be a character.
+
+    Raises:
+      ValueError: if it makes whole motions.
+    """
+    if not isinstance(model, Character):
+        raise ValueError(
+            f"{what} makes whole motions: it is sampled, not steered or rolled out"
+        )
+    return model
+
+
 def label_indices(
     names: tuple[str, ...], labels: Any = None, number: int | None = None
 ) -> np.ndarray:

@@ -664,9 +664,8 @@ def test_an_address_is_tried_before_anything_is_loaded(script, monkeypatch):
 
 
 def test_what_cannot_be_served_is_named(tmp_path, script_load):
-    (tmp_path / "config.json").write_text('{"system": "emdm"}')
-    with pytest.raises(ValueError, match="'system' is 'emdm', expected .*camdm, aamdm"):
-        script_load(str(tmp_path), None)
+    with pytest.raises(ValueError, match="actions makes whole motions: it is sampled"):
+        script_load("actions", None)
     with pytest.raises(ValueError, match="nowhere: no such file .*locomotion"):
         script_load(str(tmp_path / "nowhere"), None)
     with pytest.raises(OSError, match="none.npz"):
