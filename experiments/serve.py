@@ -56,7 +56,7 @@ async def listen(args: Config, characters: simulation.Simulation) -> None:
 def load(run: str, data: Path | None) -> simulation.Simulation:
     """A model's characters; of clips only what a start needs is kept."""
     clips = None if data is None else clips_io.load_clips(data)
-    character = steering.steered(jaxmotion.load(run), run)
+    character = steering.steered(jaxmotion.load(run), what=run)
     return simulation.Characters(character, clips=clips)
 
 

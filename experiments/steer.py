@@ -62,7 +62,7 @@ class Config:
 
 def load(run: str) -> Character:
     """A model whose feet can be locked, if it has feet."""
-    character = steered(jaxmotion.load(run, foot_lock=False), run)
+    character = steered(jaxmotion.load(run, foot_lock=False), what=run)
     return lock_feet(character) if character.skeleton.feet else character
 
 

@@ -132,7 +132,7 @@ class Character:
         return self.clip_starts(clips, found, seed)
 
 
-def steered(model: Any, what: str = "this model") -> Character:
+def steered(model: Any, *, what: str = "this model") -> Character:
     """The model, which must be a character.
 
     Raises:
