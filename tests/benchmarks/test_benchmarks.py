@@ -361,7 +361,9 @@ def test_peers_compute_the_same(tmp_path):
     else:
         assert printed.count("onnxruntime: left out") == 1
     assert found == {(batch, name) for batch in (1, 3) for name in names}
-    assert max(different.values()) < 1e-5
+    # Of whole chains, which enlarge what their networks differ by: that is at most 1e-5
+    # (tests/networks/test_parity.py), and noise in another order would give 1.
+    assert max(different.values()) < 1e-3
     assert (tmp_path / "peers.md").exists()
 
 
