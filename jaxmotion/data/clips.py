@@ -253,18 +253,48 @@ def take_clips(clips: Clips, indices: Sequence[int] | np.ndarray) -> Clips:
             f"0..{clips.num_clips - 1}"
         )
     offsets = np.asarray(clips.offsets)
-    frames = np.concatenate([np.arange(offsets[i], offsets[i + 1]) for i in indices])
-    lengths = np.diff(offsets)[indices]
+    return stretches(
+        clips,
+        indices,
+        offsets[indices],
+        np.diff(offsets)[indices],
+        names=tuple(clips.clip_names[i] for i in indices),
+    )
+
+
+def stretches(
+    clips: Clips,
+    owners: Int[np.ndarray, " stretches"],
+    firsts: Int[np.ndarray, " stretches"],
+    lengths: Int[np.ndarray, " stretches"],
+    *,
+    names: tuple[str, ...],
+) -> Clips:
+    """Stretches of frames, each as one clip with the labels of the clip it is from.
+
+    Args:
+      clips: The clips.
+      owners: Number of each stretch's clip.
+      firsts: Its first frame, counted over all clips.
+      lengths: Its frames.
+      names: Its name.
+
+    Returns:
+      The stretches in that order.
+    """
+    frames = np.concatenate(
+        [np.arange(a, a + n) for a, n in zip(firsts, lengths, strict=True)]
+    )
     return dataclasses.replace(
         clips,
         root_position=jnp.asarray(np.asarray(clips.root_position)[frames]),
         joint_rotation=jnp.asarray(np.asarray(clips.joint_rotation)[frames]),
         offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
         labels={
-            field: jnp.asarray(np.asarray(values)[indices])
+            field: jnp.asarray(np.asarray(values)[owners])
             for field, values in clips.labels.items()
         },
-        clip_names=tuple(clips.clip_names[i] for i in indices),
+        clip_names=names,
     )
 
 

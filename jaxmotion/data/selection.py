@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmotion.data.clips import Clips, check_skeletons, take_clips
+from jaxmotion.data.clips import Clips, check_skeletons, stretches, take_clips
 
 
 def _indices(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
@@ -185,22 +185,14 @@ def cut(clips: Clips, spans: Sequence[tuple[int, int, int]]) -> Clips:
     Returns:
       The stretches in that order, named "<clip>@<first frame>+<frames>".
     """
-    owner, starts, lengths = np.array(spans, np.int64).reshape(-1, 3).T
-    first = np.asarray(clips.offsets)[owner] + starts
-    frames = np.concatenate(
-        [np.arange(a, a + n) for a, n in zip(first, lengths, strict=True)]
-    )
+    owners, starts, lengths = np.array(spans, np.int64).reshape(-1, 3).T
     names = clips.clip_names or [f"clip {i}" for i in range(clips.num_clips)]
-    return dataclasses.replace(
+    return stretches(
         clips,
-        root_position=jnp.asarray(np.asarray(clips.root_position)[frames]),
-        joint_rotation=jnp.asarray(np.asarray(clips.joint_rotation)[frames]),
-        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
-        labels={
-            field: jnp.asarray(np.asarray(values)[owner])
-            for field, values in clips.labels.items()
-        },
-        clip_names=tuple(f"{names[i]}@{start}+{n}" for i, start, n in spans),
+        owners,
+        np.asarray(clips.offsets)[owners] + starts,
+        lengths,
+        names=tuple(f"{names[i]}@{start}+{n}" for i, start, n in spans),
     )
 
 

@@ -184,6 +184,7 @@ def browser():
         # One of the system's is enough, which Playwright does not know of.
         path = CHROMIUM or run.chromium.executable_path
         if not Path(path).exists():
+            # A browser is no Python package: .ci/run fetches one, others may lack it.
             pytest.skip("needs a browser: playwright install chromium")
         chromium = run.chromium.launch(
             executable_path=path, args=OPTIONS, headless=True
