@@ -29,7 +29,7 @@ from jaxmotion.typing import Exported, Key, Params
 # equal settings: it is a static argument of the compiled program.
 Method = Callable[[Params], rollout.Controller]
 
-ACTIONS = ("forward", "back", "left", "right", "run", "turn_left", "turn_right")
+MOVES = ("forward", "back", "left", "right", "run", "turn_left", "turn_right")
 # Shift multiplies the speed; Q and E turn who stands by so much, radians per second.
 RUN, TURN = 2.0, math.radians(150.0)
 # Who runs at a target slows down to cover what is left in so many seconds, and stops
@@ -303,6 +303,29 @@ def calmest(
     return jax.tree.map(lambda x: x[kept], (states, frames))
 
 
+def chosen_starts(
+    starts: Any, labels: np.ndarray, names: tuple[str, ...], *, seed: int
+) -> Any:
+    """A start of its label for each character, drawn with equal chances.
+
+    Args:
+      starts: Arrays [labels, starts, ...], of as many starts of each label.
+      labels: Label of each character.
+      names: Those that the model has.
+      seed: Seeds the choice.
+
+    Returns:
+      Arrays [characters, ...].
+
+    Raises:
+      ValueError: if a label is none of the model's.
+    """
+    check_labels(labels, names)
+    labels, number = np.asarray(labels), jax.tree.leaves(starts)[0].shape[1]
+    which = np.random.default_rng(seed).integers(number, size=labels.shape)
+    return jax.tree.map(lambda x: x[labels, which], starts)
+
+
 @functools.partial(jax.jit, static_argnames="method")
 def _stand(
     params: Params, key: Key, states: Any, commands: Command, *, method: Method
@@ -332,7 +355,7 @@ class Inputs:
     """What one person holds down.
 
     Attributes:
-      held: Of `ACTIONS`.
+      held: Of `MOVES`.
       azimuth: Where the camera looks, radians from +z toward +x.
       target: Point (x, z) on the ground to go to, meters; keys come first.
     """

@@ -29,7 +29,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from jaxmotion.control.steering import ACTIONS, Inputs
+from jaxmotion.control.steering import MOVES, Inputs
 from jaxmotion.viz.html import CAPSULES
 from jaxmotion.viz.viewer import Session, Shown
 
@@ -88,8 +88,8 @@ def read_message(text: str | bytes) -> dict[str, Any]:
     if "held" not in value:
         return value
     held, azimuth, target = (value.get(k) for k in ("held", "azimuth", "target"))
-    if not isinstance(held, list) or not all(x in ACTIONS for x in held):
-        raise ValueError(f"held is wrong, expected some of {', '.join(ACTIONS)}")
+    if not isinstance(held, list) or not all(x in MOVES for x in held):
+        raise ValueError(f"held is wrong, expected some of {', '.join(MOVES)}")
     point = [0.0, 0.0] if target is None else target
     if not isinstance(point, list) or len(point) != 2:
         raise ValueError("target is wrong, expected [x, z] or null")

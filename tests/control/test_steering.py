@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 
 from jaxmotion.control import courses, steering
 from jaxmotion.data import selection, windows
@@ -55,6 +56,19 @@ def test_characters_start_at_the_origin_facing_ahead_in_poses_of_the_data(run):
         assert far.min() < 1e-5
     heights = np.asarray(run.held_out.root_position)[:, 1]
     assert np.all(past.root_position[..., 1] <= heights.max() + 1e-6)
+
+
+def test_starts_are_of_the_label_and_drawn_evenly():
+    labels = np.tile([1, 0, 2], 1000)
+    starts = {"own": jnp.arange(12.0).reshape(3, 4), "more": jnp.ones((3, 4, 5))}
+    chosen = steering.chosen_starts(starts, labels, tuple("abc"), seed=1)
+    assert chosen["more"].shape == (3000, 5)
+    own = np.asarray(chosen["own"], int)
+    np.testing.assert_array_equal(own // 4, labels)
+    counts = np.bincount(own, minlength=12)
+    assert scipy.stats.chisquare(counts).pvalue > 0.01
+    with pytest.raises(ValueError, match="labels are in 1..3, expected 0..2"):
+        steering.chosen_starts(starts, np.array([1, 3]), tuple("abc"), seed=1)
 
 
 def test_characters_start_in_poses_of_the_models_own(run):

@@ -31,7 +31,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame, as_displayed
 from jaxmotion.control.rollout import Controller
-from jaxmotion.control.steering import Character, Tuning, check_labels
+from jaxmotion.control.steering import (
+    Character,
+    Tuning,
+    check_labels,
+    chosen_starts,
+)
 from jaxmotion.data import windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, schedule
@@ -634,11 +639,7 @@ def own_states(
     """
     if model.starts is None:
         raise ValueError("the model has no poses to start from: give clips")
-    check_labels(labels, model.labels)
-    labels = np.asarray(labels)
-    number = model.starts.root_position.shape[1]
-    which = np.random.default_rng(seed).integers(number, size=labels.shape)
-    chosen = jax.tree.map(lambda x: x[labels, which], model.starts)
+    chosen = chosen_starts(model.starts, labels, model.labels, seed=seed)
     return _states_of(model.skeleton, chosen, config=model.config)
 
 

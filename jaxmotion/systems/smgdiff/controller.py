@@ -33,7 +33,13 @@ from jaxtyping import Array, Int
 from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame, as_displayed
 from jaxmotion.control.rollout import Controller
-from jaxmotion.control.steering import Character, Tuning, calmest, check_labels
+from jaxmotion.control.steering import (
+    Character,
+    Tuning,
+    calmest,
+    check_labels,
+    chosen_starts,
+)
 from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.diffusion import chain
 from jaxmotion.diffusion.schedule import spread_steps
@@ -458,10 +464,7 @@ def own_states(model: Model, labels: np.ndarray, *, seed: int) -> PlayerState:
     """
     if model.starts is None:
         raise ValueError("the model has no frames to start from")
-    check_labels(labels, model.labels)
-    number = model.starts.ball.shape[1]
-    which = np.random.default_rng(seed).integers(number, size=len(labels))
-    chosen = jax.tree.map(lambda x: x[labels, which], model.starts)
+    chosen = chosen_starts(model.starts, labels, model.labels, seed=seed)
     skeleton = model.representation.skeleton
     start = functools.partial(init_state, skeleton, config=model.config)
     return jax.jit(jax.vmap(start))(chosen)
