@@ -7,14 +7,15 @@ command that would run it.
 Examples:
   python experiments/report.py
   python experiments/report.py --runs runs --out runs/report
-  python experiments/report.py --elsewhere smgdiff=runs/other --out runs/report
-"""
+  python experiments/report.py --seeds 3 --out runs/report
+  python experiments/report.py --elsewhere aamdm=runs/a0,runs/a1,runs/a2 --out runs/report
+"""  # noqa: E501
 
 import dataclasses
 from pathlib import Path
 
 import tyro
-from reports import results, verdicts, writing
+from reports import markdown, results, writing
 from reports.claims import Source
 
 from jaxmotion import cli, reporting
@@ -28,17 +29,21 @@ class Config:
     Attributes:
       runs: Folder of the run folders.
       out: Folder of the report.
+      seeds: Trainings of each run, of seeds 0, 1, ...: aamdm, aamdm_seed1, ...; where
+        there are several, claims are decided by paired differences over them.
       elsewhere: Run folders that do not lie in `runs` under the names that
-        experiments/papers gives them, as in smgdiff=runs/other.
+        experiments/papers gives them, as in smgdiff=runs/other; several, with commas
+        between, are several trainings.
     """
 
     runs: Path = Path("runs")
     out: Path = Path("runs/report")
+    seeds: int = 1
     elsewhere: tuple[str, ...] = ()
 
 
-def folders_of(args: Config) -> dict[Source, Path]:
-    """Run folder of each source; those that were not given need not exist.
+def folders_of(args: Config) -> dict[Source, tuple[Path, ...]]:
+    """Run folders of each source's trainings; those not given need not exist.
 
     Raises:
       FileNotFoundError: names what does not exist.
@@ -47,37 +52,58 @@ def folders_of(args: Config) -> dict[Source, Path]:
     if not args.runs.is_dir():
         raise FileNotFoundError(f"runs: no folder {args.runs}")
     names = dict.fromkeys(source.run for source in writing.SOURCES)
-    found = {name: args.runs / name for name in names}
+    ends = ("", *(f"_seed{i}" for i in range(1, args.seeds)))
+    found = {name: tuple(args.runs / f"{name}{x}" for x in ends) for name in names}
     for given in args.elsewhere:
-        name, _, folder = given.partition("=")
-        if name not in names or not folder:
+        name, _, folders = given.partition("=")
+        if name not in names or not folders:
             raise ValueError(
                 f"elsewhere: {given!r}, expected name=folder with a name of "
                 f"{', '.join(names)}"
             )
-        if not Path(folder).is_dir():
-            raise FileNotFoundError(f"elsewhere: no folder {folder} for {name}")
-        found[name] = Path(folder)
+        found[name] = tuple(map(Path, folders.split(",")))
+        for folder in found[name]:
+            if not folder.is_dir():
+                raise FileNotFoundError(f"elsewhere: no folder {folder} for {name}")
     return {source: found[source.run] for source in writing.SOURCES}
+
+
+def commands_of(source: Source, folders: tuple[Path, ...]) -> tuple[str, ...]:
+    """What leaves a source's file behind: for each training, with its seed."""
+    lines = {}
+    for seed, folder in enumerate(folders):
+        for command in source.commands:
+            line = command.format(run=folder)
+            if seed and "--out {run}" in command:
+                line += f" --seed {seed}"
+            lines[line] = None
+    return tuple(lines)
 
 
 def report(args: Config) -> None:
     """Writes the report, and prints how the claims came out."""
     folders = folders_of(args)
     found = {
-        source: results.read(folder / source.file) for source, folder in folders.items()
+        source: results.read_trainings([folder / source.file for folder in own])
+        for source, own in folders.items()
     }
     loop.check_writable(args.out)
-    commands = {
-        source: tuple(x.format(run=folders[source]) for x in source.commands)
-        for source in folders
-    }
+    commands = {source: commands_of(source, folders[source]) for source in folders}
+    for source, there in found.items():
+        trained = there.trainings if there else ()
+        for folder, one in zip(folders[source], trained, strict=False):
+            if one is None:
+                print(f"a training is missing: no {folder / source.file}")
     decided = writing.write(args.out, found, commands, reporting.provenance())
-    for name in verdicts.Verdict.__args__:
-        own = [(t, c) for t, c, decision in decided if decision.verdict == name]
-        print(f"{name}: {len(own)}")
-        for table, claim in own:
-            print(f"  {table.name}: {claim.words}")
+    for name, count in markdown.counts(decided).items():
+        print(count)
+        for table, claim, decision in decided:
+            if decision.verdict == name:
+                reason = f" ({decision.reason})" if decision.reason else ""
+                print(f"  {table.name}: {claim.words}{reason}")
+    print(f"{len(writing.ABSENT)} of the papers' results cannot be run here")
+    for absent in writing.ABSENT:
+        print(f"  {absent.paper}, {absent.what}: {absent.reason}")
     print(f"wrote report.md, report.json and pictures to {args.out}")
 
 

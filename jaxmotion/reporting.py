@@ -1,5 +1,6 @@
 """What an experiment leaves behind: a rollout to look at, and a table to cite."""
 
+import contextlib
 import dataclasses
 import datetime
 import json
@@ -19,7 +20,7 @@ from jaxtyping import Array, Float
 from jaxmotion import files
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.evaluation import bench, columns, table
-from jaxmotion.learning import runs
+from jaxmotion.learning import checkpoint, runs
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.viz.stage import Ball, make_stage
@@ -225,9 +226,11 @@ def provenance(arguments: Any = None) -> dict[str, Any]:
 
     Returns:
       Versions, hardware, commit, command and date, and the "arguments", as a JSON
-      object.
+      object; where these name a run folder, also its "seeds" and "data".
     """
     given = {} if arguments is None else {"arguments": arguments_json(arguments)}
+    if (run := getattr(arguments, "run", None)) is not None and run.is_dir():
+        given |= _training(run)
     return given | {
         **runs.versions(),
         "machine": platform.machine(),
@@ -238,6 +241,17 @@ def provenance(arguments: Any = None) -> dict[str, Any]:
         "command": " ".join(["python", *sys.argv]),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
+
+
+def _training(folder: Path) -> dict[str, Any]:
+    """Seeds of a run's stages, and fingerprints of its data."""
+    seeds = set()
+    for place in folder.glob("**/checkpoints"):
+        with contextlib.suppress(checkpoint.CheckpointError):
+            how = checkpoint.load_config(place).get("training", {})
+            seeds |= {how["seed"]} if "seed" in how else set()
+    config = files.read_object(folder / "config.json", what="expected a run folder")
+    return {"seeds": {"training": sorted(seeds)}, "data": config.get("files")}
 
 
 def arguments_json(arguments: Any) -> dict[str, Any]:

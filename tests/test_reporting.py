@@ -7,9 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from jaxmotion import reporting
+from jaxmotion.learning import checkpoint
 
 
 def test_it_names_versions_hardware_and_command():
@@ -48,3 +50,23 @@ def test_arguments_are_json():
 
     found = json.loads(json.dumps(reporting.arguments_json(Arguments())))
     assert found == dict(out="runs/a", steps=3, speed=None, contents=["walk"])
+
+
+def test_a_run_folder_says_what_was_trained_on_what(tmp_path):
+    """So that tables of several trainings can be told from one and the same twice."""
+
+    @dataclasses.dataclass
+    class Arguments:
+        run: Path
+
+    assert "seeds" not in reporting.provenance(Arguments(tmp_path / "file.npz"))
+    (tmp_path / "config.json").write_text('{"files": {"train.npz": "f00d"}}')
+    for stage, seed in (("motion", 3), ("deep/er", 3), ("other", 5)):
+        how = {"training": {"seed": seed}}
+        checkpoint.save(tmp_path / stage / "checkpoints", 1, {"x": np.ones(2)}, how)
+    # Neither a stage that is made without training nor one that has just begun.
+    checkpoint.save(tmp_path / "space" / "checkpoints", 0, {"x": np.ones(2)}, {})
+    (tmp_path / "begun" / "checkpoints").mkdir(parents=True)
+    found = json.loads(json.dumps(reporting.provenance(Arguments(tmp_path))))
+    assert found["seeds"] == {"training": [3, 5]}
+    assert found["data"] == {"train.npz": "f00d"}

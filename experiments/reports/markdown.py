@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable
 
 from jaxmotion.evaluation import columns
+from jaxmotion.evaluation.statistics import Spread
 from jaxmotion.evaluation.table import Cell
 from reports import verdicts
 from reports.claims import Absent, Claim, Column, Row, Source, Stated, Table
@@ -60,6 +61,24 @@ def measured(cell: Cell, column: Column) -> str:
     return f"{text} (n={cell.samples})"
 
 
+def over_trainings(spread: Spread | None) -> str:
+    """Mean over trainings with its interval; "" for one training."""
+    if spread is None:
+        return ""
+    if not math.isfinite(spread.mean):
+        return f"not finite in each of {spread.count} trainings"
+    low, high = map(number, verdicts.interval(spread))
+    return f"{number(spread.mean)} [{low}, {high}] of {spread.count} trainings"
+
+
+def both(table: Table, row: Row, column: Column, found: Found) -> str:
+    """A value over trainings, and that of the first; "" if it was not measured."""
+    cell = verdicts.cell_of(table, row, column, found)
+    spread = verdicts.over_trainings(table, row, column, found)
+    texts = [over_trainings(spread), "" if cell is None else measured(cell, column)]
+    return "<br>".join(filter(None, texts))
+
+
 def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     """Lines of a Markdown table.
 
@@ -101,8 +120,7 @@ def why_not(table: Table, row: Row, found: Found) -> str:
 def _row(table: Table, row: Row, found: Found) -> list[str]:
     missing, cells = why_not(table, row, found), []
     for column, paper in zip(table.columns, row.paper, strict=True):
-        cell = verdicts.cell_of(table, row, column, found)
-        here = ("" if missing else "–") if cell is None else measured(cell, column)
+        here = both(table, row, column, found) or ("" if missing else "–")
         cells.append("<br>".join(filter(None, [f"*{stated(paper)}*", here])))
     name = f"**{row.name}**" + (f"<br>`{row.here}`" if row.here else "")
     return [name + (f"<br>{missing}" if missing else ""), *cells]
@@ -130,7 +148,8 @@ def _sources(table: Table, found: Found, commands: Commands) -> list[str]:
             ]
             continue
         lacking = f" **Not run** in it: {', '.join(lacks)}." if lacks else ""
-        lines += [f"{names}: `{there.path}`.{lacking} To be made by", ""]
+        paths = ", ".join(f"`{x.path}`" for x in filter(None, there.trainings))
+        lines += [f"{names}: {paths}.{lacking} To be made by", ""]
         lines += _block(commands[source])
     return lines
 
@@ -140,9 +159,8 @@ def _values(table: Table, claim: Claim, found: Found) -> tuple[str, str]:
     column, paper, here = table.column(claim.column), [], []
     for name in claim.rows:
         paper.append(f"{name} {stated(table.stated(name, claim.column))}")
-        cell = verdicts.cell_of(table, table.row(name), column, found)
-        if cell is not None:
-            here.append(f"{name} {measured(cell, column)}")
+        if text := both(table, table.row(name), column, found):
+            here.append(f"{name} {text}")
     return "<br>".join(paper), "<br>".join(here) or "–"
 
 
@@ -150,11 +168,15 @@ def _claims(table: Table, decided: Decided, found: Found) -> list[str]:
     rows = []
     for where, claim, decision in decided:
         if where is table:
-            reason = f"<br>{decision.reason}" if decision.reason else ""
+            texts = [f"**{decision.verdict}**", decision.reason]
+            texts += [
+                f"{first} and {second} differ by {over_trainings(spread)}"
+                for (first, second), spread in decision.differences.items()
+            ]
             values = _values(table, claim, found)
             rows.append(
                 [f"{claim.words} ({claim.where})", *values]
-                + [f"**{decision.verdict}**{reason}"]
+                + ["<br>".join(filter(None, texts))]
             )
     return table_lines(("claim", "paper", "here", "verdict"), rows) if rows else []
 
@@ -191,6 +213,16 @@ def section(
     return lines + [*_claims(table, decided, found), ""]
 
 
+def counts(decided: Decided) -> dict[str, str]:
+    """Number of claims of each verdict, in words, such as "3 reproduced"."""
+    found = {}
+    for name in verdicts.Verdict.__args__:
+        own = [x.trainings > 1 for _, _, x in decided if x.verdict == name]
+        by = f" ({sum(own)} of them by several trainings)" if any(own) else ""
+        found[name] = f"{len(own)} {name}{by}"
+    return found
+
+
 def summary(decided: Decided) -> list[str]:
     """Lines of all claims with their verdicts, counted.
 
@@ -200,14 +232,13 @@ def summary(decided: Decided) -> list[str]:
     Returns:
       The lines.
     """
-    found = [decision.verdict for _, _, decision in decided]
-    counts = [f"{found.count(name)} {name}" for name in verdicts.Verdict.__args__]
     rows = [
-        [table.name, claim.words, f"**{decision.verdict}**"]
+        [table.name, claim.words, f"**{decision.verdict}**", str(decision.trainings)]
         for table, claim, decision in decided
     ]
-    head = f"{len(found)} claims: {', '.join(counts)}."
-    return [head, "", *table_lines(("table", "claim", "verdict"), rows), ""]
+    head = f"{len(decided)} claims: {', '.join(counts(decided).values())}."
+    titles = ("table", "claim", "verdict", "trainings")
+    return [head, "", *table_lines(titles, rows), ""]
 
 
 def absent_lines(absent: Iterable[Absent]) -> list[str]:
@@ -238,7 +269,8 @@ def source_lines(found: Found, evaluated: set[Source]) -> list[str]:
         if there is None:
             lines += [f"- {source.run}, {source.file}: not run"]
             continue
-        lines += [f"- `{there.path}`"]
-        told = provenance(there, evaluated=source in evaluated)
-        lines += [f"  - {name}: {text}" for name, text in told.items()]
+        for one in filter(None, there.trainings):
+            lines += [f"- `{one.path}`"]
+            told = provenance(one, evaluated=source in evaluated)
+            lines += [f"  - {name}: {text}" for name, text in told.items()]
     return [*lines, ""]

@@ -1,15 +1,20 @@
 """Reads what evaluations left behind, and says what is damaged."""
 
 import dataclasses
+import itertools
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxmotion.evaluation.table import Cell
+from jaxmotion.learning import model_json
 from reports.claims import Source
 
 NOT_RECORDED = "not recorded"
+# Arguments that trainings of one run may differ in.
+_FREE = ("run", "out", "models", "evaluator", "rows", "tables", "seed")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -20,11 +25,32 @@ class Measured:
       path: The file.
       rows: Row names to column names to cells.
       about: Everything else in the file.
+      again: The same of further trainings; None for one that is not there.
     """
 
     path: Path
     rows: dict[str, dict[str, Cell]]
     about: dict[str, Any]
+    again: tuple["Measured | None", ...] = ()
+
+    @property
+    def trainings(self) -> tuple["Measured | None", ...]:
+        """This one, followed by the further ones."""
+        return (self, *self.again)
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seeds of the training; none where the file does not say."""
+        found = self.about.get("seeds")
+        found = found.get("training", ()) if isinstance(found, dict) else ()
+        return tuple(found) if isinstance(found, list) else (found,)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """How it was evaluated: arguments that change the value of a cell."""
+        given = self.about.get("arguments")
+        given = given if isinstance(given, dict) else {}
+        return {name: value for name, value in given.items() if name not in _FREE}
 
     @property
     def evaluator(self) -> tuple[str, str] | None:
@@ -114,6 +140,49 @@ def read(path: Path) -> Measured | None:
         for row, cells in _object(path, "rows", about.pop("rows")).items()
     }
     return Measured(path=path, rows=rows, about=about)
+
+
+def differ(one: Measured, other: Measured) -> str:
+    """In what two files differ that should be of equal data and settings; or ""."""
+    data = [x.about.get("data") for x in (one, other)]
+    if None not in data and data[0] != data[1]:
+        return "data"
+    both = one.settings and other.settings
+    return model_json.differences(one.settings, other.settings) if both else ""
+
+
+def read_trainings(paths: Sequence[Path]) -> Measured | None:
+    """Reads one file of each training of a run.
+
+    Args:
+      paths: The file in the run folder of each training.
+
+    Returns:
+      The first, with the further ones; None if none is there.
+
+    Raises:
+      OSError: if a file cannot be read, or only the first is not there.
+      ValueError: if one is damaged, or two are of the same seed, of other data, or
+        evaluated otherwise; names the file.
+    """
+    first, *again = map(read, paths)
+    there = [x for x in (first, *again) if x is not None]
+    if first is None:
+        if there:
+            raise FileNotFoundError(f"{paths[0]}: no such file, but {there[0].path} is")
+        return None
+    for one, other in itertools.combinations(there, 2):
+        if both := set(one.seeds) & set(other.seeds):
+            raise ValueError(
+                f"{other.path}: trained with seed {min(both)}, as {one.path} was: "
+                "expected another training"
+            )
+        if found := differ(one, other):
+            raise ValueError(
+                f"{other.path}: differs from {one.path} in {found}: expected the same "
+                "but for the seed of training"
+            )
+    return dataclasses.replace(first, again=tuple(again))
 
 
 def _joined(about: dict[str, Any], names: tuple[str, ...]) -> str:

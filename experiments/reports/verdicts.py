@@ -1,9 +1,14 @@
 """Whether an ordering that a paper claims is seen in what was measured here."""
 
 import dataclasses
+import functools
 import math
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
+
+from jaxmotion.evaluation import statistics
+from jaxmotion.evaluation.statistics import Spread
 from jaxmotion.evaluation.table import Cell
 from reports.claims import Claim, Column, Row, Stated, Table
 from reports.results import Found
@@ -32,8 +37,13 @@ RULE = (
     f"{TIME_FACTOR:g} either way; others without an interval decide nothing.",
     "Rows of several files that an evaluator scored are compared only if the files "
     "name the same evaluator and reference clips.",
-    "Intervals run over replications, clips or rollouts with one training of each "
-    "row: what another seed of training would change is not in them.",
+    "Where both rows were trained with several seeds, these intervals do not decide: "
+    "the claimed difference is taken within each seed, and the comparison holds or "
+    "fails if the 95 % interval of its mean over seeds (Student's t, as in a paired "
+    "t-test) is above or below zero. The two rows of a seed have the same data, "
+    "commands and noise of the evaluation.",
+    "Where they were trained once, intervals run over replications, clips or rollouts "
+    "of that training: what another seed would change is not in them.",
 )
 
 
@@ -44,14 +54,21 @@ class Decision:
     Attributes:
       verdict: The verdict.
       reason: Comparisons that failed, were undecided or could not be made; or "".
+      differences: By how much the comparisons of rows of several trainings hold, over
+        these; negative where they fail.
+      trainings: Fewest trainings that a comparison rests on.
     """
 
     verdict: Verdict
     reason: str = ""
+    differences: dict[tuple[str, str], Spread] = dataclasses.field(default_factory=dict)
+    trainings: int = 1
 
 
-def cell_of(table: Table, row: Row, column: Column, found: Found) -> Cell | None:
-    """What was measured, in the paper's unit.
+def cells_of(
+    table: Table, row: Row, column: Column, found: Found
+) -> tuple[Cell | None, ...]:
+    """What was measured of each training, in the paper's unit.
 
     Args:
       table: The table.
@@ -60,19 +77,39 @@ def cell_of(table: Table, row: Row, column: Column, found: Found) -> Cell | None
       found: All that was measured.
 
     Returns:
-      The cell; None if it was not measured.
+      A cell a training; None if it was not measured.
     """
-    measured = found.get(table.source_of(row))
+    measured, cells = found.get(table.source_of(row)), []
     if measured is None or row.here is None:
-        return None
-    cell = measured.rows.get(row.here, {}).get(column.here)
-    if cell is None or column.scale == 1.0:
-        return cell
-    scaled = {
-        name: None if end is None else end * column.scale
-        for name, end in (("value", cell.value), ("low", cell.low), ("high", cell.high))
-    }
-    return dataclasses.replace(cell, **scaled)
+        return (None,)
+    for one in measured.trainings:
+        cell = one and one.rows.get(row.here, {}).get(column.here)
+        if cell and column.scale != 1.0:
+            ends = {name: getattr(cell, name) for name in ("value", "low", "high")}
+            scaled = {k: x and x * column.scale for k, x in ends.items()}
+            cell = dataclasses.replace(cell, **scaled)
+        cells.append(cell)
+    return tuple(cells)
+
+
+def cell_of(table: Table, row: Row, column: Column, found: Found) -> Cell | None:
+    """What was measured of the first training; None if it was not."""
+    return cells_of(table, row, column, found)[0]
+
+
+def over_trainings(
+    table: Table, row: Row, column: Column, found: Found
+) -> Spread | None:
+    """Values of a cell over trainings; None if there are fewer than two."""
+    cells = cells_of(table, row, column, found)
+    values = [cell.value for cell in cells if cell is not None]
+    return statistics.spread(np.array(values)) if len(values) > 1 else None
+
+
+def interval(spread: Spread) -> Ends:
+    """The 95 % interval of a mean over trainings."""
+    half = spread.half_width()
+    return float(spread.mean - half), float(spread.mean + half)
 
 
 def _wilson(count: float, samples: int) -> Ends:
@@ -177,16 +214,42 @@ def printed(value: Stated) -> float | None:
     return value[0] if isinstance(value, tuple) else value
 
 
-def _evaluators_differ(
-    table: Table, column: Column, rows: list[Row], found: Found
-) -> bool:
+def _incomparable(table: Table, column: Column, rows: list[Row], found: Found) -> str:
+    """Why rows of several files do not compare; "" if they do."""
     sources = {table.source_of(row) for row in rows}
-    if not column.evaluated or len(sources) <= 1:
-        return False
-    evaluators = {
-        measured.evaluator for source in sources if (measured := found.get(source))
-    }
-    return len(evaluators) > 1 or None in evaluators
+    files = [x for source in sources if (x := found.get(source))]
+    if len(files) <= 1:
+        return ""
+    several = all(len(x.trainings) > 1 for x in files)
+    for trained in zip(*(x.trainings for x in files), strict=False):
+        there = [x for x in trained if x is not None]
+        evaluators = {x.evaluator for x in there}
+        if column.evaluated and (len(evaluators) > 1 or None in evaluators):
+            return "rows were scored by different or unrecorded evaluators"
+        if several and len({x.seeds for x in there}) > 1:
+            return "rows were trained with different seeds"
+        if len({str(data) for x in there if (data := x.about.get("data"))}) > 1:
+            return "rows were trained on different data"
+    return ""
+
+
+def _differences(table: Table, claim: Claim, found: Found) -> dict[Any, Spread]:
+    """Claimed differences of pairs of rows over trainings, where there are several."""
+    spreads, column = {}, table.column(claim.column)
+    for pair in claim.pairs:
+        names = (*pair, claim.toward) if claim.toward else pair
+        cells = [cells_of(table, table.row(name), column, found) for name in names]
+        made = []
+        for trained in zip(*cells, strict=False):
+            if None in trained:
+                continue
+            first, second, *target = (cell.value for cell in trained)
+            if target:
+                first, second = (abs(x - target[0]) for x in (first, second))
+            made.append(second - claim.factor * first)
+        if len(made) > 1:
+            spreads[pair] = statistics.spread(np.array(made))
+    return spreads
 
 
 def decide(table: Table, claim: Claim, found: Found) -> Decision:
@@ -205,25 +268,33 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     cells = {row.name: cell_of(table, row, column, found) for row in rows}
     absent = [name for name, cell in cells.items() if cell is None]
     present = {name: cell for name, cell in cells.items() if cell is not None}
-    if _evaluators_differ(table, column, [table.row(name) for name in present], found):
-        reason = "rows were scored by different or unrecorded evaluators"
+    own = [table.row(name) for name in present]
+    if reason := _incomparable(table, column, own, found):
         return Decision(verdict="not decided", reason=reason)
     finite = {
         name: ends(cell, column)
         for name, cell in present.items()
         if math.isfinite(cell.value)
     }
-    answers = compare(claim, finite)
+    answers, differences = compare(claim, finite), _differences(table, claim, found)
+    for pair, spread in differences.items():
+        low, high = interval(spread)
+        answers[pair] = True if low > 0 else False if high < 0 else None
+    numbers = [x.count for x in differences.values()]
+    several = len(numbers) == len(claim.pairs)
+    decision = functools.partial(
+        Decision, differences=differences, trainings=min(numbers) if several else 1
+    )
     failed = [pair for pair, answer in answers.items() if answer is False]
     if failed:
-        return Decision(verdict="not reproduced", reason=f"fails: {_pairs(failed)}")
+        return decision(verdict="not reproduced", reason=f"fails: {_pairs(failed)}")
     if absent:
-        return Decision(verdict="not run", reason=f"not measured: {', '.join(absent)}")
+        return decision(verdict="not run", reason=f"not measured: {', '.join(absent)}")
     open_pairs = [pair for pair in claim.pairs if answers.get(pair) is None]
     if open_pairs:
-        reason = f"intervals overlap or are missing: {_pairs(open_pairs)}"
-        return Decision(verdict="not decided", reason=reason)
-    return Decision(verdict="reproduced")
+        reason = f"intervals overlap, hold 0 or are missing: {_pairs(open_pairs)}"
+        return decision(verdict="not decided", reason=reason)
+    return decision(verdict="reproduced")
 
 
 def lines(tables: tuple[Table, ...], found: Found) -> list[str]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxmotion import files
 from jaxmotion.evaluation import columns
+from jaxmotion.evaluation.statistics import Spread
 from jaxmotion.evaluation.table import Cell
 from jaxmotion.systems import registry
 from jaxmotion.viz import plots
@@ -37,7 +38,12 @@ EVALUATED = {
 }
 
 
-def _ends(cell: Cell | None, column: Column) -> tuple[float, float, float]:
+def _ends(
+    cell: Cell | None, spread: Spread | None, column: Column
+) -> tuple[float, float, float]:
+    """Value and interval: over trainings, or else over replications of one."""
+    if spread is not None:
+        return float(spread.mean), *verdicts.interval(spread)
     if cell is None:
         return (math.nan,) * 3
     if column.kind == "count":
@@ -61,13 +67,20 @@ def draw(path: Path, table: Table, found: Found) -> None:
     """
     panels = []
     for place, column in enumerate(table.columns):
-        cells = (verdicts.cell_of(table, row, column, found) for row in table.rows)
+        here = [
+            _ends(
+                verdicts.cell_of(table, row, column, found),
+                verdicts.over_trainings(table, row, column, found),
+                column,
+            )
+            for row in table.rows
+        ]
         target = 0 if column.better == "real" else None
         panels.append(
             plots.Panel(
                 title=f"{column.name} {columns.ARROWS[column.better]}",
                 left=np.array([_printed(row.paper[place]) for row in table.rows]),
-                right=np.array([_ends(cell, column) for cell in cells]),
+                right=np.array(here),
                 target=target,
             )
         )
@@ -95,6 +108,14 @@ def picture_of(table: Table) -> str:
     return re.sub(r"[^a-z0-9]+", "_", table.name.lower()).strip("_") + ".png"
 
 
+def _spread_json(spread: Spread | None) -> dict[str, Any] | None:
+    if spread is None or not math.isfinite(spread.mean):
+        return None
+    low, high = verdicts.interval(spread)
+    mean = float(spread.mean)
+    return {"mean": mean, "low": low, "high": high, "trainings": spread.count}
+
+
 def _table_json(table: Table, found: Found) -> dict[str, Any]:
     def cell(row: Any, column: Column) -> dict[str, Any]:
         stated = table.stated(row.name, column.name)
@@ -111,6 +132,9 @@ def _table_json(table: Table, found: Found) -> dict[str, Any]:
                 "high": here.high,
                 "samples": here.samples,
             },
+            "over trainings": _spread_json(
+                verdicts.over_trainings(table, row, column, found)
+            ),
         }
 
     return {
@@ -148,6 +172,11 @@ def _json(
                 "toward": claim.toward,
                 "verdict": decision.verdict,
                 "reason": decision.reason,
+                "trainings": decision.trainings,
+                "differences": [
+                    {"pair": pair} | (_spread_json(spread) or {})
+                    for pair, spread in decision.differences.items()
+                ],
             }
             for table, claim, decision in decided
         ],
@@ -176,7 +205,10 @@ def _lines(
     lines = ["# The papers' tables, and what is measured here", ""]
     lines += [
         "In tables the paper's value stands above in italics, and below it what was "
-        "measured here, with its interval and number of samples. Columns are to be "
+        "measured here: where there are several trainings their mean, with its 95 % "
+        "interval over these; and the first training's value, with its interval over "
+        "replications and number of samples. Pictures show the former where there is "
+        "one. Columns are to be "
         "lower ↓, higher ↑, or near recorded motion →.",
         "",
         "How claims are decided:",

@@ -1,5 +1,6 @@
 """experiments/report.py: claims decided each way, what is missing, what is damaged."""
 
+import dataclasses
 import functools
 import json
 import math
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 from PIL import Image
 
 from jaxmotion.evaluation.table import Cell
@@ -256,6 +258,150 @@ def test_beside_the_values_of_camdm_stands_what_its_release_computes(load):
     assert not {found[name] for name in set(found) - names} & released
 
 
+# --- several trainings --------------------------------------------------------------
+
+
+def measured(load, path, rows, **about):
+    """What was read of a file, of rows that have one column."""
+    results = load("reports.results")
+    rows = {k: {"fid": cell(v)} for k, v in rows.items()}
+    return results.read(put(path, rows, **about))
+
+
+@pytest.fixture
+def over(load, tmp_path):
+    """Decides a claim about rows that are arrays of values, one a training."""
+    claims, verdicts = load("reports.claims"), load("reports.verdicts")
+    source = claims.Source(run="a", file="a.json", commands=("make {run}",))
+    column = claims.Column(name="FID", here="fid", better="lower")
+
+    def run(rows, **more):
+        names = [name.upper() for name in rows]
+        table = claims.Table(
+            paper="P",
+            number="1",
+            title="t",
+            source=source,
+            columns=(column,),
+            rows=tuple(claims.Row(name=x, here=x.lower(), paper=(1.0,)) for x in names),
+        )
+        first, *again = (
+            measured(
+                load,
+                tmp_path / f"{i}.json",
+                {k: None if math.isnan(v[i]) else float(v[i]) for k, v in rows.items()},
+            )
+            for i in range(len(rows["a"]))
+        )
+        found = {source: dataclasses.replace(first, again=tuple(again))}
+        more = dict(words="w", column="FID", pairs=(("A", "B"),), where="here") | more
+        made = verdicts.decide(table, claims.Claim(**more), found)
+        return made, verdicts.over_trainings(table, table.rows[0], column, found)
+
+    return run
+
+
+def test_paired_differences_decide_as_scipys_paired_t_test(load, over):
+    generator, interval = np.random.default_rng(0), load("reports.verdicts").interval
+    seen = []
+    for _ in range(120):
+        count, factor = int(generator.integers(2, 6)), generator.uniform(0.5, 2.0)
+        a = generator.normal(10.0, 3.0, count)
+        b = factor * a + generator.normal(generator.uniform(-2, 2), 0.5, count)
+        made, mean = over(dict(a=a, b=b), factor=factor)
+        expected = scipy.stats.ttest_rel(b, factor * a)
+        ends = expected.confidence_interval(0.95)
+        (spread,) = made.differences.values()
+        np.testing.assert_allclose(interval(spread), (ends.low, ends.high), rtol=1e-9)
+        verdict = "not decided"
+        if expected.pvalue < 0.05:
+            verdict = "reproduced" if expected.statistic > 0 else "not reproduced"
+        assert (made.verdict, made.trainings) == (verdict, count)
+        ends = scipy.stats.t.interval(0.95, count - 1, a.mean(), scipy.stats.sem(a))
+        np.testing.assert_allclose(interval(mean), ends, rtol=1e-9)
+        seen.append(verdict)
+    assert all(seen.count(x) > 20 for x in set(seen)) and len(set(seen)) == 3
+
+
+def test_nearness_over_trainings_is_of_paired_distances(load, over):
+    a, b, real = np.array([[9.0, 9.5, 8.8], [12.0, 12.1, 12.5], [10.0, 10.3, 9.9]])
+    made, _ = over(dict(a=a, b=b, c=real), toward="C")
+    expected = scipy.stats.ttest_rel(np.abs(b - real), np.abs(a - real))
+    ends = expected.confidence_interval(0.95)
+    found = load("reports.verdicts").interval(made.differences["A", "B"])
+    np.testing.assert_allclose(found, (ends.low, ends.high), rtol=1e-9)
+    assert (ends.low > 0, made.verdict) == (True, "reproduced")
+
+
+def test_one_training_that_is_not_finite_decides_nothing(over):
+    made, mean = over(dict(a=[1.0, 2.0, math.nan], b=[9.0, 10.0, 11.0]))
+    assert made.verdict == "not decided" and math.isnan(mean.mean)
+    assert over(dict(a=[1.0, 2.0], b=[9.0, 10.0]))[0].verdict == "reproduced"
+
+
+def test_what_is_no_further_training_is_named(load, tmp_path):
+    read = load("reports.results").read_trainings
+    about = dict(seeds={"training": [0]}, data={"train.npz": "a"}, arguments={"n": 3})
+    paths = [tmp_path / f"{i}.json" for i in range(3)]
+    measured(load, paths[0], {"a": 1.0}, **about)
+    assert read(paths[1:]) is None
+    found = read(paths)
+    assert [x is None for x in found.trainings] == [False, True, True]
+    assert found.seeds == (0,)
+    with pytest.raises(FileNotFoundError, match="1.json: no such file, but .*0.json"):
+        read(paths[1::-1])
+    for more, message in (
+        ({}, "1.json: trained with seed 0, as .*0.json was"),
+        (dict(data={"train.npz": "b"}), "1.json: differs from .*0.json in data"),
+        (dict(arguments={"n": 4}), "in n is 3, given 4: expected the same"),
+    ):
+        own = about | (dict(seeds={"training": [1]}) if more else {}) | more
+        measured(load, paths[1], {"a": 1.0}, **own)
+        with pytest.raises(ValueError, match=message) as error:
+            read(paths)
+        assert "\n" not in str(error.value)
+
+
+def test_rows_of_two_runs_pair_by_seed_and_data(load, tmp_path):
+    claims, verdicts = load("reports.claims"), load("reports.verdicts")
+    results = load("reports.results")
+    sources = [
+        claims.Source(run=x, file="m.json", commands=("make {run}",)) for x in "ab"
+    ]
+    table = claims.Table(
+        paper="P",
+        number="1",
+        title="t",
+        source=sources[0],
+        columns=(claims.Column(name="FID", here="fid", better="lower"),),
+        rows=tuple(
+            claims.Row(name=x.run.upper(), here="it", paper=(1.0,), source=x)
+            for x in sources
+        ),
+    )
+    claim = claims.Claim(words="w", column="FID", pairs=(("A", "B"),), where="here")
+
+    def decided(seeds, data):
+        found = {}
+        for source, own, print_, value in zip(
+            sources, seeds, data, (1.0, 5.0), strict=True
+        ):
+            paths = [tmp_path / source.run / str(i) / "m.json" for i in range(len(own))]
+            for path, seed in zip(paths, own, strict=True):
+                about = dict(seeds={"training": [seed]}, data={"train.npz": print_})
+                measured(load, path, {"it": value + 0.1 * seed}, **about)
+            found[source] = results.read_trainings(paths)
+        return verdicts.decide(table, claim, found)
+
+    made = decided(((0, 1, 2), (0, 1)), "xx")
+    assert (made.verdict, made.trainings) == ("reproduced", 2)
+    assert "different seeds" in decided(((0, 1), (0, 2)), "xx").reason
+    assert "different data" in decided(((0, 1), (0, 1)), "xy").reason
+    # Of one training each, nothing is paired.
+    made = decided(((0,), (7,)), "xx")
+    assert (made.verdict, made.trainings, made.differences) == ("not decided", 1, {})
+
+
 # --- a report -----------------------------------------------------------------------
 
 SWEEP = {
@@ -289,7 +435,7 @@ def test_a_report_has_values_verdicts_and_what_is_missing(call, runs, tmp_path, 
     call(f"--runs {runs} --out {out}")
     shown, text = capsys.readouterr().out, (out / "report.md").read_text()
     whole = json.loads((out / "report.json").read_text())
-    assert "not run: " in shown and str(out) in shown
+    assert " not run\n" in shown and str(out) in shown
     verdicts = {(x["table"], x["claim"]): x["verdict"] for x in whole["claims"]}
     five = {k[1]: v for k, v in verdicts.items() if k[0] == "CAMDM, table 5"}
     assert five == {
@@ -319,12 +465,62 @@ def test_a_report_has_values_verdicts_and_what_is_missing(call, runs, tmp_path, 
         assert min(image.size) > 200
 
 
+def test_a_report_over_trainings_has_both_intervals(call, runs, tmp_path, capsys):
+    out = tmp_path / "out"
+    for seed, shift in ((1, 0.2), (2, -0.2)):
+        rows = {
+            row: {k: v | {"value": v["value"] + shift} for k, v in cells.items()}
+            for row, cells in SWEEP.items()
+        }
+        about = dict(seeds={"training": seed}, arguments={"steps": [2, 4, 8, 16]})
+        put(runs / f"sweep_camdm_seed{seed}" / "table.json", rows, **about)
+    with pytest.raises(ValueError, match="seed1/table.json: trained with seed 1"):
+        given = ",".join([f"{runs}/sweep_camdm_seed1"] * 2)
+        call(f"--runs {runs} --elsewhere sweep_camdm={given} --out {out}")
+    call(f"--runs {runs} --seeds 4 --out {out}")
+    shown, text = capsys.readouterr().out, (out / "report.md").read_text()
+    assert f"a training is missing: no {runs}/sweep_camdm_seed3/table.json" in shown
+    assert "\n1 reproduced (1 of them by several trainings)\n" in f"\n{shown}"
+    assert "of the papers' results cannot be run here" in shown
+    low, high = scipy.stats.t.interval(0.95, 2, 5.0, scipy.stats.sem([5, 5.2, 4.8]))
+    both = f"5 [{low:.3g}, {high:.3g}] of 3 trainings<br>5 [4.9, 5.1] (n=20)"
+    assert f"*0.938*<br>{both}" in text
+    assert f"--out {runs}/sweep_camdm_seed2 --seed 2" in text
+    whole = json.loads((out / "report.json").read_text())
+    claim = next(x for x in whole["claims"] if x["claim"] == "up to 8 steps FID falls")
+    assert (claim["verdict"], claim["trainings"]) == ("reproduced", 3)
+    assert [round(x["mean"], 9) for x in claim["differences"]] == [1.0, 1.0]
+
+
 def test_a_run_folder_can_be_elsewhere(load, runs, tmp_path):
     report = load("report")
     (tmp_path / "mine").mkdir()
     args = report.Config(runs=runs, elsewhere=(f"aamdm={tmp_path / 'mine'}",))
     folders = {source.run: path for source, path in report.folders_of(args).items()}
-    assert folders["aamdm"] == tmp_path / "mine" and folders["camdm"] == runs / "camdm"
+    assert folders["aamdm"] == (tmp_path / "mine",)
+    assert folders["camdm"] == (runs / "camdm",)
+
+
+def test_trainings_have_folders_of_their_own(load, runs):
+    report = load("report")
+    (runs / "b").mkdir()
+    given = (f"aamdm={runs},{runs / 'b'}",)
+    args = report.Config(runs=runs, seeds=3, elsewhere=given)
+    folders = {source.run: path for source, path in report.folders_of(args).items()}
+    assert folders["aamdm"] == (runs, runs / "b")
+    assert [path.name for path in folders["sweep_camdm"]] == [
+        "sweep_camdm",
+        "sweep_camdm_seed1",
+        "sweep_camdm_seed2",
+    ]
+    source = next(x for x in folders if x == "sweep_camdm")
+    source = next(x for x in load("reports.writing").SOURCES if x.run == source)
+    shown = report.commands_of(source, folders["sweep_camdm"])
+    assert [line.partition("--out ")[2] for line in shown] == [
+        f"{runs}/sweep_camdm",
+        f"{runs}/sweep_camdm_seed1 --seed 1",
+        f"{runs}/sweep_camdm_seed2 --seed 2",
+    ]
 
 
 def test_a_missing_folder_is_named(call, runs, tmp_path):
@@ -370,5 +566,5 @@ def test_a_damaged_file_is_named_with_its_field(call, runs, tmp_path, text):
 
 def test_the_help_names_every_option(help_of):
     text = help_of("report")
-    for option in ("--runs", "--out", "--elsewhere"):
+    for option in ("--runs", "--out", "--seeds", "--elsewhere"):
         assert option in text
