@@ -1,4 +1,4 @@
-"""Plots of tables: dots with intervals, quality against time, clouds, and sweeps.
+"""Plots: tables as dots with intervals, quality against time, curves, clouds, sweeps.
 
 Figures are made without pyplot, so that neither a display is needed nor the backend of
 a notebook changed.
@@ -23,6 +23,8 @@ _LOG_FROM = 20.0
 _ACROSS = 3
 # Axes whose largest value is so many times the smallest are logarithmic.
 _WIDE_FROM = 5.0
+# Colors of lines, in turn.
+_CYCLE = (figure.LEFT, figure.RIGHT, figure.WALKED, "#8e5bb5", "#17a2a2", "#8c6d46")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -330,3 +332,102 @@ def plot_sweep(
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize="small")
     drawing.savefig(path)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Curves:
+    """One pair of axes of `write_curves`.
+
+    Attributes:
+      title: Above them.
+      xlabel: Quantity and unit.
+      ylabel: Quantity and unit.
+      lines: Label to x, and value, lower and upper end at each x; nan for no interval.
+      references: Label to the value of a line across, its lower and its upper end.
+      noisy: The lines are smoothed, with the values thin behind; else each point is a
+        dot.
+    """
+
+    title: str
+    xlabel: str
+    ylabel: str
+    lines: dict[str, tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]]
+    references: dict[str, Float[np.ndarray, "3"]] = dataclasses.field(
+        default_factory=dict
+    )
+    noisy: bool
+
+
+def smoothed(
+    values: Float[np.ndarray, " points"], *, part: float = 0.05
+) -> Float[np.ndarray, " points"]:
+    """Means over a part of the points around each.
+
+    Narrower at the start, where losses fall; cut off at the end, where they are noise.
+    """
+    count = len(values)
+    places = np.arange(count)
+    reach = np.minimum(int(part * count / 2), places)
+    first, last = places - reach, np.minimum(places + reach, count - 1)
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    return (sums[last + 1] - sums[first]) / (last + 1 - first)
+
+
+def _draw_curves(axes: Axes, curves: Curves, *, wide: bool) -> None:
+    shown = [value[:1] for value in curves.references.values()]
+    _draw_references(axes, curves.references)
+    for i, (label, (x, y)) in enumerate(curves.lines.items()):
+        color, value = _CYCLE[i % len(_CYCLE)], y[:, 0]
+        if curves.noisy:
+            axes.plot(x, value, color=color, lw=0.6, alpha=0.35)
+            value = smoothed(value)
+            axes.plot(x, value, color=color, lw=1.6, label=label)
+        else:
+            bars = np.abs(y[:, 1:] - y[:, :1]).T
+            bars = np.where(np.isfinite(bars), bars, 0.0)
+            axes.errorbar(
+                x, value, yerr=bars, fmt="o-", markersize=4, capsize=3, color=color,
+                lw=1.2, label=label,
+            )  # fmt: skip
+        shown.append(value[np.isfinite(value)])
+    if _is_wide(np.concatenate(shown)):
+        axes.set_yscale("log")
+        _plain_ticks(axes.yaxis)
+    if wide:
+        axes.set_xscale("log")
+        _plain_ticks(axes.xaxis)
+    axes.set_title(curves.title, fontsize=9, parse_math=False)
+    axes.set_xlabel(curves.xlabel, fontsize=8)
+    axes.set_ylabel(curves.ylabel, fontsize=8)
+    axes.legend(fontsize=7)
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.3, which="both")
+
+
+def write_curves(path: str | Path, panels: tuple[Curves, ...], *, title: str) -> None:
+    """Draws one pair of axes a panel.
+
+    Axes are logarithmic where what is drawn differs by much: upright each for itself,
+    across all of them where some lines are much longer than others.
+
+    Args:
+      path: The picture.
+      panels: What to draw, each with a finite value.
+      title: Above the picture.
+
+    Raises:
+      OSError: if the file cannot be written.
+    """
+    path = figure.check_writable(path)
+    across = min(_ACROSS, len(panels))
+    down = math.ceil(len(panels) / across)
+    size = (4.0 * across + 0.4, 3.2 * down + 0.5)
+    canvas = Figure(figsize=size, dpi=110, layout="constrained")
+    canvas.suptitle(title, fontsize=11)
+    grid = canvas.subplots(down, across, squeeze=False).ravel()
+    ends = np.array([x[-1] for panel in panels for x, _ in panel.lines.values()])
+    for axes, panel in zip(grid, panels, strict=False):
+        _draw_curves(axes, panel, wide=_is_wide(ends))
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    canvas.savefig(path)

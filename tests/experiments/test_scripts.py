@@ -15,6 +15,7 @@ WRONG = {
     "aamdm": ("evaluate --run {gone}", "gone"),
     "camdm": ("train --data {gone} --out {out}", "gone"),
     "camdm_transitions": ("--run {gone}", "gone"),
+    "curves": ("--run {gone}", "gone"),
     "dribble": ("--data {gone} --out {out}", "gone"),
     "emdm": ("evaluate --run {gone}", "gone"),
     "evaluator": ("show {gone}", "gone"),
