@@ -26,6 +26,8 @@ from jaxmotion.viz import figure, plots
 
 # Values of losses.jsonl that are drawn, where a stage has them.
 _DRAWN = ("loss", "discriminator/loss")
+# How rows of recorded motion begin.
+_RECORDED = ("data", "real", "held-out", "ground truth", "noise floor")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,19 +148,20 @@ def metric_panels(
     """The metric of each row over the seconds of training of each run; or none.
 
     Those of a row are of the stage that has its name, if one does, else of all stages
-    that are drawn. What no training changes, as of recorded motion, is a line across.
+    that are drawn. Recorded motion is a line across, of the last run.
 
     Raises:
       OSError: if an evaluation cannot be read.
       ValueError: if one is damaged, or no one has the metric; names it.
     """
     points: dict[str, list[tuple[float, ...]]] = {}
-    there = set()
+    there, evaluators = set(), set()
     for folder, name in names.items():
         measured = results.read(folder / args.file)
         if measured is None:
             print(f"not evaluated, so without a dot: no {folder / args.file}")
             continue
+        evaluators.add(measured.evaluator)
         for row, cells in measured.rows.items():
             there |= cells.keys()
             cell = cells.get(args.metric)
@@ -175,17 +178,20 @@ def metric_panels(
             f"the columns {', '.join(sorted(there))}"
         )
     arrays = {row: np.array(sorted(own)) for row, own in points.items()}
-    same = {row for row, x in arrays.items() if len(x) > 1 and np.ptp(x[:, 1]) == 0}
-    lines = {row: (x[:, 0], x[:, 1:]) for row, x in arrays.items() if row not in same}
+    known = {row for row in arrays if row.startswith(_RECORDED)}
+    lines = {row: (x[:, 0], x[:, 1:]) for row, x in arrays.items() if row not in known}
     if not lines:
         return []
+    declared = columns.COLUMNS.get(args.metric)
+    if declared is not None and declared.evaluated and len(evaluators) > 1:
+        print(f"the runs have several evaluators: their {args.metric} does not compare")
     label = columns.header(args.metric)
     made = plots.Curves(
         title=f"{label} of {args.file}",
         xlabel="seconds of all stages that a row needs",
         ylabel=label,
         lines=lines,
-        references={row: arrays[row][0, 1:] for row in sorted(same)},
+        references={row: arrays[row][-1, 1:] for row in sorted(known)},
         noisy=False,
     )
     return [made]
@@ -218,7 +224,7 @@ def draw(args: Config) -> None:
     for run, stages in found.items():
         for stage, one in stages.items():
             say(run, stage, one)
-    title = f"{kinds.pop()}, {len(args.run)} runs: against training time"
+    title = f"{kinds.pop()}: losses and evaluations against training time"
     panels = (*loss_panels(found), *metric_panels(args, found, names))
     plots.write_curves(args.out, panels, title=title)
     print(f"wrote {args.out}")

@@ -149,7 +149,8 @@ def _sources(table: Table, found: Found, commands: Commands) -> list[str]:
             continue
         lacking = f" **Not run** in it: {', '.join(lacks)}." if lacks else ""
         paths = ", ".join(f"`{x.path}`" for x in filter(None, there.trainings))
-        lines += [f"{names}: {paths}.{lacking} To be made by", ""]
+        data = provenance(there, evaluated=False)["data"]
+        lines += [f"{names}: {paths}. Data: {data}.{lacking} To be made by", ""]
         lines += _block(commands[source])
     return lines
 
