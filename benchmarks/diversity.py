@@ -252,7 +252,11 @@ def one_rollout(
     """
     skeleton, config = load.model.skeleton, load.model.config
     driver = camdm_controller.controller(
-        params, skeleton, config=config, control=control
+        params,
+        skeleton,
+        config=config,
+        control=control,
+        steps=load.model.steps,
     )
     start = dataclasses.replace(load.state, guided=jnp.asarray(guided, jnp.int32))
 

@@ -6,6 +6,7 @@ Examples:
   python experiments/camdm.py evaluate --run runs/camdm
   python experiments/camdm.py rollout --run runs/camdm --style elderly --seconds 20
   python experiments/camdm.py steering --run runs/camdm --style elderly
+  python experiments/camdm.py distill --run runs/camdm --out runs/camdm_student
   python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --out runs/camdm_released
 """  # noqa: E501
 
@@ -24,6 +25,7 @@ from jaxmotion.evaluators import frozen
 from jaxmotion.learning import checkpoint, loop, runs
 from jaxmotion.learning.training import OptimizerName
 from jaxmotion.systems.camdm import controller as camdm_controller
+from jaxmotion.systems.camdm import distillation as camdm_distillation
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import published as camdm_published
@@ -146,6 +148,76 @@ def train(args: Train) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
+class Distill:
+    """Train a student whose plans take one or two network calls; it may go on.
+
+    Example: python experiments/camdm.py distill --run runs/camdm --out runs/camdm_student
+
+    Attributes:
+      run: Teacher: run folder; or a shipped model or an exported file, with `data`.
+      data: Clips; None for those that the teacher's run was trained on.
+      held_out_clips: Clips of `data` that a shipped or exported model never saw.
+      out: Run folder of the student, which all other commands take.
+      visit: Steps of the teacher's schedule that a plan of the student visits.
+      target: Where the teacher's "chain" ends, with as many network calls as the
+        steps' sum per window; or "consistency" with the student's own prediction after
+        one step of the teacher.
+      mirror: Add a mirrored copy of each clip.
+      balance: Draw rare changes more often, up to 1.
+      steps: Optimizer steps of the whole run.
+      batch: Windows of 55 frames per step, each noised to every visited step.
+      optimizer: "muon", "adamw", "radam" or "adam".
+      learning_rate: Its peak.
+      warmup: Steps in which the rate rises.
+      max_norm: Norm to clip gradients to; 0: none.
+      ema: Decay of the parameters' average; 0: none.
+      chunk: Steps of one compiled call.
+      save_every: Steps between checkpoints.
+      devices: Devices to split each batch over.
+      seed: Seeds everything random.
+      override: Go on with other settings than before.
+    """  # noqa: E501
+
+    run: Path = Path("runs/camdm")
+    data: Path | None = None
+    held_out_clips: tuple[str, ...] = ()
+    out: Path = Path("runs/camdm_student")
+    visit: tuple[int, ...] = (8,)
+    target: camdm_distillation.Target = "chain"
+    mirror: bool = True
+    balance: float = 0.0
+    steps: int = 4000
+    batch: int = 48
+    optimizer: OptimizerName = "muon"
+    learning_rate: float = 5e-4
+    warmup: int = 100
+    max_norm: float = 1.0
+    ema: float = 0.998
+    chunk: int = 50
+    save_every: int = 1000
+    devices: int = 1
+    seed: int = 0
+    override: bool = False
+
+
+def distill(args: Distill) -> None:
+    """Trains the student, with checkpoints."""
+    loop.check_writable(args.out)
+    budget = runs.Budget(**cli.given(runs.Budget, args), final=0.1)
+    run, teacher = camdm_distillation.prepare(
+        args.out,
+        args.run,
+        args.data,
+        args.held_out_clips,
+        steps=args.visit,
+        target=args.target,
+        mirrored=args.mirror,
+        balance=args.balance,
+    )
+    camdm_distillation.train(run, teacher, budget)
+
+
+@dataclasses.dataclass(frozen=True)
 class Evaluate:
     """Steer characters along a course in every style, and measure them.
 
@@ -164,6 +236,7 @@ class Evaluate:
       evaluator_steps: Updates of the evaluator of styles, if it is trained here.
       evaluator: File of a frozen evaluator of styles, from evaluator.py; None trains
         one here.
+      visit: Steps of the schedule that a plan visits; none: the model's own.
       seed: Seeds poses, noise, evaluator and subsets.
     """
 
@@ -178,6 +251,7 @@ class Evaluate:
     chunk: int = 5
     evaluator_steps: int = 1500
     evaluator: Path | None = None
+    visit: tuple[int, ...] = ()
     seed: int = 0
 
 
@@ -203,6 +277,7 @@ class Steering:
       follow: Half-life in which a character that left its course returns, seconds; 0
         to steer by velocity alone; None for what the model ships with.
       foot_lock: Measure what is displayed with locked feet, too.
+      visit: Steps of the schedule that a plan visits; none: the model's own.
       chunk: Characters to run at a time, at most.
       seed: Seeds poses and noise.
     """
@@ -224,6 +299,7 @@ class Steering:
     seconds: float = 20.0
     follow: float | None = None
     foot_lock: bool = True
+    visit: tuple[int, ...] = ()
     chunk: int = 4
     seed: int = 0
 
@@ -261,6 +337,7 @@ def evaluate(args: Evaluate) -> None:
     """Writes the table."""
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = camdm_training.load_run(args.run, args.data, args.contents)
+    run = camdm_training.with_steps(run, args.visit)
     out = cli.out_folder(args, "evaluation")
     cli.announce("compiling the rollouts", 40)
     rows, report = camdm_evaluation.evaluate_run(
@@ -286,6 +363,7 @@ def steering(args: Steering) -> None:
         run = camdm_training.load_run(args.run, args.data)
     else:
         run = camdm_training.exported_run(args.run, args.data, args.held_out_clips)
+    run = camdm_training.with_steps(run, args.visit)
     model, control = run.model, None
     out = cli.out_folder(args, "steering")
     if args.follow is not None:
@@ -419,6 +497,7 @@ def import_weights(args: Import) -> None:
 
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Distill, tyro.conf.subcommand("distill")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Steering, tyro.conf.subcommand("steering")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
@@ -432,6 +511,7 @@ def main() -> None:
     args = cli.check(tyro.cli(Command, description=__doc__))
     run = {
         Train: train,
+        Distill: distill,
         Evaluate: evaluate,
         Steering: steering,
         Rollout: rollout,

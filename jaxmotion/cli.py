@@ -87,7 +87,7 @@ LIMITS: dict[str, Range] = {
     "noise_levels": Range(1, 1000),
     "gan_window": Range(3, 1000),
     "balance": Range(0, 1),
-    "diffusion_steps": Range(1, 1000),
+    **dict.fromkeys(("diffusion_steps", "visit"), Range(1, 1000)),
     "depth": Range(1, 256),
     "frames": Range(2, 10**5),
     "heads": Range(1, 1024),

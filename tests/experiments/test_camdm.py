@@ -78,6 +78,7 @@ def trained(call, data, tmp_path_factory):
     [
         ("", ["train", "evaluate", "rollout", "Examples:", "--data data/bandai2.npz"]),
         ("train", ["(default: 11000)", "in (0, 1)", "55 frames per step", "Example:"]),
+        ("distill", ["(default: 4000)", "55 frames per step", "Example:"]),
         ("evaluate", ["(default: 60.0)", "seconds", "Meters per second", "Example:"]),
         ("rollout", ["(default: 20.0)", "seconds", "Meters per second", "Example:"]),
     ],
@@ -239,6 +240,33 @@ def test_steering_is_measured_beside_data_and_by_frame_of_the_plan(call, trained
 
 
 @pytest.mark.slow
+def test_a_student_is_taken_by_all_that_takes_a_run(call, trained, tmp_path):
+    folder = tmp_path / "student"
+    sizes = "--batch 4 --warmup 1 --chunk 1 --save-every 2"
+    line = f"distill --run {trained} --out {folder} --visit 2 {sizes} --steps"
+    call(f"{line} 2")
+    with pytest.raises(ValueError, match="steps is 2, given 4"):
+        call(f"{line} 4")
+    call(f"{line} 4 --override")
+    assert checkpoint.latest_step(folder / "motion" / "checkpoints") == 4
+    call(
+        f"evaluate --run {folder} --rollouts 2 --seconds 4 --evaluator-steps 2 "
+        "--chunk 2"
+    )
+    check_evaluation(folder / "evaluation", 2)
+    course = "--speeds 1 --courses turn_around --rollouts 2 --seconds 5"
+    rows = {}
+    for visit in ("2", "1 2"):
+        out = tmp_path / visit.replace(" ", "_")
+        call(f"steering --run {folder} {course} --visit {visit} --out {out}")
+        rows[visit] = json.loads((out / "metrics.json").read_text())["rows"]
+    assert rows["2"] != rows["1 2"]
+    call(f"rollout --run {folder} --style zombie --seconds 1")
+    call(f"export --run {folder} --out {tmp_path / 'student.npz'}")
+    assert camdm_model.load(tmp_path / "student.npz")[0].steps == (2,)
+
+
+@pytest.mark.slow
 def test_an_export_has_poses_of_the_models_own(call, trained, tmp_path):
     call(f"export --run {trained} --out {tmp_path / 'model.npz'} --starts 2")
     model, _ = camdm_model.load(tmp_path / "model.npz")
@@ -359,12 +387,22 @@ BAD = [
     ),
     ("train --data {data} --out {out} --devices 64", ValueError, "devices is 64, "),
     ("train --data {data} --out {out} --held-out 2", ValueError, "--held-out is 2.0"),
+    (
+        "distill --run {run} --out {out}",
+        ValueError,
+        r"steps are \(8,\), expected increasing ones in 1..2, the last 2",
+    ),
+    ("distill --run {gone} --out {out}", OSError, "gone"),
+    ("distill --run {run} --out {file}/below --visit 2", OSError, "plain/below"),
+    ("distill --run {run} --out {run} --visit 2", ValueError, "other data; use anoth"),
+    ("distill --run {run} --out {out} --visit 0", ValueError, "--visit is 0, expec"),
+    ("steering --run {run} --visit 1", ValueError, r"steps are \(1,\), expected"),
     ("export --run {run} --out {empty}", OSError, "empty is a folder"),
     ("export --run {empty} --out {out}", OSError, "empty"),
     ("evaluate --run {gone}", OSError, "gone"),
     ("rollout --run {empty} --style neutral", OSError, "empty"),
     ("rollout --run {run} --style sad", ValueError, "the model has neutral, zombie"),
-    ("rollout --run {run} --style zombie --to-style sad", ValueError, "style 'sad'"),
+    ("rollout --run {run} --style zombie --to-style sad", ValueError, "label 'sad'"),
     ("rollout --run {run} --style zombie --data {gone}", OSError, "gone"),
     ("rollout --run {run} --style zombie --out {file}/below", OSError, "plain/below"),
     ("rollout --run {run} --style zombie --seconds 0", ValueError, "--seconds is 0.0"),

@@ -496,13 +496,15 @@ class Method:
 
 def _tuning(method: Method) -> Tuning:
     control = Control() if method.control is None else method.control
-    total = method.config.num_steps
+    visited = method.steps or tuple(range(1, method.config.num_steps + 1))
+    total = len(visited)
 
     def tuned(num_steps: int, scale: Any) -> Method:
+        some = tuple(visited[i - 1] for i in spread_steps(total, num_steps))
         return dataclasses.replace(
             method,
             control=dataclasses.replace(control, guidance_scale=scale),
-            steps=None if num_steps == total else spread_steps(total, num_steps),
+            steps=method.steps if num_steps == total else some,
         )
 
     return Tuning(
@@ -520,6 +522,7 @@ def character(
     *,
     control: Control | None = None,
     step: chain.StepFactory = chain.ancestral_step,
+    steps: tuple[int, ...] | None = None,
 ) -> Character:
     """A model as a character to be steered.
 
@@ -530,11 +533,19 @@ def character(
         poses of its own, else for the paper's.
       step: Makes the chain's step, such as `chain.dpm_solver_step`. Another
         `functools.partial` is another program: make one once.
+      steps: Steps of the schedule to visit, increasing up to T; None for the model's.
+
+    Raises:
+      ValueError: if the steps are none of its schedule.
     """
     if control is None and model.starts is not None:
         control = OWN_STARTS
+    if steps is not None:
+        steps = camdm_model.check_steps(steps, config=model.config)
 
-    method = Method(config=model.config, control=control, step=step)
+    method = Method(
+        config=model.config, control=control, step=step, steps=steps or model.steps
+    )
 
     def clip_starts(clips: Clips, labels: np.ndarray, seed: int) -> CharacterState:
         own, field = camdm_model.fitting_clips(model, clips)
@@ -558,6 +569,7 @@ def load_character(
     *,
     control: Control | None = None,
     step: chain.StepFactory = chain.ancestral_step,
+    steps: tuple[int, ...] | None = None,
 ) -> Character:
     """The character of a run folder or an exported file; see `character`.
 
@@ -569,7 +581,7 @@ def load_character(
       ValueError: if it is of another system or damaged.
     """
     model, params = camdm_model.load(path)
-    made = character(params, model, control=control, step=step)
+    made = character(params, model, control=control, step=step, steps=steps)
     if model.starts is not None:
         return made
 

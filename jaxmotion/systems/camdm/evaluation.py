@@ -572,7 +572,8 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
     def sampler(point: bench.Point) -> Callable[[Key], Array]:
         own = run_of(point)
         condition = _condition(own, seed=job.seed)
-        plan = camdm_model.sampler(own.params, config=own.model.config)
+        model = own.model
+        plan = camdm_model.sampler(own.params, config=model.config, steps=model.steps)
         return jax.jit(lambda key: plan(key, condition))
 
     return bench.Evaluation(

@@ -121,13 +121,8 @@ def loss(
 
     Source: Chen et al. 2024 (CAMDM), eq. 2-4, and the released code's fifth term.
     """
-    windows, labels = batch
-    size = labels.shape[0]
     key_example, key_noise = jax.random.split(key)
-    keys = jax.random.split(key_example, size)
-    condition, x_0 = jax.vmap(
-        lambda k, w, c: example(k, skeleton, w, c, config=config)
-    )(keys, windows, labels)
+    condition, x_0 = examples(key_example, batch, skeleton=skeleton, config=config)
     predictions = losses.predict_clean(
         key_noise,
         x_0,
@@ -139,7 +134,28 @@ def loss(
         levels=config.noise_levels,
     )
     each = jax.vmap(lambda x: loss_terms(skeleton, x, x_0, config=config))(predictions)
-    terms = jax.tree.map(jnp.mean, each)
+    return weighted(each, config=config)
+
+
+def examples(
+    key: Key,
+    batch: tuple[Motion, Int[Array, " batch"]],
+    *,
+    skeleton: Skeleton,
+    config: Config,
+) -> tuple[Condition, Float[Array, "batch future features"]]:
+    """`example` of each window of a batch."""
+    windows, labels = batch
+    return jax.vmap(lambda k, w, c: example(k, skeleton, w, c, config=config))(
+        jax.random.split(key, labels.shape[0]), windows, labels
+    )
+
+
+def weighted(
+    terms: dict[str, Array], *, config: Config
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """The weighted sum of `loss_terms` of several levels, and their means by name."""
+    terms = jax.tree.map(jnp.mean, terms)
     weights = {
         "data": config.weight_data,
         "velocity": config.weight_velocity,

@@ -320,6 +320,24 @@ def sampler(
     return sample
 
 
+def check_steps(steps: Any, *, config: Config) -> tuple[int, ...]:
+    """Steps for a plan to visit; raises `ValueError` unless they increase up to T."""
+    whole = isinstance(steps, list | tuple) and all(type(x) is int for x in steps)
+    total = config.num_steps
+    if (
+        not whole
+        or [*steps] != sorted({*steps})
+        or not steps
+        or steps[0] < 1
+        or steps[-1] != total
+    ):
+        raise ValueError(
+            f"steps are {steps!r:.60}, expected increasing ones in 1..{total}, the "
+            f"last {total}"
+        )
+    return tuple(steps)
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Model:
     """Everything but the parameters.
@@ -332,6 +350,8 @@ class Model:
       starts: Poses to start from, [labels, number, past, ...], at the origin facing +z;
         None where characters start from clips. A shipped model has its own, which it
         made itself.
+      steps: Steps of the schedule that a plan visits, increasing, the last T; None for
+        all. A student was distilled for its few.
     """
 
     config: Config
@@ -339,6 +359,7 @@ class Model:
     labels: tuple[str, ...]
     source: str
     starts: Motion | None = None
+    steps: tuple[int, ...] | None = None
 
 
 def to_json(model: Model) -> dict[str, Any]:
@@ -357,6 +378,8 @@ def to_json(model: Model) -> dict[str, Any]:
         "labels": list(model.labels),
         "source": model.source,
     }
+    if model.steps is not None:
+        value["steps"] = list(model.steps)
     if model.starts is not None:
         value["starts"] = model_json.arrays_to_json(
             {
@@ -417,7 +440,12 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
                 f"{where}: field {name!r} has {found} entries, the config {expected}"
             )
     starts = _starts_from_json(value.get("starts"), config, where)
-    return dataclasses.replace(model, starts=starts)
+    steps = value.get("steps")
+    try:
+        steps = None if steps is None else check_steps(steps, config=config)
+    except ValueError as error:
+        raise ValueError(f"{where}: field 'steps': {error}") from None
+    return dataclasses.replace(model, starts=starts, steps=steps)
 
 
 def _shapes(model: Model, where: Path) -> Params:

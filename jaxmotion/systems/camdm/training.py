@@ -157,7 +157,7 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
             f"{path}: expected a model with the skeleton, labels and config of the one "
             f"to train: {differ}"
         )
-    return dataclasses.replace(found, source=model.source), params
+    return dataclasses.replace(found, source=model.source, steps=model.steps), params
 
 
 def window_sampler(
@@ -349,6 +349,34 @@ def with_mirrored(clips: Clips) -> Clips:
     return selection.concatenate([clips, mirror.mirror_clips(clips)])
 
 
+def training_windows(
+    run: runs.Run, config: camdm_model.Config
+) -> tuple[Clips, windows.WindowIndex]:
+    """Clips of a run, mirrored ones included, and where their windows are; says so.
+
+    Raises:
+      ValueError: if no clip is as long as a window.
+    """
+    clips = clips_io.load_clips(run.file(_FILES[0]))
+    if run.settings["mirror"]:
+        clips = with_mirrored(clips)
+    index = windows.window_index(clips, config.window, short="skip")
+    if power := run.settings["balance"]:
+        last = config.past - 1
+        index, shares = windows.balance(clips, index, last=last, power=power)
+        (rare, often), (rarely, most) = 100 * shares.min(0), 100 * shares.max(0)
+        print(
+            f"{len(shares)} kinds of windows: the rarest has {often:.2g} % instead of "
+            f"{rare:.2g} %, the most frequent {most:.2g} % instead of {rarely:.2g} %"
+        )
+    short = int(np.sum(np.diff(np.asarray(clips.offsets)) < config.window))
+    print(
+        f"{clips.num_clips} clips ({short} too short to use), {clips.num_frames} "
+        f"frames, {index.starts.shape[0]} windows of {index.length} frames"
+    )
+    return jax.tree.map(jnp.asarray, (clips, index))
+
+
 def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> None:
     """Trains the model of a run, from its newest checkpoint if there is one.
 
@@ -364,24 +392,8 @@ def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> No
       TrainingDiverged: if a loss is not finite.
     """
     model = from_json(run.model, where=str(run.config))
-    clips = clips_io.load_clips(run.file(_FILES[0]))
-    if run.settings["mirror"]:
-        clips = with_mirrored(clips)
-    config, field = model.config, run.settings["label"]
-    index = windows.window_index(clips, config.window, short="skip")
-    if power := run.settings["balance"]:
-        last = config.past - 1
-        index, shares = windows.balance(clips, index, last=last, power=power)
-        (rare, often), (rarely, most) = 100 * shares.min(0), 100 * shares.max(0)
-        print(
-            f"{len(shares)} kinds of windows: the rarest has {often:.2g} % instead of "
-            f"{rare:.2g} %, the most frequent {most:.2g} % instead of {rarely:.2g} %"
-        )
-    short = int(np.sum(np.diff(np.asarray(clips.offsets)) < config.window))
-    print(
-        f"{clips.num_clips} clips ({short} too short to use), {clips.num_frames} "
-        f"frames, {index.starts.shape[0]} windows of {index.length} frames"
-    )
+    config = model.config
+    data = training_windows(run, config)
     key_init, key_train = jax.random.split(jax.random.key(budget.seed))
     if init is None or checkpoint.latest_step(run.checkpoints(STAGE)) is not None:
         params = camdm_model.init(key_init, config)
@@ -392,8 +404,8 @@ def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> No
         run,
         STAGE,
         functools.partial(camdm_loss.loss, skeleton=model.skeleton, config=config),
-        window_sampler(field=field, batch=budget.batch),
-        jax.tree.map(jnp.asarray, (clips, index)),
+        window_sampler(field=run.settings["label"], batch=budget.batch),
+        data,
         budget=budget,
         model=dataclasses.asdict(config),
         key=key_train,
@@ -458,3 +470,15 @@ def exported_run(
     clips, field = camdm_model.fitting_clips(model, clips_io.load_clips(data))
     train, held_out = selection.split_by_name(clips, held_out_clips)
     return Run(model=model, params=params, train=train, held_out=held_out, field=field)
+
+
+def with_steps(run: Run, steps: tuple[int, ...]) -> Run:
+    """The run of a model whose plans visit these steps; none: the model's own.
+
+    Raises:
+      ValueError: if they are not steps of its schedule.
+    """
+    if not steps:
+        return run
+    steps = camdm_model.check_steps(steps, config=run.model.config)
+    return dataclasses.replace(run, model=dataclasses.replace(run.model, steps=steps))
