@@ -66,7 +66,7 @@ def over_trainings(spread: Spread | None) -> str:
     if spread is None:
         return ""
     if not math.isfinite(spread.mean):
-        return f"not finite in each of {spread.count} trainings"
+        return f"not finite in some of {spread.count} trainings"
     low, high = map(number, verdicts.interval(spread))
     return f"{number(spread.mean)} [{low}, {high}] of {spread.count} trainings"
 
@@ -75,8 +75,18 @@ def both(table: Table, row: Row, column: Column, found: Found) -> str:
     """A value over trainings, and that of the first; "" if it was not measured."""
     cell = verdicts.cell_of(table, row, column, found)
     spread = verdicts.over_trainings(table, row, column, found)
-    texts = [over_trainings(spread), "" if cell is None else measured(cell, column)]
-    return "<br>".join(filter(None, texts))
+    one = "" if cell is None else measured(cell, column)
+    if spread is None:
+        return one
+    return "<br>".join(filter(None, [over_trainings(spread), one and f"first: {one}"]))
+
+
+def difference(claim: Claim, pair: tuple[str, str], spread: Spread) -> str:
+    """By how much a comparison holds over trainings."""
+    first, second = pair
+    where = f"distances to {claim.toward}, " if claim.toward else ""
+    times = "" if claim.factor == 1 else f"{claim.factor:g} × "
+    return f"{where}{second} less {times}{first}: {over_trainings(spread)}"
 
 
 def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -171,8 +181,8 @@ def _claims(table: Table, decided: Decided, found: Found) -> list[str]:
         if where is table:
             texts = [f"**{decision.verdict}**", decision.reason]
             texts += [
-                f"{first} and {second} differ by {over_trainings(spread)}"
-                for (first, second), spread in decision.differences.items()
+                difference(claim, pair, spread)
+                for pair, spread in decision.differences.items()
             ]
             values = _values(table, claim, found)
             rows.append(
@@ -234,8 +244,9 @@ def summary(decided: Decided) -> list[str]:
       The lines.
     """
     rows = [
-        [table.name, claim.words, f"**{decision.verdict}**", str(decision.trainings)]
-        for table, claim, decision in decided
+        [table.name, claim.words, f"**{x.verdict}**"]
+        + ["–" if x.verdict == "not run" else str(x.trainings)]
+        for table, claim, x in decided
     ]
     head = f"{len(decided)} claims: {', '.join(counts(decided).values())}."
     titles = ("table", "claim", "verdict", "trainings")

@@ -40,8 +40,8 @@ RULE = (
     "Where both rows were trained with several seeds, these intervals do not decide: "
     "the claimed difference is taken within each seed, and the comparison holds or "
     "fails if the 95 % interval of its mean over seeds (Student's t, as in a paired "
-    "t-test) is above or below zero. The two rows of a seed have the same data, "
-    "commands and noise of the evaluation.",
+    "t-test) is above or below zero. Within a seed both rows have the same data, "
+    "and the same commands and noise in their evaluation.",
     "Where they were trained once, intervals run over replications, clips or rollouts "
     "of that training: what another seed would change is not in them.",
 )

@@ -483,13 +483,14 @@ def test_a_report_over_trainings_has_both_intervals(call, runs, tmp_path, capsys
     assert "\n1 reproduced (1 of them by several trainings)\n" in f"\n{shown}"
     assert "of the papers' results cannot be run here" in shown
     low, high = scipy.stats.t.interval(0.95, 2, 5.0, scipy.stats.sem([5, 5.2, 4.8]))
-    both = f"5 [{low:.3g}, {high:.3g}] of 3 trainings<br>5 [4.9, 5.1] (n=20)"
+    both = f"5 [{low:.3g}, {high:.3g}] of 3 trainings<br>first: 5 [4.9, 5.1] (n=20)"
     assert f"*0.938*<br>{both}" in text
     assert f"--out {runs}/sweep_camdm_seed2 --seed 2" in text
     whole = json.loads((out / "report.json").read_text())
     claim = next(x for x in whole["claims"] if x["claim"] == "up to 8 steps FID falls")
     assert (claim["verdict"], claim["trainings"]) == ("reproduced", 3)
     assert [round(x["mean"], 9) for x in claim["differences"]] == [1.0, 1.0]
+    assert "<br>4 steps less 8 steps: 1 [1, 1] of 3 trainings<br>" in text
 
 
 def test_a_run_folder_can_be_elsewhere(load, runs, tmp_path):
