@@ -189,10 +189,10 @@ class Distill:
     steps: int = 4000
     batch: int = 48
     optimizer: OptimizerName = "muon"
-    learning_rate: float = 5e-4
+    learning_rate: float = 3e-4
     warmup: int = 100
     max_norm: float = 1.0
-    ema: float = 0.998
+    ema: float = 0.999
     chunk: int = 50
     save_every: int = 1000
     devices: int = 1
@@ -203,7 +203,8 @@ class Distill:
 def distill(args: Distill) -> None:
     """Trains the student, with checkpoints."""
     loop.check_writable(args.out)
-    budget = runs.Budget(**cli.given(runs.Budget, args), final=0.1)
+    # Muon's changes are as large as its rate, however small the gradient.
+    budget = runs.Budget(**cli.given(runs.Budget, args), final=0.01)
     run, teacher = camdm_distillation.prepare(
         args.out,
         args.run,
