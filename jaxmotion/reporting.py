@@ -226,7 +226,8 @@ def provenance(arguments: Any = None) -> dict[str, Any]:
 
     Returns:
       Versions, hardware, commit, command and date, and the "arguments", as a JSON
-      object; where these name a run folder, also its "seeds" and "data".
+      object; where these name a run folder, also its "seeds", its "data" and the
+      "training" of its stages.
     """
     given = {} if arguments is None else {"arguments": arguments_json(arguments)}
     if (run := getattr(arguments, "run", None)) is not None and run.is_dir():
@@ -244,14 +245,20 @@ def provenance(arguments: Any = None) -> dict[str, Any]:
 
 
 def _training(folder: Path) -> dict[str, Any]:
-    """Seeds of a run's stages, and fingerprints of its data."""
-    seeds = set()
-    for place in folder.glob("**/checkpoints"):
+    """Seeds and other settings of a run's stages, and fingerprints of its data."""
+    seeds, settings = set(), {}
+    for place in sorted(folder.glob("**/checkpoints")):
         with contextlib.suppress(checkpoint.CheckpointError):
             how = checkpoint.load_config(place).get("training", {})
-            seeds |= {how["seed"]} if "seed" in how else set()
+            if "seed" in how:
+                seeds.add(how.pop("seed"))
+                settings[place.parent.relative_to(folder).as_posix()] = how
     config = files.read_object(folder / "config.json", what="expected a run folder")
-    return {"seeds": {"training": sorted(seeds)}, "data": config.get("files")}
+    return {
+        "seeds": {"training": sorted(seeds)},
+        "data": config.get("files"),
+        "training": settings,
+    }
 
 
 def arguments_json(arguments: Any) -> dict[str, Any]:

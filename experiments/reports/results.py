@@ -144,6 +144,11 @@ def read(path: Path) -> Measured | None:
 
 def differ(one: Measured, other: Measured) -> str:
     """In what two files differ that should be of equal data and settings; or ""."""
+    stages = [x.about.get("training") or {} for x in (one, other)]
+    common = stages[0].keys() & stages[1].keys()
+    found = [{name: x[name] for name in sorted(common)} for x in stages]
+    if trained := model_json.differences(*found):
+        return trained
     data = [x.about.get("data") for x in (one, other)]
     if None not in data and data[0] != data[1]:
         return "data"

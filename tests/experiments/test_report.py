@@ -342,6 +342,7 @@ def test_one_training_that_is_not_finite_decides_nothing(over):
 def test_what_is_no_further_training_is_named(load, tmp_path):
     read = load("reports.results").read_trainings
     about = dict(seeds={"training": [0]}, data={"train.npz": "a"}, arguments={"n": 3})
+    about |= dict(training={"a": {"steps": 9}, "b": {"steps": 1}})
     paths = [tmp_path / f"{i}.json" for i in range(3)]
     measured(load, paths[0], {"a": 1.0}, **about)
     assert read(paths[1:]) is None
@@ -354,6 +355,7 @@ def test_what_is_no_further_training_is_named(load, tmp_path):
         ({}, "1.json: trained with seed 0, as .*0.json was"),
         (dict(data={"train.npz": "b"}), "1.json: differs from .*0.json in data"),
         (dict(arguments={"n": 4}), "in n is 3, given 4: expected the same"),
+        (dict(training={"a": {"steps": 8}}), "in a.steps is 9, given 8: expected"),
     ):
         own = about | (dict(seeds={"training": [1]}) if more else {}) | more
         measured(load, paths[1], {"a": 1.0}, **own)
