@@ -55,6 +55,7 @@ class Train:
       gan_window: Frames of the windows of the GANs (paper: 10).
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
+      distributed: One of several processes: "auto", or address, number, index.
       override: Go on with these settings where a stage began with others.
     """
 
@@ -77,6 +78,7 @@ class Train:
     schedule: Literal["cosine", "vp"] = "cosine"
     gan_window: int = 3
     previous_noise: float = 0.05
+    distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False
 
@@ -145,6 +147,7 @@ class Rollout:
 
 def train(args: Train) -> None:
     """Trains, stage by stage."""
+    cli.join_processes(args.distributed)
     names = cli.chosen_rows(args, rows.ALL)
     rows.check(names)
     loop.check_writable(args.out)

@@ -65,9 +65,13 @@ class Train:
       diffusion_steps: Steps T of the row "emdm".
       recon: Weight R of the features' error; else 1, or 100.
       geometry: Of the losses (released: root).
+      weight_position: Of joint positions; with actions.
+      weight_velocity: Of frame differences; with actions.
+      weight_foot: Of standing feet that slide; with actions.
       learning_rate: Of generators (Muon).
       ddpm_rate: Of diffusion models (Muon).
       discriminator_rate: Of the discriminator (Adam).
+      distributed: One of several processes: "auto", or address, number, index.
       override: Go on with other settings than before.
     """
 
@@ -104,9 +108,13 @@ class Train:
     diffusion_steps: int = 10
     recon: cli.Optional[float] = None
     geometry: Literal["root", "world"] = "world"
+    weight_position: float = 1.0
+    weight_velocity: float = 1.0
+    weight_foot: float = 1.0
     learning_rate: float = 2e-3
     ddpm_rate: float = 2e-3
     discriminator_rate: float = 5e-4
+    distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False
 
@@ -236,6 +244,7 @@ def prepare(args: Train) -> emdm_training.Task:
 
 def train(args: Train) -> None:
     """Trains row by row."""
+    cli.join_processes(args.distributed)
     rows = cli.chosen_rows(args, tuple(emdm_training.ROWS))
     emdm_training.check_rows(rows)
     for row in rows:

@@ -54,6 +54,7 @@ class Train:
       path_steps: Updates of a trajectory generator.
       batch: Windows per update.
       learning_rate: Peak of Muon's rate; cosine to a twentieth.
+      distributed: One of several processes: "auto", or address, number, index.
       override: Go on with these settings where a stage began with others.
     """  # noqa: E501
 
@@ -70,6 +71,7 @@ class Train:
     path_steps: int = 2000
     batch: int = 48
     learning_rate: float = 2e-3
+    distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False
 
@@ -163,6 +165,7 @@ def sizes_of(args: Train) -> dict[str, Any]:
 
 def train(args: Train) -> None:
     """Trains stage by stage."""
+    cli.join_processes(args.distributed)
     for stage in args.stages:
         smgdiff_training.check_stage_name(stage)
     loop.check_writable(args.out)

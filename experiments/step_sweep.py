@@ -43,6 +43,8 @@ class Config:
       models: Models to use and keep; else <out>/models.
       replications: Sets of samples of each model, for intervals.
       evaluator: A frozen one (not aamdm); else it is trained.
+      distributed: One of several processes, which train together: "auto", or address,
+        number, index.
       seed: Seeds all that is random.
     """
 
@@ -55,6 +57,7 @@ class Config:
     models: cli.Optional[Path] = None
     replications: int = 20
     evaluator: cli.Optional[Path] = None
+    distributed: cli.Distributed = ()
     seed: int = 0
 
 
@@ -142,6 +145,9 @@ def sweep(args: Config, job: bench.Job, out: Path) -> None:
         call(script, "train", own.train(job, point))
         seconds[f"training, {point.row}"] = time.perf_counter() - started
         print(f"{point.row}: {seconds[f'training, {point.row}']:.0f} s", flush=True)
+    if not cli.part_processes():
+        return
+    job, out = make_job(args)
     started = time.perf_counter()
     evaluation = own.prepare(job)
     seconds["evaluator"] = time.perf_counter() - started
@@ -210,6 +216,7 @@ def budgets() -> str:
 def main() -> None:
     """Parses the command line and runs the sweep."""
     args = cli.check(tyro.cli(Config, description=f"{__doc__}\n\n{budgets()}"))
+    cli.join_processes(args.distributed)
     job, out = make_job(args)
     check(args, job, out)
     sweep(args, job, out)

@@ -16,6 +16,7 @@ import jax
 import tyro
 from jax.errors import JaxRuntimeError
 from jax.experimental import multihost_utils
+from jax.extend.backend import clear_backends
 
 from jaxmotion.learning.loop import TrainingDiverged, check_writable
 
@@ -75,6 +76,8 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("last_sigma", "max_distance", "tolerance"), _METERS),
     **dict.fromkeys(("scale", "amdm_scale", "recon"), Range(0, 10**6)),
     **dict.fromkeys(("max_norm", "previous_noise"), Range(0, 10**6)),
+    **dict.fromkeys(("weight_position", "weight_velocity"), Range(0, 10**6)),
+    "weight_foot": Range(0, 10**6),
     **dict.fromkeys(("speed", "speeds"), Range(0, 100)),
     **dict.fromkeys(("follow", "noise_half_life"), Range(0, 86400)),
     "min_acceleration": Range(0, 10**4),
@@ -198,6 +201,20 @@ def join_processes(distributed: tuple[str, ...]) -> None:
         multihost_utils.sync_global_devices("joined")
     except (RuntimeError, ValueError, TypeError) as error:
         raise ValueError(f"--distributed {' '.join(distributed)}: {error}") from error
+
+
+def part_processes() -> bool:
+    """Ends the company of `join_processes`, when the work that they share is done.
+
+    Returns:
+      Whether this is the first process, whose JAX has its own devices alone from here
+      on; arrays made before are gone. The others have nothing left to do.
+    """
+    first = jax.process_index() == 0
+    if jax.distributed.is_initialized():
+        jax.distributed.shutdown()
+        clear_backends()
+    return first
 
 
 def announce(what: str, seconds: int) -> None:

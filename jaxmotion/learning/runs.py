@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.experimental import multihost_utils
 
 from jaxmotion import files
@@ -438,7 +439,8 @@ def store(run: Run, stage: str, state: Any, *, model: dict[str, Any]) -> None:
     place = run.checkpoints(stage)
     if checkpoint.latest_step(place) is not None:
         raise ValueError(f"{run.folder}: {stage!r} exists; use another folder")
-    checkpoint.save(place, 0, state, _stage_json(run, stage, model))
+    # On the host: of several processes' arrays Orbax would take none for common.
+    checkpoint.save(place, 0, jax.device_get(state), _stage_json(run, stage, model))
 
 
 def _check_resumed(
@@ -518,13 +520,15 @@ def fit(
     )
     if key is None:
         key = jax.random.fold_in(jax.random.key(budget.seed), 1)
-    return loop.train(
+    state = loop.train(
         training.train_chunk(update, sample_batch, num_steps=chunk, mesh=mesh),
         state,
         key,
         training.replicate(data, mesh),
         loop=lengths,
     )
+    # What follows is each process's own work, on arrays that are bound to no device.
+    return jax.tree.map(jnp.asarray, jax.device_get(state)) if several else state
 
 
 def minimize(

@@ -210,17 +210,17 @@ def generator_loss(
       geometry: None if the weights of positions, velocities and feet are 0.
 
     Returns:
-      The loss, "adversarial" and the geometric terms.
+      The loss, "adversarial" (weighted) and the geometric terms.
     """
     t, _, x_t, prediction, fake = _generated(params, key, batch, config)
     seen = emdm_model.discriminator_condition(batch.vector, config=config)
     logits = emdm_model.discriminator(config).apply(
         {"params": discriminator}, fake, x_t, t, seen
     )
-    adversarial = gan.generator_loss(logits)
     geometric, terms = geometric_loss(
         prediction, batch, config=config, geometry=geometry
     )
+    adversarial = config.weight_adversarial * gan.generator_loss(logits)
     return adversarial + geometric, {"adversarial": adversarial, **terms}
 
 

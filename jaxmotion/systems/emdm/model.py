@@ -63,6 +63,8 @@ class Config:
       discriminator_width: Channels of the discriminator's first layers.
       discriminator_condition: Whether the discriminator sees the condition.
       drop_condition: Probability that the condition is dropped in training.
+      weight_adversarial: Weight of the discriminator's verdict; 0 (ours) to see what
+        the geometric losses do alone.
       weight_recon: R, of the mean squared error of features (100 for texts).
       weight_position: Weight of joint positions (0 for texts).
       weight_velocity: Weight of frame differences of features (0 for texts).
@@ -94,6 +96,7 @@ class Config:
     discriminator_width: int = 1024
     discriminator_condition: bool = True
     drop_condition: float = 0.1
+    weight_adversarial: float = 1.0
     weight_recon: float = 1.0
     weight_position: float = 1.0
     weight_velocity: float = 1.0

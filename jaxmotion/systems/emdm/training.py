@@ -36,6 +36,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "recon_10": dict(weight_recon=10.0, **_FLAT),
     "recon_100": dict(weight_recon=100.0, **_FLAT),
     "no_r1": dict(weight_r1=0.0),
+    "no_gan": dict(weight_adversarial=0.0),
 }
 # Ways to sample that need no training of their own: row, steps to visit.
 SAMPLERS: dict[str, tuple[str, int]] = {"ddim_10": ("ddpm_1000", 10)}
