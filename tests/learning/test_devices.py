@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxmotion.data import clips_io
+from jaxmotion.data import clips_io, procedural
+from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.learning import checkpoint, loop
-from tests import tiny
+from tests import ball_walker, tiny
 
 pytestmark = pytest.mark.slow
 
@@ -75,8 +76,26 @@ TRAIN = (
 )
 
 
+# The other systems train several stages, which hand over to each other.
+OTHERS = {
+    "aamdm": "--field style --labels --rows aamdm --autoencoder-steps 4 "
+    "--polisher-steps 4 --generator-steps 4 --batch 4 --width 32",
+    "emdm": "--task action --field style --least 2 --held-out 0.3 --frames 20 --merge "
+    "--rows emdm ddpm_50 --steps 4 --ddpm-steps 4 --batch 4 --width 8 --depth 1 "
+    "--hidden 8 --discriminator-width 64",
+    "smgdiff": "--width 8 --depth 1 --steps 4 --draft-steps 4 --path-steps 4 "
+    "--batch 4 --held-out 0.3",
+}
+
+
 def start_training(folder, out, steps, processes, more=""):
-    """Starts the processes of one training."""
+    """Starts the processes of one training of CAMDM."""
+    line = f"{TRAIN} --data {folder}/clips.npz --out {out} --steps {steps} {more}"
+    return start_processes(line, processes)
+
+
+def start_processes(line, processes):
+    """Starts the processes of a script."""
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
         "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
@@ -84,11 +103,9 @@ def start_training(folder, out, steps, processes, more=""):
     port = free_port()
 
     def one(index):
-        line = f"{TRAIN} --data {folder}/clips.npz --out {out} --steps {steps} {more}"
-        if processes > 1:
-            line += f" --distributed 127.0.0.1:{port} {processes} {index}"
+        joined = f" --distributed 127.0.0.1:{port} {processes} {index}"
         return subprocess.Popen(
-            [sys.executable, *line.split()],
+            [sys.executable, *(line + joined * (processes > 1)).split()],
             cwd=ROOT,
             env=environment,
             stdout=subprocess.DEVNULL,
@@ -119,6 +136,31 @@ def test_processes_of_the_script_train_as_one(alone, tmp_path, processes):
     found = losses_of(tmp_path)
     assert len(found) == 4
     np.testing.assert_allclose(found, losses_of(alone / "run"), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "system",
+    ["aamdm", *(pytest.param(x, marks=pytest.mark.long) for x in ("emdm", "smgdiff"))],
+)
+def test_stages_of_other_systems_train_as_one(system, tmp_path):
+    clips = tmp_path / "clips.npz"
+    if system == "smgdiff":
+        save_ball_clips(clips, ball_walker.clips(80))
+    else:
+        clips_io.save_clips(clips, procedural.make_clips(minutes=2.0))
+    line = f"experiments/{system}.py train --data {clips} {OTHERS[system]}"
+    for processes in (1, 2):
+        for process in start_processes(
+            f"{line} --out {tmp_path}/{processes}", processes
+        ):
+            finish(process)
+    alone = sorted((tmp_path / "1").rglob("losses.jsonl"))
+    assert len(alone) == {"aamdm": 3, "emdm": 2, "smgdiff": 3}[system]
+    for path in alone:
+        together = tmp_path / "2" / path.relative_to(tmp_path / "1")
+        found, expected = (loop.read_losses(x)[-1] for x in (together, path))
+        assert found["step"] == expected["step"] == 4
+        assert found["loss"] == pytest.approx(expected["loss"], rel=5e-3), path
 
 
 def test_a_killed_process_ends_the_run_and_it_resumes(alone, tmp_path):
