@@ -68,6 +68,7 @@ class Config(suite.Settings):
         numbers that no model has are rows that say so.
       guidance: Scales of classifier-free guidance on the past poses, in all plans; 1
         changes nothing. Less than 1 frees the motion from its past.
+      visit: Steps of the first model's schedule that a plan visits; none: its own.
       style: Style; None for the model's first.
       course: Commands.
       speed: Meters per second; None for the style's median, or 1.2 without clips.
@@ -92,6 +93,7 @@ class Config(suite.Settings):
     step_runs: tuple[Path, ...] = ()
     steps: tuple[int, ...] = (2, 4, 8, 16, 32)
     guidance: tuple[float, ...] = (0.0, 0.5, 0.7, 1.0)
+    visit: tuple[int, ...] = ()
     style: str | None = None
     course: str = "forward"
     speed: float | None = None
@@ -139,7 +141,7 @@ class Program:
     Attributes:
       roll: `roll(key, scale) -> Motions`; every plan is guided with the scale, none if
         it is None.
-      steps: Diffusion steps of a plan.
+      steps: Diffusion steps that a plan visits.
       memory: What it needs, in bytes, and the rollouts at a time.
     """
 
@@ -351,7 +353,8 @@ def fit_program(
         given = jnp.int32(guided), jnp.float32(1.0 if scale is None else scale)
         return program(load.params, key, *given)
 
-    return Program(roll=roll, steps=load.model.config.num_steps, memory=needs)
+    calls = len(load.model.steps or range(load.model.config.num_steps))
+    return Program(roll=roll, steps=calls, memory=needs)
 
 
 def measure(
@@ -480,7 +483,7 @@ def stream(args: Config, load: Load) -> streams.Stream:
     """
     size, limit = max(args.rollouts), args.memory_gib * suite.GIB
     program = fit_program(load, size, every=args.every, limit=limit, chunk=args.chunk)
-    told = ("style", "course", "speed", "seconds", "every", "seed", "pairs")
+    told = ("visit", "style", "course", "speed", "seconds", "every", "seed", "pairs")
     about = {name: suite.settings(args)[name] for name in told} | {
         "set": size,
         "chunk": program.memory["chunk"],
@@ -537,6 +540,10 @@ def main() -> None:
         seed=args.seed,
     )
     load = make_load(args.run or WALKER, **options)
+    if args.visit:
+        steps = camdm_model.check_steps(args.visit, config=load.model.config)
+        model = dataclasses.replace(load.model, steps=steps)
+        load = dataclasses.replace(load, model=model)
     if args.stream is not None:
         found = stream(args, load)
         if jax.process_index() == 0:
