@@ -79,6 +79,8 @@ class Config(suite.Settings):
         the program, as in deployment.
       chunk: Run batches of 16 and more in chunks of so many characters; 0 for all at
         once.
+      attention: "full" (the papers'), or "prefix" (camdm, smgdiff), which computes what
+        does not change from step to step once a plan.
       frames_per_token: Frames of one token; 1 is the paper's network.
       width: Channels of a token or hidden layer; None for 256, or 128 (emdm, the size
         that experiments/emdm.py trains).
@@ -99,6 +101,7 @@ class Config(suite.Settings):
     devices: int = 1
     arguments: bool = False
     chunk: int = 4
+    attention: Literal["full", "prefix"] = "full"
     frames_per_token: int = 1
     width: int | None = None
     guided: bool = False
@@ -140,6 +143,11 @@ def make_lines(args: Config) -> list[Line]:
             )
     if args.guided and "smgdiff" not in args.system:
         raise ValueError(f"--guided is of smgdiff, not of {', '.join(args.system)}")
+    others = set(args.system) - {"camdm", "smgdiff"}
+    if args.attention == "prefix" and others:
+        raise ValueError(
+            f"--attention prefix is of camdm and smgdiff, not of {', '.join(others)}"
+        )
     if args.guided and min(args.steps) < 2:
         raise ValueError("--steps 1: expected 2 or more, --guided guides the last two")
 
@@ -177,6 +185,7 @@ def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
         width=args.width,
         frames_per_token=args.frames_per_token,
         paper=args.paper,
+        attention=args.attention,
         guided=line.guided,
         step=workload.STEPS[line.sampler],
     )

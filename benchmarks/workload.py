@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -55,6 +55,8 @@ class Sizes:
       width: Channels of a token or hidden layer; None for the system's own.
       frames_per_token: Frames of one token; 1 is the paper's network.
       paper: The published network where the system's own is smaller.
+      attention: "full", or "prefix" (camdm, smgdiff): what does not change from step to
+        step is computed once a plan.
       guided: Plans with contact guidance.
       step: Makes the chain's steps: a value of `STEPS`.
     """
@@ -63,6 +65,7 @@ class Sizes:
     width: int | None = None
     frames_per_token: int = 1
     paper: bool = False
+    attention: Literal["full", "prefix"] = "full"
     guided: bool = False
     step: chain.StepFactory = chain.ancestral_step
 
@@ -267,6 +270,7 @@ def camdm_config(sizes: Sizes, **more: Any) -> camdm_model.Config:
         width=width,
         hidden=4 * width,
         frames_per_token=sizes.frames_per_token,
+        attention=sizes.attention,
     )
 
 
@@ -665,6 +669,7 @@ def _smgdiff_samples(sizes: Sizes) -> Samples:
         width=width,
         hidden=4 * width,
         frames_per_token=sizes.frames_per_token,
+        attention=sizes.attention,
     )
     guided = (
         smgdiff_guidance.Guidance(min_acceleration=0.0)

@@ -100,11 +100,28 @@ def test_a_step_is_a_network_call(load, system):
         assert found.flops > 0
 
 
+@pytest.mark.parametrize("system", ["camdm", "smgdiff"])
+def test_prefix_attention_is_less_work_from_the_second_step_on(load, system):
+    workload = load("workload")
+
+    def flops(attention, steps):
+        sizes = workload.Sizes(steps=steps, width=16, attention=attention)
+        run, given = workload.of(system, "samples")(sizes).program(1)
+        return work.count(run, *given).flops
+
+    full, prefix = ([flops(x, 1), flops(x, 5)] for x in ("full", "prefix"))
+    assert prefix[1] < 0.6 * full[1]
+    assert prefix[1] - prefix[0] < 0.5 * (full[1] - full[0])
+
+
 def test_step_counts_refuses_before_the_work(load):
     module = load("step_counts")
     refused = {
         "--sampler dpm_solver: not for aamdm": dict(sampler=("ddim", "dpm_solver")),
         "--guided is of smgdiff": dict(system=("camdm",), guided=True),
+        "--attention prefix is of camdm and smgdiff, not of aamdm": dict(
+            system=("camdm", "aamdm"), attention="prefix"
+        ),
         "--steps 1: expected 2": dict(guided=True, steps=(1, 2)),
         "--batch 0": dict(batch=(0,)),
         "--devices 9: . are there": dict(devices=9),
@@ -374,7 +391,8 @@ def test_ratios_are_of_the_same_round(load):
     rows = peers.rows_of({peers.OURS: eager * [0.5, 0.75], peers.EAGER: eager})
     ours = rows[0]
     assert peers.faster(rows) == []
-    assert peers.faster([ours | {"p50_ms": 30.0}, rows[1]]) == [peers.EAGER]
+    slow, other = ours | {"p50_ms": 30.0}, {"name": peers.PREFIX, "p50_ms": 1.0}
+    assert peers.faster([slow, other, rows[1]]) == [peers.EAGER]
     assert ours["ratio"] == pytest.approx(0.5)
     assert ours["cpu_ratio"] == pytest.approx(0.75)
     assert ours["p50_ms"] == pytest.approx(10.0)
