@@ -6,6 +6,7 @@ writes table.md, table.csv, table.json, pareto.png and a rollout of each.
 
 Examples:
   python experiments/step_sweep.py --system camdm --steps 2 4 8 16 32 --budget quick
+  python experiments/step_sweep.py --system camdm --steps 1 2 8 1/8 2/8
   python experiments/step_sweep.py --system aamdm --steps 0+3 1+3 2+3 10+3 2+10
   python experiments/step_sweep.py --system emdm --change updates=3000 width=192
 """
@@ -35,7 +36,8 @@ class Config:
 
     Attributes:
       system: camdm, aamdm, emdm or smgdiff.
-      steps: Steps T of the model (emdm: GAN; aamdm: polish, or polish+draft).
+      steps: Steps T of the model (emdm: GAN; aamdm: polish, or polish+draft). camdm:
+        1/8 after 8 for a student of one step.
       budget: quick (five models in half an hour of two cores) or full.
       change: Numbers of the budget, as in updates=3000.
       data: Clips; none: the system's usual ones.
@@ -142,7 +144,7 @@ def sweep(args: Config, job: bench.Job, out: Path) -> None:
     begun = time.perf_counter()
     for point in job.points:
         started = time.perf_counter()
-        call(script, "train", own.train(job, point))
+        call(script, *own.train(job, point))
         seconds[f"training, {point.row}"] = time.perf_counter() - started
         print(f"{point.row}: {seconds[f'training, {point.row}']:.0f} s", flush=True)
     if not cli.part_processes():
@@ -182,11 +184,16 @@ def notes(own: bench.Bench, job: bench.Job, report: dict[str, Any]) -> list[str]
     """Lines below the table."""
     budget = ", ".join(f"{key} {value:g}" for key, value in job.budget.items())
     who = [frozen.note(report["evaluator"])] if "evaluator" in report else []
+    taught = ", ".join(point.row for point in job.points if point.teacher)
+    taught = (
+        [f"{taught}: as many updates again, after the teacher's."] if taught else []
+    )
     return [
         f"Data: {report['source']}.",
         f"Trained with the same budget, data and seed {job.seed}: {budget} (--help "
         "says what each is). One training a row: what another training seed would "
         "change is in no interval.",
+        *taught,
         f"Evaluated with the same noise, commands and samples, {job.replications} "
         f"replications: {report['samples']}. Intervals are of 95 %.",
         *who,

@@ -56,7 +56,8 @@ def load(
         runs and files, whose frames are then what the network makes.
       **options: For the system's `load_character` or `load_sampler`: `step` makes
         another step of the chain, such as `diffusion.chain.ddim_step`; CAMDM has
-        `control` as well, EMDM `scale` and `row`.
+        `control` and `steps` (those of the schedule to visit) as well, EMDM `scale`
+        and `row`.
 
     Returns:
       A `control.steering.Character` for `rollout`, whose `start` makes states; of EMDM,

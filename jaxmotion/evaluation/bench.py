@@ -34,12 +34,14 @@ class Point:
       row: Its row in the table.
       folder: Name for files and folders.
       parts: Steps; for AAMDM polish steps and draft steps.
+      teacher: Name of the point that it is distilled from; None for none.
     """
 
     name: str
     row: str
     folder: str
     parts: tuple[int, ...]
+    teacher: str | None = None
 
     @property
     def steps(self) -> int:
@@ -59,13 +61,13 @@ def _number(text: str, least: int) -> int:
 def _check_distinct(points: Sequence[Point]) -> tuple[Point, ...]:
     if not points:
         raise ValueError("steps: there are none, expected at least one number of steps")
-    seen: set[tuple[int, ...]] = set()
+    seen: set[str] = set()
     for point in points:
-        if point.parts in seen:
+        if point.folder in seen:
             raise ValueError(
                 f"steps: {point.row} is given twice, expected distinct ones"
             )
-        seen.add(point.parts)
+        seen.add(point.folder)
     return tuple(points)
 
 
@@ -82,6 +84,43 @@ def plain_points(texts: Sequence[str]) -> tuple[Point, ...]:
             for n in numbers
         ]
     )
+
+
+def taught_points(texts: Sequence[str]) -> tuple[Point, ...]:
+    """Numbers of steps T, and students of such models.
+
+    Args:
+      texts: "8" for a model of 8 steps, or "1/8" for its student of 1 step, which comes
+        after it.
+
+    Returns:
+      The points, in this order.
+
+    Raises:
+      ValueError: if one is neither, is given twice, or is a student of none before it.
+    """
+    points: list[Point] = []
+    for text in texts:
+        steps, slash, total = text.partition("/")
+        if not slash:
+            points += plain_points([text])
+            continue
+        (teacher,), number = plain_points([total]), _number(steps, 1)
+        if number > teacher.steps or teacher.name not in {one.name for one in points}:
+            raise ValueError(
+                f"steps: {text!r}, expected at most {total} steps of a student, and "
+                f"{total!r}, its teacher, before it"
+            )
+        points.append(
+            Point(
+                name=f"{number}/{teacher.name}",
+                row=f"{number} of {teacher.row}, distilled",
+                folder=f"{teacher.folder}_student{number}",
+                parts=(number,),
+                teacher=teacher.name,
+            )
+        )
+    return _check_distinct(points)
 
 
 def paired_points(texts: Sequence[str]) -> tuple[Point, ...]:
@@ -233,7 +272,7 @@ class Bench:
       data: Files of clips, where none are given.
       amounts: Its budgets.
       points: Reads step counts: `texts -> points`.
-      train: Options of the `train` command of the system's script that leave a point's
+      train: The command of the system's script, with its options, that leaves a point's
         model in the job's folder; one that is there is left alone.
       show: That command of the script, with its options, that writes a motion of a
         point's model to look at, but for the folder that it writes to.
@@ -246,7 +285,7 @@ class Bench:
     data: tuple[Path, ...]
     amounts: Amounts
     points: Callable[..., tuple[Point, ...]]
-    train: Callable[[Job, Point], dict[str, Any]]
+    train: Callable[[Job, Point], tuple[str, dict[str, Any]]]
     show: Callable[[Job, Point], tuple[str, dict[str, Any]]]
     prepare: Callable[[Job], Evaluation]
     quality: str

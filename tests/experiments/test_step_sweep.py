@@ -68,10 +68,13 @@ def made_up(trained):
             ),
         },
         points=bench.plain_points,
-        train=lambda job, point: dict(
-            path=job.models / point.folder,
-            updates=job.budget["updates"],
-            steps=point.steps,
+        train=lambda job, point: (
+            "train",
+            dict(
+                path=job.models / point.folder,
+                updates=job.budget["updates"],
+                steps=point.steps,
+            ),
         ),
         show=lambda job, point: ("draw", {"name": point.name}),
         prepare=prepare,
@@ -173,6 +176,41 @@ def test_what_is_no_step_count_is_named(texts, message):
 def test_what_is_no_pair_is_named(texts, message):
     with pytest.raises(ValueError, match=message):
         bench.paired_points(texts)
+
+
+def test_students_come_after_their_teacher(tmp_path):
+    points = bench.taught_points(("8", "1", "1/8", "2/8"))
+    assert [p.steps for p in points] == [8, 1, 1, 2]
+    assert [p.teacher for p in points] == [None, None, "8", "8"]
+    assert len({p.folder for p in points} | {p.row for p in points}) == 8
+    own = registry.get("camdm").bench
+    job = bench.Job(
+        points=points,
+        data=(tmp_path,),
+        models=tmp_path,
+        budget=bench.resolve(own.amounts, "quick"),
+        replications=2,
+        seed=0,
+    )
+    commands = [own.train(job, point) for point in points]
+    assert [name for name, _ in commands] == ["train", "train", "distill", "distill"]
+    assert [options.get("visit") for _, options in commands[2:]] == [(8,), (4, 8)]
+    assert commands[2][1]["run"] == commands[0][1]["out"]
+
+
+@pytest.mark.parametrize(
+    ("texts", "message"),
+    [
+        (("1/8", "8"), "steps: '1/8', expected .* and '8', its teacher, before it"),
+        (("8", "9/8"), "steps: '9/8', expected at most 8"),
+        (("8", "0/8"), "steps: '0' is no number"),
+        (("8", "1/"), "steps: '' is no number"),
+        (("8", "1/8", "1/08"), "steps: 1 of T = 8, distilled is given twice"),
+    ],
+)
+def test_what_is_no_student_is_named(texts, message):
+    with pytest.raises(ValueError, match=message):
+        bench.taught_points(texts)
 
 
 def test_a_budget_is_changed_by_name():
@@ -301,7 +339,7 @@ def test_the_same_seed_gives_the_same_table(call, swept, tmp_path):
 
 # Step counts, data and numbers of a sweep that takes a minute or two.
 SYSTEMS = {
-    "camdm": ("1 2", "clips", TINY),
+    "camdm": ("1 2 1/2", "clips", TINY),
     "smgdiff": (
         "1 2",
         "ball",
@@ -349,7 +387,7 @@ def test_a_tiny_sweep_twice_gives_the_same_table(call, tmp_path, system):
     first, second = (report_of(tmp_path / name)["rows"] for name in "ab")
     check_same(first, second)
     truth, floor, *models = first
-    assert len(models) == 2
+    assert len(models) == len(steps.split())
     quality = registry.get(system).bench.quality
     for name in (truth, floor, *models):
         assert first[name][quality]["samples"] == 2

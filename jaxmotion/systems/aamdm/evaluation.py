@@ -501,11 +501,11 @@ _AMOUNTS = {
 }
 
 
-def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
+def _train(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
     """All models lie in one run folder."""
     budget = job.budget
     has = FIELD in dict(clips_io.load_clips(job.data[0]).label_names)
-    return dict(
+    return "train", dict(
         data=job.data[0],
         out=job.models,
         rows=(point.folder,),

@@ -61,6 +61,9 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
 * `Control(follow=...)`: the wanted path returns to the commanded one.
 * `controller.OWN_STARTS`: exponents of 3 in the blend with the path of the last plan;
   the shipped models answer a command 0.2 s earlier than with the paper's.
+* A student of one or two network calls (`distillation.py`, `experiments/camdm.py
+  distill`); `Model.steps` are the steps that a plan visits, `jm.load(..., steps=(8,))`
+  cuts any model short.
 * Locked feet (`jaxmotion/control/foot_lock.py`): what is displayed is the past of the
   next plan.
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from jaxmotion.control import courses, steering
 from jaxmotion.data import selection, windows
 from jaxmotion.data.clips import Clips
+from jaxmotion.diffusion import schedule
 from jaxmotion.evaluation import bench, table
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Row, Rows
@@ -489,21 +490,29 @@ _AMOUNTS = {
 }
 
 
-def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
+def _train(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
     budget, chunk = job.budget, math.gcd(job.budget["updates"], 50)
-    return dict(
-        data=job.data[0],
+    options = dict(
         out=job.models / point.folder,
-        held_out=budget["held_out"],
         steps=budget["updates"],
         batch=budget["batch"],
         warmup=budget["warmup"],
         chunk=chunk,
         save_every=10 * chunk,
+        seed=job.seed,
+    )
+    if point.teacher is not None:
+        (teacher,) = bench.plain_points([point.teacher])
+        return "distill", options | dict(
+            run=job.models / teacher.folder,
+            visit=schedule.spread_steps(teacher.steps, point.steps),
+        )
+    return "train", options | dict(
+        data=job.data[0],
+        held_out=budget["held_out"],
         width=budget["width"],
         depth=budget["depth"],
         diffusion_steps=point.steps,
-        seed=job.seed,
     )
 
 
@@ -599,7 +608,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
 BENCH = bench.Bench(
     data=(Path("data/bandai2.npz"),),
     amounts=_AMOUNTS,
-    points=bench.plain_points,
+    points=bench.taught_points,
     train=_train,
     show=_show,
     prepare=_prepare,

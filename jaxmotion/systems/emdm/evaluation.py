@@ -283,13 +283,13 @@ def _folder(job: bench.Job, point: bench.Point) -> Path:
     return job.models / point.folder
 
 
-def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
+def _train(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
     budget = job.budget
     names = ("least", "frames", "held_out", "batch", "width", "depth", "hidden")
     options = {name: budget[name] for name in (*names, "discriminator_width")}
     if job.data != _DATA:
         options["merge"] = ()  # the usual data's labels that name one action
-    return options | dict(
+    return "train", options | dict(
         task="action",
         rows=(_ROW,),
         data=job.data,

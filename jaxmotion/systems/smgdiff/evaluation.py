@@ -401,10 +401,10 @@ def _stage(point: bench.Point) -> str:
     return f"motion_{point.steps}"
 
 
-def _train(job: bench.Job, point: bench.Point) -> dict[str, Any]:
+def _train(job: bench.Job, point: bench.Point) -> tuple[str, dict[str, Any]]:
     """All models lie in one run folder."""
     budget = job.budget
-    return dict(
+    return "train", dict(
         data=job.data[0],
         out=job.models,
         stages=(_stage(point),),
