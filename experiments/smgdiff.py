@@ -170,7 +170,11 @@ def train(args: Train) -> None:
         smgdiff_training.check_stage_name(stage)
     loop.check_writable(args.out)
     run = smgdiff_training.prepare(
-        args.out, args.data, held_out=args.held_out, sizes=sizes_of(args)
+        args.out,
+        args.data,
+        held_out=args.held_out,
+        sizes=sizes_of(args),
+        paths=smgdiff_training.PATHS[args.preset],
     )
     clips = run.train.clips
     print(

@@ -238,6 +238,9 @@ PRESETS = {
         weight_ball_acceleration=300.0,
     ),
 }
+# The same of `trajectory.Config`. Tokens that do not overlap make paths leap by
+# centimeters every five frames, and beside places displacements count next to nothing.
+PATHS = {"paper": dict(), "small": dict(token_margin=4, weight_velocity=100.0)}
 # For the first part of a training. Displacements are least for a body at rest, and
 # a network that meets them first stays on the mean pose for thousands of updates.
 DRAFT = dict(
