@@ -635,7 +635,7 @@ def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
 
     def with_feet(states: Any) -> LockedState:
         number = jax.tree.leaves(states)[0].shape[0]
-        every = jax.tree.map(lambda x: jnp.stack([x] * number), feet)
+        every = jax.tree.map(lambda x: jnp.repeat(x[None], number, axis=0), feet)
         return LockedState(inner=states, feet=every)
 
     clip_starts, tuning = character.clip_starts, character.tuning
