@@ -9,14 +9,14 @@ Examples:
   python benchmarks/step_counts.py --system camdm --steps 2 4 8 16 32 --batch 1 64
   python benchmarks/step_counts.py --system emdm --steps 1 5 10 20 50 --batch 1 32
   python benchmarks/step_counts.py --system smgdiff --guided
-  python benchmarks/step_counts.py --system camdm --quality runs/sweep_camdm/table.json
+  python benchmarks/step_counts.py --quality runs/sweep_camdm
   python benchmarks/step_counts.py --precision float32 tf32 bfloat16 --batch 1 64
 """
 
 import contextlib
 import dataclasses
 import itertools
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -67,9 +67,11 @@ class Config(suite.Settings):
     of its own, compiled on purpose.
 
     Attributes:
-      system: What to measure: camdm, aamdm, emdm, smgdiff.
+      system: What to measure: camdm, aamdm, emdm, smgdiff; none: all, or those of
+        --quality.
       sampler: own (ancestral, or ddgan), ddim, or dpm_solver (not aamdm, emdm).
-      steps: Diffusion steps; aamdm drafts all but two, and polishes two.
+      steps: Diffusion steps; aamdm drafts all but two, and polishes two. None: 2 4 8
+        16, or those of --quality.
       batch: Characters that are sampled together.
       precision: What matrix products multiply. "difference" is the largest one of a
         sample to float32's, in deviations of that sample. A CPU refuses tf32, and
@@ -87,15 +89,16 @@ class Config(suite.Settings):
       guided: Measure SMGDiff's plans with contact guidance in the last two steps as
         well.
       paper: Measure EMDM's network of 12 layers and 1024 channels, one frame a token.
-      quality: Tables (table.json) of experiments/step_sweep.py, one a system: adds the
-        quality of its trained models to the rows of their steps and own sampler.
+      quality: Folders of experiments/step_sweep.py (or their table.json), one a system:
+        networks are of the size of its models, whose quality is added to the rows of
+        their steps and own sampler.
       runs: Timed calls of each program.
       limit: Seconds of timed calls of each program, at most.
     """
 
-    system: tuple[str, ...] = tuple(registry.SYSTEMS)
+    system: tuple[str, ...] = ()
     sampler: tuple[str, ...] = ("own",)
-    steps: tuple[int, ...] = (2, 4, 8, 16)
+    steps: tuple[int, ...] = ()
     batch: tuple[int, ...] = (1,)
     precision: tuple[Precision, ...] = ("float32",)
     devices: int = 1
@@ -127,6 +130,47 @@ class Line:
         return f"{self.system} {self.sampler}{guided}{name} batch={self.batch}"
 
 
+# Options that do not change every system.
+ONLY = {
+    "guided": ("smgdiff",),
+    "paper": ("emdm",),
+    "frames_per_token": ("camdm", "smgdiff"),
+    "attention": ("camdm", "smgdiff"),
+}
+# What a trained model's configuration says.
+SIZES = ("width", "paper", "frames_per_token", "attention")
+
+
+def without_effect(args: Config, sized: Collection[str]) -> list[str]:
+    """Lines about options that change only some of the systems to measure.
+
+    Args:
+      args: The settings, systems filled in.
+      sized: Systems whose sizes are those of trained models.
+
+    Raises:
+      ValueError: if an option changes none of them.
+    """
+    lines, paper = [], {"emdm"} if args.paper else set()
+    for field in dataclasses.fields(args):
+        name = field.name
+        if name not in {*ONLY, *SIZES} or getattr(args, name) == field.default:
+            continue
+        changed = set(ONLY.get(name, args.system)) & set(args.system)
+        if name in SIZES:
+            changed -= set(sized)
+        if name == "width":
+            changed -= paper  # the published network has its own
+        rest = [system for system in args.system if system not in changed]
+        option = f"--{name.replace('_', '-')}"
+        why = " (sizes are those of the models of --quality)" if sized else ""
+        if not changed:
+            raise ValueError(f"{option} changes nothing of {', '.join(rest)}{why}")
+        if rest:
+            lines.append(f"{option} changes nothing of {', '.join(rest)}{why}")
+    return lines
+
+
 def make_lines(args: Config) -> list[Line]:
     """What to measure, a number of steps each.
 
@@ -141,13 +185,6 @@ def make_lines(args: Config) -> list[Line]:
             raise ValueError(
                 f"--batch {batch}: expected a multiple of --devices {args.devices}"
             )
-    if args.guided and "smgdiff" not in args.system:
-        raise ValueError(f"--guided is of smgdiff, not of {', '.join(args.system)}")
-    others = set(args.system) - {"camdm", "smgdiff"}
-    if args.attention == "prefix" and others:
-        raise ValueError(
-            f"--attention prefix is of camdm and smgdiff, not of {', '.join(others)}"
-        )
     if args.guided and min(args.steps) < 2:
         raise ValueError("--steps 1: expected 2 or more, --guided guides the last two")
 
@@ -171,7 +208,9 @@ def matmul_of(precision: Precision) -> contextlib.AbstractContextManager:
     return jax.default_matmul_precision(ALGORITHMS[precision])
 
 
-def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
+def case(
+    args: Config, line: Line, steps: int, rate: float, *, config: Any = None
+) -> dict[str, Any]:
     """Measures one number of steps: a row of the report.
 
     Args:
@@ -179,6 +218,7 @@ def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
       line: What to measure.
       steps: Diffusion steps.
       rate: FLOP per second of this machine's matmul.
+      config: Configuration of a trained model, whose sizes the network has.
     """
     sizes = workload.Sizes(
         steps=steps,
@@ -188,6 +228,7 @@ def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
         attention=args.attention,
         guided=line.guided,
         step=workload.STEPS[line.sampler],
+        config=config,
     )
     samples = workload.of(line.system, "samples")(sizes)
 
@@ -232,49 +273,106 @@ def case(args: Config, line: Line, steps: int, rate: float) -> dict[str, Any]:
 Quality = dict[tuple[str, int], dict[str, Any]]
 
 
-def read_quality(args: Config) -> Quality:
-    """Quality of trained models, by system and number of steps.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """A sweep's models: their sizes, and their quality by number of steps.
 
-    Returns:
-      Entries of rows: "quality", its ends, and "quality_column".
+    Attributes:
+      path: The table.
+      system: Whose models they are.
+      config: Configuration of one of them; they differ in steps alone.
+      cells: Entries of rows: "quality", its ends, and "quality_column".
+      left_out: Rows that have no time here: of students, or without a number.
+    """
+
+    path: Path
+    system: str
+    config: Any
+    cells: dict[int, dict[str, Any]]
+    left_out: list[str]
+
+
+def read_sweep(path: Path) -> Sweep:
+    """A sweep from its folder or its table.json.
 
     Raises:
-      OSError: if a file cannot be read.
-      ValueError: if one is no table, or has nothing that is measured; names it.
+      OSError: if it cannot be read.
+      ValueError: if it is no sweep of this version; names the file.
     """
-    found: Quality = {}
-    what = "expected table.json of experiments/step_sweep.py"
-    for path in args.quality:
-        table = files.read_object(path, what=what)
-        system, rows = table.get("system"), table.get("rows")
-        if system not in args.system or not isinstance(rows, dict):
-            raise ValueError(
-                f"--quality {path}: a table of system {system!r}: {what} of --system "
-                f"{', '.join(args.system)}"
-            )
+    what = "expected the folder of a sweep of experiments/step_sweep.py"
+    path = path / "table.json" if path.is_dir() else path
+    table = files.read_object(path, what=what)
+    missing = {"system", "rows", "arguments", "config"} - set(table)
+    if missing:
+        raise ValueError(
+            f"--quality {path}: has no {', '.join(sorted(missing))}, {what}; one of an "
+            "older version is made anew from its models by the same command"
+        )
+    try:
+        system, rows, told = table["system"], table["rows"], table["arguments"]["steps"]
         bench = registry.get(system).bench
-        known = len(found)
-        for steps in args.steps:
-            (point,) = bench.points((workload.point_of(system, steps),))
-            cell = rows.get(point.row, {}).get(bench.quality)
-            if cell is None or cell.get("value") is None:
-                continue
-            if (system, steps) in found:
-                raise ValueError(f"--quality {path}: a second table of {system}")
-            ends = (cell.get(key) for key in ("low", "high"))
-            low, high = (cell["value"] if end is None else end for end in ends)
-            found[system, steps] = {
-                "quality": cell["value"],
-                "quality_low": low,
-                "quality_high": high,
-                "quality_column": columns.header(bench.quality),
-            }
-        if len(found) == known:
+        points = bench.points(tuple(told))
+        found = [rows[point.row].get(bench.quality) or {} for point in points]
+        config = workload.config_of(system, table["config"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"--quality {path}: {error}: {what}") from error
+    cells: dict[int, dict[str, Any]] = {}
+    for point, cell in zip(points, found, strict=True):
+        named = workload.point_of(system, point.steps)
+        timed = point.teacher is None and bench.points((named,))[0].row == point.row
+        if not timed or cell.get("value") is None:
+            continue
+        ends = (cell.get(key) for key in ("low", "high"))
+        low, high = (cell["value"] if end is None else end for end in ends)
+        cells[point.steps] = {
+            "quality": cell["value"],
+            "quality_low": low,
+            "quality_high": high,
+            "quality_column": columns.header(bench.quality),
+        }
+    known = {bench.points((workload.point_of(system, x),))[0].row for x in cells}
+    return Sweep(
+        path=path,
+        system=system,
+        config=config,
+        cells=cells,
+        left_out=[point.row for point in points if point.row not in known],
+    )
+
+
+def fill(args: Config, sweeps: list[Sweep]) -> Config:
+    """The settings with the systems and steps that were left to the sweeps.
+
+    Raises:
+      ValueError: if sweeps are of one system or of others than asked for, or have
+        nothing of the steps.
+    """
+    names = [sweep.system for sweep in sweeps]
+    system = args.system or tuple(names) or tuple(registry.SYSTEMS)
+    every = sorted({steps for sweep in sweeps for steps in sweep.cells})
+    steps = args.steps or tuple(every) or (2, 4, 8, 16)
+    for sweep in sweeps:
+        if names.count(sweep.system) > 1:
             raise ValueError(
-                f"--quality {path}: no {bench.quality} of --steps "
-                f"{', '.join(map(str, args.steps))}, rows are {', '.join(rows)}"
+                f"--quality {sweep.path}: a second table of {sweep.system}"
             )
-    return found
+        if sweep.system not in system:
+            raise ValueError(
+                f"--quality {sweep.path}: a table of system {sweep.system!r}, expected "
+                f"one of --system {', '.join(system)}"
+            )
+        if not set(steps) & set(sweep.cells):
+            raise ValueError(
+                f"--quality {sweep.path}: nothing of --steps "
+                f"{', '.join(map(str, steps))}, expected some of "
+                f"{', '.join(map(str, sweep.cells)) or 'a sweep that has any'}"
+            )
+    if args.guided and "smgdiff" in names:
+        raise ValueError(
+            "--guided: a sweep has no skeleton of its models: measure guided plans "
+            "without --quality"
+        )
+    return dataclasses.replace(args, system=system, steps=steps)
 
 
 def join(row: dict[str, Any], quality: Quality) -> dict[str, Any]:
@@ -318,14 +416,24 @@ def metrics_of(name: str, row: dict[str, Any]) -> list[suite.Metric]:
 def main() -> None:
     """Measures, writes the report, the table and the plot."""
     args = suite.parse(Config, __doc__)
-    lines, quality = make_lines(args), read_quality(args)
+    sweeps = [read_sweep(path) for path in args.quality]
+    args = fill(args, sweeps)
+    configs = {sweep.system: sweep.config for sweep in sweeps}
+    quality = {(x.system, n): cell for x in sweeps for n, cell in x.cells.items()}
+    lines = make_lines(args)
+    for said in without_effect(args, configs):
+        print(said, flush=True)
+    for sweep in sweeps:
+        if sweep.left_out:
+            print(f"{sweep.path}: not timed here: {', '.join(sweep.left_out)}")
     rate = timing.matmul_rate()
     print(f"matmul, float32: {rate / 1e9:.4g} GFLOP/s", flush=True)
     rows, metrics, drawn = [], [], {}
     for line in lines:
         own = []
         for steps in args.steps:
-            own.append(join(case(args, line, steps, rate), quality))
+            row = case(args, line, steps, rate, config=configs.get(line.system))
+            own.append(join(row, quality))
             about = f"{line} steps={steps}"
             print(f"{about}: {own[-1]['p50_ms']:.4g} ms", flush=True)
             metrics += metrics_of(about, own[-1])

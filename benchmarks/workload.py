@@ -23,7 +23,7 @@ from jaxmotion.data import procedural, windows
 from jaxmotion.data.builders import smpl
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, schedule
-from jaxmotion.learning import training
+from jaxmotion.learning import model_json, training
 from jaxmotion.motion import pose, trajectory
 from jaxmotion.motion.features import Normalizer, unpack
 from jaxmotion.motion.skeleton import Skeleton
@@ -59,6 +59,7 @@ class Sizes:
         step is computed once a plan.
       guided: Plans with contact guidance.
       step: Makes the chain's steps: a value of `STEPS`.
+      config: Configuration of a trained model, in place of all sizes but the steps.
     """
 
     steps: int | None = None
@@ -68,6 +69,7 @@ class Sizes:
     attention: Literal["full", "prefix"] = "full"
     guided: bool = False
     step: chain.StepFactory = chain.ancestral_step
+    config: Any = None
 
 
 # A denoising-diffusion GAN is sampled by ancestral steps whose denoiser is stochastic.
@@ -240,6 +242,21 @@ def point_of(system: str, steps: int) -> str:
     return f"{config.polishes}+{config.drafts}"
 
 
+def config_of(system: str, value: Any) -> Any:
+    """A system's configuration, from the JSON of a sweep.
+
+    Raises:
+      ValueError: names the field that is wrong.
+    """
+    kinds = {
+        "camdm": camdm_model.Config,
+        "aamdm": aamdm_model.Config,
+        "emdm": emdm_model.Config,
+        "smgdiff": smgdiff_model.Config,
+    }
+    return model_json.config_from_json(kinds[system], value)
+
+
 @functools.cache
 def make_clips() -> Clips:
     """Two minutes of the procedural walker, with labels "style"."""
@@ -263,6 +280,8 @@ def camdm() -> Workload:
 
 def camdm_config(sizes: Sizes, **more: Any) -> camdm_model.Config:
     """The paper's network: 25 joints and 100 styles, 3.44 million parameters."""
+    if sizes.config is not None:
+        return dataclasses.replace(sizes.config, num_steps=sizes.steps)
     width = sizes.width or 256
     return camdm_model.Config(
         **({"num_joints": 25, "num_labels": 100} | more),
@@ -407,6 +426,10 @@ def aamdm() -> Workload:
 def _aamdm_config(sizes: Sizes, features: int = 64) -> aamdm_model.Config:
     steps = sizes.steps or 5
     polishes = min(2, steps - 1)
+    if sizes.config is not None:
+        return dataclasses.replace(
+            sizes.config, drafts=steps - polishes, polishes=polishes
+        )
     return aamdm_model.Config(
         features=features,
         width=sizes.width or 256,
@@ -620,9 +643,12 @@ def _emdm_samples(sizes: Sizes) -> Samples:
         num_steps=sizes.steps or 10,
         **({} if sizes.paper else own),
     )
+    if sizes.config is not None:
+        config = dataclasses.replace(sizes.config, num_steps=sizes.steps)
 
     def conditions(batch: int) -> emdm_model.Condition:
-        vectors = emdm_model.action_vectors(jnp.arange(batch) % 12, 12)
+        actions = config.condition_size
+        vectors = emdm_model.action_vectors(jnp.arange(batch) % actions, actions)
         return emdm_model.make_condition(vectors, config=config)
 
     return Samples(
@@ -671,6 +697,8 @@ def _smgdiff_samples(sizes: Sizes) -> Samples:
         frames_per_token=sizes.frames_per_token,
         attention=sizes.attention,
     )
+    if sizes.config is not None:
+        config = dataclasses.replace(sizes.config, num_steps=sizes.steps)
     guided = (
         smgdiff_guidance.Guidance(min_acceleration=0.0)
         if sizes.guided
@@ -680,7 +708,7 @@ def _smgdiff_samples(sizes: Sizes) -> Samples:
     def conditions(batch: int) -> smgdiff_model.Condition:
         rng = np.random.default_rng(0)
         return smgdiff_model.Condition(
-            past=0.3 * _normal(rng, batch, config.past, size),
+            past=0.3 * _normal(rng, batch, config.past, config.num_features),
             trajectory=trajectory.Trajectory(
                 position=_normal(rng, batch, config.future, 2),
                 facing=_forward(batch, config.future),

@@ -118,22 +118,20 @@ def test_step_counts_refuses_before_the_work(load):
     module = load("step_counts")
     refused = {
         "--sampler dpm_solver: not for aamdm": dict(sampler=("ddim", "dpm_solver")),
-        "--guided is of smgdiff": dict(system=("camdm",), guided=True),
-        "--attention prefix is of camdm and smgdiff, not of aamdm": dict(
-            system=("camdm", "aamdm"), attention="prefix"
-        ),
-        "--steps 1: expected 2": dict(guided=True, steps=(1, 2)),
+        "--steps 1: expected 2": dict(system=("smgdiff",), guided=True, steps=(1, 2)),
         "--batch 0": dict(batch=(0,)),
         "--devices 9: . are there": dict(devices=9),
         "unknown system 'nn'": dict(system=("nn",)),
     }
     for message, options in refused.items():
         with pytest.raises(ValueError, match=message):
-            module.make_lines(module.Config(**options))
+            module.make_lines(module.fill(module.Config(**options), []))
     options = dict(system=("smgdiff", "emdm"), sampler=("own", "ddim", "ancestral"))
     with pytest.raises(ValueError, match="ancestral: not for emdm"):
-        module.make_lines(module.Config(**options))
-    args = module.Config(system=("smgdiff",), guided=True, sampler=options["sampler"])
+        module.make_lines(module.fill(module.Config(**options), []))
+    args = module.Config(
+        system=("smgdiff",), guided=True, sampler=options["sampler"], steps=(8,)
+    )
     assert [str(line) for line in module.make_lines(args)] == [
         "smgdiff ancestral batch=1",
         "smgdiff ancestral guided batch=1",
@@ -155,7 +153,7 @@ def row_of(line, steps, **more):
 def run_step_counts(load, monkeypatch, out, *options, **more):
     """Runs step_counts.py with `row_of` for what would be measured."""
     module = load("step_counts")
-    case = lambda args, line, steps, rate: row_of(line, steps, **more)  # noqa: E731
+    case = lambda args, line, steps, rate, config: row_of(line, steps, **more)  # noqa: E731
     monkeypatch.setattr(module, "case", case)
     monkeypatch.setattr(timing, "matmul_rate", lambda: 1e11)
     arguments = [*map(str, options), "--out", str(out)]
@@ -185,41 +183,155 @@ def test_step_counts_writes_its_tables(load, monkeypatch, tmp_path):
     assert metrics["emdm ddim batch=1 steps=4 p50"] == 4
 
 
-def write_sweep(path, system, column, rows):
+def write_sweep(folder, system, steps, config):
+    """A sweep's folder, with the same number in each row."""
+    own = registry.get(system).bench
     cells = {"value": 0.5, "low": 0.4, "high": None, "samples": 20}
-    table = {"system": system, "rows": {row: {column: cells} for row in rows}}
-    path.write_text(json.dumps(table))
-    return path
+    names = [point.row for point in own.points(steps)]
+    table = {
+        "system": system,
+        "arguments": {"steps": list(steps)},
+        "config": dataclasses.asdict(config),
+        "rows": {row: {own.quality: cells} for row in names},
+    }
+    folder.mkdir()
+    (folder / "table.json").write_text(json.dumps(table))
+    return folder
 
 
-def test_quality_joins_a_sweep(load, monkeypatch, tmp_path):
-    column = registry.get("aamdm").bench.quality
-    table = write_sweep(
-        tmp_path / "table.json", "aamdm", column, ["2 polish + 3 draft"]
+CAMDM = dict(num_joints=21, num_labels=7, width=32, heads=2, hidden=64, depth=2)
+
+
+def sizes(load, system):
+    """A configuration of each system that is not the benchmark's own."""
+    workload = load("workload")
+    return {
+        "camdm": workload.camdm_model.Config(**CAMDM),
+        "aamdm": workload.aamdm_model.Config(features=20, width=32),
+        "emdm": workload.emdm_model.Config(
+            features=30, frames=20, condition_size=5, width=32, heads=2
+        ),
+        "smgdiff": workload.smgdiff_model.Config(
+            num_features=60, num_labels=3, width=32, heads=2
+        ),
+    }[system]
+
+
+@pytest.mark.parametrize("as_file", [False, True])
+def test_quality_joins_a_sweep(load, monkeypatch, tmp_path, as_file, capsys):
+    sweep = write_sweep(
+        tmp_path / "a", "aamdm", ("2+3", "0+3", "2+6"), sizes(load, "aamdm")
     )
-    options = ["--system", "aamdm", "--steps", 5, 8, "--sampler", "own", "ddim"]
-    run_step_counts(load, monkeypatch, tmp_path, *options, "--quality", table)
+    options = ["--steps", 5, 6, "--sampler", "own", "ddim"]
+    path = sweep / "table.json" if as_file else sweep
+    run_step_counts(load, monkeypatch, tmp_path, *options, "--quality", path)
     value = json.loads((tmp_path / "step_counts.json").read_text())
+    assert {row["system"] for row in value["rows"]} == {"aamdm"}
     assert [row["quality"] for row in value["rows"]] == [0.5, None, None, None]
     assert value["rows"][0]["quality_high"] == 0.5
     assert (tmp_path / "step_counts_aamdm.png").read_bytes().startswith(b"\x89PNG")
     last = (tmp_path / "step_counts.md").read_text().splitlines()[-1]
     assert last.endswith("| – | – |")
+    assert "not timed here: 0 polish + 3 draft" in capsys.readouterr().out
 
 
-def test_quality_refuses_other_tables(load, tmp_path):
-    module = load("step_counts")
-    column = registry.get("camdm").bench.quality
-    table = write_sweep(tmp_path / "table.json", "camdm", column, ["T = 8"])
-    with pytest.raises(ValueError, match=r"table\.json: no .* of --steps 2, 4.*T = 8"):
-        module.read_quality(module.Config(steps=(2, 4), quality=(table,)))
+def test_a_sweep_says_what_to_measure(load, monkeypatch, tmp_path, capsys):
+    sweep = write_sweep(
+        tmp_path / "a", "camdm", ("8", "2", "1/8"), sizes(load, "camdm")
+    )
+    run_step_counts(load, monkeypatch, tmp_path, "--quality", sweep)
+    value = json.loads((tmp_path / "step_counts.json").read_text())
+    assert [row["steps"] for row in value["rows"]] == [2, 8]
+    assert [row["quality"] for row in value["rows"]] == [0.5, 0.5]
+    assert "not timed here: 1 of T = 8, distilled" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("system", ["camdm", "aamdm", "emdm", "smgdiff"])
+def test_networks_are_of_the_size_of_the_sweeps_models(load, tmp_path, system):
+    module, workload = load("step_counts"), load("workload")
+    own = sizes(load, system)
+    points = {"aamdm": ("2+3",)}.get(system, ("8",))
+    sweep = module.read_sweep(write_sweep(tmp_path / "a", system, points, own))
+    assert sweep.config == own
+    given = workload.Sizes(steps=3, config=sweep.config)
+    found = workload.of(system, "samples")(given)
+    for name in ("width", "features", "num_features", "num_labels", "frames", "depth"):
+        assert getattr(found.config, name, None) == getattr(own, name, None)
+    assert found.config.num_steps == 3
+    run, arguments = found.program(1)
+    assert jax.eval_shape(run, *arguments).shape[-1] in (20, 30, 60, 22 * 6)
+
+
+def test_quality_refuses_what_is_no_sweep_of_these(load, tmp_path):
+    module, config = load("step_counts"), sizes(load, "camdm")
+    folder = write_sweep(tmp_path / "a", "camdm", ("8",), config)
+    sweep = module.read_sweep(folder)
+
+    def fill(*sweeps, **options):
+        return module.fill(module.Config(**options), list(sweeps))
+
+    with pytest.raises(ValueError, match="nothing of --steps 2, 4, expected .* of 8"):
+        fill(sweep, steps=(2, 4))
     with pytest.raises(ValueError, match="second table of camdm"):
-        module.read_quality(module.Config(steps=(8,), quality=(table, table)))
-    with pytest.raises(ValueError, match="system 'camdm'.*--system emdm"):
-        module.read_quality(module.Config(system=("emdm",), quality=(table,)))
-    table.write_text("[]")
+        fill(sweep, sweep)
+    with pytest.raises(ValueError, match="system 'camdm', expected .*--system emdm"):
+        fill(sweep, system=("emdm",))
+    other = write_sweep(tmp_path / "b", "smgdiff", ("8",), sizes(load, "smgdiff"))
+    with pytest.raises(ValueError, match="--guided: a sweep has no skeleton"):
+        fill(module.read_sweep(other), guided=True)
+    with pytest.raises(FileNotFoundError, match="gone: no such file: .*step_sweep"):
+        module.read_sweep(tmp_path / "gone")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match="empty/table.json: .*step_sweep"):
+        module.read_sweep(tmp_path / "empty")
+    path = folder / "table.json"
+    whole = json.loads(path.read_text())
+    for field, value in (
+        ("config", {"width": 3}),
+        ("config", None),
+        ("system", "nn"),
+        ("rows", []),
+        ("rows", {"T = 8": []}),
+        ("arguments", {"steps": ["0"]}),
+        ("arguments", {}),
+    ):
+        path.write_text(json.dumps(whole | {field: value}))
+        with pytest.raises(ValueError, match=r"--quality .*table\.json: .*step_sweep"):
+            module.read_sweep(folder)
+    path.write_text(json.dumps({k: x for k, x in whole.items() if k != "config"}))
+    with pytest.raises(ValueError, match="has no config, .*made anew"):
+        module.read_sweep(folder)
+    path.write_text("[]")
     with pytest.raises(ValueError, match=r"table\.json.*step_sweep"):
-        module.read_quality(module.Config(quality=(table,)))
+        module.read_sweep(folder)
+
+
+def test_options_that_change_nothing_are_refused_or_named(load):
+    module = load("step_counts")
+
+    def lines(*sized, **options):
+        return module.without_effect(module.Config(**options), sized)
+
+    every = ("camdm", "aamdm", "emdm", "smgdiff")
+    assert lines(system=every) == []
+    assert lines(system=every, width=64) == []
+    for message, system, options in (
+        ("--paper changes nothing of camdm, aamdm$", ("camdm", "aamdm"), "paper"),
+        ("--guided changes nothing of camdm$", ("camdm",), "guided"),
+        ("--frames-per-token .* of emdm$", ("emdm",), "frames_per_token"),
+        ("--attention changes nothing of aamdm$", ("aamdm",), "attention"),
+    ):
+        value = {"frames_per_token": 5, "attention": "prefix"}.get(options, True)
+        with pytest.raises(ValueError, match=message):
+            lines(system=system, **{options: value})
+        (said,) = lines(system=every, **{options: value})
+        assert "changes nothing of" in said
+    with pytest.raises(ValueError, match="--width changes nothing of emdm$"):
+        lines(system=("emdm",), width=64, paper=True)
+    with pytest.raises(ValueError, match="--width .* of camdm .sizes are those of"):
+        lines("camdm", system=("camdm",), width=64)
+    (said,) = lines("camdm", system=("camdm", "emdm"), width=64)
+    assert said.startswith("--width changes nothing of camdm (sizes are")
 
 
 def test_history_has_a_line_per_metric_and_a_picture(load, monkeypatch, tmp_path):

@@ -41,7 +41,13 @@ from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm.controller import CharacterState, Stepper
 from jaxmotion.systems.aamdm.data import PoseData, starts
 from jaxmotion.systems.aamdm.space import Space
-from jaxmotion.systems.aamdm.training import Run, load_chain, load_run, load_space
+from jaxmotion.systems.aamdm.training import (
+    Run,
+    load_chain,
+    load_networks,
+    load_run,
+    load_space,
+)
 from jaxmotion.typing import Key
 
 
@@ -554,6 +560,8 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         )
 
     truth = real(run.held_out)
+    polishes, drafts = job.points[0].parts
+    _, config = load_networks(run, "embedded", space, drafts=drafts, polishes=polishes)
 
     def score(point: bench.Point) -> Row:
         row = score_stepper(
@@ -582,6 +590,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         score=score,
         sampler=sampler,
         describe={
+            "config": dataclasses.asdict(config),
             "source": run.source,
             "samples": f"{budget['characters']} rollouts of {budget['seconds']:g} s, "
             f"free and steered (course {COURSE!r}, {SPEED:g} m/s); Fréchet distances "

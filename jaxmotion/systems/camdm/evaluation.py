@@ -590,6 +590,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         score=score,
         sampler=sampler,
         describe={
+            "config": dataclasses.asdict(run.model.config),
             "source": run.model.source,
             "samples": f"one rollout of {job.budget['seconds']:g} s for each of "
             f"{len(run.model.labels)} styles, course {_COURSE!r}; Fréchet distances of "

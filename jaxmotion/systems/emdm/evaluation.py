@@ -3,6 +3,7 @@
 One evaluation, for the table of a run and for a sweep over numbers of steps.
 """
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -331,12 +332,13 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         sample = load(point)
         return jax.jit(lambda key: sample(key, scorer.one, scale=scorer.scale))
 
-    actions = len(run.actions)
+    actions, (_, config) = len(run.actions), emdm_training.load_row(run.record, _ROW)
     return bench.Evaluation(
         real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: floor},
         score=score,
         sampler=sampler,
         describe={
+            "config": dataclasses.asdict(config),
             "source": run.clips.source,
             "samples": f"{scorer.samples} motions, {scorer.samples // actions} of each "
             f"of {actions} actions; FID against as many real ones",

@@ -451,6 +451,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         return {column: found[column] for column in truth}
 
     windows = int(setting.known.label.shape[0])
+    model, _ = smgdiff_training.load_stage(run, _stage(job.points[0]))
     return bench.Evaluation(
         real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: floor},
         score=score,
@@ -458,6 +459,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
             _sampler(run, _stage(point), UNGUIDED)[1], setting
         ),
         describe={
+            "config": dataclasses.asdict(model.config),
             "source": run.model.source,
             "samples": f"plans for {windows // 2} of {windows} held-out windows along "
             f"the path that was walked; Fréchet distances to {2 * windows} training "
