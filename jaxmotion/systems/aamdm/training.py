@@ -307,7 +307,7 @@ def load_space(run: Run, name: SpaceName) -> Space:
     like = jax.eval_shape(leaves)
     stored = checkpoint.restore(run.record.checkpoints(name), like)
     return jax.tree.unflatten(
-        structure[0], [stored[str(i)] for i in range(len(stored))]
+        structure[0], [jnp.asarray(stored[str(i)]) for i in range(len(stored))]
     )
 
 
