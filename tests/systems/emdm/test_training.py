@@ -123,6 +123,7 @@ def test_rows_are_changes_of_the_base():
         "ddpm_1000": dict(num_steps=1000, **mdm),
         "ddim_10": dict(num_steps=1000, **mdm),
         "no_r1": dict(weight_r1=0.0),
+        "no_gan": dict(weight_adversarial=0.0),
     }
     for weight in (0, 1, 10, 100):
         expected[f"recon_{weight}"] = dict(weight_recon=float(weight), **flat)
