@@ -540,10 +540,8 @@ def main() -> None:
         seed=args.seed,
     )
     load = make_load(args.run or WALKER, **options)
-    if args.visit:
-        steps = camdm_model.check_steps(args.visit, config=load.model.config)
-        model = dataclasses.replace(load.model, steps=steps)
-        load = dataclasses.replace(load, model=model)
+    model = camdm_model.with_steps(load.model, args.visit)
+    load = dataclasses.replace(load, model=model)
     if args.stream is not None:
         found = stream(args, load)
         if jax.process_index() == 0:

@@ -338,7 +338,8 @@ def evaluate(args: Evaluate) -> None:
     """Writes the table."""
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = camdm_training.load_run(args.run, args.data, args.contents)
-    run = camdm_training.with_steps(run, args.visit)
+    model = camdm_model.with_steps(run.model, args.visit)
+    run = dataclasses.replace(run, model=model)
     out = cli.out_folder(args, "evaluation")
     cli.announce("compiling the rollouts", 40)
     rows, report = camdm_evaluation.evaluate_run(
@@ -364,8 +365,8 @@ def steering(args: Steering) -> None:
         run = camdm_training.load_run(args.run, args.data)
     else:
         run = camdm_training.exported_run(args.run, args.data, args.held_out_clips)
-    run = camdm_training.with_steps(run, args.visit)
-    model, control = run.model, None
+    model = camdm_model.with_steps(run.model, args.visit)
+    run, control = dataclasses.replace(run, model=model), None
     out = cli.out_folder(args, "steering")
     if args.follow is not None:
         control = camdm_controller.Control(follow=args.follow)

@@ -362,6 +362,17 @@ class Model:
     steps: tuple[int, ...] | None = None
 
 
+def with_steps(model: Model, steps: tuple[int, ...]) -> Model:
+    """The model whose plans visit these steps; none: its own.
+
+    Raises:
+      ValueError: if they are not steps of its schedule.
+    """
+    if not steps:
+        return model
+    return dataclasses.replace(model, steps=check_steps(steps, config=model.config))
+
+
 def to_json(model: Model) -> dict[str, Any]:
     """JSON of a model.
 

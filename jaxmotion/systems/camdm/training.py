@@ -470,15 +470,3 @@ def exported_run(
     clips, field = camdm_model.fitting_clips(model, clips_io.load_clips(data))
     train, held_out = selection.split_by_name(clips, held_out_clips)
     return Run(model=model, params=params, train=train, held_out=held_out, field=field)
-
-
-def with_steps(run: Run, steps: tuple[int, ...]) -> Run:
-    """The run of a model whose plans visit these steps; none: the model's own.
-
-    Raises:
-      ValueError: if they are not steps of its schedule.
-    """
-    if not steps:
-        return run
-    steps = camdm_model.check_steps(steps, config=run.model.config)
-    return dataclasses.replace(run, model=dataclasses.replace(run.model, steps=steps))
