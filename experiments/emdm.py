@@ -53,7 +53,7 @@ class Train:
       held_out: Part of the clips kept for evaluation.
       mirror: Add a mirrored copy of each training clip (actions).
       steps: Updates of each GAN.
-      ddpm_steps: Updates of each diffusion model.
+      ddpm_steps: Updates of each row without a discriminator.
       batch: Motions an update.
       width: Channels of a token.
       hidden: Channels of the feed-forward layers.
@@ -65,11 +65,12 @@ class Train:
       diffusion_steps: Steps T of the row "emdm".
       recon: Weight R of the features' error; else 1, or 100.
       geometry: Of the losses (released: root).
+      fade_geometry: Losses of joints count less at noisy steps (ours).
       weight_position: Of joint positions; with actions.
       weight_velocity: Of frame differences; with actions.
       weight_foot: Of standing feet that slide; with actions.
       learning_rate: Of generators (Muon).
-      ddpm_rate: Of diffusion models (Muon).
+      ddpm_rate: Of rows without a discriminator (Muon).
       discriminator_rate: Of the discriminator (Adam).
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with other settings than before.
@@ -108,6 +109,7 @@ class Train:
     diffusion_steps: int = 10
     recon: cli.Optional[float] = None
     geometry: Literal["root", "world"] = "world"
+    fade_geometry: bool = False
     weight_position: float = 1.0
     weight_velocity: float = 1.0
     weight_foot: float = 1.0
@@ -256,9 +258,9 @@ def train(args: Train) -> None:
     task = prepare(args)
     for row in rows:
         begun = time.perf_counter()
-        latent = emdm_training.row_config(task.base, row).latent
+        config = emdm_training.row_config(task.base, row)
         budget = runs.Budget(**cli.given(runs.Budget, args))
-        if not latent:
+        if not config.adversarial:
             budget = dataclasses.replace(
                 budget, steps=args.ddpm_steps, learning_rate=args.ddpm_rate
             )

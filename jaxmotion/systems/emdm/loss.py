@@ -18,7 +18,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.diffusion import gan, schedule
 from jaxmotion.learning import losses
@@ -70,6 +70,7 @@ class Geometry:
 def geometric_loss(
     prediction: Float[Array, "batch frames features"],
     batch: Batch,
+    t: Int[Array, " batch"],
     *,
     config: Config,
     geometry: Geometry | None,
@@ -79,11 +80,12 @@ def geometric_loss(
     Args:
       prediction: Predicted x_0.
       batch: The motions.
+      t: Steps of the noise that it is predicted from.
       config: The weights.
       geometry: None if the three last weights are 0.
 
     Returns:
-      The loss, and its terms, unweighted.
+      The loss, and its terms, unweighted but for `config.fade_geometry`.
 
     Source: EMDM, eq. 11-12; MDM, eq. 3-5.
     """
@@ -96,20 +98,25 @@ def geometric_loss(
         weights["position"] = config.weight_position
         weights["velocity"] = config.weight_velocity
         weights["foot"] = config.weight_foot
-        found, truth = geometry.positions(prediction), geometry.positions(batch.x_0)
+        features = batch.x_0
+        found, truth = geometry.positions(prediction), geometry.positions(features)
+        feet = jnp.asarray(geometry.feet)
+        stands = contact.foot_contacts(
+            truth[..., feet, :], geometry.fps, max_speed=geometry.contact_speed
+        )
+        if config.fade_geometry:  # errors are squared
+            fade = jnp.sqrt(config.table().alpha_bar[t])[:, None, None]
+            prediction, features = fade * prediction, fade * features
+            found, truth = fade[..., None] * found, fade[..., None] * truth
         flat = lambda p: p.reshape(*p.shape[:-2], -1)  # noqa: E731
         terms["position"] = losses.masked_mse(
             flat(found), flat(truth), mask, average=average
         )
         terms["velocity"] = losses.velocity_loss(
             prediction[..., geometry.channels],
-            batch.x_0[..., geometry.channels],
+            features[..., geometry.channels],
             mask,
             average=average,
-        )
-        feet = jnp.asarray(geometry.feet)
-        stands = contact.foot_contacts(
-            truth[..., feet, :], geometry.fps, max_speed=geometry.contact_speed
         )
         terms["foot"] = losses.foot_slide_loss(
             found[..., feet, :], stands, mask, average=average
@@ -218,7 +225,7 @@ def generator_loss(
         {"params": discriminator}, fake, x_t, t, seen
     )
     geometric, terms = geometric_loss(
-        prediction, batch, config=config, geometry=geometry
+        prediction, batch, t, config=config, geometry=geometry
     )
     adversarial = config.weight_adversarial * gan.generator_loss(logits)
     return adversarial + geometric, {"adversarial": adversarial, **terms}
@@ -232,13 +239,13 @@ def diffusion_loss(
     config: Config,
     geometry: Geometry | None,
 ) -> tuple[Float[Array, ""], Info]:
-    """MDM's loss: the geometric one of a deterministic denoiser.
+    """MDM's loss: the geometric one alone, of a denoiser with or without latent.
 
     Args:
-      params: The generator's, without latent.
+      params: The generator's.
       key: Consumed.
       batch: The motions.
-      config: The method, with `latent` 0.
+      config: The method.
       geometry: None if the weights of positions, velocities and feet are 0.
 
     Returns:
@@ -246,8 +253,11 @@ def diffusion_loss(
 
     Source: Tevet et al. 2023 (MDM), eq. 2-6.
     """
-    key_t, key_noise, key_keep, key_dropout = jax.random.split(key, 4)
+    key_t, key_noise, key_keep, key_dropout, key_latent = jax.random.split(key, 5)
     size = batch.x_0.shape[0]
+    latent = None
+    if config.latent:
+        latent = jax.random.normal(key_latent, (size, config.latent))
     t = jax.random.randint(key_t, (size,), 1, config.num_steps + 1)
     noise = jax.random.normal(key_noise, batch.x_0.shape)
     x_t = schedule.q_sample(config.table(), batch.x_0, t, noise)
@@ -259,8 +269,8 @@ def diffusion_loss(
         batch.vector,
         keep,
         batch.mask | (not config.mask_frames),
-        None,
+        latent,
         train=True,
         rngs={"dropout": key_dropout},
     )
-    return geometric_loss(prediction, batch, config=config, geometry=geometry)
+    return geometric_loss(prediction, batch, t, config=config, geometry=geometry)

@@ -63,8 +63,8 @@ class Config:
       discriminator_width: Channels of the discriminator's first layers.
       discriminator_condition: Whether the discriminator sees the condition.
       drop_condition: Probability that the condition is dropped in training.
-      weight_adversarial: Weight of the discriminator's verdict; 0 (ours) to see what
-        the geometric losses do alone.
+      weight_adversarial: Weight of the discriminator's verdict; 0 (ours): none is
+        trained, to see what the geometric losses do alone.
       weight_recon: R, of the mean squared error of features (100 for texts).
       weight_position: Weight of joint positions (0 for texts).
       weight_velocity: Weight of frame differences of features (0 for texts).
@@ -72,6 +72,9 @@ class Config:
       geometry: Joint positions of those losses relative to the "root" (released code)
         or in the "world" (ours: else a standing foot seems to slide under a moving
         root).
+      fade_geometry: Whether those losses count alpha_bar_t times as much at step t
+        (ours): at noisy steps, where x_0 can only be guessed, they outweigh the
+        features' error and bend its mean.
       weight_r1: gamma of the gradient penalty gamma / 2 |grad D|^2.
       r1_every: Updates from one penalty to the next; it is not scaled up by them.
     """
@@ -102,6 +105,7 @@ class Config:
     weight_velocity: float = 1.0
     weight_foot: float = 1.0
     geometry: Literal["root", "world"] = "root"
+    fade_geometry: bool = False
     weight_r1: float = 0.02
     r1_every: int = 15
 
@@ -122,6 +126,11 @@ class Config:
                 f"frames is {self.frames}, expected a multiple of frames_per_token "
                 f"({self.frames_per_token})"
             )
+
+    @property
+    def adversarial(self) -> bool:
+        """Whether it is trained with a discriminator."""
+        return bool(self.latent and self.weight_adversarial)
 
     def table(self) -> Schedule:
         """The schedule.

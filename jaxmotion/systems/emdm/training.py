@@ -207,7 +207,7 @@ def train_row(
     def sample(key: Key, data: Any) -> emdm_loss.Batch:
         return task.batch(key, data, generator.batch)
 
-    if not config.latent:
+    if not config.adversarial:
         loss = functools.partial(
             emdm_loss.diffusion_loss, config=config, geometry=geometry
         )
@@ -282,7 +282,7 @@ def load_row(run: runs.Run, row: str) -> tuple[Params, Config]:
         run,
         stage,
         lambda: emdm_model.init(jax.random.key(0), config)["generator"],
-        adversarial=bool(config.latent),
+        adversarial=config.adversarial,
     )
     return params, config
 

@@ -359,9 +359,9 @@ def guess(data, seed=1):
     return data.x_0 + float32(0.3 * noise)
 
 
-def terms_of(prediction, data, config=CONFIG):
+def terms_of(prediction, data, config=CONFIG, t=1):
     run = functools.partial(emdm_loss.geometric_loss, config=config, geometry=GEOMETRY)
-    return jax.jit(run)(prediction, data)
+    return jax.jit(run)(prediction, data, jnp.full(data.x_0.shape[0], t))
 
 
 def test_geometric_terms_are_the_formulas():
@@ -444,10 +444,26 @@ def test_without_a_geometry_only_features_count():
     data = batch(6, 6)
     prediction = guess(data)
     total, found = emdm_loss.geometric_loss(
-        prediction, data, config=CONFIG, geometry=None
+        prediction, data, jnp.ones(2, int), config=CONFIG, geometry=None
     )
     assert set(found) == {"recon"}
     np.testing.assert_allclose(total, 2.0 * found["recon"], rtol=1e-6)
+
+
+def test_losses_of_joints_fade_with_the_noise():
+    data = batch(6, 6)
+    prediction = guess(data)
+    _, plain = terms_of(prediction, data)
+    config = dataclasses.replace(CONFIG, fade_geometry=True)
+    for t in (1, 3):
+        total, found = terms_of(prediction, data, config, t)
+        part = float(config.table().alpha_bar[t])
+        np.testing.assert_allclose(found["recon"], plain["recon"], rtol=1e-6)
+        expected = 2.0 * plain["recon"]
+        for name, weight in (("position", 3.0), ("velocity", 5.0), ("foot", 7.0)):
+            np.testing.assert_allclose(found[name], part * plain[name], rtol=1e-4)
+            expected += weight * part * plain[name]
+        np.testing.assert_allclose(total, expected, rtol=1e-4)
 
 
 # --- MDM ---------------------------------------------------------------------------

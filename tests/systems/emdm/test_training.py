@@ -152,7 +152,7 @@ def test_unknown_rows_are_named_with_the_known_ones(tmp_path):
 def trained(tmp_path_factory):
     """A run folder with a row of each kind."""
     folder = tmp_path_factory.mktemp("run")
-    for row in ("emdm", "ddpm_1000"):
+    for row in ("emdm", "no_gan", "ddpm_1000"):
         fit(folder, row)
     return folder
 
@@ -167,7 +167,7 @@ def same(a, b):
     return all(np.array_equal(x, y) for x, y in pairs)
 
 
-@pytest.mark.parametrize("row", ["emdm", "ddpm_1000"])
+@pytest.mark.parametrize("row", ["emdm", "no_gan", "ddpm_1000"])
 def test_a_row_leaves_checkpoints_and_losses(trained, row):
     folder = trained / row
     assert checkpoint.latest_step(folder / "checkpoints") == 4
@@ -181,7 +181,7 @@ def test_a_row_leaves_checkpoints_and_losses(trained, row):
     runs.check_model(run_of(trained), row, config)
 
 
-@pytest.mark.parametrize("row", ["emdm", "ddpm_1000"])
+@pytest.mark.parametrize("row", ["emdm", "no_gan", "ddpm_1000"])
 def test_a_row_is_read_back(trained, row):
     params, config = load(trained, row)
     assert config == emdm_training.row_config(CONFIG, row)
