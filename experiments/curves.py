@@ -22,6 +22,7 @@ from reports import results
 from jaxmotion import cli, files
 from jaxmotion.evaluation import columns
 from jaxmotion.learning import loop
+from jaxmotion.systems.emdm.training import SAMPLERS
 from jaxmotion.viz import figure, plots
 
 # Values of losses.jsonl that are drawn, where a stage has them.
@@ -147,8 +148,9 @@ def metric_panels(
 ) -> list[plots.Curves]:
     """The metric of each row over the seconds of training of each run; or none.
 
-    Those of a row are of the stage that has its name, if one does, else of all stages
-    that are drawn. Recorded motion is a line across, of the last run.
+    Those of a row are of the stage that has its name (or that it samples, as ddim_10
+    does), if one does, else of all stages that are drawn. Recorded motion is a line
+    across, of the last run.
 
     Raises:
       OSError: if an evaluation cannot be read.
@@ -168,7 +170,8 @@ def metric_panels(
             if cell is None or cli.chosen_rows(args) and row not in args.rows:
                 continue
             stages = found[name]
-            own = [x for k, x in stages.items() if k.split("/")[-1] == row]
+            stage = SAMPLERS.get(row, (row,))[0]
+            own = [x for k, x in stages.items() if k.split("/")[-1] == stage]
             spent = sum(x.seconds[-1] for x in own or stages.values())
             ends = (math.nan if x is None else x for x in (cell.low, cell.high))
             points.setdefault(row, []).append((spent, cell.value, *ends))

@@ -160,7 +160,7 @@ def _sources(table: Table, found: Found, commands: Commands) -> list[str]:
         lacking = f" **Not run** in it: {', '.join(lacks)}." if lacks else ""
         paths = ", ".join(f"`{x.path}`" for x in filter(None, there.trainings))
         data = provenance(there, evaluated=False)["data"]
-        lines += [f"{names}: {paths}. Data: {data}.{lacking} To be made by", ""]
+        lines += [f"{names}: {paths}. Data: {data}.{lacking} With the defaults:", ""]
         lines += _block(commands[source])
     return lines
 

@@ -211,6 +211,14 @@ def _data(about: dict[str, Any], evaluator: Any) -> str:
     return "; ".join(filter(None, parts)) or NOT_RECORDED
 
 
+def _training(stages: Any) -> str:
+    if not isinstance(stages, dict):
+        return NOT_RECORDED
+    lengths = {k: x.get("steps") for k, x in stages.items() if isinstance(x, dict)}
+    parts = [f"{name} {steps} updates" for name, steps in lengths.items() if steps]
+    return ", ".join(parts) or NOT_RECORDED
+
+
 def _evaluator(evaluator: Any) -> str:
     if not isinstance(evaluator, dict) or "fingerprint" not in evaluator:
         return NOT_RECORDED
@@ -235,6 +243,7 @@ def provenance(measured: Measured, *, evaluated: bool) -> dict[str, str]:
     return {
         "data": _data(about, evaluator),
         "seed": NOT_RECORDED if seeds is None else str(seeds),
+        "training": _training(about.get("training")),
         "versions": _joined(about, ("python", "jax", "jaxlib", "flax", "numpy")),
         "hardware": _joined(about, ("cpu", "machine", "cores", "devices")),
         "git commit": str(about.get("git_commit") or NOT_RECORDED),

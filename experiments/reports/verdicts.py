@@ -100,7 +100,15 @@ def cell_of(table: Table, row: Row, column: Column, found: Found) -> Cell | None
 def over_trainings(
     table: Table, row: Row, column: Column, found: Found
 ) -> Spread | None:
-    """Values of a cell over trainings; None if there are fewer than two."""
+    """Values of a cell over trainings; None if there are fewer than two.
+
+    Nor for recorded motion, which is scored alike beside every training.
+    """
+    measured = found.get(table.source_of(row))
+    there = filter(None, measured.trainings if measured else ())
+    scored = [one.rows[row.here] for one in there if row.here in one.rows]
+    if scored and all(cells == scored[0] for cells in scored):
+        return None
     cells = cells_of(table, row, column, found)
     values = [cell.value for cell in cells if cell is not None]
     return statistics.spread(np.array(values)) if len(values) > 1 else None

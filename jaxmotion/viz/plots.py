@@ -25,6 +25,8 @@ _ACROSS = 3
 _WIDE_FROM = 5.0
 # Colors of lines, in turn.
 _CYCLE = (figure.LEFT, figure.RIGHT, figure.WALKED, "#8e5bb5", "#17a2a2", "#8c6d46")
+# Markers of dots, changed where colors begin again.
+_MARKERS = "osD^v"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -378,6 +380,7 @@ def _draw_curves(axes: Axes, curves: Curves, *, wide: bool) -> None:
     _draw_references(axes, curves.references)
     for i, (label, (x, y)) in enumerate(curves.lines.items()):
         color, value = _CYCLE[i % len(_CYCLE)], y[:, 0]
+        marker = _MARKERS[i // len(_CYCLE) % len(_MARKERS)]
         if curves.noisy:
             axes.plot(x, value, color=color, lw=0.6, alpha=0.35)
             value = smoothed(value)
@@ -386,8 +389,8 @@ def _draw_curves(axes: Axes, curves: Curves, *, wide: bool) -> None:
             bars = np.abs(y[:, 1:] - y[:, :1]).T
             bars = np.where(np.isfinite(bars), bars, 0.0)
             axes.errorbar(
-                x, value, yerr=bars, fmt="o-", markersize=4, capsize=3, color=color,
-                lw=1.2, label=label,
+                x, value, yerr=bars, fmt=f"{marker}-", markersize=4, capsize=3,
+                color=color, lw=1.2, label=label,
             )  # fmt: skip
         shown.append(value[np.isfinite(value)])
     if _is_wide(np.concatenate(shown)):

@@ -52,19 +52,21 @@ def test_seconds_add_up_without_the_compiling(load):
 def test_a_metric_stands_over_the_time_of_its_rows_stages(load, tmp_path):
     curves = load("curves")
     rows = {"real": 0.5, "gan": 4.0, "both": 3.0}
-    short = put(tmp_path / "a", ("gan", "ddpm"), rows)
+    short = put(tmp_path / "a", ("gan", "ddpm_1000"), rows | {"ddim_10": 6.0})
     long = put(
         tmp_path / "b", ("gan",), rows | dict(gan=2.0, both=1.0), rates=RATES * 2
     )
     args = curves.Config(run=(short, long))
     found = {x.name: curves.read_run(x, ()) for x in (short, long)}
-    assert list(found["a"]) == ["gan", "ddpm"]
+    assert list(found["a"]) == ["gan", "ddpm_1000"]
     (panel,) = curves.metric_panels(args, found, {short: "a", long: "b"})
     assert list(panel.references) == ["real"]
     # The second run goes on for 50 updates at 2 per second, and as the first.
     spent = 27.5 + 25 + 22.5
     np.testing.assert_allclose(panel.lines["gan"][0], [27.5, spent])
     np.testing.assert_allclose(panel.lines["gan"][1], [[4, 3, 5], [2, 1, 3]])
+    # A sampler needs the stage that it samples, and no other.
+    np.testing.assert_allclose(panel.lines["ddim_10"][0], [27.5])
     # No stage is named so: all of them.
     np.testing.assert_allclose(panel.lines["both"][0], [55.0, spent])
     args = curves.Config(run=(short, long), rows=("gan",))

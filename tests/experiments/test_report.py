@@ -333,6 +333,12 @@ def test_nearness_over_trainings_is_of_paired_distances(load, over):
     assert (ends.low > 0, made.verdict) == (True, "reproduced")
 
 
+def test_recorded_motion_has_no_interval_over_trainings(over):
+    assert over(dict(a=[2.0, 2.0, 2.0], b=[9.0, 10.0, 11.0]))[1] is None
+    made, mean = over(dict(a=[2.0, 2.0, 2.1], b=[9.0, 10.0, 11.0]))
+    assert (mean.count, made.verdict) == (3, "reproduced")
+
+
 def test_one_training_that_is_not_finite_decides_nothing(over):
     made, mean = over(dict(a=[1.0, 2.0, math.nan], b=[9.0, 10.0, 11.0]))
     assert made.verdict == "not decided" and math.isnan(mean.mean)
