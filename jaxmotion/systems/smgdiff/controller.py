@@ -45,7 +45,7 @@ from jaxmotion.diffusion import chain
 from jaxmotion.diffusion.schedule import spread_steps
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
 from jaxmotion.systems.smgdiff import model as smgdiff_model
@@ -58,6 +58,9 @@ from jaxmotion.systems.smgdiff.scene import Representation
 from jaxmotion.systems.smgdiff.trajectory import SamplePath, Wish
 from jaxmotion.typing import Key, Params
 
+# As near the ball's surface a joint may push the ball, meters: half a foot, and 2 cm.
+_TOUCH_MARGIN = 0.07
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Control:
@@ -68,7 +71,10 @@ class Control:
       reuse: K of HFTE, points reflected at a time.
       bias_position: Exponent of the blend of positions (CAMDM's).
       bias_facing: Exponent of the blend of facings (CAMDM's).
-      seam: Duration of the inertialized seam, seconds; 0 for none.
+      seam: Duration of the inertialized seam of the body, seconds; 0 for no seam, of
+        the ball either.
+      ball_seam: Duration of the ball's. A ball that is drawn to its new place within
+        the body's 0.2 s is pushed by nobody: 10 cm are 14 m/s^2.
     """
 
     apply: int = 15
@@ -76,6 +82,7 @@ class Control:
     bias_position: float = 0.7
     bias_facing: float = 2.2
     seam: float = 0.2
+    ball_seam: float = 0.5
 
 
 @jax.tree_util.register_dataclass
@@ -243,20 +250,40 @@ def replan(
     scene, _ = smgdiff_scene.to_scene(x, past.ball[-1], representation)
     chunk = smgdiff_scene.from_frame(scene, frame)
     if control.seam > 0:
-        chunk = _seam(state.past, chunk, duration=control.seam)
+        chunk = join(state.past, chunk, representation, control=control)
     return dataclasses.replace(state, plan=chunk, cursor=jnp.zeros_like(state.cursor))
 
 
-def _seam(past: Scene, chunk: Scene, *, duration: float) -> Scene:
-    """A chunk that starts where body and ball are displayed."""
+def join(
+    past: Scene, chunk: Scene, representation: Representation, *, control: Control
+) -> Scene:
+    """Step 1d: a chunk that starts where body and ball are displayed.
+
+    The ball keeps its velocity, too, unless a joint is near enough to push it.
+
+    Args:
+      past: Displayed frames, two at least.
+      chunk: The frames that follow.
+      representation: Says what may touch the ball, and its radius.
+      control: Durations of the seams.
+
+    Returns:
+      The chunk, its differences from what is displayed faded out.
+    """
     fps = chunk.motion.fps
     shown = jax.tree.map(lambda x: x[-2:], past.motion)
-    motion = inertia.inertialize(shown, chunk.motion, duration=duration)
-    # The ball's offset alone: its velocity jumps at touches, which is no error.
-    step = chunk.ball[1] - chunk.ball[0]
+    motion = inertia.inertialize(shown, chunk.motion, duration=control.seam)
+    step, moved = chunk.ball[1] - chunk.ball[0], past.ball[-1] - past.ball[-2]
     offset = past.ball[-1] - (chunk.ball[0] - step)
+    # Where a foot is at the ball, the ball's velocity may jump: a touch is no error.
+    first = jax.tree.map(lambda x: x[:2], motion)
+    feet = joint_positions(representation.skeleton, first)
+    feet = feet[:, jnp.array(representation.joints)]
+    away = jnp.linalg.norm(feet - past.ball[-1], axis=-1)
+    touched = jnp.min(away) < representation.radius + _TOUCH_MARGIN
+    drift = jnp.where(touched, 0.0, (moved - step) * fps)
     times = jnp.arange(1, chunk.ball.shape[0] + 1, dtype=offset.dtype) / fps
-    fade = inertia.decay(offset, jnp.zeros_like(offset), times, duration=duration)
+    fade = inertia.decay(offset, drift, times, duration=control.ball_seam)
     return dataclasses.replace(chunk, motion=motion, ball=chunk.ball + fade)
 
 

@@ -37,6 +37,9 @@ from jaxmotion.systems.smgdiff.training import Run
 from jaxmotion.systems.smgdiff.trajectory import SamplePath, Wish
 from jaxmotion.typing import Key
 
+# Moments of training clips among which similar inputs are looked for.
+_SIMILAR = 4000
+
 Play = Callable[[Key, EvalWindows], Scene]
 
 
@@ -176,44 +179,83 @@ def _diversity(scene: Scene, model: Model, repeats: int) -> Array:
     return jnp.mean(jax.vmap(diversity.intra_style_variance)(groups))
 
 
-def noise_share(
-    key: Key, generate: SamplePath, known: EvalWindows, model: Model, *, repeats: int
-) -> dict[str, Float[Array, ""]]:
-    """How much generated paths depend on their noise.
+def _nearest(own: Wish, seen: Wish, number: int, fps: float) -> tuple[Array, Array]:
+    """Inputs of the same skill that are most alike, and how far they are, m/s."""
+
+    def one(wish: Wish) -> tuple[Array, Array]:
+        moved = seen.past.position - wish.past.position
+        turned = seen.past.facing - wish.past.facing
+        seconds = moved.shape[-2] / fps
+        away = jnp.linalg.norm(seen.velocity - wish.velocity, axis=-1)
+        away += jnp.sqrt(jnp.mean(jnp.sum(moved**2, -1), -1)) / seconds
+        away += jnp.sqrt(jnp.mean(jnp.sum(turned**2, -1), -1))
+        away = jnp.where(seen.label == wish.label, away, jnp.inf)
+        found, chosen = jax.lax.top_k(-away, number)
+        return chosen, -found
+
+    return jax.lax.map(one, own, batch_size=16)
+
+
+def path_spread(
+    key: Key,
+    generate: SamplePath,
+    known: EvalWindows,
+    seen: EvalWindows,
+    model: Model,
+    *,
+    repeats: int,
+) -> dict[str, Float[Array, "..."]]:
+    """How much paths vary at a fixed input, beside how much people's do.
 
     Args:
       key: Consumed.
       generate: Paths.
-      known: Moments of recordings.
+      known: Moments of held-out recordings.
+      seen: Moments of recordings among which similar inputs are looked for.
       model: The model.
-      repeats: Paths of each wish.
+      repeats: Paths of each wish, and similar inputs of each.
 
     Returns:
-      Root mean square distance, half way, of a path from the mean of its wish ("noise
-      cm"), of the mean from what was recorded ("error cm"), and of the straight path
-      from it: with noise far below error, paths do not vary as people do.
+      By frame, root mean square distances in cm: of generated paths from the mean of
+      their wish ("generated"); of what people did after the most similar inputs of that
+      skill from its mean ("recorded"), the same once the generator's mean for each
+      input is taken off, so that inputs need not be alike ("recorded, own mean"); and
+      of the mean from what was recorded ("error") and of the straight path from it
+      ("straight"). "input": how far similar inputs are, m/s.
     """
-    wish = wishes(known, model)
-    number = known.label.shape[0]
+    wish, others = wishes(known, model), wishes(seen, model)
 
     @jax.jit
-    def run(key: Key) -> tuple[Array, Array, Array]:
-        keys = jax.random.split(key, (number, repeats))
-        draw = jax.vmap(jax.vmap(generate, (0, None)), (0, 0))
-        middle = model.config.future // 2
-        ends = draw(keys, wish).position[:, :, middle]
-        real = known.future.motion.root_position[:, middle, ::2]
-        line = wish.velocity * (middle + 1) / model.config.fps
-        mean = jnp.mean(ends, axis=1)
-        return ends - mean[:, None], mean - real, line - real
+    def run(key: Key) -> dict[str, Array]:
+        key_own, key_other = jax.random.split(key)
 
-    spread, error, plain = run(key)
-    rms = lambda x: 100 * jnp.sqrt(jnp.mean(jnp.sum(x**2, -1)))  # noqa: E731
-    return {
-        "noise cm": rms(spread),
-        "error cm": rms(error),
-        "straight error cm": rms(plain),
-    }
+        def draw(key: Key, wish: Wish) -> Array:
+            keys = jax.random.split(key, (wish.label.shape[0], repeats))
+            many = jax.vmap(jax.vmap(generate, (0, None)), (0, 0))
+            return many(keys, wish).position
+
+        rms = lambda x, axis: 100 * jnp.sqrt(jnp.mean(jnp.sum(x**2, -1), axis))  # noqa: E731
+        about = lambda x: x - jnp.mean(x, axis=1, keepdims=True)  # noqa: E731
+        paths, real = (draw(key_own, wish), known.future.motion.root_position[..., ::2])
+        mean, after = (
+            jnp.mean(paths, axis=1),
+            seen.future.motion.root_position[..., ::2],
+        )
+        rest = after - jnp.mean(draw(key_other, others), axis=1)
+        chosen, away = _nearest(wish, others, repeats, model.config.fps)
+        # Of few draws the deviation from their own mean is too small.
+        fair = jnp.sqrt(repeats / (repeats - 1))
+        times = jnp.arange(1, real.shape[1] + 1) / model.config.fps
+        return {
+            "generated": fair * rms(about(paths), (0, 1)),
+            "recorded": fair * rms(about(after[chosen]), (0, 1)),
+            "recorded, own mean": fair * rms(about(rest[chosen]), (0, 1)),
+            "error": rms(mean - real, 0),
+            "straight": rms(jnp.einsum("f,bc->bfc", times, wish.velocity) - real, 0),
+            "input": jnp.mean(away),
+        }
+
+    return run(key)
 
 
 def straight(model: Model) -> SamplePath:
@@ -263,15 +305,19 @@ def path_table(
       chunk: Players at a time.
 
     Returns:
-      The rows, and how much each generator's paths depend on their noise.
+      The rows, and how much each generator's paths vary (`path_spread`).
     """
     model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
     generators = _generators(run)
-    shares = {
+    seen = smgdiff_scoring.eval_windows(
+        run.train, model, number=_SIMILAR, seed=setting.seed + 6
+    )
+    key = jax.random.key(setting.seed)
+    spreads = {
         name: {
-            k: float(v)
-            for k, v in noise_share(
-                jax.random.key(setting.seed), generate, setting.known, model, repeats=8
+            part: np.round(np.asarray(value), 3).tolist()
+            for part, value in path_spread(
+                key, generate, setting.known, seen, model, repeats=8
             ).items()
         }
         for name, generate in generators.items()
@@ -297,7 +343,7 @@ def path_table(
             row = table.row(scores)
             rows[f"{name}, guidance {schedule}"] = row
             print(f"{name}, guidance {schedule}: done", flush=True)
-    return rows, {"noise of the paths": shares}
+    return rows, {"spread of the paths": spreads}
 
 
 # The direction of the command turns by so much, every so many seconds.

@@ -9,6 +9,7 @@ import pytest
 
 from jaxmotion.control import rollout
 from jaxmotion.diffusion import chain
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
@@ -117,7 +118,7 @@ def test_a_plan_begins_where_body_and_ball_are_displayed(parts):
     wanted = jax.tree.map(lambda x: x[0], commands(1))
 
     def plan(seam):
-        control = dataclasses.replace(CONTROL, seam=seam)
+        control = dataclasses.replace(CONTROL, seam=seam, ball_seam=seam)
         return jax.jit(
             lambda key: (
                 smgdiff_controller.replan(
@@ -144,6 +145,35 @@ def test_a_plan_begins_where_body_and_ball_are_displayed(parts):
         assert float(near) < 0.5 * float(off)
         # From 0.2 s on the plan is the network's.
         np.testing.assert_allclose(get(joined)[6:], get(bare)[6:], atol=1e-5)
+
+
+def accelerations(ball):
+    """Lengths, m/s^2."""
+    change = np.diff(np.asarray(ball, np.float64), n=2, axis=0)
+    return 30.0**2 * np.linalg.norm(change, axis=-1)
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_at_a_seam_only_a_foot_pushes_the_ball(parts, near):
+    """The next plan has the ball 15 cm aside, and 0.6 m/s slower."""
+    representation, _, _ = parts
+    still = jax.tree.map(lambda x: jnp.repeat(x[:1], 26, axis=0), past())
+    feet = representation.skeleton.feet
+    places = joint_positions(representation.skeleton, still.motion)[0, list(feet)]
+    begin = places[0] if near else jnp.array([0.0, 0.11, 5.0])
+    times = jnp.arange(-1.0, 25.0)[:, None] / 30.0
+    rolls = begin + times * jnp.array([0.0, 0.0, 1.2])
+    shown = dataclasses.replace(still, ball=rolls)
+    slower = begin + jnp.array([0.15, 0.0, 0.0]) + times * jnp.array([0.0, 0.0, 0.6])
+    chunk = dataclasses.replace(still, ball=slower)
+    cut = lambda scene, *at: jax.tree.map(lambda x: x[slice(*at)], scene)  # noqa: E731
+    joined = smgdiff_controller.join(
+        cut(shown, 2), cut(chunk, 2, None), representation, control=CONTROL
+    )
+    found = accelerations(jnp.concatenate([rolls[:2], joined.ball]))
+    assert (found.max() > 12.0) == near
+    # After half a second the plan's own.
+    np.testing.assert_allclose(joined.ball[15:], slower[17:], atol=1e-5)
 
 
 @pytest.mark.slow

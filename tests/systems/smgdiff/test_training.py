@@ -3,12 +3,14 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.learning import runs
 from jaxmotion.learning.checkpoint import CheckpointError, latest_step, load_config
+from jaxmotion.motion import trajectory
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
@@ -233,17 +235,33 @@ def test_players_are_scored_with_their_spread(trained, setting):
 
 
 def test_a_straight_path_owes_nothing_to_noise(run, setting):
-    share = smgdiff_players.noise_share(
+    model = run.model
+    found = smgdiff_players.path_spread(
         jax.random.key(0),
-        smgdiff_players.straight(run.model),
+        smgdiff_players.straight(model),
         setting.known,
-        run.model,
+        setting.known,
+        model,
         repeats=3,
     )
-    assert float(share["noise cm"]) == pytest.approx(0.0, abs=1e-4)
-    assert float(share["error cm"]) == pytest.approx(
-        float(share["straight error cm"]), rel=1e-4
+    np.testing.assert_allclose(found["generated"], 0.0, atol=1e-4)
+    np.testing.assert_allclose(found["error"], found["straight"], rtol=1e-3, atol=1e-3)
+    assert found["recorded"].shape == (model.config.future,)
+    assert float(found["recorded"][-1]) > 0.0
+
+
+def test_paths_of_noise_alone_vary_by_their_noise(run, setting):
+    model, shape = run.model, (run.model.config.future, 2)
+
+    def generate(key, wish):
+        place = 0.1 * jax.random.normal(key, shape)
+        return trajectory.Trajectory(position=place, facing=jnp.ones(shape))
+
+    found = smgdiff_players.path_spread(
+        jax.random.key(0), generate, setting.known, setting.known, model, repeats=8
     )
+    # 10 cm in each of two directions.
+    assert float(jnp.mean(found["generated"])) == pytest.approx(14.1, rel=0.05)
 
 
 def test_the_evaluator_sees_the_ball_no_farther_than_the_reach(run):
