@@ -279,7 +279,7 @@ def join(
     first = jax.tree.map(lambda x: x[:2], motion)
     feet = joint_positions(representation.skeleton, first)
     feet = feet[:, jnp.array(representation.joints)]
-    away = jnp.linalg.norm(feet - past.ball[-1], axis=-1)
+    away = jnp.linalg.norm(feet - past.ball[None, -1:], axis=-1)
     touched = jnp.min(away) < representation.radius + _TOUCH_MARGIN
     drift = jnp.where(touched, 0.0, (moved - step) * fps)
     times = jnp.arange(1, chunk.ball.shape[0] + 1, dtype=offset.dtype) / fps

@@ -183,10 +183,10 @@ def _nearest(own: Wish, seen: Wish, number: int, fps: float) -> tuple[Array, Arr
     """Inputs of the same skill that are most alike, and how far they are, m/s."""
 
     def one(wish: Wish) -> tuple[Array, Array]:
-        moved = seen.past.position - wish.past.position
-        turned = seen.past.facing - wish.past.facing
+        moved = seen.past.position - wish.past.position[None]
+        turned = seen.past.facing - wish.past.facing[None]
         seconds = moved.shape[-2] / fps
-        away = jnp.linalg.norm(seen.velocity - wish.velocity, axis=-1)
+        away = jnp.linalg.norm(seen.velocity - wish.velocity[None], axis=-1)
         away += jnp.sqrt(jnp.mean(jnp.sum(moved**2, -1), -1)) / seconds
         away += jnp.sqrt(jnp.mean(jnp.sum(turned**2, -1), -1))
         away = jnp.where(seen.label == wish.label, away, jnp.inf)

@@ -161,16 +161,16 @@ def test_at_a_seam_only_a_foot_pushes_the_ball(parts, near):
     feet = representation.skeleton.feet
     places = joint_positions(representation.skeleton, still.motion)[0, list(feet)]
     begin = places[0] if near else jnp.array([0.0, 0.11, 5.0])
-    times = jnp.arange(-1.0, 25.0)[:, None] / 30.0
-    rolls = begin + times * jnp.array([0.0, 0.0, 1.2])
-    shown = dataclasses.replace(still, ball=rolls)
-    slower = begin + jnp.array([0.15, 0.0, 0.0]) + times * jnp.array([0.0, 0.0, 0.6])
-    chunk = dataclasses.replace(still, ball=slower)
+    times = np.arange(-1.0, 25.0)[:, None] / 30.0
+    rolls = np.asarray(begin) + times * [0.0, 0.0, 1.2]
+    slower = np.asarray(begin) + [0.15, 0.0, 0.0] + times * [0.0, 0.0, 0.6]
+    shown = dataclasses.replace(still, ball=jnp.asarray(rolls, jnp.float32))
+    chunk = dataclasses.replace(still, ball=jnp.asarray(slower, jnp.float32))
     cut = lambda scene, *at: jax.tree.map(lambda x: x[slice(*at)], scene)  # noqa: E731
     joined = smgdiff_controller.join(
         cut(shown, 2), cut(chunk, 2, None), representation, control=CONTROL
     )
-    found = accelerations(jnp.concatenate([rolls[:2], joined.ball]))
+    found = accelerations(np.concatenate([rolls[:2], joined.ball]))
     assert (found.max() > 12.0) == near
     # After half a second the plan's own.
     np.testing.assert_allclose(joined.ball[15:], slower[17:], atol=1e-5)
