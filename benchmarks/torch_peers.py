@@ -380,7 +380,7 @@ def make(
     """
     number = config.num_steps
     if system == "aamdm":
-        _expect(config, target="frame")
+        _expect(config, predict="frame")
         polisher = load(TorchMlp(config), params["polisher"])
         drafter = load(TorchMlp(config, latent=config.latent), params["generator"])
         nets = (polisher,) * config.polishes + (drafter,) * config.drafts

@@ -440,10 +440,12 @@ def _aamdm_config(sizes: Sizes, features: int = 64) -> aamdm_model.Config:
 
 def _aamdm_samples(sizes: Sizes) -> Samples:
     config = _aamdm_config(sizes)
+    # Of some size: it does not matter to the time.
+    change = jnp.ones(config.features) if config.predict == "change" else None
     return Samples(
         params=aamdm_model.init(jax.random.key(0), config),
         sampler=lambda params: aamdm_model.sampler(
-            params, config=config, step=sizes.step
+            params, config=config, change=change, step=sizes.step
         ),
         conditions=lambda batch: _normal(
             np.random.default_rng(0), batch, config.features
@@ -493,7 +495,8 @@ def _aamdm_rollouts(
     )
 
     def controller(params: Params) -> rollout.Controller:
-        sample = aamdm_model.sampler(params["networks"], config=config)
+        change = aamdm_training.scale_of_changes(params["space"], config)
+        sample = aamdm_model.sampler(params["networks"], config=config, change=change)
         return aamdm_controller.controller(
             aamdm_controller.guided(sample, scale=0.0),
             params["space"],

@@ -52,6 +52,9 @@ class Train:
       batch: Windows per update.
       width: Channels of the networks of AAMDM and AMDM (Learned Motion Matching has
         512, Motion VAE 256, as published).
+      window: Frames that AAMDM's polishers predict in a row in training (paper: 10).
+      polisher_batch: Windows per update of these.
+      weight_pose: Weight of the errors of the poses that these frames mean (paper: 0).
       gan_window: Frames of the windows of the GANs (paper: 10).
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
@@ -76,6 +79,9 @@ class Train:
     batch: int = 64
     width: int = 256
     schedule: Literal["cosine", "vp"] = "cosine"
+    window: int = 4
+    polisher_batch: int = 128
+    weight_pose: float = 1.0
     gan_window: int = 3
     previous_noise: float = 0.05
     distributed: cli.Distributed = ()
@@ -164,17 +170,15 @@ def train(args: Train) -> None:
     sizes = rows.Sizes(
         width=args.width,
         schedule=args.schedule,
+        window=args.window,
+        weight_pose=args.weight_pose,
         gan_window=args.gan_window,
         previous_noise=args.previous_noise,
     )
 
-    def budget(steps: int, **more) -> runs.Budget:
+    def budget(steps: int, batch: int = args.batch, **more) -> runs.Budget:
         return runs.Budget(
-            steps=steps,
-            batch=args.batch,
-            seed=args.seed,
-            override=args.override,
-            **more,
+            steps=steps, batch=batch, seed=args.seed, override=args.override, **more
         )
 
     adversarial = budget(args.generator_steps, optimizer="radam", learning_rate=2e-4)
@@ -195,7 +199,7 @@ def train(args: Train) -> None:
             run,
             spaces[where],
             sizes,
-            polisher=budget(steps),
+            polisher=budget(steps, args.polisher_batch),
             generator=adversarial,
             baseline=budget(
                 args.window_steps if name in ("mvae", "lmm") else args.amdm_steps,

@@ -3,8 +3,10 @@
 aamdm               2 polishes after 3 drafts, in the embedded space
 polish1_draft3 ...  other numbers of steps (its table 2)
 full_pose           2 and 3 without the embedding
-change              2 and 3 on scaled changes of the frame (ours)
+frame               2 and 3 by networks that predict the frame instead of its change,
+                    with windows of ten and no errors of poses (paper)
 amdm5, amdm200      AMDM in the full pose space
+amdm5_embedded ...  the same in the embedded space
 mvae                Motion VAE in the full pose space
 lmm                 Learned Motion Matching in the embedded space
 """
@@ -35,10 +37,13 @@ TABLE_2 = tuple(
 )
 # The most expensive last.
 ALL = (*TABLE_1, *TABLE_2, "full_pose", "amdm200")
+# Rows that the paper does not have.
+MORE = ("frame", "amdm5_embedded", "amdm200_embedded")
 _CHAIN = re.compile(r"polish(\d+)_draft(\d+)$")
-_BASELINES = {"amdm5": amdm, "amdm200": amdm, "lmm": lmm, "mvae": mvae}
+_AMDM = ("amdm5", "amdm200", "amdm5_embedded", "amdm200_embedded")
+_BASELINES = dict.fromkeys(_AMDM, amdm) | {"lmm": lmm, "mvae": mvae}
 # Frames of the windows that each baseline is trained on, and which is the first given.
-_WINDOWS = {"amdm5": (3, 1), "amdm200": (3, 1), "lmm": (20, 0), "mvae": (8, 0)}
+_WINDOWS = dict.fromkeys(_AMDM, (3, 1)) | {"lmm": (20, 0), "mvae": (8, 0)}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,12 +53,16 @@ class Sizes:
     Attributes:
       width: Channels of the networks of AAMDM and AMDM.
       schedule: Schedule of AAMDM's chains.
+      window: Frames that AAMDM's polishers predict in a row in training.
+      weight_pose: Weight of the poses' errors in their loss.
       gan_window: Frames of the windows of AAMDM's GANs.
       previous_noise: Noise on given previous frames in training, for all rows alike.
     """
 
     width: int = 256
     schedule: str = "cosine"
+    window: int = 4
+    weight_pose: float = 1.0
     gan_window: int = 3
     previous_noise: float = 0.05
 
@@ -66,7 +75,7 @@ def space_of(name: str) -> SpaceName:
 
 def is_chain(name: str) -> bool:
     """Whether a row is AAMDM with some numbers of steps."""
-    return name in ("aamdm", "full_pose", "change") or bool(_CHAIN.match(name))
+    return name in ("aamdm", "full_pose", "frame") or bool(_CHAIN.match(name))
 
 
 def check(names: tuple[str, ...]) -> None:
@@ -74,7 +83,7 @@ def check(names: tuple[str, ...]) -> None:
     for name in names:
         if name not in _BASELINES and not is_chain(name):
             raise ValueError(
-                f"unknown row {name!r}: there are {', '.join(ALL)}, change, and "
+                f"unknown row {name!r}: there are {', '.join((*ALL, *MORE))}, and "
                 "polish<n>_draft<m>"
             )
 
@@ -85,8 +94,8 @@ def _steps(name: str) -> tuple[int, int]:
     return (int(found[1]), int(found[2])) if found else (2, 3)
 
 
-def _target(name: str) -> Literal["frame", "change"]:
-    return "change" if name == "change" else "frame"
+def _predict(name: str) -> Literal["frame", "change"]:
+    return "frame" if name == "frame" else "change"
 
 
 def _config(name: str, space: Space, sizes: Sizes) -> Any:
@@ -94,21 +103,25 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
     common = dict(features=space.num_features, width=sizes.width)
     if is_chain(name):
         polishes, drafts = _steps(name)
+        ours = dict(window=sizes.window, weight_pose=sizes.weight_pose)
+        if _predict(name) == "frame":
+            ours = {}
         return aamdm_model.Config(
             **common,
+            **ours,
             polishes=polishes,
             drafts=drafts,
             schedule=sizes.schedule,
             gan_window=sizes.gan_window,
             previous_noise=sizes.previous_noise,
-            target=_target(name),
+            predict=_predict(name),
         )
     if name == "lmm":
         return lmm.Config(**common | {"width": 512}, queries=12)
     if name == "mvae":
         # With the published weight 1 the latent dies: of 350 channels most are smooth.
         return mvae.Config(**common | {"width": 256}, weight_kl=0.01)
-    return amdm.Config(**common, num_steps=int(name.removeprefix("amdm")))
+    return amdm.Config(**common, num_steps=int(name.split("_")[0].removeprefix("amdm")))
 
 
 def _stage(name: str) -> str:
@@ -204,7 +217,7 @@ def load_row(
             space,
             drafts=drafts,
             polishes=polishes,
-            target=_target(name),
+            predict=_predict(name),
         )
         memory = None
         if half_life:

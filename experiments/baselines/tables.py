@@ -24,7 +24,7 @@ def trained_rows(
 ) -> dict[str, tuple[Any, Any]]:
     """Steppers and spaces of rows; without names, of all that the folder has."""
     found, spaces = {}, {}
-    for name in names or (*rows.ALL, "change"):
+    for name in names or (*rows.ALL, *rows.MORE):
         where = rows.space_of(name)
         scale = args.amdm_scale if name.startswith("amdm") else args.scale
         try:
@@ -88,7 +88,7 @@ def measure(
     )
     row = {name: row[name] for name in row if name not in _LEFT_OUT}
     row["diverged_unbounded"] = _unbounded(run, space, step, reference, args)
-    ticks = 20 if name == "amdm200" else 300
+    ticks = 20 if name.startswith("amdm200") else 300
     rate = aamdm_evaluation.frames_per_second(run, space, step, ticks=ticks)
     print(f"{name}: {rate:.0f} frames/s", flush=True)
     return row | {"fps": table.Cell(value=rate, samples=5)}

@@ -278,15 +278,15 @@ def test_from_a_shell_train_twice_evaluate_and_roll_out(data, tmp_path):
     folder = tmp_path / "run"
     for line in (
         f"train --data {data} --out {folder} {SETTINGS}",
-        f"train --data {data} --out {folder} {SETTINGS}".replace("aamdm lmm", "change"),
+        f"train --data {data} --out {folder} {SETTINGS}".replace("aamdm lmm", "frame"),
         f"evaluate --run {folder} --rollouts 4 --seconds 2 --long-minutes 0 "
-        "--rows aamdm change",
-        f"rollout --run {folder} --row change --seconds 1",
+        "--rows aamdm frame",
+        f"rollout --run {folder} --row frame --seconds 1",
     ):
         done = run(line)
         assert done.returncode == 0, done.stderr
     found = json.loads((folder / "evaluation" / "metrics.json").read_text())["rows"]
-    assert {"aamdm", "change"} < set(found) and "lmm" not in found
+    assert {"aamdm", "frame"} < set(found) and "lmm" not in found
     assert bvh_text.read_bvh(folder / "rollout" / "rollout.bvh").values.shape[0] == 60
 
 

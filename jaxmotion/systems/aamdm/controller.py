@@ -369,7 +369,7 @@ class Method:
     def __call__(self, params: tuple[Params, Space]) -> Controller:
         """The controller."""
         networks, space = params
-        change = space.change if self.config.target == "change" else None
+        change = aamdm_training.scale_of_changes(space, self.config)
         sample = aamdm_model.sampler(
             networks, config=self.config, change=change, step=self.step
         )

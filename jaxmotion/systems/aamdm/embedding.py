@@ -225,6 +225,38 @@ def _views(poses: Array, parents: tuple[int, ...], joints: int) -> dict[str, Arr
     return parts | {"character_position": where, "character_rotation": axes}
 
 
+def pose_errors(
+    found: Float[Array, "*batch frames features"],
+    poses: Float[Array, "*batch frames features"],
+    *,
+    parents: tuple[int, ...],
+    config: Config,
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How far pose vectors are from others: weighted L1 means.
+
+    Args:
+      found: Pose vectors, frame after frame.
+      poses: Those that they should be.
+      parents: Parent of each joint.
+      config: Sizes and weights.
+
+    Returns:
+      The error of values, and of their changes per second.
+
+    Source: Li et al. 2024 (AAMDM), eq. 1 and 2.
+    """
+    views = [_views(x, parents, config.num_joints) for x in (found, poses)]
+    weights: dict[str, Any] = dataclasses.asdict(config.weights)
+    value = change = jnp.zeros(())
+    for name, mine in views[0].items():
+        error = mine - views[1][name]
+        value = value + weights[name] * jnp.mean(jnp.abs(error))
+        if f"{name}_change" in weights:
+            rate = jnp.diff(error, axis=poses.ndim - 2) * config.fps
+            change = change + weights[f"{name}_change"] * jnp.mean(jnp.abs(rate))
+    return value, change
+
+
 def loss(
     params: Params,
     key: Key,
@@ -253,21 +285,14 @@ def loss(
     poses, paths = batch
     embedded = encode(params, statistics, poses, paths, config=config)
     found = decode(params, statistics, embedded, config=config)
-    views = [_views(x, parents, config.num_joints) for x in (found, poses)]
-    weights: dict[str, Any] = dataclasses.asdict(config.weights)
-    value = change = jnp.zeros(())
-    for name, mine in views[0].items():
-        error = mine - views[1][name]
-        value = value + weights[name] * jnp.mean(jnp.abs(error))
-        if f"{name}_change" in weights:
-            rate = (error[:, 1] - error[:, 0]) * config.fps
-            change = change + weights[f"{name}_change"] * jnp.mean(jnp.abs(rate))
+    value, change = pose_errors(found, poses, parents=parents, config=config)
+    weights = config.weights
     latent = embedded[..., PATH:]
     rate = jnp.diff(latent, axis=1) * config.fps
     regular = (
-        weights["latent"] * jnp.mean(jnp.abs(latent))
-        + weights["latent_square"] * jnp.mean(jnp.square(latent))
-        + weights["latent_change"] * jnp.mean(jnp.abs(rate))
+        weights.latent * jnp.mean(jnp.abs(latent))
+        + weights.latent_square * jnp.mean(jnp.square(latent))
+        + weights.latent_change * jnp.mean(jnp.abs(rate))
     )
     terms = {"value": value, "change": change, "latent": regular}
     return value + change + regular, terms

@@ -543,9 +543,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
 
     def stepper(point: bench.Point) -> Stepper:
         polishes, drafts = point.parts
-        chain = load_chain(
-            run, "embedded", space, drafts=drafts, polishes=polishes, target="frame"
-        )
+        chain = load_chain(run, "embedded", space, drafts=drafts, polishes=polishes)
         return aamdm_controller.guided(chain, scale=aamdm_controller.SCALE)
 
     def real(data: PoseData) -> Row:

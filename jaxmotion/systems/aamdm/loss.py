@@ -5,8 +5,11 @@ Differs: eq. 8 divides differences of neighboring frames by h times the frame's 
 here they are per frame and `Config.weight_velocity` scales them. The paper trains both
 modules on windows of ten frames and does not say how the GAN's are used; here each
 frame of its windows from the third on is predicted from the one before, which the
-generator may have predicted itself. The R1 penalty and `own_previous` are ours.
+generator may have predicted itself. The R1 penalty, `own_previous` and the errors of
+poses are ours.
 """
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +54,7 @@ def polisher_loss(
     *,
     config: Config,
     change: Scale = None,
+    pose_error: Callable[[Frames, Frames], Float[Array, ""]] | None = None,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """Loss of the diffusion model on windows, fed with its own predictions.
 
@@ -63,14 +67,25 @@ def polisher_loss(
       key: Consumed.
       windows: Frames of the data, `config.window` + 1 each.
       config: The method.
-      change: Deviation of each channel's changes; for `target` "change" only. Errors
+      change: Deviation of each channel's changes; where they are predicted only. Errors
         are then measured in it.
+      pose_error: Error of the poses that windows of frames mean, from those that others
+        do; where `config.weight_pose` is not zero only.
 
     Returns:
-      The weighted sum, and its terms "value" and "velocity".
+      The weighted sum, and its terms "value" and "velocity", and "pose" if it counts.
+
+    Raises:
+      ValueError: if `change` or `pose_error` does not fit the method.
     """
     aamdm_model.check_change(config, change)
-    table, net = config.table(), aamdm_model.network(config)
+    if (pose_error is None) != (config.weight_pose == 0):
+        found = "none" if pose_error is None else "one"
+        raise ValueError(
+            f"weight_pose is {config.weight_pose:g}, but of the errors of poses there "
+            f"is {found}: expected one for weights that are not zero"
+        )
+    table = config.table()
     size, frames, _ = windows.shape
     if config.previous_noise:
         key, key_shake = jax.random.split(key)
@@ -82,10 +97,9 @@ def polisher_loss(
 
     def predict(previous: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
         frame, noise, t = given
-        x_0 = aamdm_model.to_target(frame, jax.lax.stop_gradient(previous), change)
-        x_t = schedule.q_sample(table, x_0, t, noise)
-        found = net.apply({"params": params}, x_t, t, previous)
-        prediction = aamdm_model.from_target(found, previous, change)
+        x_t = schedule.q_sample(table, frame, t, noise)
+        denoise = aamdm_model.polish(params, previous, config=config, change=change)
+        prediction = denoise(key_t, x_t, t)
         return prediction, prediction
 
     over_time = jnp.swapaxes(windows, 0, 1)
@@ -100,7 +114,12 @@ def polisher_loss(
         "value": jnp.mean(jnp.abs(error)),
         "velocity": jnp.mean(jnp.abs(velocity)),
     }
-    return terms["value"] + config.weight_velocity * terms["velocity"], terms
+    total = terms["value"] + config.weight_velocity * terms["velocity"]
+    if pose_error is not None:
+        whole = jnp.concatenate([over_time[:1], predictions])
+        terms["pose"] = pose_error(jnp.swapaxes(whole, 0, 1), windows)
+        total = total + config.weight_pose * terms["pose"]
+    return total, terms
 
 
 def discriminator_loss(
@@ -120,7 +139,7 @@ def discriminator_loss(
       key: Consumed.
       windows: Frames of the data, `config.gan_window` each, at least three.
       config: The method.
-      change: Deviation of each channel's changes; for `target` "change" only.
+      change: Deviation of each channel's changes; where they are predicted only.
 
     Returns:
       The loss, and "adversarial" and "r1".
@@ -151,7 +170,7 @@ def generator_loss(
       key: Consumed.
       windows: Frames of the data, `config.gan_window` each, at least three.
       config: The method.
-      change: Deviation of each channel's changes; for `target` "change" only.
+      change: Deviation of each channel's changes; where they are predicted only.
 
     Returns:
       The loss, and nothing more.
@@ -177,9 +196,9 @@ def _pairs(
 
     table = config.table()
     t = jax.random.randint(keys[0], frame.shape[:1], 1, config.num_steps + 1)
-    x_0 = aamdm_model.to_target(frame, previous, change)
-    x_prev, x_t = gan.q_pair(table, keys[1], x_0, t)
-    prediction = aamdm_model.draft(generator, previous, config=config)(keys[2], x_t, t)
+    x_prev, x_t = gan.q_pair(table, keys[1], frame, t)
+    draft = aamdm_model.draft(generator, previous, config=config, change=change)
+    prediction = draft(keys[2], x_t, t)
     fake = gan.posterior_sample(table, keys[3], prediction, x_t, t)
     return previous, t, x_prev, x_t, fake
 
@@ -222,7 +241,6 @@ def _own(
     key_t, key_noise, key_latent = jax.random.split(key, 3)
     t = jax.random.randint(key_t, frame.shape[:1], 1, config.num_steps + 1)
     noise = jax.random.normal(key_noise, frame.shape)
-    x_0 = aamdm_model.to_target(frame, before, change)
-    x_t = schedule.q_sample(config.table(), x_0, t, noise)
-    found = aamdm_model.draft(generator, before, config=config)(key_latent, x_t, t)
-    return aamdm_model.from_target(found, before, change)
+    x_t = schedule.q_sample(config.table(), frame, t, noise)
+    draft = aamdm_model.draft(generator, before, config=config, change=change)
+    return draft(key_latent, x_t, t)

@@ -7,10 +7,10 @@ first steps, a diffusion model its last ones; both see the previous frame:
     x_0 = reverse_chain(ancestral_step(table, polish), key, x_p, start=p)
 
 The frame is any vector: the learned 64-dimensional embedding of a pose, or a point of
-the toy problem. What the chain denoises is the frame itself, as in the paper, or its
-change: at 60 frames per second a frame is nearly the one before it, and beside the
-noise of the paper's last steps what is left to choose vanishes; a change, scaled to
-unit variance, does not.
+the toy problem. At 60 frames per second a frame is nearly the one before it, so that a
+network which predicts it spends itself on saying again what it was given: ours may
+predict the change instead, scaled to unit variance. The chain denoises frames either
+way.
 
 Source: Li et al. 2024, "AAMDM: Accelerated Auto-regressive Motion Diffusion Model",
 sections 3.2-3.5. Sizes and the schedule are ours, since the paper gives none.
@@ -44,16 +44,19 @@ class Config:
       drafts: Steps of the generator, the first of the chain (paper: 3).
       polishes: Steps of the diffusion model, the last of the chain (paper: 2).
       schedule: "cosine", or "vp" (which keeps less of the sample at each step).
-      target: What the chain denoises: the "frame" (paper), or its "change" since the
-        previous one divided by the deviation of changes (ours).
+      predict: What the networks predict: the "frame" (paper), or its "change" since the
+        previous one in deviations of changes (ours), in which the polisher's errors are
+        then measured, too.
       latent: Channels of the generator's latent.
       width: Channels of a hidden layer.
       depth: Hidden layers.
       window: Frames that the diffusion model predicts in a row in training (paper).
       gan_window: Frames of the windows of the GAN, at least three (paper: 10).
       weight_velocity: Weight of the differences of neighboring frames.
+      weight_pose: Weight of the errors of the poses that the polisher's frames mean, as
+        the autoencoder measures them; ours.
       previous_noise: Largest deviation of the noise that is added in training to the
-        previous frames of the data, in units of the target's scale; ours, so that a
+        previous frames of the data, in units of what is predicted; ours, so that a
         rollout recovers after leaving the data. 0 for none.
       own_previous: Probability that the GAN's previous frame in training is the
         generator's own prediction of it.
@@ -64,13 +67,14 @@ class Config:
     drafts: int = 3
     polishes: int = 2
     schedule: Literal["cosine", "vp"] = "cosine"
-    target: Literal["frame", "change"] = "frame"
+    predict: Literal["frame", "change"] = "frame"
     latent: int = 64
     width: int = 512
     depth: int = 4
     window: int = 10
     gan_window: int = 3
     weight_velocity: float = 0.1
+    weight_pose: float = 0.0
     previous_noise: float = 0.0
     own_previous: float = 0.5
     weight_r1: float = 0.05
@@ -140,44 +144,25 @@ def init(key: Key, config: Config) -> Params:
     }
 
 
-def to_target(
-    frame: Float[Array, "*batch features"],
+def to_frame(
+    found: Float[Array, "*batch features"],
     previous: Float[Array, "*batch features"],
     change: Float[Array, " features"] | None,
 ) -> Float[Array, "*batch features"]:
-    """What the chain denoises for a frame.
+    """The frame that a network's prediction means.
 
     Args:
-      frame: The frame.
-      previous: The one before.
-      change: Deviation of each channel's changes; None for `target` "frame".
-
-    Returns:
-      The frame, or its scaled change.
-    """
-    if change is None:
-        return frame
-    return (frame - previous) / change.reshape((1,) * (frame.ndim - 1) + (-1,))
-
-
-def from_target(
-    x_0: Float[Array, "*batch features"],
-    previous: Float[Array, "*batch features"],
-    change: Float[Array, " features"] | None,
-) -> Float[Array, "*batch features"]:
-    """Inverse of `to_target`.
-
-    Args:
-      x_0: What the chain denoised.
+      found: What the network predicts.
       previous: The frame before.
-      change: As in `to_target`.
+      change: Deviation of each channel's changes, which it predicts; None where it
+        predicts the frame.
 
     Returns:
       The frame.
     """
     if change is None:
-        return x_0
-    return previous + x_0 * change.reshape((1,) * (x_0.ndim - 1) + (-1,))
+        return found
+    return previous + found * change.reshape((1,) * (found.ndim - 1) + (-1,))
 
 
 def check_change(config: Config, change: Array | None) -> None:
@@ -190,16 +175,20 @@ def check_change(config: Config, change: Array | None) -> None:
     Raises:
       ValueError: if it is missing, or given for nothing.
     """
-    if (change is None) != (config.target == "frame"):
+    if (change is None) != (config.predict == "frame"):
         found = "none" if change is None else f"shape {change.shape}"
         raise ValueError(
-            f"target is {config.target!r}, but the scale of changes is {found}: "
+            f"predict is {config.predict!r}, but the scale of changes is {found}: "
             "expected one for 'change' and none for 'frame'"
         )
 
 
 def draft(
-    params: Params, previous: Float[Array, "*batch features"], *, config: Config
+    params: Params,
+    previous: Float[Array, "*batch features"],
+    *,
+    config: Config,
+    change: Float[Array, " features"] | None = None,
 ) -> Denoiser:
     """The generator as a denoiser; its latent comes from its key.
 
@@ -207,6 +196,7 @@ def draft(
       params: The generator's.
       previous: The previous frame.
       config: The method.
+      change: As in `to_frame`.
 
     Returns:
       The denoiser.
@@ -214,13 +204,18 @@ def draft(
 
     def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
         latent = jax.random.normal(key, (*x_t.shape[:-1], config.latent), x_t.dtype)
-        return network(config).apply({"params": params}, x_t, t, previous, latent)
+        found = network(config).apply({"params": params}, x_t, t, previous, latent)
+        return to_frame(found, previous, change)
 
     return denoise
 
 
 def polish(
-    params: Params, previous: Float[Array, "*batch features"], *, config: Config
+    params: Params,
+    previous: Float[Array, "*batch features"],
+    *,
+    config: Config,
+    change: Float[Array, " features"] | None = None,
 ) -> Denoiser:
     """The diffusion model as a denoiser.
 
@@ -228,6 +223,7 @@ def polish(
       params: Its parameters.
       previous: The previous frame.
       config: The method.
+      change: As in `to_frame`.
 
     Returns:
       The denoiser.
@@ -235,7 +231,8 @@ def polish(
 
     def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
         del key  # deterministic
-        return network(config).apply({"params": params}, x_t, t, previous)
+        found = network(config).apply({"params": params}, x_t, t, previous)
+        return to_frame(found, previous, change)
 
     return denoise
 
@@ -256,7 +253,7 @@ def sampler(
       params: Parameters of the generator and the polisher; the discriminator's are not
         used, and one that takes no steps may be missing.
       config: The method.
-      change: Deviation of each channel's changes; for `target` "change" only.
+      change: Deviation of each channel's changes; where they are predicted only.
       step: Makes the chain's step from the schedule and a denoiser; the default is the
         paper's. One that looks back forgets where the polisher takes over.
 
@@ -266,7 +263,7 @@ def sampler(
       `noise` is that of the posteriors, [T, features], for steps that take one.
 
     Raises:
-      ValueError: if `change` does not fit the target.
+      ValueError: if `change` does not fit what is predicted.
     """
     check_change(config, change)
     table = config.table()
@@ -284,10 +281,7 @@ def sampler(
         def part(denoise: Denoiser, x: Array, start: int, stop: int) -> Array:
             if objective is not None:
                 denoise = guidance.gradient_guidance(
-                    table,
-                    denoise,
-                    lambda x_0: objective(from_target(x_0, previous, change)),
-                    scale=scale,
+                    table, denoise, objective, scale=scale
                 )
             move = make(table, denoise)
             return chain.sample_from(move, key_chain, x, start=start, stop=stop)
@@ -295,11 +289,13 @@ def sampler(
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, previous.shape, previous.dtype)
         if config.drafts:
-            drafter = draft(params["generator"], previous, config=config)
+            drafter = draft(params["generator"], previous, config=config, change=change)
             x = part(drafter, x, config.num_steps, config.polishes)
         if config.polishes:
-            polisher = polish(params["polisher"], previous, config=config)
+            polisher = polish(
+                params["polisher"], previous, config=config, change=change
+            )
             x = part(polisher, x, config.polishes, 0)
-        return from_target(x, previous, change)
+        return x
 
     return sample

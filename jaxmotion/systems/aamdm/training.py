@@ -14,7 +14,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from jaxmotion import files
 from jaxmotion.data import clips_io, mirror, selection
@@ -311,19 +311,19 @@ def load_space(run: Run, name: SpaceName) -> Space:
     )
 
 
-def chain_stage(space: SpaceName, *, num_steps: int, target: str) -> str:
+def chain_stage(space: SpaceName, *, num_steps: int, predict: str) -> str:
     """Name that the stages of a chain share.
 
     Args:
       space: Its space.
       num_steps: T.
-      target: What the chain denoises.
+      predict: What its networks predict.
     """
-    return f"{space}/T{num_steps}" + ("" if target == "frame" else f"_{target}")
+    return f"{space}/T{num_steps}" + ("" if predict == "change" else f"_{predict}")
 
 
 def _stage(space: SpaceName, config: aamdm_model.Config, network: str) -> str:
-    chain = chain_stage(space, num_steps=config.num_steps, target=config.target)
+    chain = chain_stage(space, num_steps=config.num_steps, predict=config.predict)
     return f"{chain}/{network}"
 
 
@@ -332,6 +332,23 @@ def _shared(config: aamdm_model.Config) -> dict[str, Any]:
     value = dataclasses.asdict(config)
     del value["drafts"], value["polishes"]
     return value
+
+
+def scale_of_changes(
+    space: Space, config: aamdm_model.Config
+) -> Float[Array, " channels"] | None:
+    """What predicted changes are in; None for networks that predict frames."""
+    return space.change if config.predict == "change" else None
+
+
+def _pose_error(run: Run, space: Space, found: Array, frames: Array) -> Array:
+    """Error of the poses that windows of frames mean, as the autoencoder has it."""
+    value, change = aamdm_embedding.pose_errors(
+        *(aamdm_space.to_poses(space, x) for x in (found, frames)),
+        parents=run.skeleton.parents,
+        config=run.embedding,
+    )
+    return value + change
 
 
 def train_polisher(
@@ -350,12 +367,15 @@ def train_polisher(
       Averaged parameters.
     """
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
-    change = space.change if config.target == "change" else None
+    change = scale_of_changes(space, config)
+    error = functools.partial(_pose_error, run, space) if config.weight_pose else None
     state = runs.minimize(
         aamdm_model.init(jax.random.key(budget.seed), config)["polisher"],
         run.record,
         _stage(name, config, "polisher"),
-        functools.partial(aamdm_loss.polisher_loss, config=config, change=change),
+        functools.partial(
+            aamdm_loss.polisher_loss, config=config, change=change, pose_error=error
+        ),
         *frame_windows(frames, run.train, config.window + 1, batch=budget.batch),
         budget=budget,
         model=_shared(config),
@@ -380,7 +400,7 @@ def train_generator(
       The generator's averaged parameters.
     """
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
-    change = space.change if config.target == "change" else None
+    change = scale_of_changes(space, config)
     discriminate, generate = (
         functools.partial(loss, config=config, change=change)
         for loss in (aamdm_loss.discriminator_loss, aamdm_loss.generator_loss)
@@ -413,7 +433,7 @@ def load_networks(
     *,
     drafts: int,
     polishes: int,
-    target: Literal["frame", "change"] = "frame",
+    predict: Literal["frame", "change"] = "change",
 ) -> tuple[Params, aamdm_model.Config]:
     """The networks of a trained chain.
 
@@ -423,7 +443,7 @@ def load_networks(
       space: The space.
       drafts: Steps of the generator.
       polishes: Steps of the diffusion model.
-      target: What the chain denoises.
+      predict: What the networks predict.
 
     Returns:
       Parameters of those stages that take steps, and the configuration that they were
@@ -433,7 +453,7 @@ def load_networks(
       CheckpointError: if a stage that it needs is missing, or of another kind.
       ValueError: if a stage was trained for another space.
     """
-    chain = chain_stage(name, num_steps=drafts + polishes, target=target)
+    chain = chain_stage(name, num_steps=drafts + polishes, predict=predict)
     stage = f"{chain}/{'polisher' if polishes else 'generator'}"
     own = {"drafts": drafts, "polishes": polishes}
     config = runs.stage_config(run.record, stage, aamdm_model.Config, **own)
@@ -459,5 +479,5 @@ def load_networks(
 def load_chain(run: Run, name: SpaceName, space: Space, **chain: Any) -> Sample:
     """The sampler of a trained chain, named as `load_networks` takes it."""
     params, config = load_networks(run, name, space, **chain)
-    change = space.change if config.target == "change" else None
+    change = scale_of_changes(space, config)
     return aamdm_model.sampler(params, config=config, change=change)

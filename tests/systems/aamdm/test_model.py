@@ -15,7 +15,7 @@ from jaxmotion.systems.aamdm import model as aamdm_model
 from tests import mostly_slow, tiny
 
 CONFIG = aamdm_model.Config(features=3, latent=2, width=16, depth=2, window=4)
-CHANGING = dataclasses.replace(CONFIG, target="change")
+CHANGING = dataclasses.replace(CONFIG, predict="change")
 CHANGE = jnp.array([0.5, 0.1, 2.0])
 
 
@@ -119,24 +119,16 @@ def test_each_player_moves_only_itself():
     assert any(np.abs(x).max() > 0 for x in jax.tree.leaves(grad))
 
 
-# --- changes as the target ---------------------------------------------------------
+# --- networks that predict changes --------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (2, 5)])
-def test_a_change_is_scaled_and_comes_back(shape):
-    frame, previous = normal(*shape, 3), normal(*shape, 3, seed=1)
-    x_0 = aamdm_model.to_target(frame, previous, CHANGE)
-    for i, scale in enumerate((0.5, 0.1, 2.0)):
-        step = np.float64(frame - previous)[..., i] / scale
-        np.testing.assert_allclose(x_0[..., i], step, rtol=1e-5, atol=1e-6)
-    found = aamdm_model.from_target(x_0, previous, CHANGE)
-    np.testing.assert_allclose(found, frame, rtol=1e-5, atol=1e-6)
-
-
-def test_without_a_scale_the_target_is_the_frame():
-    frame, previous = normal(5, 3), normal(5, 3, seed=1)
-    for through in (aamdm_model.to_target, aamdm_model.from_target):
-        np.testing.assert_array_equal(through(frame, previous, None), frame)
+def test_a_predicted_change_is_in_deviations(shape):
+    found, previous = normal(*shape, 3), normal(*shape, 3, seed=1)
+    frame = aamdm_model.to_frame(found, previous, CHANGE)
+    expected = np.float64(previous) + np.float64(found) * [0.5, 0.1, 2.0]
+    np.testing.assert_allclose(frame, expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(aamdm_model.to_frame(found, previous, None), found)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +138,7 @@ def test_without_a_scale_the_target_is_the_frame():
         (CONFIG, CHANGE, r"'frame'.*shape \(3,\)"),
     ],
 )
-def test_the_scale_of_changes_must_fit_the_target(config, change, message):
+def test_the_scale_of_changes_must_fit_what_is_predicted(config, change, message):
     params, windows, key = parameters(), normal(8, 5, 3), jax.random.key(0)
     given = dict(config=config, change=change)
     players = params["generator"], params["discriminator"]
@@ -163,7 +155,8 @@ def test_the_scale_of_changes_must_fit_the_target(config, change, message):
     aamdm_model.check_change(CONFIG, None)
 
 
-def test_the_chain_of_changes_is_added_to_the_previous_frame():
+def test_the_chain_denoises_frames_whatever_is_predicted():
+    """Networks of frames that say what those of changes mean make the same frames."""
     params, key, previous = parameters(), jax.random.key(1), normal(3)
     step = aamdm_model.sampler(params, config=CHANGING, change=CHANGE)
     found = jax.jit(step)(key, previous)
@@ -173,28 +166,11 @@ def test_the_chain_of_changes_is_added_to_the_previous_frame():
     for t in range(5, 0, -1):
         name, make = ("generator", aamdm_model.draft), ("polisher", aamdm_model.polish)
         part = name if t > 2 else make
-        denoise = part[1](params[part[0]], previous, config=CHANGING)
-        reverse = chain.ancestral_step(CHANGING.table(), denoise)
+        change = part[1](params[part[0]], previous, config=CONFIG)
+        frame = lambda *a, change=change: previous + CHANGE * change(*a)  # noqa: E731
+        reverse = chain.ancestral_step(CHANGING.table(), frame)
         x = reverse(jax.random.fold_in(key_chain, t), x, jnp.array(t))
-    expected = np.float64(previous) + np.float64(x) * [0.5, 0.1, 2.0]
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-
-
-def test_guidance_sees_frames_and_not_changes():
-    """An objective that is flat where frames lie, and steep at their changes."""
-    step = aamdm_model.sampler(parameters(), config=CHANGING, change=CHANGE)
-
-    @jax.jit
-    def guided(previous):
-        objective = lambda x: jnp.sum(jnp.where(x < 50.0, x**2, 0.0))  # noqa: E731
-        key = jax.random.key(3)
-        return step(key, previous, objective=objective, scale=0.1)
-
-    plain = jax.jit(step)
-    for place, moves in ((100.0, False), (0.0, True)):
-        previous = jnp.full(3, place)
-        gap = np.abs(guided(previous) - plain(jax.random.key(3), previous)).max()
-        assert (gap > 1e-3) == moves
+    np.testing.assert_allclose(found, x, rtol=1e-5, atol=1e-6)
 
 
 class Constant:
@@ -228,6 +204,31 @@ def test_windows_of_an_even_change_cost_who_predicts_it_nothing(monkeypatch):
     np.testing.assert_allclose(value, 0.75 + 0.1 * 0.3, rtol=1e-4)
 
 
+def test_errors_of_poses_are_those_of_whole_windows():
+    config = dataclasses.replace(CONFIG, weight_pose=0.5)
+    windows, key = normal(6, 5, 3), jax.random.key(2)
+    seen = []
+
+    def error(found, frames):
+        seen.append((found, frames))
+        return jnp.mean(jnp.square(found - frames))
+
+    params = parameters()["polisher"]
+    loss, terms = aamdm_loss.polisher_loss(
+        params, key, windows, config=config, pose_error=error
+    )
+    (found, frames) = seen[0]
+    np.testing.assert_array_equal(frames, windows)
+    np.testing.assert_array_equal(found[:, 0], windows[:, 0])
+    value = np.abs(np.float64(found) - np.float64(windows))[:, 1:].mean()
+    np.testing.assert_allclose(terms["value"], value, rtol=1e-5)
+    expected = terms["value"] + 0.1 * terms["velocity"] + 0.5 * terms["pose"]
+    np.testing.assert_allclose(loss, expected, rtol=1e-5)
+    for own, given in ((CONFIG, error), (config, None)):
+        with pytest.raises(ValueError, match="weight_pose is"):
+            aamdm_loss.polisher_loss(params, key, windows, config=own, pose_error=given)
+
+
 # --- noise on given frames ---------------------------------------------------------
 
 
@@ -242,7 +243,7 @@ def test_each_row_has_noise_of_a_size_of_its_own():
 
 
 @pytest.mark.parametrize("largest", [0.0, 0.2])
-def test_given_frames_are_shaken_in_units_of_the_target(monkeypatch, largest):
+def test_given_frames_are_shaken_in_units_of_what_is_predicted(monkeypatch, largest):
     """Who adds the right change keeps the error of the first frame to the end."""
     pace = jnp.array([1.0, -2.0, 0.5])
     frames = jnp.arange(5.0).reshape(1, 5, 1) * (pace * CHANGE).reshape(1, 1, 3)

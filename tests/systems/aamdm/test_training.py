@@ -145,7 +145,9 @@ def space(run):
     return aamdm_training.make_space(run, None)
 
 
-CONFIG = aamdm_model.Config(features=110, latent=2, width=16, depth=1, window=2)
+CONFIG = aamdm_model.Config(
+    features=110, latent=2, width=16, depth=1, window=2, predict="change"
+)
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +216,7 @@ def test_a_stored_chain_makes_frames(run, space, chain):
     step = aamdm_training.load_chain(run, "full_pose", space, drafts=3, polishes=2)
     previous = aamdm_space.to_frames(space, run.train.poses[0], run.train.paths[0])
     found = jax.jit(step)(jax.random.key(0), previous)
-    made = aamdm_model.sampler(chain, config=CONFIG)
+    made = aamdm_model.sampler(chain, config=CONFIG, change=space.change)
     expected = jax.jit(made)(jax.random.key(0), previous)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
@@ -222,7 +224,7 @@ def test_a_stored_chain_makes_frames(run, space, chain):
 def test_a_chain_that_was_not_trained_is_named(run, space, chain):
     for missing, options in (
         ("T6", dict(drafts=4, polishes=2)),
-        ("T5_change", dict(drafts=3, polishes=2, target="change")),
+        ("T5_frame", dict(drafts=3, polishes=2, predict="frame")),
     ):
         folder = str(run.record.folder / "full_pose" / missing)
         with pytest.raises(checkpoint.CheckpointError, match=folder):
