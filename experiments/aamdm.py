@@ -194,12 +194,14 @@ def train(args: Train) -> None:
                 autoencoder = aamdm_training.train_autoencoder(run, steps)
             spaces[where] = aamdm_training.make_space(run, autoencoder)
         steps = args.full_pose_steps if name == "full_pose" else args.polisher_steps
+        # Windows of that row are longer: as many frames, about.
+        windows = args.batch if name == "frame" else args.polisher_batch
         rows.train_row(
             name,
             run,
             spaces[where],
             sizes,
-            polisher=budget(steps, args.polisher_batch),
+            polisher=budget(steps, windows),
             generator=adversarial,
             baseline=budget(
                 args.window_steps if name in ("mvae", "lmm") else args.amdm_steps,
