@@ -83,7 +83,7 @@ class Train:
     polisher_batch: int = 128
     weight_pose: float = 1.0
     gan_window: int = 3
-    previous_noise: float = 0.05
+    previous_noise: float = 0.5
     distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False

@@ -64,7 +64,7 @@ class Sizes:
     window: int = 4
     weight_pose: float = 1.0
     gan_window: int = 3
-    previous_noise: float = 0.05
+    previous_noise: float = 0.5
 
 
 def space_of(name: str) -> SpaceName:

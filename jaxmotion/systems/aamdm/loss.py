@@ -24,9 +24,8 @@ Frames = Float[Array, "batch frames features"]
 Scale = Float[Array, " features"] | None
 
 
-def _shaken(key: Key, frame: Array, config: Config, change: Scale) -> Array:
-    noise = random_noise(key, frame.shape, largest=config.previous_noise)
-    return frame + (noise if change is None else noise * change.reshape(1, -1))
+def _shaken(key: Key, frame: Array, config: Config) -> Array:
+    return frame + random_noise(key, frame.shape, largest=config.previous_noise)
 
 
 def random_noise(
@@ -89,7 +88,7 @@ def polisher_loss(
     size, frames, _ = windows.shape
     if config.previous_noise:
         key, key_shake = jax.random.split(key)
-        first = _shaken(key_shake, windows[:, 0], config, change)
+        first = _shaken(key_shake, windows[:, 0], config)
         windows = windows.at[:, 0].set(first)
     key_t, key_noise = jax.random.split(key)
     steps = jax.random.randint(key_t, (frames, size), 1, config.num_steps + 1)
@@ -217,7 +216,7 @@ def _previous(
         key, frame = given
         key_shake, key_own, key_choice = jax.random.split(key, 3)
         if config.previous_noise:
-            frame = _shaken(key_shake, frame, config, change)
+            frame = _shaken(key_shake, frame, config)
         own = _own(generator, key_own, before, frame, config, change)
         choice = jax.random.bernoulli(
             key_choice, config.own_previous, (*frame.shape[:1], 1)

@@ -56,7 +56,7 @@ class Config:
       weight_pose: Weight of the errors of the poses that the polisher's frames mean, as
         the autoencoder measures them; ours.
       previous_noise: Largest deviation of the noise that is added in training to the
-        previous frames of the data, in units of what is predicted; ours, so that a
+        previous frames of the data, in deviations of these; ours, so that a
         rollout recovers after leaving the data. 0 for none.
       own_previous: Probability that the GAN's previous frame in training is the
         generator's own prediction of it.

@@ -243,7 +243,7 @@ def test_each_row_has_noise_of_a_size_of_its_own():
 
 
 @pytest.mark.parametrize("largest", [0.0, 0.2])
-def test_given_frames_are_shaken_in_units_of_what_is_predicted(monkeypatch, largest):
+def test_given_frames_are_shaken_in_deviations_of_frames(monkeypatch, largest):
     """Who adds the right change keeps the error of the first frame to the end."""
     pace = jnp.array([1.0, -2.0, 0.5])
     frames = jnp.arange(5.0).reshape(1, 5, 1) * (pace * CHANGE).reshape(1, 1, 3)
@@ -253,7 +253,8 @@ def test_given_frames_are_shaken_in_units_of_what_is_predicted(monkeypatch, larg
     config = dataclasses.replace(CHANGING, previous_noise=largest)
     given = dict(config=config, change=CHANGE)
     _, terms = aamdm_loss.polisher_loss({}, jax.random.key(0), windows, **given)
-    error = largest / 2 * np.sqrt(2 / np.pi)
+    # Errors are measured in deviations of changes.
+    error = largest / 2 * np.sqrt(2 / np.pi) * np.mean(1 / np.float64(CHANGE))
     np.testing.assert_allclose(terms["value"], error, rtol=0.05, atol=1e-5)
     np.testing.assert_allclose(terms["velocity"], error / 4, rtol=0.05, atol=1e-5)
 
@@ -277,8 +278,7 @@ def test_players_are_given_shaken_frames(monkeypatch, config, change):
         given = dict(config=own, change=change)
         aamdm_loss.generator_loss({}, {}, jax.random.key(0), windows, **given)
         noise = np.abs(np.float64(seen.pop()) - np.float64(windows[:, -2])).mean(0)
-        units = np.ones(3) if change is None else np.float64(change)
-        expected = largest / 2 * np.sqrt(2 / np.pi) * units
+        expected = largest / 2 * np.sqrt(2 / np.pi) * np.ones(3)
         np.testing.assert_allclose(noise, expected, rtol=0.1, atol=1e-6)
 
 
