@@ -48,7 +48,7 @@ from jaxmotion.systems.aamdm.space import Space
 from jaxmotion.typing import Exported, Key, Objective, Params
 
 # Strength of the guidance, epsilon of eq. 13; ours.
-SCALE = 10.0
+SCALE = 3.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
