@@ -311,11 +311,14 @@ def test_the_generator_loses_its_condition_at_a_rate(watch, rate):
     seen, discriminated = watch("generator", constant(0.0)), watch("discriminator", SUM)
     data, options = many(), dict(config=config, geometry=None)
     emdm_loss.generator_loss({}, {}, jax.random.key(0), data, **options)
-    emdm_loss.diffusion_loss({}, jax.random.key(1), data, **options)
+    plain = dataclasses.replace(config, latent=0)
+    emdm_loss.diffusion_loss({}, jax.random.key(1), data, config=plain, geometry=None)
+    emdm_loss.diffusion_loss({}, jax.random.key(2), data, **options)
     np.testing.assert_array_equal(discriminated[0][0][3], data.vector)
     assert seen[1][0][-1] is None
-    latent = np.asarray(seen[0][0][-1])
-    assert latent.shape == (MANY, 5) and np.abs(latent.std() - 1.0) < 0.02
+    for call in (seen[0], seen[2]):
+        latent = np.asarray(call[0][-1])
+        assert latent.shape == (MANY, 5) and np.abs(latent.std() - 1.0) < 0.02
     for (_, t, vector, keep, mask, _), options, _ in seen:
         np.testing.assert_array_equal(vector, data.vector)
         assert np.asarray(mask).all() and set(np.unique(t)) == {1, 2, 3, 4}
