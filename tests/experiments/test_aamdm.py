@@ -174,7 +174,8 @@ def test_a_rollout_is_written_as_bvh_gif_and_page(
         assert image.n_frames > 1
     text = (out / "rollout.html").read_text()
     shown = json.loads(re.search(r"^const data = (.*);$", text, re.M).group(1))
-    assert len(shown["positions"]) == len(shown["commanded"]) == 60
+    assert shown["shape"] == [1, 60]
+    assert [name for name, *_ in shown["paths"]] == ["commanded", "walked"]
     assert title in text and "procedural" in text
 
 

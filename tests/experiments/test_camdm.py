@@ -149,7 +149,8 @@ def check_rollout(folder, seconds):
         assert image.n_frames > 1
     text = (folder / "rollout.html").read_text()
     data = json.loads(re.search(r"^const data = (.*);$", text, re.M).group(1))
-    assert len(data["positions"]) == len(data["commanded"]) == frames
+    assert data["shape"] == [1, frames]
+    assert [name for name, *_ in data["paths"]] == ["commanded", "walked"]
     assert "procedural walker" in text
 
 
