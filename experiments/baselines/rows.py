@@ -103,9 +103,9 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
     common = dict(features=space.num_features, width=sizes.width)
     if is_chain(name):
         polishes, drafts = _steps(name)
-        ours = dict(window=sizes.window, weight_pose=sizes.weight_pose)
-        if _predict(name) == "frame":
-            ours = {}
+        predict, ours = _predict(name), {}
+        if predict == "change":
+            ours = dict(window=sizes.window, weight_pose=sizes.weight_pose)
         return aamdm_model.Config(
             **common,
             **ours,
@@ -114,7 +114,7 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
             schedule=sizes.schedule,
             gan_window=sizes.gan_window,
             previous_noise=sizes.previous_noise,
-            predict=_predict(name),
+            predict=predict,
         )
     if name == "lmm":
         return lmm.Config(**common | {"width": 512}, queries=12)

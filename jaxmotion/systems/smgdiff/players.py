@@ -236,11 +236,9 @@ def path_spread(
 
         rms = lambda x, axis: 100 * jnp.sqrt(jnp.mean(jnp.sum(x**2, -1), axis))  # noqa: E731
         about = lambda x: x - jnp.mean(x, axis=1, keepdims=True)  # noqa: E731
-        paths, real = (draw(key_own, wish), known.future.motion.root_position[..., ::2])
-        mean, after = (
-            jnp.mean(paths, axis=1),
-            seen.future.motion.root_position[..., ::2],
-        )
+        real, after = (x.future.motion.root_position[..., ::2] for x in (known, seen))
+        paths = draw(key_own, wish)
+        mean = jnp.mean(paths, axis=1)
         rest = after - jnp.mean(draw(key_other, others), axis=1)
         chosen, away = _nearest(wish, others, repeats, model.config.fps)
         # Of few draws the deviation from their own mean is too small.
