@@ -148,9 +148,9 @@ def metric_panels(
 ) -> list[plots.Curves]:
     """The metric of each row over the seconds of training of each run; or none.
 
-    Those of a row are of the stage that has its name (or that it samples, as ddim_10
-    does), if one does, else of all stages that are drawn. Recorded motion is a line
-    across, of the last run.
+    A line joins runs of one seed of training. The seconds of a row are those of the
+    stage that has its name (or that it samples, as ddim_10 does), if one does, else of
+    all stages that are drawn. Recorded motion is a line across, of the last run.
 
     Raises:
       OSError: if an evaluation cannot be read.
@@ -158,23 +158,30 @@ def metric_panels(
     """
     points: dict[str, list[tuple[float, ...]]] = {}
     there, evaluators = set(), set()
-    for folder, name in names.items():
-        measured = results.read(folder / args.file)
-        if measured is None:
+    evaluations = {
+        folder: one
+        for folder in names
+        if (one := results.read(folder / args.file)) is not None
+    }
+    for folder in names:
+        if folder not in evaluations:
             print(f"not evaluated, so without a dot: no {folder / args.file}")
-            continue
+    several = len({one.seeds for one in evaluations.values()}) > 1
+    for folder, measured in evaluations.items():
         evaluators.add(measured.evaluator)
+        seed = f", seed {', '.join(map(str, measured.seeds)) or '?'}" if several else ""
         for row, cells in measured.rows.items():
             there |= cells.keys()
             cell = cells.get(args.metric)
             if cell is None or cli.chosen_rows(args) and row not in args.rows:
                 continue
-            stages = found[name]
+            stages = found[names[folder]]
             stage = SAMPLERS.get(row, (row,))[0]
             own = [x for k, x in stages.items() if k.split("/")[-1] == stage]
             spent = sum(x.seconds[-1] for x in own or stages.values())
             ends = (math.nan if x is None else x for x in (cell.low, cell.high))
-            points.setdefault(row, []).append((spent, cell.value, *ends))
+            label = row if row.startswith(_RECORDED) else f"{row}{seed}"
+            points.setdefault(label, []).append((spent, cell.value, *ends))
     if there and not points:
         raise ValueError(
             f"metric: no row {', '.join(args.rows)} with {args.metric!r}; there are "

@@ -16,7 +16,7 @@ def call(invoke):
     return functools.partial(invoke, "curves")
 
 
-def put(folder, stages, rows=None, system="emdm", rates=RATES):
+def put(folder, stages, rows=None, system="emdm", rates=RATES, **about):
     """A run folder with stages and an evaluation."""
     folder.mkdir(exist_ok=True)
     (folder / "config.json").write_text(json.dumps({"system": system}))
@@ -33,7 +33,8 @@ def put(folder, stages, rows=None, system="emdm", rates=RATES):
             row: {"fid": dict(value=x, low=x - 1, high=x + 1, samples=9)}
             for row, x in rows.items()
         }
-        (folder / "evaluation" / "metrics.json").write_text(json.dumps({"rows": cells}))
+        written = json.dumps({"rows": cells} | about)
+        (folder / "evaluation" / "metrics.json").write_text(written)
     return folder
 
 
@@ -72,6 +73,20 @@ def test_a_metric_stands_over_the_time_of_its_rows_stages(load, tmp_path):
     args = curves.Config(run=(short, long), rows=("gan",))
     (panel,) = curves.metric_panels(args, found, {short: "a", long: "b"})
     assert list(panel.lines) == ["gan"] and not panel.references
+
+
+def test_lines_join_runs_of_one_seed_only(load, tmp_path):
+    curves = load("curves")
+    runs = {}
+    for name, seed, count in (("a", 0, 1), ("b", 0, 2), ("c", 1, 1)):
+        about = dict(rates=RATES * count, seeds={"training": [seed]})
+        runs[put(tmp_path / name, ("gan",), {"real": 0.5, "gan": 4.0}, **about)] = name
+    args = curves.Config(run=tuple(runs))
+    found = {name: curves.read_run(x, ()) for x, name in runs.items()}
+    (panel,) = curves.metric_panels(args, found, runs)
+    sizes = {label: len(x) for label, (x, _) in panel.lines.items()}
+    assert sizes == {"gan, seed 0": 2, "gan, seed 1": 1}
+    assert list(panel.references) == ["real"]
 
 
 def test_a_picture_and_the_losses_in_words(call, tmp_path, capsys):
