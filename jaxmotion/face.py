@@ -27,7 +27,7 @@ from jax.sharding import Mesh
 
 from jaxmotion import files
 from jaxmotion.control import courses, sampling, steering
-from jaxmotion.control.foot_lock import FootLock, lock_feet
+from jaxmotion.control.foot_lock import FootLock, clean_sampler, lock_feet
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.sampling import Sampler
 from jaxmotion.control.steering import Character
@@ -52,8 +52,9 @@ def load(
       source: Name of a shipped model (one of `files.SHIPPED`), a run folder, or a file
         of a system's `export`.
       foot_lock: Settings of the lock that keeps planted feet in place; True for the
-        defaults, False for none. None: on for shipped models that are steered, off for
-        runs and files, whose frames are then what the network makes.
+        defaults, False for none. None: on for shipped models, off for runs and files,
+        whose frames are then what the network makes. Motions that are sampled whole
+        are cleaned with foresight (`control.foot_lock.clean_motion`).
       **options: For the system's `load_character` or `load_sampler`: `step` makes
         another step of the chain, such as `diffusion.chain.ddim_step`; CAMDM has
         `control` and `steps` (those of the schedule to visit) as well, EMDM `scale`
@@ -83,16 +84,16 @@ def load(
             f"{path}: field 'system' is {system_of(path)!r}, expected one of "
             f"{', '.join(registry.SYSTEMS)}"
         )
+    wanted = is_shipped if foot_lock is None else foot_lock
+    lock = wanted if isinstance(wanted, FootLock) else None
     if found.steerable:
         model = found.room("controller").load_character(path, **options)
-        wanted = is_shipped if foot_lock is None else foot_lock
         if wanted is not False:
-            given = wanted if isinstance(wanted, FootLock) else None
-            model = lock_feet(model, given)
-    elif foot_lock:
-        raise ValueError(f"{source} is sampled, not steered: it has no foot lock")
+            model = lock_feet(model, lock)
     else:
         model = found.room("sampler").load_sampler(path, **options)
+        if wanted is not False:
+            model = clean_sampler(model, lock)
     if is_shipped:
         model = dataclasses.replace(model, license=files.SHIPPED_LICENSE)
     return model

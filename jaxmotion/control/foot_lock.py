@@ -39,18 +39,21 @@ motion matching; two-bone inverse kinematics is textbook geometry.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxmotion.control import sampling
 from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character, Method, Tuning
 from jaxmotion.motion.rotation import rot6d_from_matrix, safe_normalize
 from jaxmotion.motion.rotation_vector import to_matrix
 from jaxmotion.motion.skeleton import Motion, Skeleton, global_transforms
 from jaxmotion.motion.spring import spring
+from jaxmotion.typing import Key
 
 _UP = (0.0, 1.0, 0.0)
 
@@ -426,24 +429,6 @@ def lock_frame(
     return state, root_position, shown
 
 
-@functools.partial(jax.jit, static_argnames=("lock",))
-def lock_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motion:
-    """A motion of one character with its feet locked, frame after frame.
-
-    For many characters, `jax.vmap` over the motion.
-    """
-
-    def step(
-        state: LockState, frame: tuple[Array, Array]
-    ) -> tuple[LockState, tuple[Array, Array]]:
-        state, *shown = lock_frame(skeleton, state, *frame, fps=motion.fps, lock=lock)
-        return state, tuple(shown)
-
-    frames = (motion.root_position, motion.joint_rotation)
-    _, (root, rotations) = jax.lax.scan(step, init_lock(skeleton), frames)
-    return dataclasses.replace(motion, root_position=root, joint_rotation=rotations)
-
-
 def _planted(
     toes: Float[Array, "frames feet 3"], *, fps: float, lock: FootLock
 ) -> Bool[Array, "frames-1 feet"]:
@@ -505,8 +490,8 @@ def toe_offsets(
 def clean_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motion:
     """A recorded or generated motion of one character whose planted feet stand.
 
-    Unlike `lock_motion` it looks ahead: toes begin to move to their places before the
-    contact begins, see `toe_offsets`.
+    Unlike the lock of frame after frame it looks ahead: toes begin to move to their
+    places before the contact begins, see `toe_offsets`.
     """
     transforms = jax.vmap(functools.partial(global_transforms, skeleton))
     pose = transforms(motion.root_position, motion.joint_rotation)
@@ -647,4 +632,39 @@ def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
         starts=lambda labels, seed: with_feet(character.starts(labels, seed)),
         clip_starts=clip_starts
         and (lambda clips, labels, seed: with_feet(clip_starts(clips, labels, seed))),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Cleaned:
+    """Makes motions whose planted feet stand, of parameters and the skeleton."""
+
+    method: sampling.Method
+    lock: FootLock
+
+    def __call__(self, params: Any) -> Callable[[Key, Array], Motion]:
+        inner, skeleton = params
+        make = self.method(inner)
+        return lambda key, label: clean_motion(
+            skeleton, make(key, label), lock=self.lock
+        )
+
+
+def clean_sampler(
+    sampler: sampling.Sampler, lock: FootLock | None = None
+) -> sampling.Sampler:
+    """A sampler whose motions stand on their planted feet; see `clean_motion`.
+
+    Args:
+      sampler: Sampler of any system; its skeleton has legs.
+      lock: Settings; None for the defaults.
+
+    Raises:
+      ValueError: if the skeleton names no feet, or a foot has no leg above it.
+    """
+    legs(sampler.skeleton)
+    return dataclasses.replace(
+        sampler,
+        params=(sampler.params, sampler.skeleton),
+        method=_Cleaned(sampler.method, FootLock() if lock is None else lock),
     )

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.control import foot_lock, rollout, steering
+from jaxmotion.control import foot_lock, rollout, sampling, steering
 from jaxmotion.control.frame import Frame
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import (
@@ -69,6 +69,20 @@ def drift(speed, seconds=2.0):
         joint_rotation=jnp.tile(pose(), (frames, 1, 1)),
         fps=FPS,
     )
+
+
+@functools.partial(jax.jit, static_argnames=("lock",))
+def lock_motion(skeleton, motion, *, lock):
+    """A motion of one character with its feet locked, frame after frame."""
+
+    def step(state, frame):
+        given = skeleton, state, *frame
+        state, *shown = foot_lock.lock_frame(*given, fps=motion.fps, lock=lock)
+        return state, tuple(shown)
+
+    frames = (motion.root_position, motion.joint_rotation)
+    _, (root, rotations) = jax.lax.scan(step, foot_lock.init_lock(skeleton), frames)
+    return dataclasses.replace(motion, root_position=root, joint_rotation=rotations)
 
 
 solve = jax.jit(functools.partial(foot_lock.place_toes, SKELETON, lock=LOCK))
@@ -160,13 +174,13 @@ def test_no_toe_and_no_ankle_goes_below_the_ground():
 
 def test_feet_that_slide_stand():
     motion = drift(0.05)
-    found = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
+    found = lock_motion(SKELETON, motion, lock=LOCK)
     toes = tiny.positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
     # The first frame has no speed, and the second begins the contact.
     moved = np.linalg.norm(np.asarray(toes)[15:] - np.asarray(toes)[15], axis=-1)
     assert moved.max() < 1e-3
     still = dataclasses.replace(LOCK, body_reach=0.0)
-    found = foot_lock.lock_motion(SKELETON, motion, lock=still)
+    found = lock_motion(SKELETON, motion, lock=still)
     np.testing.assert_array_equal(found.root_position, motion.root_position)
 
 
@@ -176,7 +190,7 @@ def test_a_body_that_creeps_stays_over_its_feet_and_goes_with_a_free_one():
     lifted[45:] = np.asarray(pose(0.9))
     walks = dataclasses.replace(motion, joint_rotation=jnp.asarray(lifted))
     root = lambda x: np.asarray(  # noqa: E731
-        foot_lock.lock_motion(SKELETON, x, lock=LOCK).root_position
+        lock_motion(SKELETON, x, lock=LOCK).root_position
     )[:, ::2]
     own, stands = np.asarray(motion.root_position)[:, ::2], root(motion)
     strayed = lambda x: np.linalg.norm(x - x[0], axis=-1)  # noqa: E731
@@ -190,7 +204,7 @@ def test_a_body_that_creeps_stays_over_its_feet_and_goes_with_a_free_one():
 def test_a_body_strays_from_its_plan_by_its_reach_at_most():
     motion = drift(0.2, seconds=2.0)
     lock = dataclasses.replace(LOCK, body_reach=0.04, radius=10.0)
-    found = foot_lock.lock_motion(SKELETON, motion, lock=lock)
+    found = lock_motion(SKELETON, motion, lock=lock)
     away = np.linalg.norm(found.root_position - motion.root_position, axis=-1)
     assert 0.03 < away.max() < 0.04 + 1e-5
 
@@ -226,7 +240,7 @@ def test_nothing_jumps():
         joint_rotation=jnp.asarray(joints),
         fps=FPS,
     )
-    found = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
+    found = lock_motion(SKELETON, motion, lock=LOCK)
     step = lambda x: np.abs(np.diff(tiny.positions(SKELETON, x), axis=0)).max()  # noqa: E731
     assert step(found) < step(motion) + 0.02
 
@@ -249,7 +263,7 @@ def test_gradients_are_finite_everywhere():
         motion = dataclasses.replace(
             motion, joint_rotation=jnp.broadcast_to(joints, (9, 9, 6))
         )
-        found = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
+        found = lock_motion(SKELETON, motion, lock=LOCK)
         return jnp.sum(found.joint_rotation**2)
 
     gradient = jax.grad(loss)(jnp.zeros((9, 2)))
@@ -261,7 +275,7 @@ def test_gradients_are_finite_everywhere():
 def test_many_are_each_alone():
     motions = [drift(0.05), drift(0.3)]
     both = jax.tree.map(lambda *x: jnp.stack(x), *motions)
-    run = functools.partial(foot_lock.lock_motion, SKELETON, lock=LOCK)
+    run = functools.partial(lock_motion, SKELETON, lock=LOCK)
     found = jax.vmap(run)(both)
     for i, motion in enumerate(motions):
         np.testing.assert_allclose(
@@ -346,7 +360,7 @@ def test_a_controller_displays_locked_feet():
         inner=jnp.zeros((), jnp.int32), feet=foot_lock.init_lock(SKELETON)
     )
     _, frames = jax.lax.scan(made.advance, start, jnp.zeros(60))
-    want = foot_lock.lock_motion(SKELETON, motion, lock=LOCK)
+    want = lock_motion(SKELETON, motion, lock=LOCK)
     np.testing.assert_allclose(frames.joint_rotation, want.joint_rotation, atol=1e-6)
 
 
@@ -378,6 +392,31 @@ def test_a_clip_is_cleaned():
     toes = tiny.positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
     speed = np.linalg.norm(np.diff(toes, axis=0), axis=-1) * FPS
     assert speed.max() < 0.005
+
+
+def test_a_samplers_motions_are_cleaned():
+    """Motion by motion, as `clean_motion` does."""
+    motion = drift(0.05)
+
+    def method(params):
+        return lambda key, label: jax.tree.map(lambda x: x + 0 * params, motion)
+
+    plain = sampling.Sampler(
+        skeleton=SKELETON,
+        labels=("drift",),
+        fps=FPS,
+        frames=len(motion.root_position),
+        source="tests",
+        params=jnp.zeros(()),
+        method=method,
+    )
+    draw = functools.partial(sampling.sample_motions, labels=np.zeros(2, int), chunk=2)
+    found = draw(foot_lock.clean_sampler(plain, LOCK), jax.random.key(0))
+    want = foot_lock.clean_motion(SKELETON, motion, lock=LOCK)
+    for one in (found[0], found[1]):
+        np.testing.assert_allclose(one.joint_rotation, want.joint_rotation, atol=1e-5)
+    raw = draw(plain, jax.random.key(0))
+    assert np.abs(raw.joint_rotation - found.joint_rotation).max() > 1e-3
 
 
 @pytest.mark.slow
@@ -431,7 +470,7 @@ def test_a_character_is_displayed_with_locked_feet_by_one_program():
         roll = functools.partial(steering.steered_rollouts, commands=commands)
         frames = roll(character, jax.random.key(0), character.start(2))
         raw = roll(plain, jax.random.key(0), plain.start(2))
-        want = foot_lock.lock_motion(skeleton, raw[0].motion, lock=LOCK)
+        want = lock_motion(skeleton, raw[0].motion, lock=LOCK)
         np.testing.assert_allclose(
             frames.joint_rotation[0], want.joint_rotation, atol=1e-5
         )

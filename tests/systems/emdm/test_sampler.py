@@ -99,7 +99,7 @@ def test_wrong_words_end_in_one_line(file):
     key = jax.random.key(0)
     with pytest.raises(ValueError, match="unknown label 'fly': the model has walk"):
         jm.sample(model, key, "fly")
-    with pytest.raises(ValueError, match="no foot lock"):
+    with pytest.raises(ValueError, match="expected hip, knee and ankle"):
         jm.load(file, foot_lock=True)
     assert model.license is None and model.frames == 8
 
