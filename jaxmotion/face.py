@@ -67,7 +67,8 @@ def load(
 
     Raises:
       OSError: if a file cannot be read.
-      ValueError: if there is no such model, or it is of no system that is known.
+      ValueError: if there is no such model, it is of no system that is known, or its
+        skeleton has no legs whose feet could be locked.
     """
     path = Path(source)
     is_shipped = not path.exists()
