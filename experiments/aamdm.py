@@ -55,6 +55,8 @@ class Train:
       window: Frames that AAMDM's polishers predict in a row in training (paper: 10).
       polisher_batch: Windows per update of these.
       weight_pose: Weight of the errors of the poses that these frames mean (paper: 0).
+      weight_foot: Weight of the errors of slow toes' velocities over the ground beside
+        them (paper: 0).
       gan_window: Frames of the windows of the GANs (paper: 10).
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
@@ -82,6 +84,7 @@ class Train:
     window: int = 4
     polisher_batch: int = 128
     weight_pose: float = 1.0
+    weight_foot: float = 5.0
     gan_window: int = 3
     previous_noise: float = 0.5
     distributed: cli.Distributed = ()
@@ -172,6 +175,7 @@ def train(args: Train) -> None:
         schedule=args.schedule,
         window=args.window,
         weight_pose=args.weight_pose,
+        weight_foot=args.weight_foot,
         gan_window=args.gan_window,
         previous_noise=args.previous_noise,
     )
@@ -222,7 +226,11 @@ def evaluate(args: Evaluate) -> None:
     here = results.Measured(path=out / "metrics.json", rows=table, about=report)
     papers = claims.read_paper(registry.get("aamdm")).tables
     report["claims"] = verdicts.lines(papers, {papers[0].source: here})
-    note = "div and fid are of joint positions in the character's axes: no evaluator."
+    note = (
+        f"Steered: course {args.course!r} at {args.speed:g} m/s, guidance "
+        f"{args.scale:g}, half-life of noise {args.noise_half_life:g} s; div and fid "
+        "are of joint positions in the character's axes: no evaluator."
+    )
     reporting.write_table(out, table, report, (note,))
     for line in report["claims"]:
         print(line)

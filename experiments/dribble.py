@@ -9,6 +9,7 @@ Example:
 """  # noqa: E501
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,8 @@ class Config:
       celebrate: The same, under a skill of its own.
       off_ball: Part of the clips of `dribble` and `sprint` that are used once more,
         with the ball lying out of reach.
+      draws: How often every clip is used, each time with a ball drawn anew.
+      sprint_draws: The same of sprints, of which recordings have few; None for `draws`.
       overwrite: Replace --out.
     """
 
@@ -53,6 +56,8 @@ class Config:
     stand: tuple[str, ...] = ("bow", "guide", "wave-left-hand", "wave-right-hand")
     celebrate: tuple[str, ...] = ("raise-up-both-hands", "wave-both-hands")
     off_ball: float = 0.3
+    draws: int = 1
+    sprint_draws: int | None = None
     seed: int = 0
     overwrite: bool = False
 
@@ -69,40 +74,72 @@ def chosen(clips: Clips, config: Config, skill: str) -> Clips | None:
 
 
 def synthesise(config: Config, clips: Clips) -> BallClips:
-    """All skills.
+    """All skills, in all draws.
 
     Args:
       config: The settings.
       clips: The recordings.
 
     Returns:
-      Clips with a ball, of the label field "skill".
+      Clips with a ball, of the label field "skill"; names of all draws but the first
+      end in "#" and the draw's number.
     """
-    parts, moving = [], []
-    for skill, gap in (("dribble", (0.3, 1.2)), ("sprint", (0.5, 1.6))):
-        own = chosen(clips, config, skill)
-        if own is not None:
-            settings = Dribble(gap=gap)
-            moving.append(own)
-            parts.append(
-                dribble_clips(own, skill=skill, settings=settings, seed=config.seed)
-            )
-    for skill in ("stand", "celebrate"):
-        own = chosen(clips, config, skill)
-        if own is not None:
-            near = dict(distance=_NEAR, angle=np.pi / 3, travel=0.5)
-            parts.append(resting_clips(own, skill=skill, seed=config.seed, **near))
-    if moving and config.off_ball > 0:
-        every = selection.concatenate(moving)
-        generator = np.random.default_rng(config.seed)
-        number = max(round(config.off_ball * every.num_clips), 1)
-        some = take_clips(every, generator.permutation(every.num_clips)[:number])
-        parts.append(
-            resting_clips(some, skill="off_ball", distance=_FAR, seed=config.seed)
+    sprints = config.draws if config.sprint_draws is None else config.sprint_draws
+    own = {skill: chosen(clips, config, skill) for skill in _SKILLS}
+    parts = [
+        _numbered(part, draw)
+        for draw in range(max(config.draws, sprints))
+        for part in _one_draw(
+            {
+                skill: some
+                for skill, some in own.items()
+                if some is not None
+                and draw < (sprints if skill == "sprint" else config.draws)
+            },
+            off_ball=config.off_ball if draw < config.draws else 0.0,
+            seed=config.seed + draw,
         )
+    ]
     if not parts:
         raise ValueError("every list of labels is none: nothing to make")
-    return _one_source(concatenate_ball_clips(parts), parts[0].clips.source)
+    source = parts[0].clips.source
+    if len(parts) > 1 and max(config.draws, sprints) > 1:
+        source = f"{source}, {config.draws} draws ({sprints} of sprint)"
+    return _one_source(concatenate_ball_clips(parts), source)
+
+
+_GAPS = {"dribble": (0.3, 1.2), "sprint": (0.5, 1.6)}
+_SKILLS = (*_GAPS, "stand", "celebrate")
+
+
+def _one_draw(
+    own: dict[str, Clips], *, off_ball: float, seed: int
+) -> Iterator[BallClips]:
+    """A ball beside the clips of each skill."""
+    near = dict(distance=_NEAR, angle=np.pi / 3, travel=0.5)
+    for skill, clips in own.items():
+        if skill in _GAPS:
+            settings = Dribble(gap=_GAPS[skill])
+            yield dribble_clips(clips, skill=skill, settings=settings, seed=seed)
+        else:
+            yield resting_clips(clips, skill=skill, seed=seed, **near)
+    moving = [clips for skill, clips in own.items() if skill in _GAPS]
+    if moving and off_ball > 0:
+        every = selection.concatenate(moving)
+        generator = np.random.default_rng(seed)
+        number = max(round(off_ball * every.num_clips), 1)
+        some = take_clips(every, generator.permutation(every.num_clips)[:number])
+        yield resting_clips(some, skill="off_ball", distance=_FAR, seed=seed)
+
+
+def _numbered(data: BallClips, draw: int) -> BallClips:
+    """Clips whose names say of which draw they are."""
+    if not draw:
+        return data
+    names = tuple(f"{name}#{draw + 1}" for name in data.clips.clip_names)
+    return dataclasses.replace(
+        data, clips=dataclasses.replace(data.clips, clip_names=names)
+    )
 
 
 def _one_source(data: BallClips, source: str) -> BallClips:

@@ -99,7 +99,7 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("batch", "polisher_batch", "chunk", "save_every"), _COUNT),
     **dict.fromkeys(("frames_per_token", "least", "length", "sequences"), _COUNT),
     **dict.fromkeys(("characters", "samples", "windows", "starts", "repeats"), _COUNT),
-    **dict.fromkeys(("rollouts", "long_rollouts"), _COUNT),
+    **dict.fromkeys(("rollouts", "long_rollouts", "draws", "sprint_draws"), _COUNT),
     **dict.fromkeys(("replications", "long_replications"), _COUNT),
     **dict.fromkeys(("steps", "updates", "path_steps", "window_steps"), _UPDATES),
     **dict.fromkeys(("autoencoder_steps", "polisher_steps"), _UPDATES),

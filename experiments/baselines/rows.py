@@ -55,6 +55,7 @@ class Sizes:
       schedule: Schedule of AAMDM's chains.
       window: Frames that AAMDM's polishers predict in a row in training.
       weight_pose: Weight of the poses' errors in their loss.
+      weight_foot: Weight of slow toes' errors beside these.
       gan_window: Frames of the windows of AAMDM's GANs.
       previous_noise: Noise on given previous frames in training, for all rows alike.
     """
@@ -63,6 +64,7 @@ class Sizes:
     schedule: str = "cosine"
     window: int = 4
     weight_pose: float = 1.0
+    weight_foot: float = 5.0
     gan_window: int = 3
     previous_noise: float = 0.5
 
@@ -105,7 +107,11 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
         polishes, drafts = _steps(name)
         predict, ours = _predict(name), {}
         if predict == "change":
-            ours = dict(window=sizes.window, weight_pose=sizes.weight_pose)
+            ours = dict(
+                window=sizes.window,
+                weight_pose=sizes.weight_pose,
+                weight_foot=sizes.weight_foot,
+            )
         return aamdm_model.Config(
             **common,
             **ours,

@@ -196,6 +196,42 @@ def advance_frame(
     return PlanarFrame(origin=frame.origin + step, facing=ground.unit(facing))
 
 
+def point_velocities(
+    poses: Float[Array, "*batch frames features"],
+    points: Float[Array, "*batch frames points 3"],
+    *,
+    num_joints: int,
+    fps: float,
+) -> Float[Array, "*batch frames-1 points 3"]:
+    """How fast points that poses carry move over the ground; planted feet do not.
+
+    The bone's own movement counts, as `integrate_root` has it.
+
+    Args:
+      poses: Pose vectors, frame after frame.
+      points: Points in the axes of each frame's simulation bone, meters, such as joints
+        of `character_transforms`.
+      num_joints: J.
+      fps: Frames per second.
+
+    Returns:
+      Velocity from each frame to the next in the axes of the former's bone, meters per
+      second.
+
+    Source: own.
+    """
+    parts = unpack(pose_layout(num_joints), poses[..., 1:, :])
+    moves = parts["root_velocity"], parts["root_angular_velocity"]
+    here = jnp.zeros((*moves[0].shape[:-1], 2))
+    still = PlanarFrame(origin=here, facing=here.at[..., 1].set(1.0))
+    bone = advance_frame(still, *moves, fps=fps)
+    after = points[..., 1:, :, :]
+    facing = jnp.broadcast_to(bone.facing[..., None, :], after[..., ::2].shape)
+    planar = bone.origin[..., None, :] + ground.out_of_frame(after[..., ::2], facing)
+    where = jnp.stack([planar[..., 0], after[..., 1], planar[..., 1]], axis=-1)
+    return (where - points[..., :-1, :, :]) * fps
+
+
 @functools.partial(jax.jit, static_argnames=("num_joints",))
 def place(
     poses: Float[Array, "*batch features"], frame: PlanarFrame, *, num_joints: int

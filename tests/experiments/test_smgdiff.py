@@ -83,6 +83,27 @@ def test_dribble_makes_skills_of_labels(invoke, tmp_path):
     data = load_ball_clips(out)
     assert data.clips.names("skill") == ("dribble", "off_ball")
     assert bool(data.touch.any()) and "synthetic ball" in data.clips.source
+    again = tmp_path / "again.npz"
+    invoke(
+        "dribble",
+        f"--data {source} --out {again} --field style --dribble {styles} --sprint "
+        f"{styles} --stand none --celebrate none --draws 2 --sprint-draws 3",
+    )
+    drawn = load_ball_clips(again)
+    assert drawn.clips.source == f"{data.clips.source}, 2 draws (3 of sprint)"
+    skill = np.asarray(drawn.clips.labels["skill"])
+    names = drawn.clips.names("skill")
+    seen = {
+        (names[s], clip.partition("#")[2])
+        for s, clip in zip(skill, drawn.clips.clip_names, strict=True)
+    }
+    assert seen == {
+        *((name, draw) for name in ("dribble", "off_ball") for draw in ("", "2")),
+        *(("sprint", draw) for draw in ("", "2", "3")),
+    }
+    # The first draw is what one draw alone is.
+    alone, first = data.clips.clip_names, drawn.clips.clip_names
+    assert first[: len(alone)] != alone and set(alone) <= set(first)
     with pytest.raises(FileExistsError, match="--overwrite"):
         invoke("dribble", f"--data {source} --out {out}")
     with pytest.raises(

@@ -445,6 +445,41 @@ def test_straight_walk_survives_the_round_trip(skeleton):
     np.testing.assert_allclose(found.joint_rotation, motion.joint_rotation, atol=1e-4)
 
 
+# --- points over the ground --------------------------------------------------------
+
+
+def test_points_that_stand_in_the_world_do_not_move(skeleton):
+    position, yaw = person.wandering_bone(FRAMES)
+    root, matrices = person.wander(FRAMES)
+    vectors = pose_vectors(
+        skeleton, person.motion(root, matrices), person.path(position, yaw)
+    )
+    bone = pose.integrate_root(
+        vectors, person.frames(position[0], yaw[0]), num_joints=6, fps=60.0
+    )
+    marks = np.random.default_rng(6).normal(size=(3, 3))
+    inverse = [
+        np.linalg.inv(reference.bone_matrix(o, f))
+        for o, f in zip(*map(np.asarray, (bone.origin, bone.facing)), strict=True)
+    ]
+    points = np.array([marks @ m[:3, :3].T + m[:3, 3] for m in inverse])
+    found = pose.point_velocities(vectors, float32(points), num_joints=6, fps=60.0)
+    np.testing.assert_allclose(found, 0.0, atol=2e-3)
+
+
+def test_points_that_go_with_the_bone_move_as_it_does():
+    vectors = np.zeros((2, 4, 98))
+    vectors[..., 90], vectors[..., 92] = 0.3, -0.7
+    points = np.broadcast_to([0.4, 1.2, -0.1], (2, 4, 5, 3))
+    found = pose.point_velocities(
+        float32(vectors), float32(points), num_joints=6, fps=30.0
+    )
+    assert found.shape == (2, 3, 5, 3)
+    np.testing.assert_allclose(
+        found, np.broadcast_to([0.3, 0.0, -0.7], found.shape), atol=1e-5
+    )
+
+
 # --- gradients -------------------------------------------------------------------
 
 

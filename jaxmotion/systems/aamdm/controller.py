@@ -150,6 +150,9 @@ def wanted_path(
 ) -> Float[Array, " 12"]:
     """Path features that a command asks for.
 
+    They begin with the character's own velocity, but never faster than told: a wish
+    that does would ask him who is too fast to go on so.
+
     Args:
       state: The character.
       command: What the user wants now.
@@ -159,13 +162,18 @@ def wanted_path(
     Returns:
       Path features in the axes of the character's bone.
 
-    Source: Holden et al. 2020, released code (controller).
+    Source: Holden et al. 2020, released code (controller), but for this.
     """
     times = jnp.array(path_features.path_offsets(fps)) / fps
     over = lambda x: jnp.broadcast_to(x, (times.shape[0], *x.shape))  # noqa: E731
+    told, own = (
+        jnp.sqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True) + 1e-12)
+        for x in (command.velocity, state.velocity)
+    )
+    velocity = state.velocity * jnp.minimum(1.0, told / own)
     position, _, _ = spring.velocity_spring(
         over(state.bone.origin),
-        over(state.velocity),
+        over(velocity),
         over(jnp.zeros(2)),
         over(command.velocity),
         half_life=half_life,

@@ -29,6 +29,7 @@ from jaxmotion.systems.aamdm import network as aamdm_network
 from jaxmotion.typing import Key, Params
 
 PATH = 12
+SLOW = 1.0  # meters per second; slower feet are near or on the ground
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -215,12 +216,31 @@ def decode(
     return features.denormalize(statistics.pose, found)
 
 
-def _views(poses: Array, parents: tuple[int, ...], joints: int) -> dict[str, Array]:
+def _transforms(
+    parts: dict[str, Array], parents: tuple[int, ...]
+) -> tuple[Array, Array]:
+    split = lambda x: x.reshape(*x.shape[:-1], len(parents), -1)  # noqa: E731
+    return pose.character_transforms(
+        parents, split(parts["position"]), split(parts["rotation"])
+    )
+
+
+def character_positions(
+    poses: Float[Array, "*batch features"], parents: tuple[int, ...]
+) -> Float[Array, "*batch joints 3"]:
+    """Joints that pose vectors mean, in the axes of the simulation bone, meters.
+
+    Args:
+      poses: Pose vectors.
+      parents: Parent of each joint.
+    """
+    return _transforms(unpack(pose.pose_layout(len(parents)), poses), parents)[0]
+
+
+def _views(poses: Array, parents: tuple[int, ...]) -> dict[str, Array]:
     """Poses in their own channels, and in the character's axes."""
-    parts = unpack(pose.pose_layout(joints), poses)
-    split = lambda x, n: x.reshape(*x.shape[:-1], joints, n)  # noqa: E731
-    position, rot6d = split(parts["position"], 3), split(parts["rotation"], 6)
-    where, turned = pose.character_transforms(parents, position, rot6d)
+    parts = unpack(pose.pose_layout(len(parents)), poses)
+    where, turned = _transforms(parts, parents)
     axes = rotation.rot6d_from_matrix(turned)
     return parts | {"character_position": where, "character_rotation": axes}
 
@@ -245,7 +265,7 @@ def pose_errors(
 
     Source: Li et al. 2024 (AAMDM), eq. 1 and 2.
     """
-    views = [_views(x, parents, config.num_joints) for x in (found, poses)]
+    views = [_views(x, parents) for x in (found, poses)]
     weights: dict[str, Any] = dataclasses.asdict(config.weights)
     value = change = jnp.zeros(())
     for name, mine in views[0].items():
@@ -255,6 +275,44 @@ def pose_errors(
             rate = jnp.diff(error, axis=poses.ndim - 2) * config.fps
             change = change + weights[f"{name}_change"] * jnp.mean(jnp.abs(rate))
     return value, change
+
+
+def foot_error(
+    found: Float[Array, "*batch frames features"],
+    poses: Float[Array, "*batch frames features"],
+    *,
+    parents: tuple[int, ...],
+    feet: tuple[int, ...],
+    config: Config,
+) -> Float[Array, ""]:
+    """How much faster or slower toes go over the ground than recorded slow ones.
+
+    Errors of joints are in the character's axes, where a planted foot moves as fast as
+    the bone: this one is in the world, where it stands.
+
+    Args:
+      found: Pose vectors, frame after frame.
+      poses: Those that they should be.
+      parents: Parent of each joint.
+      feet: The toes.
+      config: Sizes.
+
+    Returns:
+      Mean error of a coordinate of the toes' velocities, meters per second; toes that
+      are recorded at `SLOW` or more count as without error.
+
+    Source: own.
+    """
+
+    def velocities(x: Array) -> Array:
+        toes = character_positions(x, parents)[..., jnp.array(feet), :]
+        return pose.point_velocities(
+            x, toes, num_joints=config.num_joints, fps=config.fps
+        )
+
+    own, recorded = velocities(found), velocities(poses)
+    slow = jnp.sum(jnp.square(recorded), axis=-1, keepdims=True) < SLOW**2
+    return jnp.mean(jnp.abs(own - recorded) * slow)
 
 
 def loss(

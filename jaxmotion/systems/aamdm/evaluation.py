@@ -34,12 +34,12 @@ from jaxmotion.evaluation import (
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Row
 from jaxmotion.motion import features, ground, path_features, pose
-from jaxmotion.motion.features import unpack
 from jaxmotion.motion.skeleton import Skeleton, forward_kinematics
 from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
 from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm.controller import CharacterState, Stepper
 from jaxmotion.systems.aamdm.data import PoseData, starts
+from jaxmotion.systems.aamdm.embedding import character_positions
 from jaxmotion.systems.aamdm.space import Space
 from jaxmotion.systems.aamdm.training import (
     Run,
@@ -235,13 +235,6 @@ class Reference:
     root_height: float
 
 
-def _pose_positions(skeleton: Skeleton, poses: Array) -> Array:
-    parts = unpack(pose.pose_layout(skeleton.num_joints), poses)
-    split = lambda x: x.reshape(*x.shape[:-1], skeleton.num_joints, -1)  # noqa: E731
-    position, rot6d = split(parts["position"]), split(parts["rotation"])
-    return pose.character_transforms(skeleton.parents, position, rot6d)[0]
-
-
 def make_reference(skeleton: Skeleton, data: PoseData) -> Reference:
     """The reference of training frames.
 
@@ -252,7 +245,8 @@ def make_reference(skeleton: Skeleton, data: PoseData) -> Reference:
     Returns:
       The reference; every fifth frame counts.
     """
-    found = jax.jit(lambda x: _pose_positions(skeleton, x))(data.poses[::STRIDE])
+    parents = skeleton.parents
+    found = jax.jit(lambda x: character_positions(x, parents))(data.poses[::STRIDE])
     toes = np.asarray(found[:, jnp.array(skeleton.feet), 1])
     flat = found.reshape(len(found), -1)
     # A centimeter: the chest hardly leaves the bone's axis.

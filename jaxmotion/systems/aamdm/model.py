@@ -55,6 +55,8 @@ class Config:
       weight_velocity: Weight of the differences of neighboring frames.
       weight_pose: Weight of the errors of the poses that the polisher's frames mean, as
         the autoencoder measures them; ours.
+      weight_foot: Weight of the errors of slow toes' velocities over the ground, in the
+        unit of these errors of poses, to which they are added; ours.
       previous_noise: Largest deviation of the noise that is added in training to the
         previous frames of the data, in deviations of these; ours, so that a
         rollout recovers after leaving the data. 0 for none.
@@ -75,6 +77,7 @@ class Config:
     gan_window: int = 3
     weight_velocity: float = 0.1
     weight_pose: float = 0.0
+    weight_foot: float = 0.0
     previous_noise: float = 0.0
     own_previous: float = 0.5
     weight_r1: float = 0.05

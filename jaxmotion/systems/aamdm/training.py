@@ -341,14 +341,21 @@ def scale_of_changes(
     return space.change if config.predict == "change" else None
 
 
-def _pose_error(run: Run, space: Space, found: Array, frames: Array) -> Array:
-    """Error of the poses that windows of frames mean, as the autoencoder has it."""
-    value, change = aamdm_embedding.pose_errors(
-        *(aamdm_space.to_poses(space, x) for x in (found, frames)),
-        parents=run.skeleton.parents,
-        config=run.embedding,
-    )
-    return value + change
+def _pose_error(
+    run: Run, space: Space, weight_foot: float, found: Array, frames: Array
+) -> Array:
+    """Error of the poses that windows of frames mean, as the autoencoder has it.
+
+    With a weight of feet that of slow toes, too.
+    """
+    poses = [aamdm_space.to_poses(space, x) for x in (found, frames)]
+    common = dict(parents=run.skeleton.parents, config=run.embedding)
+    total = sum(aamdm_embedding.pose_errors(*poses, **common))
+    if weight_foot:
+        feet = run.skeleton.feet
+        error = aamdm_embedding.foot_error(*poses, feet=feet, **common)
+        total = total + weight_foot * error
+    return total
 
 
 def train_polisher(
@@ -368,13 +375,16 @@ def train_polisher(
     """
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     change = scale_of_changes(space, config)
-    error = functools.partial(_pose_error, run, space) if config.weight_pose else None
+    error = functools.partial(_pose_error, run, space, config.weight_foot)
     state = runs.minimize(
         aamdm_model.init(jax.random.key(budget.seed), config)["polisher"],
         run.record,
         _stage(name, config, "polisher"),
         functools.partial(
-            aamdm_loss.polisher_loss, config=config, change=change, pose_error=error
+            aamdm_loss.polisher_loss,
+            config=config,
+            change=change,
+            pose_error=error if config.weight_pose else None,
         ),
         *frame_windows(frames, run.train, config.window + 1, batch=budget.batch),
         budget=budget,

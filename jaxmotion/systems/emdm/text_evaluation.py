@@ -8,6 +8,7 @@ Source: Guo et al. 2022 (T2M); Zhou et al. 2024 (EMDM), section 4.2.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -420,9 +421,8 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
         if run.motions.clips_of(split).size
     }
     draw = jax.jit(sample_text_batch, static_argnames="batch")
-    embed = jax.jit(
-        lambda x, frames, padding: embed(run, chosen, x, frames, padding=padding),
-        static_argnums=2,
+    embedding = jax.jit(
+        functools.partial(embed, run, chosen), static_argnames="padding"
     )
     score = {
         padding: make_scorer(run, chosen, padding=padding)
@@ -432,7 +432,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
     def moments(split: str) -> frechet.Moments:
         key = jax.random.key(settings.seed)
         x, length, _ = draw(key, arrays[split], batch=number)
-        return frechet.moments(embed(x, length, "zeros"))
+        return frechet.moments(embedding(x, length, padding="zeros"))
 
     references = {split: moments(split) for split in arrays}
 
@@ -468,7 +468,8 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
         _, length, caption = draw(key_draw, arrays["test"], batch=_SENTENCES)
         length, caption = (jnp.repeat(v, _REPEATS) for v in (length, caption))
         x = many(key_sample, conditions(caption, length), scale)
-        features = embed(x, length, settings.padding).reshape(_SENTENCES, _REPEATS, -1)
+        features = embedding(x, length, padding=settings.padding)
+        features = features.reshape(_SENTENCES, _REPEATS, -1)
         found["multimodality"] = diversity.multimodality(
             key_pairs, features, num_pairs=_PAIRS
         )

@@ -1,6 +1,7 @@
 """Clips with a ball for SMGDiff: splits, and windows on the device."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,10 @@ class SceneArrays:
     index: windows.WindowIndex
 
 
+def _recording(name: str) -> str:
+    return re.split("[@#]", name, maxsplit=1)[0].removesuffix("_mirrored")
+
+
 def split(
     data: BallClips, *, fraction: float, seed: int = 0
 ) -> tuple[BallClips, BallClips]:
@@ -40,7 +45,8 @@ def split(
     recordings has one on either side.
 
     Args:
-      data: The clips; what stands before "@" in a name is its recording.
+      data: The clips; what stands before "@" or "#" in a name is its recording, of
+        which a mirror image is one, too.
       fraction: Part of the recordings to hold out, in (0, 1).
       seed: Seeds the choice.
 
@@ -52,7 +58,7 @@ def split(
     """
     if not 0.0 < fraction < 1.0:
         raise ValueError(f"fraction should be between 0 and 1, found {fraction}")
-    recordings = np.array([n.partition("@")[0] for n in data.clips.clip_names])
+    recordings = np.array([_recording(name) for name in data.clips.clip_names])
     names, first = np.unique(recordings, return_index=True)
     skills = np.asarray(data.clips.labels[FIELD])[first]
     generator = np.random.default_rng(seed)

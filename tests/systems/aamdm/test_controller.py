@@ -131,6 +131,29 @@ def test_a_later_point_is_nearer_to_the_command():
     assert np.all(np.diff(yaw) > 0) and 0 < yaw[0] and yaw[-1] < 1
 
 
+def test_who_is_too_fast_wants_no_more_than_told():
+    told = command(1.5 * person.directions(0.2), 0.0)
+    expected = wanted_path(character(1.5 * person.directions(0.9), 0.0), told)
+    for speed in (1.6, 3.0, 40.0):
+        found = wanted_path(character(speed * person.directions(0.9), 0.0), told)
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+    slower = wanted_path(character(0.7 * person.directions(0.9), 0.0), told)
+    assert np.linalg.norm(slower[:2]) < np.linalg.norm(expected[:2]) - 0.02
+
+
+def test_who_is_told_to_stand_wants_to_stand_where_he_is():
+    found = wanted_path(character([0.4, 2.0], 0.0), command([0.0, 0.0], 0.0))
+    np.testing.assert_allclose(found[:6], 0.0, atol=1e-5)
+
+
+def test_gradients_of_the_wish_are_finite_for_who_stands():
+    def far(velocity):
+        state = dataclasses.replace(character([0.0, 0.0], 0.0), velocity=velocity)
+        return jnp.sum(wanted_path(state, command([0.0, 0.0], 0.0)))
+
+    assert np.isfinite(jax.grad(far)(jnp.zeros(2))).all()
+
+
 # --- guidance ----------------------------------------------------------------------
 
 

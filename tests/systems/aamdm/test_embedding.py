@@ -299,3 +299,73 @@ def test_training_on_a_few_poses_lowers_the_loss():
     _, info = run(state, jax.random.key(0), (poses, paths))
     assert np.all(np.isfinite(info["loss"]))
     assert info["value"][-1] < 0.5 * info["value"][0]
+
+
+# --- slow toes ---------------------------------------------------------------------
+
+FEET = (2, 4)
+
+
+def error_of_feet(found, poses):
+    return aamdm_embedding.foot_error(
+        found, poses, parents=person.PARENTS, feet=FEET, config=CONFIG
+    )
+
+
+def toe_velocities(vectors):
+    """World velocities of the toes from frame to frame, in the former's bone axes."""
+    rows = []
+    for before, after in zip(vectors, vectors[1:], strict=False):
+        origin, facing = reference.advance(
+            np.zeros(2),
+            np.array([0.0, 1.0]),
+            after[SLICES["root_velocity"]],
+            after[SLICES["root_angular_velocity"]],
+            60.0,
+        )
+        bone = reference.bone_matrix(origin, facing)
+        here, there = (
+            parts_of(vector)["character_position"][list(FEET)]
+            for vector in (before, after)
+        )
+        there = there @ bone[:3, :3].T + bone[:3, 3]
+        rows.append((there - here) * 60.0)
+    return np.array(rows)
+
+
+def near_poses(seed):
+    """Two windows of poses that hardly change, of which some toes are slow."""
+    own = np.random.default_rng(seed)
+    first = np.float64(drawn(2, 1, SIZE, seed=seed))
+    size = np.array([0.1, 3.0])[:, None, None]
+    windows = first + size * 0.004 * own.normal(size=(2, 5, SIZE))
+    for name in ("root_velocity", "root_angular_velocity"):
+        windows[..., SLICES[name]] = own.normal(size=(2, 5, 3)) * size / 3
+    return windows
+
+
+def test_errors_of_slow_toes_are_those_of_the_definition():
+    poses, found = near_poses(7), near_poses(8)
+    found[0] = poses[0] + 0.001 * np.random.default_rng(9).normal(size=poses[0].shape)
+    recorded, own = (np.stack([toe_velocities(w) for w in x]) for x in (poses, found))
+    slow = np.linalg.norm(recorded, axis=-1) < 1.0
+    assert 0.2 < slow.mean() < 0.8
+    expected = (np.abs(own - recorded) * slow[..., None]).mean()
+    result = error_of_feet(person.float32(found), person.float32(poses))
+    np.testing.assert_allclose(result, expected, rtol=2e-3)
+
+
+def test_toes_that_stand_as_recorded_cost_nothing_and_fast_ones_never_do():
+    poses = person.float32(near_poses(7))
+    assert error_of_feet(poses, poses) == 0.0
+    fast = poses.at[..., SLICES["root_velocity"]].add(90.0)
+    assert error_of_feet(poses, fast) == 0.0
+    assert error_of_feet(fast, poses) > 1.0
+
+
+def test_gradients_of_slow_toes_are_finite():
+    poses = person.float32(near_poses(7))
+    slope = jax.grad(error_of_feet)
+    assert np.isfinite(slope(poses, poses)).all()
+    found = slope(person.float32(near_poses(8)), poses)
+    assert np.isfinite(found).all() and np.abs(found).sum() > 0

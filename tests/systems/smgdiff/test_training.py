@@ -83,12 +83,14 @@ def test_a_motion_model_starts_from_a_draft_with_weights_of_its_own(trained):
 
 def test_pieces_of_one_recording_stay_together():
     data = ball_walker.clips(40)
-    names = tuple(f"take{i // 2}@{i}+40" for i in range(8))
+    # Pieces, their mirror images, and a ball drawn anew.
+    kinds = ("@{}+40", "_mirrored@{}+40#2", "", "_mirrored#3")
+    names = tuple(f"take{i // 2}" + kinds[i % 4].format(i) for i in range(8))
     data = dataclasses.replace(
         data, clips=dataclasses.replace(data.clips, clip_names=names)
     )
     parts = smgdiff_data.split(data, fraction=0.5, seed=3)
-    takes = [{n.split("@")[0] for n in part.clips.clip_names} for part in parts]
+    takes = [{n[:5] for n in part.clips.clip_names} for part in parts]
     assert not takes[0] & takes[1] and len(takes[0] | takes[1]) == 4
     for part in parts:
         assert set(np.asarray(part.clips.labels["skill"])) == {0, 1}
