@@ -106,7 +106,8 @@ class Evaluate:
       course: Commands of the steered rollouts.
       speed: Meters per second that are commanded.
       scale: Strength of AAMDM's guidance, epsilon of eq. 13.
-      amdm_scale: Strength of AMDM's.
+      guided_steps: How many steps at the chain's end are guided; None for all (paper).
+      amdm_scale: Strength of AMDM's, of which all steps are guided.
       noise_half_life: Seconds in which noise of AAMDM's posteriors is forgotten; 0 to
         draw it anew in every frame (paper).
       long_minutes: Length of the long rollouts of the row "aamdm"; 0 for none.
@@ -122,6 +123,7 @@ class Evaluate:
     course: Course = aamdm_evaluation.COURSE
     speed: float = aamdm_evaluation.SPEED
     scale: float = aamdm_controller.SCALE
+    guided_steps: int | None = aamdm_controller.GUIDED_STEPS
     amdm_scale: float = 1.0
     noise_half_life: float = 0.0
     long_minutes: float = 10.0
@@ -138,6 +140,7 @@ class Rollout:
     Attributes:
       speed: Meters per second that are commanded.
       scale: Strength of the guidance, epsilon of eq. 13.
+      guided_steps: As of `evaluate`.
       noise_half_life: As of `evaluate`.
       out: Folder; None for <run>/rollout.
     """
@@ -149,6 +152,7 @@ class Rollout:
     course: Course = aamdm_evaluation.COURSE
     speed: float = aamdm_evaluation.SPEED
     scale: float = aamdm_controller.SCALE
+    guided_steps: int | None = aamdm_controller.GUIDED_STEPS
     noise_half_life: float = 0.0
     out: Path | None = None
     seed: int = 0
@@ -226,10 +230,12 @@ def evaluate(args: Evaluate) -> None:
     here = results.Measured(path=out / "metrics.json", rows=table, about=report)
     papers = claims.read_paper(registry.get("aamdm")).tables
     report["claims"] = verdicts.lines(papers, {papers[0].source: here})
+    guided = "all" if args.guided_steps is None else f"the last {args.guided_steps}"
     note = (
         f"Steered: course {args.course!r} at {args.speed:g} m/s, guidance "
-        f"{args.scale:g}, half-life of noise {args.noise_half_life:g} s; div and fid "
-        "are of joint positions in the character's axes: no evaluator."
+        f"{args.scale:g} in {guided} steps, half-life of noise "
+        f"{args.noise_half_life:g} s; div and fid are of joint positions in the "
+        "character's axes: no evaluator."
     )
     reporting.write_table(out, table, report, (note,))
     for line in report["claims"]:
@@ -243,7 +249,12 @@ def rollout(args: Rollout) -> None:
     out = cli.out_folder(args, "rollout")
     space = aamdm_training.load_space(run, rows.space_of(args.row))
     step = rows.load_row(
-        args.row, run, space, scale=args.scale, half_life=args.noise_half_life
+        args.row,
+        run,
+        space,
+        scale=args.scale,
+        guided_steps=args.guided_steps,
+        half_life=args.noise_half_life,
     )
     states = aamdm_evaluation.start_states(run, space, step, 1, seed=args.seed)
     ticks = round(args.seconds * run.train.fps)

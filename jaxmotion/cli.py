@@ -87,7 +87,7 @@ LIMITS: dict[str, Range] = {
     "draft_steps": Range(0, 10**9),
     "token_margin": Range(0, 1000),
     "frame_kernel": Range(0, 255),
-    "noise_levels": Range(1, 1000),
+    **dict.fromkeys(("noise_levels", "guided_steps"), Range(1, 1000)),
     "gan_window": Range(3, 1000),
     "window": Range(1, 1000),
     "balance": Range(0, 1),

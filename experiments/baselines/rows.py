@@ -197,7 +197,13 @@ def train_row(
 
 
 def load_row(
-    name: str, run: Run, space: Space, *, scale: float, half_life: float = 0.0
+    name: str,
+    run: Run,
+    space: Space,
+    *,
+    scale: float,
+    guided_steps: int | None = aamdm_controller.GUIDED_STEPS,
+    half_life: float = 0.0,
 ) -> Stepper:
     """The stepper of a trained row.
 
@@ -206,6 +212,7 @@ def load_row(
       run: The run.
       space: The row's space.
       scale: Strength of the guidance, for those that are guided.
+      guided_steps: How many steps at a chain's end are guided; None for all.
       half_life: In which noise of a chain's posteriors is forgotten, seconds; 0 to draw
         it anew in every frame.
 
@@ -228,7 +235,9 @@ def load_row(
         memory = None
         if half_life:
             memory = Memory(num_steps=polishes + drafts, half_life=half_life)
-        return aamdm_controller.guided(transition, scale=scale, memory=memory)
+        return aamdm_controller.guided(
+            transition, scale=scale, guided_steps=guided_steps, memory=memory
+        )
     module = _BASELINES[name]
     config = runs.stage_config(run.record, _stage(name), module.Config)
     params = runs.load_params(

@@ -31,7 +31,12 @@ def trained_rows(
             if where not in spaces:
                 spaces[where] = aamdm_training.load_space(run, where)
             step = rows.load_row(
-                name, run, spaces[where], scale=scale, half_life=args.noise_half_life
+                name,
+                run,
+                spaces[where],
+                scale=scale,
+                guided_steps=args.guided_steps,
+                half_life=args.noise_half_life,
             )
             found[name] = (step, spaces[where])
         except checkpoint.CheckpointError as error:

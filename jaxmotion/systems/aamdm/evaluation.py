@@ -538,7 +538,11 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
     def stepper(point: bench.Point) -> Stepper:
         polishes, drafts = point.parts
         chain = load_chain(run, "embedded", space, drafts=drafts, polishes=polishes)
-        return aamdm_controller.guided(chain, scale=aamdm_controller.SCALE)
+        return aamdm_controller.guided(
+            chain,
+            scale=aamdm_controller.SCALE,
+            guided_steps=aamdm_controller.GUIDED_STEPS,
+        )
 
     def real(data: PoseData) -> Row:
         frames = data_frames(run, data, rollouts, ticks, seed=seed)

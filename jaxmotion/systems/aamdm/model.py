@@ -261,9 +261,10 @@ def sampler(
         paper's. One that looks back forgets where the polisher takes over.
 
     Returns:
-      `sample(key, previous, *, objective=None, scale=0.0, noise=None) -> next`. With an
-      objective of the predicted frame every step is guided down its gradient (eq. 13).
-      `noise` is that of the posteriors, [T, features], for steps that take one.
+      `sample(key, previous, *, objective=None, scale=0.0, guided_steps=None,
+      noise=None) -> next`. With an objective of the predicted frame so many steps at
+      the chain's end are guided down its gradient, by default all (eq. 13). `noise` is
+      that of the posteriors, [T, features], for steps that take one.
 
     Raises:
       ValueError: if `change` does not fit what is predicted.
@@ -277,17 +278,26 @@ def sampler(
         *,
         objective: Objective | None = None,
         scale: float | Float[Array, ""] = 0.0,
+        guided_steps: int | None = None,
         noise: Float[Array, "steps *batch features"] | None = None,
     ) -> Float[Array, "*batch features"]:
         make = step if noise is None else functools.partial(step, noise=noise)
+        guided = config.num_steps if guided_steps is None else guided_steps
+        if objective is None:
+            guided = 0
 
         def part(denoise: Denoiser, x: Array, start: int, stop: int) -> Array:
-            if objective is not None:
+            border = min(max(guided, stop), start)
+            if start > border:
+                move = make(table, denoise)
+                x = chain.sample_from(move, key_chain, x, start=start, stop=border)
+            if border > stop:
                 denoise = guidance.gradient_guidance(
                     table, denoise, objective, scale=scale
                 )
-            move = make(table, denoise)
-            return chain.sample_from(move, key_chain, x, start=start, stop=stop)
+                move = make(table, denoise)
+                x = chain.sample_from(move, key_chain, x, start=border, stop=stop)
+            return x
 
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, previous.shape, previous.dtype)

@@ -188,8 +188,9 @@ def test_a_goal_becomes_the_objective_of_the_transition():
         return previous
 
     goal = normal(12, seed=1)
-    aamdm_controller.guided(transition, scale=0.7)(jax.random.key(0), normal(20), goal)
-    assert seen["scale"] == 0.7
+    step = aamdm_controller.guided(transition, scale=0.7, guided_steps=2)
+    step(jax.random.key(0), normal(20), goal)
+    assert (seen["scale"], seen["guided_steps"]) == (0.7, 2)
     at_goal = jnp.concatenate([goal, jnp.ones(8)])
     assert seen["objective"](at_goal) == 0.0 < seen["objective"](at_goal + 1.0)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import chain, schedule
+from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
 from tests import mostly_slow, tiny
@@ -78,6 +78,32 @@ def test_guidance_lowers_its_objective():
     plain = jax.jit(step)(jax.random.key(5), normal(3))
     off = step(jax.random.key(5), normal(3), objective=objective, scale=0.0)
     np.testing.assert_allclose(off, plain, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("guided_steps", mostly_slow([None, 1, 3, 4], [1]))
+def test_only_the_last_steps_are_guided(guided_steps):
+    """Each step, one by one, with the gradient of the objective or without."""
+    sample = aamdm_model.sampler(parameters(), config=CONFIG)
+    key, previous = jax.random.key(1), normal(3)
+    objective = lambda x: 0.5 * jnp.sum(jnp.square(x - 0.5))  # noqa: E731
+    guide = dict(objective=objective, scale=0.3)
+    found = jax.jit(functools.partial(sample, **guide, guided_steps=guided_steps))
+    found = found(key, previous)
+
+    key_start, key_chain = jax.random.split(jax.random.clone(key))
+    x = jax.random.normal(key_start, (3,))
+    for t in range(5, 0, -1):
+        name, make = ("polisher", aamdm_model.polish)
+        if t > 2:
+            name, make = ("generator", aamdm_model.draft)
+        denoise = make(parameters()[name], previous, config=CONFIG)
+        if t <= (guided_steps or 5):
+            denoise = guidance.gradient_guidance(
+                CONFIG.table(), denoise, objective, scale=0.3
+            )
+        step = chain.ancestral_step(CONFIG.table(), denoise)
+        x = step(jax.random.fold_in(key_chain, t), x, jnp.array(t))
+    np.testing.assert_allclose(found, x, rtol=1e-5, atol=1e-6)
 
 
 def test_polisher_loss_is_a_loop_over_its_own_predictions():
