@@ -41,6 +41,8 @@ class Train:
       fps: Frames per second to which clips are resampled.
       held_out: Part of each clip, at its end, kept for evaluation.
       mirror: Add a mirrored copy of every clip.
+      balance: How much more often rare speeds and turns are drawn: 0 as recorded, 1 all
+        alike.
       autoencoder_steps: Updates of the pose autoencoder.
       polisher_steps: Updates of each diffusion model.
       generator_steps: Updates of each denoising-diffusion GAN.
@@ -72,6 +74,7 @@ class Train:
     fps: float = 60.0
     held_out: float = 0.1
     mirror: bool = True
+    balance: float = 0.0
     autoencoder_steps: int = 20000
     polisher_steps: int = 5000
     generator_steps: int = 8000
@@ -172,6 +175,7 @@ def train(args: Train) -> None:
         fps=args.fps,
         held_out=args.held_out,
         mirrored=args.mirror,
+        balance=args.balance,
     )
     print(f"{run.train.num_frames} training frames, {run.held_out.num_frames} held out")
     sizes = rows.Sizes(

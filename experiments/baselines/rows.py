@@ -151,7 +151,7 @@ def train_baseline(
     loss = _baseline_loss(name, frames, space, config)
     length, given = _WINDOWS[name]
     windows, arrays = aamdm_training.frame_windows(
-        frames, run.train, length, batch=budget.batch
+        frames, run.train, length, batch=budget.batch, balance=run.balance
     )
 
     def sample(key: jax.Array, arrays: Any) -> jax.Array:

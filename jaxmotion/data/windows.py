@@ -134,27 +134,61 @@ def balance(
 
     def speed(end: np.ndarray) -> np.ndarray:
         way = np.linalg.norm(position[end] - position[end - third], axis=-1)
-        return np.digitize(way * clips.fps / third, SPEED_BORDERS)
+        return way * clips.fps / third
 
     now, end = starts + last, starts + index.length - 1
     before = np.maximum(now, starts + third)
     angle = np.arctan2(facing[:, 0], facing[:, 1])
-    turned = (angle[end] - angle[now] + np.pi) % (2 * np.pi) - np.pi
-    width = len(SPEED_BORDERS) + 1
-    kinds = speed(before) * width + speed(end)
-    kinds = kinds * (len(TURN_BORDERS) + 1) + np.digitize(turned, TURN_BORDERS)
-    _, kind, count = np.unique(kinds, return_inverse=True, return_counts=True)
-    weight = count[kind] ** -power
-    times = 2.0 * starts.size * weight / weight.sum()
-    # Rounded so that the sum is right: the n-th entry lies where the sum passes n.
-    edges = np.round(np.concatenate([[0.0], np.cumsum(times)])).astype(int)
-    chosen = np.repeat(np.arange(starts.size), np.diff(edges))
-    shares = np.stack(
-        [count / starts.size, np.bincount(kind[chosen]) / chosen.size], axis=-1
-    )
+    kinds = motion_kinds(speed(before), speed(end), angle[end] - angle[now])
+    chosen, shares = repeat_rare(kinds, power=power)
     return dataclasses.replace(
         index, starts=index.starts[chosen], clips=index.clips[chosen]
     ), shares
+
+
+def motion_kinds(
+    now: Float[np.ndarray, " windows"],
+    end: Float[np.ndarray, " windows"],
+    turned: Float[np.ndarray, " windows"],
+) -> Int[np.ndarray, " windows"]:
+    """Classes of windows by what changes in them.
+
+    Args:
+      now: Speed at the beginning, meters per second.
+      end: Speed at the end.
+      turned: Angle by which the facing turns between, radians.
+
+    Returns:
+      Numbers of classes.
+    """
+    speeds, turns = len(SPEED_BORDERS) + 1, len(TURN_BORDERS) + 1
+    kinds = np.digitize(now, SPEED_BORDERS) * speeds + np.digitize(end, SPEED_BORDERS)
+    turned = (turned + np.pi) % (2 * np.pi) - np.pi
+    return kinds * turns + np.digitize(turned, TURN_BORDERS)
+
+
+def repeat_rare(
+    kinds: Int[np.ndarray, " windows"], *, power: float
+) -> tuple[Int[np.ndarray, " chosen"], Float[np.ndarray, "classes 2"]]:
+    """Windows in which rare classes stand more often, each n^-power for n windows.
+
+    Args:
+      kinds: The class of each window.
+      power: 0 draws all windows alike; 1 gives all classes the same share.
+
+    Returns:
+      Numbers of windows, about twice as many, and each class's share before and after.
+    """
+    _, kind, count = np.unique(kinds, return_inverse=True, return_counts=True)
+    weight = count[kind] ** -power
+    times = 2.0 * kinds.size * weight / weight.sum()
+    # Rounded so that the sum is right: the n-th entry lies where the sum passes n.
+    edges = np.round(np.concatenate([[0.0], np.cumsum(times)])).astype(int)
+    chosen = np.repeat(np.arange(kinds.size), np.diff(edges))
+    shares = np.stack(
+        [count / kinds.size, np.bincount(kind[chosen]) / chosen.size], axis=-1
+    )
+    return chosen, shares
 
 
 def cut(clips: Clips, start: Int[Array, ""], length: int) -> Motion:

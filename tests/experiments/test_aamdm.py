@@ -24,7 +24,7 @@ SCRIPT = ROOT / "experiments" / "aamdm.py"
 SETTINGS = (
     "--field style --labels --rows aamdm lmm --autoencoder-steps 10 "
     "--polisher-steps 10 --generator-steps 10 --window-steps 10 --batch 8 "
-    "--width 32"
+    "--width 32 --balance 0.5"
 )
 STAGES = (
     "autoencoder",
@@ -75,6 +75,7 @@ def test_training_leaves_every_stage(trained, data):
     config = json.loads((trained / "config.json").read_text())
     assert config["system"] == "aamdm" and list(config["data"]) == [str(data)]
     assert config["settings"]["labels"] == [] and config["settings"]["fps"] == 60.0
+    assert config["settings"]["balance"] == 0.5
     assert "procedural" in config["source"]
     # Sixteen clips and their mirror images.
     assert len(config["split"]["train"]) == 32

@@ -62,6 +62,34 @@ def starts(data: PoseData, length: int, *, stride: int = 1) -> Int[Array, " wind
     return jnp.asarray(found, jnp.int32)
 
 
+def balanced_starts(
+    data: PoseData, length: int, *, power: float
+) -> Int[Array, " windows"]:
+    """First frames of windows, those of rare speeds and turns more often.
+
+    A window's class is what the path features of its first frame say: the speeds over
+    the first third of a second and over the last of the second ahead, and the turn of
+    the facing.
+
+    Args:
+      data: The frames.
+      length: Frames per window.
+      power: As of `windows.repeat_rare`; 0 lists each once, as `starts`.
+
+    Raises:
+      ValueError: if no clip is long enough.
+    """
+    first = np.asarray(starts(data, length))
+    if not power:
+        return jnp.asarray(first)
+    ahead = np.asarray(data.paths, np.float64)[first].reshape(-1, 2, 3, 2)
+    points, facing = ahead[:, 0], ahead[:, 1, -1]
+    speeds = 3.0 * np.linalg.norm(np.diff(points, axis=1, prepend=0.0), axis=-1)
+    turned = np.arctan2(facing[:, 0], facing[:, 1])
+    kinds = windows.motion_kinds(speeds[:, 0], speeds[:, -1], turned)
+    return jnp.asarray(first[windows.repeat_rare(kinds, power=power)[0]])
+
+
 def take(data: PoseData, spans: list[tuple[int, int]]) -> PoseData:
     """Parts of the frames, each a clip of its own.
 

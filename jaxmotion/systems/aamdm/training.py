@@ -27,7 +27,7 @@ from jaxmotion.systems.aamdm import embedding as aamdm_embedding
 from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
-from jaxmotion.systems.aamdm.data import PoseData, starts
+from jaxmotion.systems.aamdm.data import PoseData
 from jaxmotion.systems.aamdm.model import Sample
 from jaxmotion.systems.aamdm.space import Autoencoder, Space
 from jaxmotion.typing import Key, Params
@@ -37,7 +37,7 @@ SpaceName = Literal["embedded", "full_pose"]
 
 
 def frame_windows(
-    frames: Array, data: PoseData, length: int, *, batch: int
+    frames: Array, data: PoseData, length: int, *, batch: int, balance: float = 0.0
 ) -> tuple[Callable, tuple[Array, Int[Array, " windows"]]]:
     """Windows of frames for training.
 
@@ -46,6 +46,8 @@ def frame_windows(
       data: The data.
       length: Frames per window.
       batch: Windows per batch.
+      balance: How much more often rare speeds and turns are drawn; see
+        `data.balanced_starts`.
 
     Returns:
       `sample_batch(key, arrays) -> windows`, and its arrays.
@@ -60,7 +62,8 @@ def frame_windows(
         chosen = first[jax.random.randint(key, (batch,), 0, first.shape[0])]
         return frames[jnp.add.outer(chosen, offsets)]
 
-    return sample, (frames, starts(data, length))
+    first = aamdm_data.balanced_starts(data, length, power=balance)
+    return sample, (frames, first)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -82,6 +85,11 @@ class Run:
     held_out: PoseData
 
     @property
+    def balance(self) -> float:
+        """How much more often training draws rare speeds and turns."""
+        return self.record.settings["balance"]
+
+    @property
     def source(self) -> str:
         """The data, and its license."""
         return self.record.source
@@ -96,6 +104,7 @@ def prepare(
     fps: float,
     held_out: float,
     mirrored: bool,
+    balance: float = 0.0,
 ) -> Run:
     """Makes the frames of a run folder, or loads those it has.
 
@@ -107,6 +116,7 @@ def prepare(
       fps: Frames per second.
       held_out: Part of each clip, at its end, to hold out.
       mirrored: Whether mirrored clips are added.
+      balance: As of `frame_windows`, for all stages.
 
     Raises:
       OSError: if the clips cannot be read.
@@ -144,6 +154,7 @@ def prepare(
         fps=fps,
         held_out=held_out,
         mirrored=mirrored,
+        balance=balance,
     )
     record = runs.begin(
         folder, system=SYSTEM, data=[data], settings=settings, make=make
@@ -235,7 +246,9 @@ def train_autoencoder(run: Run, budget: Budget) -> Autoencoder:
         config=config,
     )
     both = jnp.concatenate([data.poses, data.paths], axis=-1)
-    windows, arrays = frame_windows(both, data, 2, batch=budget.batch)
+    windows, arrays = frame_windows(
+        both, data, 2, batch=budget.batch, balance=run.balance
+    )
     size = config.num_features
 
     def sample(key: Key, arrays: Any) -> tuple[Array, Array]:
@@ -386,7 +399,13 @@ def train_polisher(
             change=change,
             pose_error=error if config.weight_pose else None,
         ),
-        *frame_windows(frames, run.train, config.window + 1, batch=budget.batch),
+        *frame_windows(
+            frames,
+            run.train,
+            config.window + 1,
+            batch=budget.batch,
+            balance=run.balance,
+        ),
         budget=budget,
         model=_shared(config),
         show=("loss", "value", "velocity"),
@@ -428,7 +447,13 @@ def train_generator(
         adversarial.make_gan_update(
             discriminate, generate, (optimizer, optimizer), ema_decay=budget.ema
         ),
-        *frame_windows(frames, run.train, config.gan_window, batch=budget.batch),
+        *frame_windows(
+            frames,
+            run.train,
+            config.gan_window,
+            batch=budget.batch,
+            balance=run.balance,
+        ),
         budget=budget,
         model=_shared(config),
         show=("generator/loss", "discriminator/loss"),

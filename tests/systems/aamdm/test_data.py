@@ -1,5 +1,7 @@
 """Frames of clips for AAMDM: what is left out, held out, and windowed."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,6 +86,41 @@ def test_windows_longer_than_every_clip_are_refused():
     assert aamdm_data.starts(counted(), 400).tolist() == [0]
     with pytest.raises(ValueError, match="401 frames.*longest has 400"):
         aamdm_data.starts(counted(), 401)
+
+
+def ahead(speeds, turn=0.0):
+    """Path features of a bone that goes straight at these speeds, third by third."""
+    points = np.stack([np.zeros(3), np.cumsum(speeds) / 3], axis=-1)
+    facings = person.directions(turn * np.array([1 / 3, 2 / 3, 1.0]))
+    return np.concatenate([points.ravel(), facings.ravel()])
+
+
+@pytest.mark.parametrize("power", [0.0, 0.5, 1.0])
+def test_windows_of_rare_speeds_and_turns_start_more_often(power):
+    kinds = {
+        (0, 900): ahead([1.4, 1.4, 1.4]),
+        (900, 960): ahead([3.4, 3.4, 3.4]),
+        (960, 980): ahead([1.4, 1.0, 0.1]),
+        (980, 1000): ahead([1.4, 1.4, 1.4], turn=-2.0),
+    }
+    paths = np.concatenate([np.tile(x, (b - a, 1)) for (a, b), x in kinds.items()])
+    data = dataclasses.replace(counted((1000,)), paths=person.float32(paths))
+    found = np.asarray(aamdm_data.balanced_starts(data, 1, power=power))
+    times = np.bincount(found, minlength=1000)
+    sizes = np.array([b - a for a, b in kinds])
+    shares = np.array([times[a:b].sum() for a, b in kinds]) / found.size
+    expected = sizes ** (1 - power) / (sizes ** (1 - power)).sum()
+    np.testing.assert_allclose(shares, expected, atol=2e-3)
+    # Within a class all windows stand equally often.
+    assert all(np.ptp(times[a:b]) <= 1 for a, b in kinds)
+
+
+def test_balanced_windows_fit_into_a_clip():
+    every = set(aamdm_data.starts(counted(), 90).tolist())
+    found = aamdm_data.balanced_starts(counted(), 90, power=0.5).tolist()
+    assert set(found) <= every and len(found) > len(every)
+    with pytest.raises(ValueError, match="401 frames"):
+        aamdm_data.balanced_starts(counted(), 401, power=0.5)
 
 
 def test_parts_are_taken_in_order():
