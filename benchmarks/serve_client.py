@@ -123,7 +123,8 @@ class Config:
 
     Attributes:
       port: Port of a server on this machine that runs already.
-      serve: Run folder: start a server of it, and stop it in the end.
+      serve: Shipped model, run folder or exported file: start a server of it, and stop
+        it in the end.
       seconds: How long to steer.
     """
 
