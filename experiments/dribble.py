@@ -103,7 +103,7 @@ def synthesise(config: Config, clips: Clips) -> BallClips:
     if not parts:
         raise ValueError("every list of labels is none: nothing to make")
     source = parts[0].clips.source
-    if len(parts) > 1 and max(config.draws, sprints) > 1:
+    if max(config.draws, sprints) > 1:
         source = f"{source}, {config.draws} draws ({sprints} of sprint)"
     return _one_source(concatenate_ball_clips(parts), source)
 

@@ -33,7 +33,7 @@ def start(*arguments, flags=""):
 
 
 def finish(process):
-    _, errors = process.communicate(timeout=600)
+    _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
 
 
@@ -171,7 +171,7 @@ def test_a_killed_process_ends_the_run_and_it_resumes(alone, tmp_path):
             assert first.poll() is None and second.poll() is None
             time.sleep(0.2)
         second.kill()
-        _, errors = first.communicate(timeout=600)
+        _, errors = first.communicate(timeout=120)
     finally:
         first.kill()
         second.kill()

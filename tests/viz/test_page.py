@@ -239,9 +239,10 @@ def walks_at(speed):
 def test_held_keys_walk(tab, served, key, way):
     before = after_ticks(served, 15).roots[0, ::2]
     tab.keyboard.down(key)
-    # Keys and frames may be late here.
-    tick = shows(served, lambda x: (x.roots[0, ::2] - before) @ np.array(way) > 1)
-    assert abs((tick.roots[0, ::2] - before) @ np.array(way[::-1])) < 0.3
+    # Keys may be late here. Then three seconds of the character's time.
+    shows(served, lambda tick: tick.told.speed > 0)
+    went = after_ticks(served, 90).roots[0, ::2] - before
+    assert went @ np.array(way) > 1 and abs(went @ np.array(way[::-1])) < 0.3
     tab.keyboard.up(key)
     shows(served, walks_at(0))
 

@@ -303,12 +303,10 @@ def test_training_on_a_few_poses_lowers_the_loss():
 
 # --- slow toes ---------------------------------------------------------------------
 
-FEET = (2, 4)
-
 
 def error_of_feet(found, poses):
     return aamdm_embedding.foot_error(
-        found, poses, parents=person.PARENTS, feet=FEET, config=CONFIG
+        found, poses, parents=person.PARENTS, feet=person.FEET, config=CONFIG
     )
 
 
@@ -325,7 +323,7 @@ def toe_velocities(vectors):
         )
         bone = reference.bone_matrix(origin, facing)
         here, there = (
-            parts_of(vector)["character_position"][list(FEET)]
+            parts_of(vector)["character_position"][list(person.FEET)]
             for vector in (before, after)
         )
         there = there @ bone[:3, :3].T + bone[:3, 3]
