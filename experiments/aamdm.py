@@ -15,12 +15,10 @@ from typing import Annotated, Literal
 import jax
 import tyro
 from baselines import rows, tables
-from reports import claims, results, verdicts
 
 from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
 from jaxmotion.learning import loop, runs
-from jaxmotion.systems import registry
 from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
 from jaxmotion.systems.aamdm import stored as aamdm_stored
@@ -231,9 +229,6 @@ def evaluate(args: Evaluate) -> None:
     run = aamdm_training.load_run(args.run)
     cli.announce("compiling the rollouts of each row", 40)
     table, report = tables.evaluate(run, args, out)
-    here = results.Measured(path=out / "metrics.json", rows=table, about=report)
-    papers = claims.read_paper(registry.get("aamdm")).tables
-    report["claims"] = verdicts.lines(papers, {papers[0].source: here})
     guided = "all" if args.guided_steps is None else f"the last {args.guided_steps}"
     note = (
         f"Steered: course {args.course!r} at {args.speed:g} m/s, guidance "
@@ -242,8 +237,6 @@ def evaluate(args: Evaluate) -> None:
         "character's axes: no evaluator."
     )
     reporting.write_table(out, table, report, (note,))
-    for line in report["claims"]:
-        print(line)
 
 
 def rollout(args: Rollout) -> None:

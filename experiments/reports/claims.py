@@ -91,6 +91,7 @@ class Claim:
       where: Section or table of the paper.
       factor: The larger is at least so many times the smaller.
       toward: Row that the nearer is nearer to; None to compare values.
+      margin: The two rows differ by less, in the column's unit; None for an ordering.
     """
 
     words: str
@@ -99,6 +100,7 @@ class Claim:
     where: str
     factor: float = 1.0
     toward: str | None = None
+    margin: float | None = None
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -187,8 +189,11 @@ class Paper:
 def _pairs(claim: dict[str, Any]) -> tuple[tuple[str, str], ...]:
     """Comparisons (smaller, larger) of a claim as the file writes it.
 
-    `rising`: rows whose values rise; `lowest` or `highest`: a row beside those in `of`.
+    `rising`: rows whose values rise; `lowest` or `highest`: a row beside those in `of`;
+    `alike`: two rows that differ by less than `margin`.
     """
+    if "alike" in claim:
+        return (tuple(claim.pop("alike")),)
     if "rising" in claim:
         rising = claim.pop("rising")
         return tuple(zip(rising, rising[1:], strict=False))

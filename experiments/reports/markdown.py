@@ -3,7 +3,9 @@
 import math
 from collections.abc import Iterable
 
-from jaxmotion.evaluation import columns
+import numpy as np
+
+from jaxmotion.evaluation import columns, sequential
 from jaxmotion.evaluation.statistics import Spread
 from jaxmotion.evaluation.table import Cell
 from reports import verdicts
@@ -81,12 +83,18 @@ def both(table: Table, row: Row, column: Column, found: Found) -> str:
     return "<br>".join(filter(None, [over_trainings(spread), one and f"first: {one}"]))
 
 
-def difference(claim: Claim, pair: tuple[str, str], spread: Spread) -> str:
-    """By how much a comparison holds over trainings."""
+def difference(claim: Claim, pair: tuple[str, str], values: np.ndarray) -> str:
+    """By how much a comparison holds over trainings; "" of fewer than two."""
+    if len(values) < 2:
+        return ""
     first, second = pair
     where = f"distances to {claim.toward}, " if claim.toward else ""
     times = "" if claim.factor == 1 else f"{claim.factor:g} × "
-    return f"{where}{second} less {times}{first}: {over_trainings(spread)}"
+    mean, low, high = map(number, sequential.interval(values))
+    return (
+        f"{where}{second} less {times}{first}: {mean} [{low}, {high}] of {len(values)} "
+        "trainings"
+    )
 
 
 def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -181,12 +189,11 @@ def _claims(table: Table, decided: Decided, found: Found) -> list[str]:
         if where is table:
             texts = [f"**{decision.verdict}**", decision.reason]
             texts += [
-                difference(claim, pair, spread)
-                for pair, spread in decision.differences.items()
+                difference(claim, pair, values)
+                for pair, values in decision.differences.items()
             ]
-            values = _values(table, claim, found)
             rows.append(
-                [f"{claim.words} ({claim.where})", *values]
+                [f"{claim.words} ({claim.where})", *_values(table, claim, found)]
                 + ["<br>".join(filter(None, texts))]
             )
     return table_lines(("claim", "paper", "here", "verdict"), rows) if rows else []
@@ -226,12 +233,10 @@ def section(
 
 def counts(decided: Decided) -> dict[str, str]:
     """Number of claims of each verdict, in words, such as "3 reproduced"."""
-    found = {}
-    for name in verdicts.Verdict.__args__:
-        own = [x.trainings > 1 for _, _, x in decided if x.verdict == name]
-        by = f" ({sum(own)} of them by several trainings)" if any(own) else ""
-        found[name] = f"{len(own)} {name}{by}"
-    return found
+    return {
+        name: f"{sum(x.verdict == name for _, _, x in decided)} {name}"
+        for name in verdicts.Verdict.__args__
+    }
 
 
 def summary(decided: Decided) -> list[str]:

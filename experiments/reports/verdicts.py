@@ -3,11 +3,12 @@
 import dataclasses
 import functools
 import math
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 
-from jaxmotion.evaluation import statistics
+from jaxmotion.evaluation import sequential, statistics
 from jaxmotion.evaluation.statistics import Spread
 from jaxmotion.evaluation.table import Cell
 from reports.claims import Claim, Column, Row, Stated, Table
@@ -16,34 +17,40 @@ from reports.results import Found
 Ends = tuple[float, float]
 Verdict = Literal["reproduced", "not reproduced", "not decided", "not run"]
 
-# In place of the interval of a time that has none.
-TIME_FACTOR = 1.25
 _QUANTILE = 1.96  # of the normal distribution, two-sided 95 %
 
+# Familywise probability of a false verdict of a claim, on either side.
+ALPHA = 0.05
+# A claim that as many trainings leave open is given up.
+MAX_TRAININGS = 12
+
 RULE = (
-    "A claim is a set of comparisons, each of two rows of one column. A comparison "
-    "holds if the intervals are apart in the claimed order, fails if they are apart in "
-    "the opposite one, and is undecided if they overlap. (That two intervals of 95 % "
-    "are apart asks for more than Welch's test at 5 % does.)",
-    "The claim is **reproduced** if all hold, **not reproduced** if one fails, **not "
-    "run** if a row was not measured and none fails, and else **not decided**.",
-    "Where the larger is claimed to be so many times the smaller, its interval must "
-    "begin above so many times the upper end of the smaller. The bar is ours, below "
-    "the paper's own ratio, since machines differ.",
-    "Nearness to recorded motion must come out alike for every value in the latter's "
-    "interval.",
-    "Intervals are those of the file, of 95 %. Counts have Wilson's. Times have what "
-    "their column says, and those without spread a factor of "
-    f"{TIME_FACTOR:g} either way; others without an interval decide nothing.",
+    "A claim is a set of comparisons, each of two rows of one column. For each, the "
+    "claimed difference is taken within every training: both rows have the same seed, "
+    "data, commands and noise in their evaluation. A training without one of the rows, "
+    "or with a value that is not finite, decides nothing.",
+    "Trainings are added one at a time, and evidence is counted after each by a "
+    "sequential t-test (`jaxmotion/evaluation/sequential.py`): the probability that it "
+    "ever exceeds 1 / a without an effect is at most a, whenever one stops.",
+    "A claim of k comparisons is **reproduced** once evidence for each has exceeded "
+    f"{1 / ALPHA:g}, and **not reproduced** once evidence for the opposite of one has "
+    f"exceeded {1 / ALPHA:g} k: either verdict is false with probability {ALPHA:g} at "
+    "most. What comes first stands. It is **not run** if a row was not measured, and "
+    f"else **not decided**; after {MAX_TRAININGS} trainings it stays so, and its "
+    "interval says how large a difference may be.",
+    "One training decides nothing, for intervals over its replications, clips or "
+    "rollouts do not hold what another seed would change.",
+    "Where the larger is claimed to be so many times the smaller, the difference is "
+    "that of the larger and so many times the smaller. The bar is ours, below the "
+    "paper's own ratio, since machines differ. Nearness to recorded motion compares "
+    "distances to it.",
+    "That two rows are alike is claimed with a margin: both that their difference is "
+    "above its negative and that it is below it must hold (two one-sided tests).",
     "Rows of several files that an evaluator scored are compared only if the files "
     "name the same evaluator and reference clips.",
-    "Where both rows were trained with several seeds, these intervals do not decide: "
-    "the claimed difference is taken within each seed, and the comparison holds or "
-    "fails if the 95 % interval of its mean over seeds (Student's t, as in a paired "
-    "t-test) is above or below zero. Within a seed both rows have the same data, "
-    "and the same commands and noise in their evaluation.",
-    "Where they were trained once, intervals run over replications, clips or rollouts "
-    "of that training: what another seed would change is not in them.",
+    "Intervals of a claim's differences hold the mean at all numbers of trainings at "
+    "once with 95 %; those of a cell are Student's, or of the file where it was "
+    "trained once (Wilson's of counts).",
 )
 
 
@@ -53,16 +60,18 @@ class Decision:
 
     Attributes:
       verdict: The verdict.
-      reason: Comparisons that failed, were undecided or could not be made; or "".
-      differences: By how much the comparisons of rows of several trainings hold, over
-        these; negative where they fail.
-      trainings: Fewest trainings that a comparison rests on.
+      reason: Comparisons that failed, are open or could not be made; or "".
+      differences: By how much each comparison holds in each training; negative where it
+        fails.
+      trainings: Trainings until the verdict, or of the comparison that has fewest.
     """
 
     verdict: Verdict
     reason: str = ""
-    differences: dict[tuple[str, str], Spread] = dataclasses.field(default_factory=dict)
-    trainings: int = 1
+    differences: dict[tuple[str, str], np.ndarray] = dataclasses.field(
+        default_factory=dict
+    )
+    trainings: int = 0
 
 
 def cells_of(
@@ -120,94 +129,13 @@ def interval(spread: Spread) -> Ends:
     return float(spread.mean - half), float(spread.mean + half)
 
 
-def _wilson(count: float, samples: int) -> Ends:
+def wilson(count: float, samples: int) -> Ends:
+    """The 95 % interval of a count of so many samples (Wilson 1927)."""
     part, z2 = count / samples, _QUANTILE**2
     middle = (part + z2 / (2 * samples)) / (1 + z2 / samples)
     spread = part * (1 - part) / samples + z2 / (4 * samples**2)
     half = _QUANTILE / (1 + z2 / samples) * math.sqrt(spread)
     return samples * (middle - half), samples * (middle + half)
-
-
-def ends(cell: Cell, column: Column) -> Ends:
-    """Interval of a cell, for decisions.
-
-    Args:
-      cell: With a finite value.
-      column: Its column.
-
-    Returns:
-      Lower and upper end.
-    """
-    if column.kind == "count" and cell.samples:
-        return _wilson(cell.value, cell.samples)
-    if cell.low is not None and cell.high is not None:
-        return cell.low, cell.high
-    if column.kind == "time":
-        return cell.value / TIME_FACTOR, cell.value * TIME_FACTOR
-    # A single sample says nothing about its spread.
-    return -math.inf, math.inf
-
-
-def ordered(smaller: Ends, larger: Ends, factor: float = 1.0) -> bool | None:
-    """Whether one quantity is below another.
-
-    Args:
-      smaller: Interval of what is claimed to be the smaller.
-      larger: That of the larger.
-      factor: The larger is at least so many times the smaller.
-
-    Returns:
-      True or False if the intervals are apart; None if they overlap.
-    """
-    if factor * smaller[1] < larger[0]:
-        return True
-    return False if larger[1] < factor * smaller[0] else None
-
-
-def _distance(interval: Ends, point: float) -> Ends:
-    far = max(abs(end - point) for end in interval)
-    near = min(abs(end - point) for end in interval)
-    return (0.0 if interval[0] <= point <= interval[1] else near), far
-
-
-def nearer(near: Ends, far: Ends, target: Ends) -> bool | None:
-    """Whether one quantity is nearer to a third than another.
-
-    Args:
-      near: Interval of what is claimed to be the nearer.
-      far: That of the farther.
-      target: That of the third.
-
-    Returns:
-      True or False if it is so for every target; None otherwise.
-    """
-    # Distances are straight lines between these points.
-    low, high = target
-    points = {low, high} | {min(max(x, low), high) for x in (*near, *far)}
-    answers = {ordered(_distance(near, x), _distance(far, x)) for x in points}
-    return answers.pop() if len(answers) == 1 else None
-
-
-def compare(claim: Claim, intervals: dict[str, Ends]) -> dict[tuple[str, str], bool]:
-    """Makes the comparisons of a claim that can be made.
-
-    Args:
-      claim: The claim.
-      intervals: Intervals of rows; those that are not known are missing.
-
-    Returns:
-      True, False or None for each pair of known rows.
-    """
-    answers = {}
-    for pair in claim.pairs:
-        names = (*pair, claim.toward) if claim.toward else pair
-        if not all(name in intervals for name in names):
-            continue
-        known = [intervals[name] for name in names]
-        answers[pair] = (
-            nearer(*known) if claim.toward else ordered(*known, claim.factor)
-        )
-    return answers
 
 
 def printed(value: Stated) -> float | None:
@@ -241,23 +169,73 @@ def _incomparable(table: Table, column: Column, rows: list[Row], found: Found) -
     return ""
 
 
-def _differences(table: Table, claim: Claim, found: Found) -> dict[Any, Spread]:
-    """Claimed differences of pairs of rows over trainings, where there are several."""
-    spreads, column = {}, table.column(claim.column)
+def holds(claim: Claim, values: Sequence[float]) -> float:
+    """By how much a comparison holds for the values of its rows.
+
+    Args:
+      claim: The claim.
+      values: Of the smaller (nearer) row and of the larger (farther) one, and of that
+        which they are near to.
+
+    Returns:
+      Positive where it holds, negative where it does not; for a claim of likeness, how
+      far the difference is below the margin.
+    """
+    first, second, *target = values
+    if target:
+        first, second = (abs(x - target[0]) for x in (first, second))
+    difference = second - claim.factor * first
+    return difference if claim.margin is None else claim.margin - abs(difference)
+
+
+def _differences(
+    table: Table, claim: Claim, found: Found
+) -> dict[tuple[str, str], np.ndarray]:
+    """Claimed differences of pairs of rows, one per training that has both."""
+    made, column = {}, table.column(claim.column)
     for pair in claim.pairs:
         names = (*pair, claim.toward) if claim.toward else pair
         cells = [cells_of(table, table.row(name), column, found) for name in names]
-        made = []
-        for trained in zip(*cells, strict=False):
-            if None in trained:
-                continue
-            first, second, *target = (cell.value for cell in trained)
-            if target:
-                first, second = (abs(x - target[0]) for x in (first, second))
-            made.append(second - claim.factor * first)
-        if len(made) > 1:
-            spreads[pair] = statistics.spread(np.array(made))
-    return spreads
+        values = [
+            [cell.value for cell in trained]
+            for trained in zip(*cells, strict=False)
+            if None not in trained
+        ]
+        plain = dataclasses.replace(claim, margin=None)
+        own = np.array([holds(plain, x) for x in values])
+        made[pair] = own[np.isfinite(own)][:MAX_TRAININGS]
+    return made
+
+
+def _first(evidence: np.ndarray, bar: float) -> float:
+    """Trainings after which evidence has exceeded a bar; infinite if it never does."""
+    over = np.flatnonzero(evidence >= math.log(bar))
+    return float(over[0] + 1) if over.size else math.inf
+
+
+def when_decided(
+    differences: Sequence[np.ndarray], *, margin: float | None = None
+) -> tuple[float, float]:
+    """After how many trainings a set of comparisons is found to hold, or not to.
+
+    Args:
+      differences: One of each training, in their order; an array per comparison.
+      margin: Of likeness; None where differences should be positive.
+
+    Returns:
+      Trainings until all comparisons hold, and until one fails; infinite for never.
+      Without an effect the one or the other is finite with probability `ALPHA` at most.
+    """
+    hold, fail = [], []
+    for own in differences:
+        if margin is None:
+            sides, against = [own], [-own]
+        else:
+            sides, against = [margin + own, margin - own], [own - margin, -own - margin]
+        hold += [_first(sequential.log_evidence(x), 1 / ALPHA) for x in sides]
+        bar = len(differences) * len(against) / ALPHA
+        fail += [_first(sequential.log_evidence(x), bar) for x in against]
+    return max(hold), min(fail)
 
 
 def decide(table: Table, claim: Claim, found: Found) -> Decision:
@@ -273,55 +251,37 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     """
     column = table.column(claim.column)
     rows = [table.row(name) for name in claim.rows]
-    cells = {row.name: cell_of(table, row, column, found) for row in rows}
-    absent = [name for name, cell in cells.items() if cell is None]
-    present = {name: cell for name, cell in cells.items() if cell is not None}
-    own = [table.row(name) for name in present]
-    if reason := _incomparable(table, column, own, found):
+    cells = {row.name: cells_of(table, row, column, found) for row in rows}
+    absent = [name for name, own in cells.items() if not any(own)]
+    present = [row for row in rows if row.name not in absent]
+    if reason := _incomparable(table, column, present, found):
         return Decision(verdict="not decided", reason=reason)
-    finite = {
-        name: ends(cell, column)
-        for name, cell in present.items()
-        if math.isfinite(cell.value)
-    }
-    answers, differences = compare(claim, finite), _differences(table, claim, found)
-    for pair, spread in differences.items():
-        low, high = interval(spread)
-        answers[pair] = True if low > 0 else False if high < 0 else None
-    numbers = [x.count for x in differences.values()]
-    several = len(numbers) == len(claim.pairs)
-    decision = functools.partial(
-        Decision, differences=differences, trainings=min(numbers) if several else 1
-    )
-    failed = [pair for pair, answer in answers.items() if answer is False]
-    if failed:
-        return decision(verdict="not reproduced", reason=f"fails: {_pairs(failed)}")
+    differences = _differences(table, claim, found)
+    trainings = min(x.size for x in differences.values())
+    decision = functools.partial(Decision, differences=differences, trainings=trainings)
+    hold, fail = when_decided(list(differences.values()), margin=claim.margin)
+    if fail < hold:
+        failed = [
+            pair
+            for pair, own in differences.items()
+            if when_decided([own], margin=claim.margin)[1] <= fail
+        ]
+        reason = f"fails: {_pairs(failed)}"
+        return decision(verdict="not reproduced", reason=reason, trainings=int(fail))
     if absent:
         return decision(verdict="not run", reason=f"not measured: {', '.join(absent)}")
-    open_pairs = [pair for pair in claim.pairs if answers.get(pair) is None]
-    if open_pairs:
-        reason = f"intervals overlap, hold 0 or are missing: {_pairs(open_pairs)}"
+    if hold < math.inf:
+        return decision(verdict="reproduced", trainings=int(hold))
+    if trainings < 2:
+        reason = f"{trainings} trainings with finite values of all rows: expected more"
         return decision(verdict="not decided", reason=reason)
-    return decision(verdict="reproduced")
-
-
-def lines(tables: tuple[Table, ...], found: Found) -> list[str]:
-    """What became of every claim of some tables, one line each.
-
-    Args:
-      tables: The tables.
-      found: All that was measured.
-
-    Returns:
-      Verdict, claim, and what the verdict rests on.
-    """
-    shown = []
-    for table in tables:
-        for claim in table.claims:
-            made = decide(table, claim, found)
-            reason = f" ({made.reason})" if made.reason else ""
-            shown.append(f"{made.verdict}: {claim.words}{reason}")
-    return shown
+    open_pairs = [
+        pair
+        for pair, own in differences.items()
+        if when_decided([own], margin=claim.margin)[0] == math.inf
+    ]
+    reason = f"open after {trainings} trainings: {_pairs(open_pairs)}"
+    return decision(verdict="not decided", reason=reason)
 
 
 def _pairs(pairs: list[tuple[str, str]]) -> str:

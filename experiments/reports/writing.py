@@ -46,8 +46,8 @@ def _ends(
         return float(spread.mean), *verdicts.interval(spread)
     if cell is None:
         return (math.nan,) * 3
-    if column.kind == "count":
-        return cell.value, *verdicts.ends(cell, column)
+    if column.kind == "count" and cell.samples:
+        return cell.value, *verdicts.wilson(cell.value, cell.samples)
     return cell.value, *(math.nan if x is None else x for x in (cell.low, cell.high))
 
 
@@ -170,12 +170,13 @@ def _json(
                 "pairs": claim.pairs,
                 "factor": claim.factor,
                 "toward": claim.toward,
+                "margin": claim.margin,
                 "verdict": decision.verdict,
                 "reason": decision.reason,
                 "trainings": decision.trainings,
                 "differences": [
-                    {"pair": pair} | (_spread_json(spread) or {})
-                    for pair, spread in decision.differences.items()
+                    {"pair": pair, "of each training": values.tolist()}
+                    for pair, values in decision.differences.items()
                 ],
             }
             for table, claim, decision in decided

@@ -67,7 +67,11 @@ DOORS = {
     "optax": ("jaxmotion/learning/training.py",),
     "orbax": ("jaxmotion/learning/checkpoint.py",),
     "tensorflow_datasets": ("jaxmotion/data/builders/",),
-    "scipy": ("jaxmotion/data/", "jaxmotion/evaluation/statistics.py"),
+    "scipy": (
+        "jaxmotion/data/",
+        "jaxmotion/evaluation/sequential.py",
+        "jaxmotion/evaluation/statistics.py",
+    ),
     "ufbx": ("jaxmotion/data/fbx.py",),
     "matplotlib": ("jaxmotion/viz/",),
     "PIL": ("jaxmotion/viz/",),
