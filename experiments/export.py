@@ -5,7 +5,13 @@ arrays, the order of calls, the skeleton); start.npz (how a character starts, fo
 label); for ONNX also player.py, which needs onnxruntime and NumPy alone and steers the
 character for ten seconds. A run of EMDM gives the graph of its sampler.
 
-Example: python experiments/export.py --model locomotion --format onnx --out runs/onnx
+The format web is a folder of static files for one or several models: a page on which
+they walk in any browser, with nothing installed (needs Node, to bundle it).
+
+Examples:
+  python experiments/export.py --model locomotion --format onnx --out runs/onnx
+  python experiments/export.py --format web --model locomotion dribble --out site
+  python -m http.server -d site
 """
 
 import dataclasses
@@ -21,7 +27,9 @@ import tyro
 
 import jaxmotion as jm
 from jaxmotion import cli, face, files
-from jaxmotion.export import graph, onnx, stablehlo
+from jaxmotion.control.foot_lock import lock_feet
+from jaxmotion.control.steering import steered as steered_character
+from jaxmotion.export import graph, onnx, stablehlo, web
 from jaxmotion.learning import loop, model_json, runs
 from jaxmotion.systems import registry
 
@@ -48,20 +56,24 @@ class Config:
     """Writes the graphs of a shipped model or a run.
 
     Attributes:
-      model: Name of a shipped model.
-      run: Run folder of any system, or an exported file, in its place.
+      model: Names of shipped models; several for the format web.
+      run: Run folder of any system, or an exported file, in their place.
       out: Folder to write to.
-      format: onnx or stablehlo.
+      format: onnx, stablehlo or web.
+      steps: Numbers of diffusion steps that the page offers besides the model's own.
       batch: one (arrays have no axis for characters), a number, or any.
       foot_lock: Planted feet stay; None as jm.load has it (on for shipped models).
+      cache: Folder for the packages of npm that the page is made of.
       row: EMDM's row.
       scale: EMDM's guidance; None for the paper's.
     """
 
-    model: str | None = None
+    model: cli.Names = ()
     run: Path | None = None
     out: Path = Path("runs/export")
     format: str = "onnx"
+    steps: tuple[int, ...] = ()
+    cache: Path = Path.home() / ".cache" / "jaxmotion" / "web"
     batch: str = "one"
     foot_lock: bool | None = None
     row: str = "emdm"
@@ -98,6 +110,32 @@ def steered(character: Any) -> tuple[dict, dict, dict, dict]:
     return functions, arguments, facts, starts
 
 
+def export_page(args: Config) -> None:
+    """Writes the folder of the page, for shipped models or a run."""
+    web.check()
+    loop.check_writable(args.out)
+    sources = (
+        dict.fromkeys(args.model) if args.run is None else {args.run.stem: args.run}
+    )
+    say = lambda line: print(line, flush=True)  # noqa: E731
+    loaded = {}
+    for name, what in sources.items():  # before any work that takes long
+        character = steered_character(jm.load(what, foot_lock=False), what=str(what))
+        if args.foot_lock is not False and character.skeleton.feet:
+            character = lock_feet(character)
+        web.step_choices(character, args.steps)
+        loaded[name] = character
+    web.write_page(args.out, list(loaded), cache=args.cache, say=say)
+    for name, character in loaded.items():
+        tick = jax.tree.map(
+            lambda x: x[0, 0], jm.commands("stand", character, 1, seconds=1.0)
+        )
+        web.write_character(
+            args.out / name, name, character, tick, steps=args.steps, say=say
+        )
+    print(f"python -m http.server -d {args.out}")
+
+
 def export(args: Config) -> None:
     """Loads, converts, and writes.
 
@@ -108,17 +146,23 @@ def export(args: Config) -> None:
     """
     cli.check(args)
     batch = batch_of(args.batch)
-    if args.format not in FORMATS:
+    if args.format not in (*FORMATS, "web"):
         raise ValueError(
-            f"--format is {args.format!r}, expected one of {', '.join(FORMATS)}"
+            f"--format is {args.format!r}, expected one of {', '.join(FORMATS)}, web"
         )
-    if (args.model is None) == (args.run is None):
+    if (not args.model) == (args.run is None):
         raise ValueError("expected either --model or --run")
+    if args.format == "web":
+        return export_page(args)
+    if len(args.model) > 1:
+        raise ValueError(
+            f"--model has {len(args.model)} names, expected one (but for --format web)"
+        )
     writer = FORMATS[args.format]
     writer.check()
     loop.check_writable(args.out)
-    source = args.model if args.run is None else args.run
-    path = files.SHIPPED.get(args.model) if args.run is None else args.run
+    source = args.model[0] if args.run is None else args.run
+    path = files.SHIPPED.get(args.model[0]) if args.run is None else args.run
     system = None
     if path is not None:
         system = registry.get(str(face.system_of(path)))

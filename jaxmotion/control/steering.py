@@ -37,6 +37,8 @@ RUN, TURN = 2.0, math.radians(150.0)
 ARRIVE, NEAR, FAR = 0.7, 0.2, 0.45
 # What is told stays as it is until what is wanted differs by more, radians and m/s.
 HEADING_STEP, SPEED_STEP = math.radians(8.0), 0.15
+# A stick that is pushed less far is in its middle.
+STICK = 0.12
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -358,11 +360,16 @@ class Inputs:
       held: Of `MOVES`.
       azimuth: Where the camera looks, radians from +z toward +x.
       target: Point (x, z) on the ground to go to, meters; keys come first.
+      stick: A stick's (right, ahead), at most 1 long: go so, seen by the camera, and as
+        fast as it is pushed; keys come first.
+      face: Another one's: face so, whatever the way.
     """
 
     held: frozenset[str] = frozenset()
     azimuth: float = 0.0
     target: tuple[float, float] | None = None
+    stick: tuple[float, float] | None = None
+    face: tuple[float, float] | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -393,7 +400,7 @@ def wanted(
     """What held keys and the mouse ask for.
 
     Directions are the camera's; who moves faces where he goes, and who stands keeps
-    facing where he did.
+    facing where he did. `viz/web/steer.js` is the same for pages without a server.
 
     Args:
       last: What was wanted a tick ago.
@@ -405,10 +412,17 @@ def wanted(
     ahead = ("forward" in held) - ("back" in held)
     aside = ("right" in held) - ("left" in held)
     speed = speed * (RUN if "run" in held else 1.0)
+    face = _pushed(inputs.face, inputs.azimuth)
+    facing = None if face is None else _toward(face[0])
     if ahead or aside:
         # To the right of who looks along +z lies -x.
         angle = inputs.azimuth - math.atan2(aside, ahead)
-        return _go(angle, speed)
+        return _go(angle, speed, facing)
+    stick = _pushed(inputs.stick, inputs.azimuth)
+    if stick is not None:
+        return _go(stick[0], stick[1] * speed, facing)
+    if facing is not None:
+        return Wish(facing=facing)
     turn = ("turn_left" in held) - ("turn_right" in held)
     if turn:
         facing = math.atan2(*last.facing) + turn * TURN * seconds
@@ -421,9 +435,21 @@ def wanted(
     return Wish(facing=last.facing)
 
 
-def _go(angle: float, speed: float) -> Wish:
-    x, z = math.sin(angle), math.cos(angle)
-    return Wish(velocity=(speed * x, speed * z), facing=(x, z))
+def _toward(angle: float) -> tuple[float, float]:
+    return math.sin(angle), math.cos(angle)
+
+
+def _pushed(
+    stick: tuple[float, float] | None, azimuth: float
+) -> tuple[float, float] | None:
+    """A stick's angle in the world and how far it is pushed; None in its middle."""
+    far = 0.0 if stick is None else math.hypot(*stick)
+    return None if far < STICK else (azimuth - math.atan2(*stick), min(far, 1.0))
+
+
+def _go(angle: float, speed: float, facing: tuple[float, float] | None = None) -> Wish:
+    x, z = way = _toward(angle)
+    return Wish(velocity=(speed * x, speed * z), facing=facing or way)
 
 
 def settled(told: Wish, wish: Wish, *, steady: bool) -> Wish:

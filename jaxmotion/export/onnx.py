@@ -49,6 +49,13 @@ def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
       ValueError: if packages of the extra are missing, or the function has no ONNX form
         that runs; says which operation.
     """
+    made = content(graph, batch=batch)
+    with files.replacing(path) as file:
+        file.write(made)
+
+
+def content(graph: Graph, *, batch: Batch = None) -> bytes:
+    """What `write` writes, with its arguments and errors of the same kinds."""
     check()
     import onnx
 
@@ -58,8 +65,7 @@ def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
     model.producer_name = "jaxmotion"
     onnx.checker.check_model(model)
     _try(model, graph, batch)
-    with files.replacing(path) as file:
-        file.write(model.SerializeToString())
+    return model.SerializeToString()
 
 
 def open_session(model: bytes, *, threads: int = 0) -> Any:
@@ -128,8 +134,13 @@ def _is_lost(eqn: core.JaxprEqn) -> bool:
     """Whether the converter gets an equation wrong; gradients are full of such.
 
     Of loops it ignores that they run backward, of products of two matrices that the
-    first one is turned.
+    first one is turned. What it makes of a choice between truth values does not run,
+    and a slice that would reach beyond the end becomes shorter instead of moving back.
     """
+    if eqn.primitive.name == "dynamic_slice":
+        return True
+    if eqn.primitive.name == "select_n":
+        return eqn.invars[1].aval.dtype == bool and len(eqn.invars) == 3
     if eqn.primitive.name == "dot_general":
         (first, _), batch = eqn.params["dimension_numbers"]
         return batch == ((), ()) and eqn.invars[0].aval.ndim == 2 and first == (0,)
@@ -148,7 +159,7 @@ def _forward(traced: core.ClosedJaxpr, values: list) -> list:
     """The results, without what the converter gets wrong.
 
     Loops that run backward run forward over turned rows; matrices are turned before
-    their product.
+    their product; truth values are chosen by logic; slices stay within their arrays.
     """
     if not _loses(traced):
         return core.jaxpr_as_fun(traced)(*values)
@@ -161,6 +172,11 @@ def _forward(traced: core.ClosedJaxpr, values: list) -> list:
             found = _forward(inner, given)
         elif eqn.primitive.name == "scan":
             found = _scan(eqn, *loop_parts(eqn, given))
+        elif eqn.primitive.name == "select_n" and _is_lost(eqn):
+            which, no, yes = (jnp.asarray(x) for x in given)
+            found = [(which & yes) | (~which & no)]
+        elif eqn.primitive.name == "dynamic_slice":
+            found = [_within(eqn, *given)]
         elif _is_lost(eqn):
             (_, second), batch = eqn.params["dimension_numbers"]
             axes = {"dimension_numbers": (((1,), second), batch)}
@@ -170,6 +186,16 @@ def _forward(traced: core.ClosedJaxpr, values: list) -> list:
             found = one_equation(eqn, jaxpr, given)
         env.update(zip(eqn.outvars, found, strict=True))
     return [read(x) for x in jaxpr.outvars]
+
+
+def _within(eqn: core.JaxprEqn, values: Any, *starts: Any) -> Any:
+    """A slice whose starts are kept within the array, as JAX says, one by one."""
+    sizes = eqn.params["slice_sizes"]
+    kept = [
+        jnp.clip(start, 0, whole - size) if size < whole else jnp.zeros_like(start)
+        for start, whole, size in zip(starts, values.shape, sizes, strict=True)
+    ]
+    return jax.lax.dynamic_slice(values, kept, sizes)
 
 
 def _scan(eqn: core.JaxprEqn, consts: list, carry: list, rows: list) -> list:

@@ -1,16 +1,18 @@
 """Serves a session to browsers: a page over HTTP, frames and inputs over a WebSocket.
 
-The page is one file without any other. The server sends it text (JSON: `state` whenever
-it changes, `body` whenever what is drawn does, `error` for input that was wrong) and a
+The page's sources are plain modules in the folder `web`, served as they are. The server
+sends text (JSON: `state` whenever it changes, `body`, a number, whenever what is drawn
+does, for /body/<number> as `packed` has it, `error` for input that was wrong) and a
 frame a tick as little-endian float32:
 
-    engine, tick, milliseconds, plans, characters, capsules, balls, fps,
+    engine, tick, milliseconds, plans, characters, joints, balls, fps,
     told velocity (x, z), told facing (x, z), ticks of the shown plan,
-    roots (x, z) of all characters, capsule ends [characters, capsules, 2, 3],
-    balls [balls, 3], the plan's path (x, z), capsule ends at its end [capsules, 2, 3]
+    roots [characters, 3], rotations [characters, joints, 6], balls [balls, 3],
+    the plan's path (x, z), root (3) and rotations [joints, 6] at its end
 
 The browser sends JSON: {"held": [...], "azimuth": radians, "target": [x, z] or null},
-{"set": {name: value}}, {"do": "reset" | "step" | "record"} or {"save": ".bvh"}.
+where "stick" and "face" may be [right, ahead] of somebody's sticks, {"set": {name:
+value}}, {"do": "reset" | "step" | "record"} or {"save": ".bvh"}.
 
 A browser that reads slowly gets fewer frames, the newest ones, and holds up nobody.
 Only pages from this very server may connect, so no other web site steers, and a name
@@ -18,6 +20,7 @@ that someone points at this machine is not answered.
 """
 
 import asyncio
+import dataclasses
 import json
 import math
 import threading
@@ -30,12 +33,19 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from jaxmotion.control.steering import MOVES, Inputs
-from jaxmotion.viz.html import CAPSULES
+from jaxmotion.viz import packed
 from jaxmotion.viz.viewer import Session, Shown
 
 MOST_PEOPLE = 32
 SUFFIXES = (".bvh", ".glb", ".npz")
 _LARGEST_MESSAGE = 4096
+_STICKS = ("stick", "face")
+_WEB = Path(__file__).with_name("web")
+# What the page is made of; `local.js` and what it needs are the static page's.
+_FILES = (
+    *("body.js", "camera.js", "figures.js", "input.js", "page.js", "panel.js"),
+    *("save.js", "scene.js", "socket.js"),
+)
 
 # Writes a take: (path, skeleton, motion).
 Save = Callable[[Path, Any, Any], None]
@@ -59,17 +69,19 @@ def websockets() -> Any:
 def frame_bytes(shown: Shown, fps: float) -> bytes:
     """A tick as the page reads it; see the module's text."""
     balls = np.zeros((0, 3)) if shown.ball is None else shown.ball
-    path, ghost = ((), ()) if shown.plan is None else shown.plan
-    characters, capsules = shown.ends.shape[:2]
+    characters, joints = shown.rotations.shape[:2]
+    path, end = np.zeros((0, 3)), ()
+    if shown.plan is not None:
+        path, ghost = shown.plan
+        end = (path[-1], ghost)
     head = (
         *(shown.engine, shown.tick, shown.milliseconds, shown.planned),
-        *(characters, capsules, len(balls), fps),
+        *(characters, joints, len(balls), fps),
         *shown.told.velocity,
         *shown.told.facing,
         len(path),
     )
-    path = np.reshape(path, (-1, 3))[:, ::2]
-    parts = (head, shown.roots[:, ::2], shown.ends, balls, path, ghost)
+    parts = (head, shown.roots, shown.rotations, balls, path[:, ::2], *end)
     return np.concatenate([np.ravel(x) for x in parts]).astype("<f4").tobytes()
 
 
@@ -99,9 +111,16 @@ def read_message(text: str | bytes) -> dict[str, Any]:
     ):
         raise ValueError("azimuth or target is no finite number")
     place = None if target is None else (float(target[0]), float(target[1]))
-    return {
-        "inputs": Inputs(held=frozenset(held), azimuth=float(azimuth), target=place)
-    }
+    inputs = Inputs(held=frozenset(held), azimuth=float(azimuth), target=place)
+    sticks = {name: _stick(name, value[name]) for name in _STICKS if name in value}
+    return {"inputs": dataclasses.replace(inputs, **sticks)}
+
+
+def _stick(name: str, value: Any) -> tuple[float, float]:
+    right = isinstance(value, list) and len(value) == 2
+    if not right or not all(type(x) in (int, float) and abs(x) <= 1 for x in value):
+        raise ValueError(f"{name} is wrong, expected [right, ahead] in -1..1")
+    return float(value[0]), float(value[1])
 
 
 class Page:
@@ -125,11 +144,16 @@ class Page:
         """
         self.session, self._out, self._save = session, out, save
         self._is_local = is_local
-        text = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
-        self._html = text.replace("__CAPSULES__", CAPSULES).encode()
+        html = (_WEB / "index.html").read_text(encoding="utf-8")
+        # Its own entry, in the place of the one that the static page is bundled to.
+        html = html.replace('src="page.js"', 'src="socket.js"')
+        self._files = {f"/{name}": (_WEB / name).read_bytes() for name in _FILES}
+        self._html = html.encode()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._clients: set[_Client] = set()
         self._local = True
+        # Number of the engine and its body's file.
+        self._body = (-1, b"")
         session.on_frame, session.on_change = self._on_frame, self._on_change
 
     async def serve(
@@ -200,6 +224,11 @@ class Page:
             return None
         if path == "/":
             return self._answer(connection, self._html, "text/html; charset=utf-8")
+        if path in self._files:
+            kind = "text/javascript; charset=utf-8"
+            return self._answer(connection, self._files[path], kind)
+        if path == f"/body/{self._body[0]}":
+            return self._answer(connection, self._body[1], "application/octet-stream")
         name = path.removeprefix("/takes/")
         if path != name and name == Path(name).name and (self._out / name).is_file():
             data = (self._out / name).read_bytes()
@@ -253,9 +282,10 @@ class Page:
                 if client.state_due:
                     client.state_due = False
                     state = self.session.state()
-                    if state["engine"] != body and self.session.body is not None:
+                    if state["engine"] != body and self.session.skeleton is not None:
                         body = state["engine"]
-                        await socket.send(json.dumps({"body": self._body(body)}))
+                        await asyncio.to_thread(self._pack, body)
+                        await socket.send(json.dumps({"body": body}))
                     await socket.send(json.dumps({"state": state}))
                 while client.errors:
                     await socket.send(json.dumps({"error": client.errors.pop(0)}))
@@ -268,13 +298,12 @@ class Page:
         except package.exceptions.ConnectionClosed:
             pass
 
-    def _body(self, engine: int) -> dict[str, Any]:
-        body = self.session.body
-        return {
-            "engine": engine,
-            "radii": np.round(body.radii, 4).tolist(),
-            "colors": list(body.colors),
-        }
+    def _pack(self, engine: int) -> None:
+        """Makes the file of an engine's body, if it is not made yet."""
+        skeleton = self.session.skeleton
+        if self._body[0] != engine:
+            about = {"skeleton": packed.skeleton_json(skeleton)}
+            self._body = engine, packed.pack(about, packed.body_arrays(skeleton))
 
     async def _obey(self, client: "_Client", text: str | bytes) -> None:
         message, session = read_message(text), self.session

@@ -22,9 +22,8 @@ import numpy as np
 
 from jaxmotion.control import rollout
 from jaxmotion.control.steering import Character, Inputs, Wish, settled, wanted
-from jaxmotion.motion.skeleton import Motion, global_transforms
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.motion.trajectory import Command
-from jaxmotion.viz import body as bodies
 
 MOST_CHARACTERS = 64
 SPEEDS = (0.3, 4.0)
@@ -77,11 +76,11 @@ class Shown:
     Attributes:
       engine: Number of the program that made it; another one may have another body.
       tick: Counted from 0.
-      ends: [characters, capsules, 2, 3] of `Session.body`, world, meters.
       roots: [characters, 3] world, meters.
+      rotations: [characters, joints, 6] as `Motion` has them.
       ball: [characters, 3] world, meters; None in systems without.
       plan: Of the first character, if it is to be shown: the path of its root to the
-        plan's end [ticks, 3], and its capsules there [capsules, 2, 3].
+        plan's end [ticks, 3], and its rotations there [joints, 6].
       told: What the first character was told.
       planned: Characters that got a new plan.
       milliseconds: That the tick took.
@@ -89,8 +88,8 @@ class Shown:
 
     engine: int
     tick: int
-    ends: np.ndarray
     roots: np.ndarray
+    rotations: np.ndarray
     ball: np.ndarray | None
     plan: tuple[np.ndarray, np.ndarray] | None
     told: Wish
@@ -111,8 +110,7 @@ class Engine:
     ) -> None:
         """Compiles nothing yet."""
         self.character, self.num_steps, self.number = character, num_steps, number
-        self.body = bodies.describe(character.skeleton)
-        tuning, skeleton = character.tuning, character.skeleton
+        tuning = character.tuning
         patience = 0 if tuning is None else tuning.patience
         at_most = number if not patience else math.ceil(number / patience)
 
@@ -130,9 +128,6 @@ class Engine:
             crowd, frames = rollout.crowd_tick(
                 controller, key, crowd, commands, at_most=at_most
             )
-            pose = lambda frame: global_transforms(  # noqa: E731
-                skeleton, frame.root_position, frame.joint_rotation
-            )
             plan = None
             if show_plan and patience:  # what would be shown without another plan
                 first, command = jax.tree.map(lambda x: x[0], (crowd.states, commands))
@@ -141,11 +136,10 @@ class Engine:
                     first,
                     length=patience,
                 )
-                end = jax.tree.map(lambda x: x[-1], ahead)
-                plan = ahead.root_position, pose(end)
+                plan = ahead.root_position, ahead.joint_rotation[-1]
             return (
                 crowd,
-                (jax.vmap(pose)(frames), frames.root_position, frames.joint_rotation),
+                (frames.root_position, frames.joint_rotation),
                 dict(
                     # A frame of who still waits for his first plan is none of a plan.
                     planned=jnp.sum(frames.planned & (crowd.waited == 0)),
@@ -327,9 +321,9 @@ class Session:
     # What people see.
 
     @property
-    def body(self) -> bodies.Body | None:
-        """What is drawn; None until a model is loaded."""
-        return None if self._engine is None else self._engine.body
+    def skeleton(self) -> Skeleton | None:
+        """Whose body is drawn; None until a model is loaded."""
+        return None if self._engine is None else self._engine.character.skeleton
 
     @property
     def fps(self) -> float:
@@ -407,19 +401,18 @@ class Session:
         self._crowd, made, more = engine.step(
             self._crowd, self._told, settings, seed=self._seed, n=self._tick
         )
-        (places, turns), roots, rotations = jax.tree.map(np.asarray, made)
+        roots, rotations = jax.tree.map(np.asarray, made)
         ball, plan = more["ball"], more["plan"]
         shift = np.insert(self._home, 1, 0.0, axis=1)
         roots = roots + shift
         if plan is not None:
-            path, (joints, turned) = jax.tree.map(np.asarray, plan)
-            ghost = engine.body.ends(joints + shift[0], turned)
-            plan = path + shift[0], ghost.astype(np.float32)
+            path, ghost = jax.tree.map(np.asarray, plan)
+            plan = path + shift[0], ghost
         shown = Shown(
             engine=self.engine_number,
             tick=self._tick,
-            ends=engine.body.ends(places + shift[:, None], turns).astype(np.float32),
             roots=roots,
+            rotations=rotations,
             ball=None if ball is None else np.asarray(ball) + shift,
             plan=plan,
             told=self._told,

@@ -219,3 +219,25 @@ def test_stablehlo_in_a_process_without_the_library(tmp_path, batch):
         for name, expected in zip(found.files, wanted, strict=True):
             for row in [found[name]] if batch is None else found[name]:
                 np.testing.assert_allclose(row, expected, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_onnx_of_choices_and_slices(tmp_path):
+    """Between truth values; a slice beyond the end moves back, as JAX has it."""
+    pytest.importorskip("jax2onnx")
+    runtime = pytest.importorskip("onnxruntime")
+
+    def choose(start, yes):
+        part = jax.lax.dynamic_slice(jnp.arange(12.0).reshape(6, 2), (start, 0), (4, 2))
+        return part, jnp.where(yes, part > 3, part < 1)
+
+    chosen = Exported(choose, ("start", "yes"), ("part", "which"))
+    one = graph.make("choose", chosen, {"start": jnp.int32(0), "yes": jnp.bool_(True)})
+    onnx.write(tmp_path / "choose.onnx", one)
+    session = runtime.InferenceSession(tmp_path / "choose.onnx")
+    for start in (-1, 0, 2, 5):
+        for yes in (False, True):
+            given = {"start": np.int32(start), "yes": np.bool_(yes)}
+            found = session.run(None, {k: np.array(v) for k, v in given.items()})
+            for a, b in zip(found, one.run(*given.values()), strict=True):
+                np.testing.assert_array_equal(a, b)

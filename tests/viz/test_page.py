@@ -117,8 +117,11 @@ def test_what_is_served_and_what_not(served):
     assert status(served.address, Host="127.0.0.2:80")[0] == 200
     with pytest.raises(Exception, match="403"), served.socket(origin="http://a.org"):
         pass
-    html = status(served.address)[1].decode()
-    assert "http" not in html.replace('replace("http", "ws")', "")
+    for name in ("", "/page.js", "/socket.js", "/scene.js"):
+        text = status(served.address + name)[1].decode()
+        assert "http" not in text.replace('replace("http", "ws")', "")
+    # What only the static page needs is not there.
+    assert status(served.address + "/worker.js")[0] == 404
 
 
 def test_wrong_input_is_answered_in_one_line_and_changes_nothing(served):
@@ -267,8 +270,8 @@ def test_shift_runs_and_a_label_changes(tab, served):
 def test_a_click_on_the_ground_is_a_target(tab, served):
     after_ticks(served, 15)
     tab.mouse.click(300, 450)
-    tab.wait_for_function("target", timeout=PATIENCE)
-    target = tab.evaluate("target")
+    tab.wait_for_function("input.target", timeout=PATIENCE)
+    target = tab.evaluate("input.target")
     far = lambda x: np.linalg.norm(x.roots[0, ::2] - target)  # noqa: E731
     shows(served, lambda x: far(x) < steering.FAR)
 
@@ -303,24 +306,24 @@ def test_a_take_is_saved_as_it_was_shown(tab, served):
 
 def test_many_characters_and_other_steps_compile_beside_the_running_ones(tab, served):
     engine = served.session.engine_number
-    tab.evaluate("say({ set: { characters: 5 } })")
-    tab.wait_for_function("shown.roots.length === 10", timeout=PATIENCE)
+    tab.evaluate("panel.say({ set: { characters: 5 } })")
+    tab.wait_for_function("shown.n === 5", timeout=PATIENCE)
     assert served.session.engine_number == engine + 1
-    assert tab.evaluate("frame.balls") == 5
-    tab.evaluate("say({ set: { characters: 1, num_steps: 3 } })")
-    tab.wait_for_function("shown.roots.length === 2", timeout=PATIENCE)
-    tab.wait_for_function("state.num_steps === 3", timeout=PATIENCE)
-    assert tab.evaluate("state.note") == ""
+    assert tab.evaluate("shown.ball.length") == 15
+    tab.evaluate("panel.say({ set: { characters: 1, num_steps: 3 } })")
+    tab.wait_for_function("shown.n === 1", timeout=PATIENCE)
+    tab.wait_for_function("panel.state.num_steps === 3", timeout=PATIENCE)
+    assert tab.evaluate("panel.state.note") == ""
 
 
 def test_the_plan_is_drawn_when_asked_for(tab, served):
-    assert tab.evaluate("shown.ghost.length") == 0
+    assert tab.evaluate("shown.ghost") is None
     tab.click("#plan")
-    tab.wait_for_function("shown.ghost.length", timeout=PATIENCE)
+    tab.wait_for_function("shown.ghost", timeout=PATIENCE)
     ticks = served.session._engine.character.tuning.patience
     assert tab.evaluate("shown.path.length") == 2 * ticks
     tab.click("#plan")
-    tab.wait_for_function("!shown.ghost.length", timeout=PATIENCE)
+    tab.wait_for_function("!shown.ghost", timeout=PATIENCE)
 
 
 def test_pause_and_step(tab, served):

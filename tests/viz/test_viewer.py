@@ -141,6 +141,8 @@ def test_settings_in_range():
         ('{"held": [], "azimuth": 0, "target": [1]}', "target is wrong"),
         ('{"held": [], "azimuth": 0, "target": [1, true]}', "no finite number"),
         ('{"held": [], "target": null}', "no finite number"),
+        ('{"held": [], "azimuth": 0, "stick": [2, 0]}', "stick is wrong"),
+        ('{"held": [], "azimuth": 0, "face": [NaN, 0]}', "face is wrong"),
     ],
 )
 def test_wrong_messages_are_refused(text, message):
@@ -152,6 +154,11 @@ def test_inputs_are_read():
     text = '{"held": ["run", "left"], "azimuth": 1, "target": [2, -3.5]}'
     want = Inputs(held=frozenset(("run", "left")), azimuth=1.0, target=(2.0, -3.5))
     assert page.read_message(text) == {"inputs": want}
+    text = (
+        '{"held": [], "azimuth": 0, "target": null, "stick": [0, 0.5], "face": [1, 0]}'
+    )
+    found = page.read_message(text)["inputs"]
+    assert (found.stick, found.face) == ((0.0, 0.5), (1.0, 0.0))
     assert page.read_message('{"do": "reset"}') == {"do": "reset"}
 
 
@@ -159,21 +166,21 @@ def test_a_frame_is_packed_as_the_page_reads_it():
     shown = viewer.Shown(
         engine=3,
         tick=7,
-        ends=np.arange(24.0).reshape(2, 2, 2, 3),
         roots=np.array([[1.0, 9, 2], [3, 9, 4]]),
+        rotations=np.arange(24.0).reshape(2, 2, 6),
         ball=np.ones((2, 3)),
-        plan=(np.arange(6).reshape(2, 3), np.arange(12).reshape(2, 2, 3)),
+        plan=(np.arange(6).reshape(2, 3), np.arange(12).reshape(2, 6)),
         told=Wish(velocity=(0.5, 0.25)),
         planned=1,
         milliseconds=12.5,
     )
     data = np.frombuffer(page.frame_bytes(shown, 30.0), "<f4")
-    want = [3, 7, 12.5, 1, 2, 2, 2, 30, 0.5, 0.25, 0, 1, 2, 1, 2, 3, 4]
-    np.testing.assert_array_equal(data[:17], want)
-    np.testing.assert_array_equal(data[17:41], np.arange(24))
-    np.testing.assert_array_equal(data[41:47], np.ones(6))
-    np.testing.assert_array_equal(data[47:51], [0, 2, 3, 5])
-    np.testing.assert_array_equal(data[51:], np.arange(12))
+    want = [3, 7, 12.5, 1, 2, 2, 2, 30, 0.5, 0.25, 0, 1, 2, 1, 9, 2, 3, 9, 4]
+    np.testing.assert_array_equal(data[:19], want)
+    np.testing.assert_array_equal(data[19:43], np.arange(24))
+    np.testing.assert_array_equal(data[43:49], np.ones(6))
+    np.testing.assert_array_equal(data[49:56], [0, 2, 3, 5, 3, 4, 5])
+    np.testing.assert_array_equal(data[56:], np.arange(12))
 
 
 class Ticking:
@@ -283,7 +290,7 @@ def test_the_plan_is_shown_to_its_end():
     assert path.shape == (it.character.tuning.patience, 3)
     it.tick("forward", times=len(path))
     np.testing.assert_allclose(it.shown[-1].roots[0], path[-1], atol=1e-3)
-    np.testing.assert_allclose(it.shown[-1].ends[0], ghost, atol=1e-2)
+    np.testing.assert_allclose(it.shown[-1].rotations[0], ghost, atol=1e-2)
 
 
 @pytest.mark.slow
@@ -317,7 +324,7 @@ def test_a_session_runs_only_while_somebody_looks():
     thread = threading.Thread(target=session.run, daemon=True)
     thread.start()
     deadline = time.time() + 300
-    while session.body is None and time.time() < deadline:
+    while session.skeleton is None and time.time() < deadline:
         time.sleep(0.05)
     time.sleep(0.3)
     assert not shown

@@ -1,0 +1,130 @@
+"""ONNX files made small, as onnxruntime-web takes them: few nodes, shared weights.
+
+A model is folded by native onnxruntime; the shapes of inner values, of which the
+converter writes wrong ones that the browser's runtime refuses, go; numbers that are
+the same as 16-bit floats are kept as such; and large constants move to a file that all
+graphs of a character share.
+"""
+
+import hashlib
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# Smaller constants stay in the graph.
+LEAST_BYTES = 1024
+
+
+class Weights:
+    """Constants that several graphs share; each is kept once.
+
+    Attributes:
+      name: Name of the file, by which the graphs refer to it.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._bytes = bytearray()
+        self._places: dict[bytes, int] = {}
+
+    def add(self, raw: bytes) -> int:
+        """Where a constant begins in the file."""
+        digest = hashlib.sha256(raw).digest()
+        if digest not in self._places:
+            self._bytes += b"\0" * (-len(self._bytes) % 64)
+            self._places[digest] = len(self._bytes)
+            self._bytes += raw
+        return self._places[digest]
+
+    def content(self) -> bytes:
+        return bytes(self._bytes)
+
+
+def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:
+    """A model's content with fewer nodes, and its large constants elsewhere.
+
+    Args:
+      model: Content of an ONNX file.
+      weights: Takes the large constants.
+      half: Round all large constants to 16-bit floats, not only those that are such.
+    """
+    import onnx
+
+    found = onnx.load_model_from_string(_folded(model))
+    _clean(found.graph)
+    names = {x.name for x in found.graph.initializer}
+    casts = []
+    for tensor in found.graph.initializer:
+        values = onnx.numpy_helper.to_array(tensor)
+        if values.nbytes < LEAST_BYTES:
+            continue
+        if values.dtype == np.float32 and (half or _is_half(values)):
+            tensor.data_type = onnx.TensorProto.FLOAT16
+            values = values.astype(np.float16)
+            wide, tensor.name = tensor.name, _free(tensor.name + ".half", names)
+            casts.append(
+                onnx.helper.make_node(
+                    "Cast", [tensor.name], [wide], to=onnx.TensorProto.FLOAT
+                )
+            )
+        raw = np.ascontiguousarray(values).tobytes()
+        _refer(tensor, weights.name, weights.add(raw), len(raw))
+    nodes = [*casts, *found.graph.node]
+    del found.graph.node[:]
+    found.graph.node.extend(nodes)
+    return found.SerializeToString()
+
+
+def _folded(model: bytes) -> bytes:
+    """The model as onnxruntime has it after its basic optimizations."""
+    import onnxruntime
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "folded.onnx"
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = 4
+        options.graph_optimization_level = (
+            onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+        )
+        options.optimized_model_filepath = str(path)
+        onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        return path.read_bytes()
+
+
+def _clean(graph: Any) -> None:
+    """Takes out the shapes of inner values and texts, also in bodies of loops."""
+    del graph.value_info[:]
+    graph.doc_string = ""
+    for node in graph.node:
+        node.doc_string = ""
+        del node.metadata_props[:]
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                _clean(attribute.g)
+
+
+def _is_half(values: np.ndarray) -> bool:
+    with np.errstate(over="ignore"):
+        return bool((values.astype(np.float16).astype(np.float32) == values).all())
+
+
+def _free(name: str, taken: set[str]) -> str:
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name
+
+
+def _refer(tensor: Any, file: str, offset: int, length: int) -> None:
+    """Makes a constant a place in another file."""
+    import onnx
+
+    tensor.ClearField("raw_data")
+    for field in ("float_data", "int32_data", "int64_data", "double_data"):
+        tensor.ClearField(field)
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    del tensor.external_data[:]
+    for key, value in (("location", file), ("offset", offset), ("length", length)):
+        tensor.external_data.add(key=key, value=str(value))

@@ -1,0 +1,238 @@
+"""A folder of static files: the page on which characters walk in any browser.
+
+    index.html, page.js, worker.js, ort.wasm.gz, models.json
+    <model>/character.bin.gz   skeleton, skinned mesh, starts, names of all arrays
+    <model>/weights.bin.gz     constants that its graphs share
+    <model>/<graph>.onnx.gz
+
+Any web server serves it: files are packed already, and the page unpacks them itself.
+The page is bundled from the sources in `viz/web` by npm and esbuild.
+"""
+
+import gzip
+import hashlib
+import json
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion import files
+from jaxmotion.export import graph, onnx, slim
+from jaxmotion.typing import Exported
+from jaxmotion.viz import packed
+
+SOURCES = Path(packed.__file__).with_name("web")
+WEIGHTS = "weights.bin"
+# What a graph takes besides noise, state and command.
+SETTINGS = {"scale": jnp.float32(1.0), "locks": jnp.bool_(True)}
+
+
+def check() -> None:
+    """Raises `ValueError` unless Node is there and the packages of the extra are."""
+    onnx.check()
+    missing = [name for name in ("node", "npm") if shutil.which(name) is None]
+    if missing:
+        raise ValueError(
+            f"the page is bundled by Node 20 or newer, which has {' and '.join(missing)}:"
+            " not found on the path (see nodejs.org)"
+        )
+
+
+def step_choices(character: Any, wanted: tuple[int, ...]) -> tuple[int, ...]:
+    """Numbers of diffusion steps to offer, the model's own last.
+
+    Raises:
+      ValueError: if one of those wanted is none that the model offers.
+    """
+    offered = character.tuning.num_steps
+    for steps in wanted:
+        if steps not in offered:
+            raise ValueError(
+                f"--steps has {steps}, expected some of {', '.join(map(str, offered))}"
+            )
+    return tuple(sorted({*wanted, offered[-1]}))
+
+
+def functions(character: Any, steps: int) -> dict[str, Exported]:
+    """What a tick calls, as functions of the guidance scale and the foot lock too.
+
+    Args:
+      character: A `control.steering.Character` with tuning.
+      steps: Diffusion steps of a plan.
+    """
+    tuning, params = character.tuning, character.params
+
+    def tuned(name: str, plain: Exported) -> Exported:
+        def run(*arguments: Any) -> Any:
+            *rest, scale, locks = arguments
+            more = {"locks": locks} if tuning.lockable else {}
+            controller = tuning.method(steps, scale, **more)(params)
+            return character.exports(controller)[name].function(*rest)
+
+        return Exported(run, (*plain.takes, *SETTINGS), plain.gives)
+
+    plain = character.exports(character.method(params))
+    return {name: tuned(name, one) for name, one in plain.items()}
+
+
+def write_character(
+    folder: Path,
+    name: str,
+    character: Any,
+    command: Any,
+    *,
+    steps: tuple[int, ...] = (),
+    say: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Writes a character's files.
+
+    Args:
+      folder: Of this character.
+      name: What the page calls it.
+      character: A `control.steering.Character` with tuning.
+      command: Of one tick; only its shapes matter.
+      steps: Numbers of diffusion steps to offer besides the model's own.
+      say: Called with a line for each file.
+
+    Raises:
+      OSError: if a file cannot be written.
+      ValueError: if a function has no ONNX form that runs, or a number of steps is none
+        that the model offers.
+    """
+    labels = character.labels or (None,)
+    states = character.start(labels=list(range(len(labels))))
+    arguments = {
+        "state": jax.tree.map(lambda x: x[0], states),
+        "command": command,
+        **SETTINGS,
+    }
+    names = [port.name for port in graph.ports({"state": states})]
+    starts = dict(zip(names, map(np.asarray, jax.tree.leaves(states)), strict=True))
+    weights, graphs, runs = slim.Weights(WEIGHTS), {}, {}
+    for number in step_choices(character, steps):
+        runs[number] = []
+        for which, function in functions(character, number).items():
+            # Only these know how many steps a plan takes.
+            key = f"{which}@{number}" if which[:4] in ("plan", "step") else which
+            key = which if which == "plan_level" else key
+            runs[number].append(key)
+            if key in graphs:
+                continue
+            made = graph.make(which, function, arguments)
+            content = slim.slim(onnx.content(made), weights)
+            file = key.replace("@", ".") + onnx.SUFFIX
+            graphs[key] = {
+                "file": file,
+                "inputs": _ports(made.inputs),
+                "outputs": _ports(made.outputs),
+            }
+            say(_write(folder / file, content))
+    about = {
+        "format": 1,
+        "model": name,
+        "fps": character.fps,
+        "source": character.source,
+        "labels": list(character.labels),
+        "skeleton": packed.skeleton_json(character.skeleton),
+        "graphs": graphs,
+        "runs": runs,
+        "steps": list(runs),
+        "scale": character.tuning.scale,
+        "scales": list(character.tuning.scales),
+        "lockable": character.tuning.lockable,
+        "patience": character.tuning.patience,
+        "plan": _plan_arrays(names),
+        "weights": WEIGHTS,
+    }
+    arrays = starts | packed.body_arrays(character.skeleton)
+    say(_write(folder / WEIGHTS, weights.content()))
+    say(_write(folder / "character.bin", packed.pack(about, arrays)))
+
+
+def _ports(ports: tuple[graph.Port, ...]) -> list[dict[str, Any]]:
+    return [{"name": x.name, "dtype": x.dtype, "shape": x.shape} for x in ports]
+
+
+def _plan_arrays(names: list[str]) -> dict[str, str] | None:
+    """Where the state has its plan; None for characters without one."""
+    find = lambda end: next((x for x in names if x.endswith(end)), None)  # noqa: E731
+    found = {
+        "root": next(
+            (x for x in names if ".plan." in x and x.endswith("root_position")), None
+        ),
+        "rotation": next(
+            (x for x in names if ".plan." in x and x.endswith("joint_rotation")), None
+        ),
+        "cursor": find(".cursor"),
+    }
+    return found if all(found.values()) else None
+
+
+def _write(path: Path, content: bytes) -> str:
+    """Writes a packed file; a line about it."""
+    path = path.with_name(path.name + ".gz")
+    # No time of day in it: the same content is the same file.
+    small = gzip.compress(content, 9, mtime=0)
+    with files.replacing(path) as file:
+        file.write(small)
+    return f"{path}: {len(small) / 1e6:.2f} MB ({len(content) / 1e6:.2f} unpacked)"
+
+
+def write_page(
+    folder: Path,
+    models: list[str],
+    *,
+    cache: Path,
+    say: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Bundles the page's sources and writes them, the runtime and the list of models.
+
+    Args:
+      folder: To write to.
+      models: Names, each of a character's folder there; the first is shown first.
+      cache: Folder for the packages of npm; those there are used again.
+
+    Raises:
+      OSError: if a file cannot be written.
+      ValueError: if Node is missing, or npm or esbuild fails.
+    """
+    check()
+    lock = (SOURCES / "package-lock.json").read_bytes()
+    place = cache / hashlib.sha256(lock).hexdigest()[:16]
+    if not (place / "node_modules" / ".package-lock.json").exists():
+        place.mkdir(parents=True, exist_ok=True)
+        for name in ("package.json", "package-lock.json"):
+            shutil.copyfile(SOURCES / name, place / name)
+        _run(["npm", "ci", "--no-audit", "--no-fund"], place)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=place) as build:
+        for path in SOURCES.iterdir():
+            if path.suffix in (".js", ".html"):
+                shutil.copyfile(path, Path(build) / path.name)
+        for source, made in (("local.js", "page.js"), ("worker.js", "worker.js")):
+            options = ["--bundle", "--minify", "--format=esm", "--target=es2022"]
+            bundler = str(place / "node_modules" / ".bin" / "esbuild")
+            out = [f"--outfile={made}.out", "--log-level=error"]
+            _run([bundler, source, *options, *out], Path(build))
+            shutil.copyfile(Path(build) / f"{made}.out", folder / made)
+        shutil.copyfile(Path(build) / "index.html", folder / "index.html")
+    for made in ("index.html", "page.js", "worker.js"):
+        say(f"{folder / made}: {(folder / made).stat().st_size / 1e6:.2f} MB")
+    runtime = place / "node_modules/onnxruntime-web/dist/ort-wasm-simd-threaded.wasm"
+    say(_write(folder / "ort.wasm", runtime.read_bytes()))
+    files.write_text(folder / "models.json", json.dumps({"models": models}) + "\n")
+
+
+def _run(command: list[str], folder: Path) -> None:
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    if done.returncode:
+        said = [x for x in (done.stderr or done.stdout).splitlines() if x.strip()]
+        reason = said[0].strip() if said else f"exit status {done.returncode}"
+        raise ValueError(f"{Path(command[0]).name} failed: {reason}")

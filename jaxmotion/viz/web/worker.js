@@ -1,0 +1,151 @@
+// The Worker of the static page: makes frames a little ahead of what is shown, so that a
+// plan that takes long holds up no picture. Obeys what the live page's server obeys.
+
+import * as ort from "onnxruntime-web/wasm";
+import { Crowd } from "./crowd.js";
+import { Model } from "./player.js";
+
+// Ticks to be ahead: at least so many, and never more.
+const LEAST = 2, MOST = 15, MOST_CHARACTERS = 64, SPEEDS = [0.3, 4.0];
+const state = {
+  model: "", label: 0, speed: 1.4, num_steps: 1, scale: 1, foot_lock: true,
+  characters: 1, plan: false, paused: false, engine: 0, models: [], labels: [], fps: 0,
+  source: "", steps: [], scales: null, lockable: false, planning: false,
+  speeds: SPEEDS, most_characters: MOST_CHARACTERS, note: "starting", recording: false,
+  taken: 0, recordable: false,
+};
+let base = "", crowd = null, model = null, single = 0, inputs = null, due = 0, busy = false;
+const nothing = { held: [], azimuth: 0, target: null };
+inputs = nothing;
+const opened = new Map();
+
+const tell = () => postMessage({ state: { ...state } });
+function note(text) { state.note = text; tell(); }
+// One line for whoever looks, and no more frames of what failed.
+function fail(error) { note(`error: ${String(error.message || error).split("\n")[0]}`); }
+
+// A file of the folder, unpacked if it is packed.
+async function fetched(path) {
+  let answer;
+  try {
+    answer = await fetch(new URL(path, base));
+  } catch {
+    throw new Error(`${path} cannot be fetched`);
+  }
+  if (!answer.ok) throw new Error(`${path} is missing (${answer.status})`);
+  const bytes = new Uint8Array(await answer.arrayBuffer());
+  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) return bytes;
+  try {
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return new Uint8Array(await new Response(stream).arrayBuffer());
+  } catch {
+    throw new Error(`${path} is damaged`);
+  }
+}
+
+// The smallest module with a vector instruction.
+const SIMD = [0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1,
+  8, 0, 65, 0, 253, 15, 253, 98, 11];
+
+async function open(message) {
+  base = message.base;
+  if (typeof WebAssembly !== "object" || !WebAssembly.validate(new Uint8Array(SIMD)))
+    throw new Error("this browser has no WebAssembly SIMD: plans cannot be made here");
+  note("loading the runtime");
+  const [about, binary] = await Promise.all([
+    fetched("models.json"), fetched("ort.wasm.gz")]);
+  ort.env.wasm.numThreads = 1;
+  ort.env.wasm.wasmBinary = binary;
+  state.models = JSON.parse(new TextDecoder().decode(about)).models;
+  const wish = message.settings || {};
+  await choose(wish.model || state.models[0], wish);
+}
+
+// Another model; settings that it does not have are those it was made with.
+async function choose(name, wish = {}) {
+  if (!state.models.includes(name))
+    throw new Error(`unknown model ${name}, expected one of ${state.models.join(", ")}`);
+  note(`loading ${name}`);
+  if (!opened.has(name)) {
+    const read = file => fetched(`${name}/${file}.gz`);
+    opened.set(name, await new Model(ort, read).open(name));
+  }
+  const next = opened.get(name), { about } = next;
+  const label = Number(wish.label) || 0, steps = Number(wish.num_steps);
+  const given = {
+    label: about.labels[label] ? label : 0,
+    num_steps: about.steps.includes(steps) ? steps : about.steps[about.steps.length - 1],
+    scale: about.scale, foot_lock: "foot_lock" in wish ? wish.foot_lock : true,
+  };
+  await next.prepare(given.num_steps);
+  model = next;
+  Object.assign(state, given, {
+    model: name, labels: about.labels, fps: about.fps, source: about.source,
+    steps: about.steps, scales: about.scales, lockable: about.lockable,
+    planning: Boolean(about.plan), engine: state.engine + 1, note: "",
+  });
+  for (const key of ["speed", "characters", "plan"])
+    if (key in wish) state[key] = wish[key];
+  begin();
+  postMessage({ body: await next.read("character.bin"), engine: state.engine });
+  tell();
+}
+
+function begin() {
+  crowd = new Crowd(model, state);
+  crowd.resize(state.characters);
+  due = performance.now();
+}
+
+const CHANGES = {
+  async model(value) { await choose(value, { characters: state.characters }); },
+  async num_steps(value) {
+    if (!state.steps.includes(value)) throw new Error(`${value} steps are none offered`);
+    note(`loading ${value} steps`);
+    await model.prepare(value);
+    state.num_steps = value; state.note = "";
+  },
+  async characters(value) { state.characters = value; crowd.resize(value); },
+};
+
+async function obey(message) {
+  if (message.base) return open(message);
+  if (message.held) { inputs = message; return; }
+  if (!crowd) return;
+  if (message.do === "reset") begin();
+  if (message.do === "step") single += 1;
+  for (const [name, value] of Object.entries(message.set || {})) {
+    if (CHANGES[name]) await CHANGES[name](value); else state[name] = value;
+    if (name === "paused") due = performance.now();
+  }
+  if (message.set) tell();
+}
+
+// Messages are obeyed in their order, between two ticks.
+const queue = [];
+onmessage = event => { queue.push(event.data); work(); };
+const later = ms => new Promise(done => setTimeout(done, ms));
+
+async function work() {
+  if (busy) return;
+  busy = true;
+  for (;;) {
+    while (queue.length) await obey(queue.shift()).catch(fail);
+    if (!crowd || (state.paused && !single) || state.note.startsWith("error")) break;
+    const tick = 1000 / state.fps, now = performance.now();
+    const slow = Math.ceil((crowd.planMs + 2 * crowd.tickMs) / tick);
+    const depth = Math.min(Math.max(LEAST, slow + 1), MOST);
+    if (due < now) due = now;  // too slow: time stands still rather than jumps
+    const early = due - now - (depth - 1) * tick;
+    if (early > 1 && !single) { await later(Math.min(early, tick)); continue; }
+    try {
+      const data = await crowd.next(inputs, due - now + tick);
+      single = Math.max(single - 1, 0);
+      postMessage({ frame: data, due: performance.timeOrigin + due },
+        [data.buffer]);
+      due += tick;
+    } catch (error) { fail(error); }
+    await later(0);
+  }
+  busy = false;
+}

@@ -1,0 +1,200 @@
+"""The page's modules, run by Node, against the library they stand in for."""
+
+import base64
+import json
+import math
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxmotion.control import steering
+from jaxmotion.control.steering import Inputs, Wish
+from jaxmotion.data import bvh as bvh_motion
+from jaxmotion.data import bvh_text
+from jaxmotion.motion.skeleton import global_transforms, joint_positions
+from jaxmotion.viz import packed, page, viewer
+from tests import tiny
+
+pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
+WEB = Path(page.__file__).with_name("web")
+
+
+def run(module, name, *calls):
+    """What a function of a module gives for each tuple of arguments."""
+    message = json.dumps({"module": module, "name": name, "calls": calls})
+    done = subprocess.run(
+        ["node", str(Path(__file__).with_name("web.mjs")), str(WEB)],
+        input=message,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout)
+
+
+def floats(values):
+    return {"float32": np.asarray(values, float).ravel().tolist()}
+
+
+def data(content):
+    return {"base64": base64.b64encode(content).decode()}
+
+
+def wish_json(wish):
+    return {"velocity": wish.velocity, "facing": wish.facing}
+
+
+def random_inputs(random):
+    held = [x for x in steering.MOVES if random.random() < 0.2]
+    stick = lambda: tuple(random.uniform(-0.7, 0.7, 2).tolist())  # noqa: E731
+    some = lambda x: x if random.random() < 0.4 else None  # noqa: E731
+    return Inputs(
+        held=frozenset(held),
+        azimuth=float(random.uniform(-4, 4)),
+        target=some(tuple(random.uniform(-1, 1, 2).tolist())),
+        stick=some(stick()),
+        face=some(stick()),
+    )
+
+
+def test_the_page_steers_as_the_library_does():
+    random, calls, wants = np.random.default_rng(0), [], []
+    for _ in range(300):
+        inputs, angle = random_inputs(random), random.uniform(-math.pi, math.pi)
+        speed = random.choice([0.0, 1.4])
+        facing = (math.sin(angle), math.cos(angle))
+        last = Wish(velocity=tuple(speed * x for x in facing), facing=facing)
+        more = dict(position=tuple(random.uniform(-1, 1, 2).tolist()), speed=1.4)
+        wants.append(steering.wanted(inputs, last, seconds=1 / 30, **more))
+        given = {
+            "held": sorted(inputs.held),
+            "azimuth": inputs.azimuth,
+            "target": inputs.target,
+            "stick": inputs.stick,
+            "face": inputs.face,
+        }
+        calls.append((given, wish_json(last), more | {"seconds": 1 / 30}))
+    found = run("steer.js", "wanted", *calls)
+    assert len({len(x.velocity) for x in wants}) == 1
+    for a, b in zip(found, wants, strict=True):
+        np.testing.assert_allclose(a["velocity"], b.velocity, atol=1e-9)
+        np.testing.assert_allclose(a["facing"], b.facing, atol=1e-9)
+    calls, kept = [], []
+    for a, b in zip(wants[:-1], wants[1:], strict=True):
+        for other in (b, Wish(velocity=(a.velocity[0], a.velocity[1] + 0.1))):
+            for steady in (False, True):
+                calls.append((wish_json(a), wish_json(other), steady))
+                kept.append(steering.settled(a, other, steady=steady))
+    for a, b in zip(run("steer.js", "settled", *calls), kept, strict=True):
+        assert a == json.loads(json.dumps(wish_json(b)))
+
+
+def test_a_stick_walks_as_far_as_it_is_pushed_and_another_one_faces():
+    half = Inputs(stick=(0.0, 0.5), face=(1.0, 0.0))
+    more = dict(position=(0.0, 0.0), speed=2.0, seconds=1 / 30)
+    wish = steering.wanted(half, Wish(), **more)
+    np.testing.assert_allclose(wish.velocity, (0, 1), atol=1e-9)
+    np.testing.assert_allclose(wish.facing, (-1, 0), atol=1e-9)
+    assert steering.wanted(Inputs(stick=(0.1, 0.0)), Wish(), **more) == Wish()
+    stands = steering.wanted(Inputs(face=(0.0, -1.0)), Wish(), **more)
+    np.testing.assert_allclose(stands.facing, (0, -1), atol=1e-9)
+    assert stands.speed == 0
+
+
+def test_formations_are_the_same():
+    numbers = (1, 2, 7, 16, 64)
+    found = run("crowd.js", "formation", *((n,) for n in numbers))
+    for number, places in zip(numbers, found, strict=True):
+        np.testing.assert_allclose(places, viewer.formation(number), atol=1e-6)
+
+
+def test_the_pages_kinematics_and_skinning():
+    """Positions of joints, and of points that stay where their joint carries them."""
+    motion, skeleton = tiny.walk(3, turn=1.0), tiny.skeleton()
+    places, turns = map(
+        np.asarray,
+        global_transforms(skeleton, motion.root_position, motion.joint_rotation),
+    )
+    about, joints = packed.skeleton_json(skeleton), len(skeleton.parents)
+    world = floats(np.zeros(12 * joints))
+    calls = [
+        (about, floats(root), floats(rotation), world)
+        for root, rotation in zip(
+            motion.root_position, motion.joint_rotation, strict=True
+        )
+    ]
+    found = np.array(run("body.js", "kinematics", *calls)).reshape(-1, joints, 4, 3)
+    np.testing.assert_allclose(found[:, :, 3], places, atol=1e-4)
+    columns = np.swapaxes(turns, -1, -2)
+    np.testing.assert_allclose(found[:, :, :3], columns, atol=1e-4)
+
+
+def test_a_packed_body_is_unpacked():
+    skeleton = tiny.skeleton()
+    arrays = packed.body_arrays(skeleton)
+    about = {"skeleton": packed.skeleton_json(skeleton)}
+    (found,) = run("body.js", "unpack", (data(packed.pack(about, arrays)),))
+    assert found["skeleton"]["names"] == list(skeleton.names)
+    assert set(found["arrays"]) == set(arrays)
+    for name, values in arrays.items():
+        got = found["arrays"][name]
+        got = (
+            np.frombuffer(base64.b64decode(got["base64"]), np.uint8)
+            if isinstance(got, dict)
+            else np.array(got)
+        )
+        np.testing.assert_allclose(got, values.ravel(), rtol=1e-6)
+    weights = arrays["weights"].astype(int)
+    assert (weights.sum(axis=-1) == 255).all()
+    assert arrays["faces"].max() < len(arrays["positions"])
+
+
+def takes(frames=20):
+    motion, skeleton = tiny.walk(frames, turn=1.0), tiny.skeleton()
+    parts = (motion.root_position, motion.joint_rotation)
+    return skeleton, motion, [[floats(x) for x in part] for part in parts]
+
+
+def test_the_pages_bvh_is_what_was_shown():
+    skeleton, motion, parts = takes()
+    about = packed.skeleton_json(skeleton)
+    (text,) = run("save.js", "bvh", (about, float(motion.fps), *parts))
+    read, found = bvh_motion.motion_from_bvh(bvh_text.parse_bvh(text))
+    expected = joint_positions(skeleton, motion)
+    np.testing.assert_allclose(joint_positions(read, found), expected, atol=1e-4)
+
+
+def test_the_pages_glb_is_what_was_shown(tmp_path):
+    """Read by another importer: names, tree, and the mesh in its bind pose."""
+    trimesh = pytest.importorskip("trimesh")
+    skeleton, motion, parts = takes()
+    arrays = packed.body_arrays(skeleton)
+    listed = {
+        name: floats(x) if x.dtype == np.float32 else x.ravel().tolist()
+        for name, x in arrays.items()
+    }
+    for name in ("joints", "weights"):  # as bytes, which have `subarray`
+        listed[name] = {"float64": listed[name]}
+    body = {"skeleton": packed.skeleton_json(skeleton), "arrays": listed}
+    (found,) = run("save.js", "glb", (body, float(motion.fps), *parts))
+    content = base64.b64decode(found["base64"])
+    (tmp_path / "take.glb").write_bytes(content)
+    scene = trimesh.load(tmp_path / "take.glb")
+    assert set(skeleton.names) <= set(scene.graph.nodes)
+    (mesh,) = scene.geometry.values()
+    assert len(mesh.faces) == len(arrays["faces"]) // 3
+    low, high = arrays["positions"].min(0), arrays["positions"].max(0)
+    np.testing.assert_allclose(mesh.bounds, [low, high], atol=1e-4)
+    length = int.from_bytes(content[12:16], "little")
+    text = json.loads(content[20 : 20 + length])
+    (animation,) = text["animations"]
+    assert len(animation["channels"]) == len(skeleton.parents) + 1
+    places = text["accessors"][animation["samplers"][-1]["output"]]
+    view = text["bufferViews"][places["bufferView"]]
+    start = 28 + length + view["byteOffset"]
+    values = np.frombuffer(content[start : start + view["byteLength"]], "<f4")
+    roots = np.asarray(motion.root_position).ravel()
+    np.testing.assert_allclose(values, roots, atol=1e-5)
