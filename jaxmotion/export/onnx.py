@@ -5,7 +5,9 @@ loop over the first axis, "Scan", so that one file takes any number of them and 
 each exactly what it gives one; they run one after the other.
 """
 
+import contextlib
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -110,12 +112,13 @@ def _converted(graph: Graph, *, inner: bool) -> Any:
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
-        model = to_onnx(
-            lambda *arrays: _forward(traced, list(arrays)),
-            structs,
-            model_name=graph.name,
-            input_names=[own + port.name for port in graph.inputs],
-        )
+        with _newest_first():
+            model = to_onnx(
+                lambda *arrays: _forward(traced, list(arrays)),
+                structs,
+                model_name=graph.name,
+                input_names=[own + port.name for port in graph.inputs],
+            )
     except Exception as error:  # whatever the converter raises for what it lacks
         reason = str(error).strip().split("\n")[0] or type(error).__name__
         raise ValueError(f"{graph.name!r} has no form in ONNX: {reason}") from error
@@ -128,6 +131,36 @@ def _converted(graph: Graph, *, inner: bool) -> Any:
         value.name = name
     _prune(model.graph)
     return model
+
+
+@contextlib.contextmanager
+def _newest_first() -> Iterator[None]:
+    """Lets the converter find a value where it was just made.
+
+    It asks of each value, several times, whether some node gives it, and looks through
+    all constants and nodes from the oldest on: most of its time where there are
+    thousands. Another release of it, which has no such function, is left alone.
+    """
+    from jax2onnx.converter import output_binding
+
+    name = "_value_is_graph_connected"
+    slow = getattr(output_binding, name, None)
+    if slow is None:
+        yield
+        return
+
+    def found(context: Any, value: Any) -> bool:
+        nodes = context.builder.nodes
+        newest = (nodes[-i] for i in range(1, min(len(nodes), 64) + 1))
+        return any(given is value for node in newest for given in node.outputs) or slow(
+            context, value
+        )
+
+    setattr(output_binding, name, found)
+    try:
+        yield
+    finally:
+        setattr(output_binding, name, slow)
 
 
 def _is_lost(eqn: core.JaxprEqn) -> bool:

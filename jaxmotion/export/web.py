@@ -40,8 +40,8 @@ def check() -> None:
     missing = [name for name in ("node", "npm") if shutil.which(name) is None]
     if missing:
         raise ValueError(
-            f"the page is bundled by Node 20 or newer, which has {' and '.join(missing)}:"
-            " not found on the path (see nodejs.org)"
+            f"the page is bundled by Node 20 or newer: {' and '.join(missing)} not on "
+            "the path (see nodejs.org)"
         )
 
 

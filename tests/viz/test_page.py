@@ -204,6 +204,8 @@ def tab(browser, served):
     tab.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
     tab.goto(served.address)
     tab.wait_for_function("window.shown", timeout=PATIENCE)
+    # W walks along +z.
+    tab.evaluate("input.camera.azimuth = 0; input.on.change()")
     served.session.reset()
     yield tab
     assert not errors
