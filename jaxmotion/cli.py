@@ -66,7 +66,7 @@ LIMITS: dict[str, Range] = {
     "port": Range(0, 65535),
     "max_clients": Range(1, 1000),
     "devices": Range(1, 10**4),
-    "seeds": Range(1, 1000),
+    **dict.fromkeys(("seeds", "most", "cores"), Range(1, 1000)),
     **dict.fromkeys(("held_out",), _PART),
     **dict.fromkeys(("learning_rate", "ddpm_rate", "discriminator_rate"), _RATE),
     **dict.fromkeys(("dropout", "ema"), Range(0, 1, (1,))),

@@ -1,0 +1,265 @@
+"""Trains and evaluates what the papers' claims still need, a process per core.
+
+Takes the runs of experiments/papers and their commands, with seeds 0, 1, ...: each run
+until all claims of its tables are decided, or MAX trainings are made. What is there is
+not made again. Ctrl-C and `kill -9` lose nothing but the updates since the last
+checkpoint: the same command goes on, and leaves alone what still runs.
+
+Examples:
+  python experiments/train_queue.py --only emdm_ablation --minutes 240
+  nohup python experiments/train_queue.py --cores 1 > queue.log &
+
+Beside each run folder's files are queue.log (all output) and queue.json (the commands
+and their minutes, which add up over restarts).
+"""
+
+import dataclasses
+import fcntl
+import json
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import report
+import tqdm
+import tyro
+from reports import results, verdicts, writing
+from reports.claims import Source
+
+from jaxmotion import cli, files
+from jaxmotion.learning import loop
+
+POLL = 1.0  # seconds between looks at running trainings
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train what the papers' claims still need.
+
+    Attributes:
+      runs: Folder of the run folders.
+      only: Names of runs (as experiments/papers has them); none: all.
+      least: Trainings of each run, whatever its claims say.
+      most: Trainings at most; claims that are open then stay so.
+      cores: Trainings at a time, each on a core of its own; None for all cores.
+      minutes: Start nothing after so many; None to go on until all is done.
+    """
+
+    runs: Path = Path("runs")
+    only: cli.Names = ()
+    least: int = 3
+    most: int = verdicts.MAX_TRAININGS
+    cores: cli.Optional[int] = None
+    minutes: cli.Optional[float] = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One training of a run, and its evaluations.
+
+    Attributes:
+      run: Name of the run, of all its seeds.
+      folder: The run folder.
+      commands: What makes it, in turn.
+      files: What it leaves behind when it is done.
+    """
+
+    run: str
+    folder: Path
+    commands: tuple[str, ...]
+    files: tuple[Path, ...]
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is missing."""
+        return all(path.is_file() for path in self.files)
+
+
+def sources_of(args: Config) -> dict[str, list[Source]]:
+    """Files that each run leaves behind, by its name.
+
+    Raises:
+      ValueError: names what is no run of the papers' tables.
+    """
+    found: dict[str, list[Source]] = {}
+    for source in writing.SOURCES:
+        found.setdefault(source.run, []).append(source)
+    for name in args.only:
+        if name not in found:
+            raise ValueError(
+                f"--only: unknown run {name!r}, expected one of {', '.join(found)}"
+            )
+    return {name: found[name] for name in args.only or found}
+
+
+def job_of(args: Config, sources: list[Source], seed: int) -> Job:
+    """The training of a seed."""
+    run = sources[0].run
+    folder = args.runs / (f"{run}_seed{seed}" if seed else run)
+    # The seed's place among the folders says which seed a command gets.
+    folders = (*(Path("-"),) * seed, folder)
+    lines = [line for x in sources for line in report.commands_of(x, folders)]
+    own = dict.fromkeys(line for line in lines if str(folder) in shlex.split(line))
+    return Job(run, folder, tuple(own), tuple(folder / x.file for x in sources))
+
+
+def needed(args: Config, sources: list[Source]) -> int:
+    """Trainings that a run needs, as far as those that are there tell."""
+    tables = [
+        x for x in writing.TABLES if any(x.source_of(r) in sources for r in x.rows)
+    ]
+    claims = [(table, claim) for table in tables for claim in table.claims]
+    there = 0
+    while there < args.most and job_of(args, sources, there).done:
+        there += 1
+    if there < args.least:
+        return args.least
+    folders = [job_of(args, sources, seed).folder for seed in range(there)]
+    found = {
+        x: results.read_trainings([folder / x.file for folder in folders])
+        for x in sources
+    }
+    made = [verdicts.decide(table, claim, found).verdict for table, claim in claims]
+    return min(there + ("not decided" in made), args.most)
+
+
+@dataclasses.dataclass
+class Running:
+    """A training that this queue started.
+
+    Attributes:
+      job: Which.
+      process: Its shell, in a session of its own.
+      minutes: What it had taken before.
+      begun: When it started, on the monotonic clock.
+    """
+
+    job: Job
+    process: subprocess.Popen
+    minutes: float
+    begun: float
+
+    def note(self) -> None:
+        """Writes down how long it has taken so far."""
+        minutes = self.minutes + (time.monotonic() - self.begun) / 60
+        value = {"minutes": round(minutes, 2), "commands": self.job.commands}
+        path = self.job.folder / "queue.json"
+        files.write_text(path, json.dumps(value, indent=1))
+
+
+def start(job: Job, core: int) -> Running | None:
+    """Starts a training on a core; None if it is running already.
+
+    The lock is the training's own: it outlives a queue that is killed.
+    """
+    job.folder.mkdir(parents=True, exist_ok=True)
+    lock = (job.folder / "queue.lock").open("w")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        return None
+    minutes, path = 0.0, job.folder / "queue.json"
+    if path.is_file():
+        minutes = float(json.loads(path.read_text())["minutes"])
+    lines = [
+        shlex.join([sys.executable, *shlex.split(line)[1:]]) for line in job.commands
+    ]
+    with (job.folder / "queue.log").open("a") as log, lock:
+        process = subprocess.Popen(
+            ["sh", "-c", " && ".join(lines)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            pass_fds=[lock.fileno()],
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(process.pid, {core})
+    return Running(job, process, minutes, time.monotonic())
+
+
+def last_line(path: Path) -> str:
+    """The last line of a log that says something."""
+    lines = [x for x in path.read_text(errors="replace").splitlines() if x.strip()]
+    return lines[-1].strip() if lines else "no output"
+
+
+def work(args: Config, show: Callable[[str], None] = print) -> list[Job]:
+    """Runs the queue to its end.
+
+    Args:
+      args: What, where and how much.
+      show: Takes lines for the user.
+
+    Returns:
+      Trainings that failed.
+    """
+    sources = sources_of(args)
+    cores = sorted(os.sched_getaffinity(0))[: args.cores]
+    wanted = {name: needed(args, own) for name, own in sources.items()}
+    running: dict[int, Running] = {}
+    left: dict[Path, Job] = {}  # failed, or at work elsewhere
+    failed, begun = [], time.monotonic()
+
+    def jobs() -> list[Job]:
+        """All that is wanted, the first seeds of all runs first."""
+        found = [
+            (seed, job_of(args, own, seed))
+            for name, own in sources.items()
+            for seed in range(wanted[name])
+        ]
+        return [job for _, job in sorted(found, key=lambda x: x[0])]
+
+    def following() -> Job | None:
+        """The next to be started, if any."""
+        if args.minutes is not None and time.monotonic() - begun > 60 * args.minutes:
+            return None
+        busy = {x.job.folder for x in running.values()} | left.keys()
+        waiting = (x for x in jobs() if not x.done and x.folder not in busy)
+        return next(waiting, None)
+
+    with tqdm.tqdm(unit="training", disable=None) as bar:
+        while True:
+            bar.total, bar.n = len(jobs()), sum(job.done for job in jobs())
+            bar.refresh()
+            idle = [core for core in cores if core not in running]
+            while idle and (job := following()):
+                if made := start(job, idle[0]):
+                    running[idle.pop(0)] = made
+                    show(f"{job.folder}: started")
+                else:
+                    left[job.folder] = job
+                    show(f"{job.folder}: another queue trains it, left alone")
+            if not running:
+                return failed
+            time.sleep(POLL)
+            for core, own in list(running.items()):
+                own.note()
+                if (code := own.process.poll()) is None:
+                    continue
+                job = running.pop(core).job
+                if code == 0 and job.done:
+                    show(f"{job.folder}: done")
+                    wanted[job.run] = needed(args, sources[job.run])
+                else:
+                    left[job.folder] = job
+                    failed.append(job)
+                    log = job.folder / "queue.log"
+                    show(f"{job.folder}: failed: {last_line(log)} ({log})")
+
+
+def main() -> None:
+    """Parses the command line and works the queue off."""
+    args = cli.check(tyro.cli(Config, description=__doc__))
+    loop.check_writable(args.runs)
+    if failed := work(args, show=tqdm.tqdm.write):
+        raise ValueError(f"{len(failed)} trainings failed, see their queue.log")
+
+
+if __name__ == "__main__":
+    cli.start(main)

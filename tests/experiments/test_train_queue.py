@@ -1,0 +1,172 @@
+"""experiments/train_queue.py: more trainings until claims are decided; kill -9."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).parents[2] / "experiments"
+
+# A training that goes on where it was: counts to `steps`, a line each, and evaluates.
+TRAIN = """
+import json, pathlib, sys, time
+out, steps, pause, gap = pathlib.Path(sys.argv[2]), *map(float, sys.argv[3:6])
+seed = int(sys.argv[7]) if "--seed" in sys.argv else 0
+log = out / "steps.txt"
+done = len(log.read_text().split()) if log.exists() else 0
+for step in range(done, int(steps)):
+    time.sleep(pause)
+    with log.open("a") as file:
+        file.write(f"{seed * 1000 + step}\\n")
+if "fail" in str(out):
+    sys.exit("no such thing")
+total = sum(map(int, log.read_text().split()))
+# The gap between rows wiggles a little from seed to seed.
+rows = {"a": total, "b": total + gap * (1 + 0.05 * (-1) ** seed)}
+cells = {k: {"fid": dict(value=v, low=None, high=None, samples=1)} for k, v in rows.items()}
+about = {"seeds": {"training": [seed]}}
+(out / "metrics.json").write_text(json.dumps(about | {"rows": cells}))
+"""  # noqa: E501
+
+DRIVER = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import train_queue
+from jaxmotion import cli
+from reports import claims, writing
+def make(name, gap, pause):
+    source = claims.Source(
+        run=name, file="metrics.json",
+        commands=(f"python {sys.argv[2]} --out {{run}} 6 {pause} {gap}",),
+    )
+    row = lambda x: claims.Row(name=x, here=x.lower(), paper=(1.0,))
+    claim = claims.Claim(words=name, column="FID", pairs=(("A", "B"),), where="here")
+    return source, claims.Table(
+        paper="P", number=name, title="t", source=source, rows=(row("A"), row("B")),
+        columns=(claims.Column(name="FID", here="fid", better="lower"),),
+        claims=(claim,),
+    )
+made = [make(*x.split(",")) for x in sys.argv[4:]]
+writing.SOURCES, writing.TABLES = tuple(zip(*made))
+sys.argv = ["train_queue.py", *sys.argv[3].split()]
+cli.start(train_queue.main)
+"""
+
+
+@pytest.fixture
+def queue(tmp_path):
+    """Starts a queue over runs such as "name,gap,pause" in a process of its own."""
+    script, driver = tmp_path / "train.py", tmp_path / "driver.py"
+    script.write_text(TRAIN)
+    driver.write_text(DRIVER)
+    # Scripts are imported by path: only this repository's own packages are needed.
+    path = os.pathsep.join([str(FOLDER.parent), os.environ.get("PYTHONPATH", "")])
+
+    def start(options, *runs):
+        line = [sys.executable, driver, FOLDER, script, options, *runs]
+        return subprocess.Popen(
+            list(map(str, line)),
+            text=True,
+            env=os.environ | {"PYTHONPATH": path},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+
+    return start
+
+
+def finish(process):
+    out, errors = process.communicate(timeout=120)
+    return process.returncode, out + errors
+
+
+def numbers(folder):
+    return {
+        path.parent.name: json.loads(path.read_text())["rows"]
+        for path in sorted(folder.glob("*/metrics.json"))
+    }
+
+
+@pytest.mark.slow
+def test_trainings_are_added_until_a_claim_is_decided(queue, tmp_path):
+    runs = tmp_path / "runs"
+    code, shown = finish(
+        queue(f"--runs {runs} --most 5", "clear,9,0", "none,0,0", "against,-9,0")
+    )
+    assert code == 0, shown
+    made = sorted(numbers(runs))
+    for name in ("clear", "against"):  # three trainings decide either way
+        assert [x for x in made if x.startswith(name)] == [
+            name, f"{name}_seed1", f"{name}_seed2"
+        ]  # fmt: skip
+    assert sum(x.startswith("none") for x in made) == 5
+    note = json.loads((runs / "clear_seed1" / "queue.json").read_text())
+    assert note["minutes"] >= 0 and "--seed 1" in note["commands"][0]
+    # All is there: nothing is made again.
+    before = {path: path.stat().st_mtime for path in runs.glob("*/metrics.json")}
+    assert finish(queue(f"--runs {runs} --most 5", "clear,9,0"))[0] == 0
+    assert before == {path: path.stat().st_mtime for path in before}
+
+
+@pytest.mark.slow
+def test_a_queue_that_is_killed_twice_ends_with_the_same_numbers(queue, tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert finish(queue(f"--runs {whole} --cores 1", "slow,9,0"))[0] == 0
+    for _ in range(2):
+        process = queue(f"--runs {killed} --cores 1", "slow,9,0.3")
+        before = len(list(killed.glob("*/steps.txt")))
+        end = time.monotonic() + 60
+        while len(list(killed.glob("*/steps.txt"))) == before:
+            assert process.poll() is None and time.monotonic() < end
+            time.sleep(0.1)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        # What it started still runs: a new queue leaves that alone.
+        other = queue(f"--runs {killed} --cores 1 --minutes 0.001", "slow,9,0.3")
+        finish(other)
+    while True:
+        code, shown = finish(queue(f"--runs {killed} --cores 1", "slow,9,0"))
+        if "left alone" not in shown:
+            break
+        time.sleep(0.5)
+    assert code == 0, shown
+    assert numbers(killed) == numbers(whole) and len(numbers(whole)) == 3
+
+
+def test_what_fails_is_named_and_the_rest_is_made(queue, tmp_path):
+    code, shown = finish(queue(f"--runs {tmp_path}/runs", "fail,9,0", "good,9,0"))
+    assert code == 2 and "fail: failed: no such thing" in shown
+    assert shown.rstrip().splitlines()[-1].endswith("see their queue.log")
+    assert len(numbers(tmp_path / "runs")) == 3
+
+
+def test_an_unknown_run_is_named(load):
+    module = load("train_queue")
+    with pytest.raises(ValueError, match="--only: unknown run 'emd', expected one of"):
+        module.sources_of(module.Config(only=("emd",)))
+
+
+def test_a_job_has_the_commands_of_its_run_with_its_seed(load, tmp_path):
+    module = load("train_queue")
+    args = module.Config(runs=tmp_path, only=("smgdiff",))
+    (sources,) = module.sources_of(args).values()
+    job = module.job_of(args, sources, 2)
+    folder = tmp_path / "smgdiff_seed2"
+    assert (job.run, job.folder) == ("smgdiff", folder)
+    assert all(str(folder) in line for line in job.commands)
+    assert all(("--seed 2" in x) == (" train " in x) for x in job.commands)
+    assert len(set(job.commands)) == len(job.commands)
+    assert {x.parents[2] for x in job.files} == {folder} and not job.done
+    assert dataclasses.replace(job, files=()).done
+
+
+def test_the_help_names_every_option(help_of):
+    text = help_of("train_queue")
+    for option in ("--runs", "--only", "--least", "--most", "--cores", "--minutes"):
+        assert option in text
