@@ -1,4 +1,4 @@
-"""A motion as binary glTF: a simple skinned body, its joints, and their animation.
+"""A motion as binary glTF: a skinned mannequin, its joints, and their animation.
 
 The container is a JSON chunk and one chunk of bytes; writing it needs no package.
 Meters, y up, facing +z; the zero pose is the T-pose, standing on the ground.
@@ -6,6 +6,7 @@ Meters, y up, facing +z; the zero pose is the T-pose, standing on the ground.
 Source: glTF 2.0 specification (Khronos), sections 3 and 4.4.
 """
 
+import dataclasses
 import json
 import struct
 from pathlib import Path
@@ -17,7 +18,8 @@ from jaxmotion import files
 from jaxmotion.motion.anatomy import as_t_pose, zero_pose
 from jaxmotion.motion.rotation import matrix_from_rot6d, quaternion_from_matrix
 from jaxmotion.motion.skeleton import Motion, Skeleton
-from jaxmotion.viz import body as bodies
+from jaxmotion.viz import mannequin
+from jaxmotion.viz.mannequin import Mannequin
 
 _FLOAT, _UINT, _USHORT = 5126, 5125, 5123
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
@@ -63,29 +65,22 @@ def _linear(color: str) -> list[float]:
 
 
 def _primitives(
-    body: bodies.Body, ends: np.ndarray, buffer: _Buffer, colors: list[str]
+    body: Mannequin, buffer: _Buffer, colors: list[int]
 ) -> list[dict[str, Any]]:
-    """The capsules of each color; every vertex follows the joint of its end."""
+    """The faces of each color."""
     found = []
     for material, color in enumerate(colors):
-        mine = [s for s, other in enumerate(body.colors) if other == color]
-        made = [bodies.capsule_mesh(ends[s], body.radii[s]) for s in mine]
-        starts = np.cumsum([0, *(len(shape[0]) for shape in made)])
-        joints = np.zeros((starts[-1], 4), np.uint16)
-        joints[:, 0] = np.concatenate(
-            [body.joints[s][shape[2]] for s, shape in zip(mine, made, strict=True)]
-        )
-        weights = np.zeros((starts[-1], 4))
-        weights[:, 0] = 1.0
-        vertices, normals = (np.concatenate([m[i] for m in made]) for i in (0, 1))
-        faces = [m[3] + start for m, start in zip(made, starts, strict=False)]
+        mine = np.flatnonzero(body.materials == color)
+        number = np.zeros(len(body.vertices), int)
+        number[mine] = np.arange(len(mine))
+        faces = body.faces[body.materials[body.faces[:, 0]] == color]
         attributes = {
-            "POSITION": buffer.add(vertices, target=_VERTICES, range_=True),
-            "NORMAL": buffer.add(normals, target=_VERTICES),
-            "JOINTS_0": buffer.add(joints, target=_VERTICES),
-            "WEIGHTS_0": buffer.add(weights, target=_VERTICES),
+            "POSITION": buffer.add(body.vertices[mine], target=_VERTICES, range_=True),
+            "NORMAL": buffer.add(body.normals[mine], target=_VERTICES),
+            "JOINTS_0": buffer.add(body.joints[mine], target=_VERTICES),
+            "WEIGHTS_0": buffer.add(body.weights[mine], target=_VERTICES),
         }
-        indices = buffer.add(np.concatenate(faces).ravel(), target=_FACES)
+        indices = buffer.add(number[faces].ravel(), target=_FACES)
         found.append(
             {"attributes": attributes, "indices": indices, "material": material}
         )
@@ -130,16 +125,20 @@ def to_glb(skeleton: Skeleton, motion: Motion) -> bytes:
     places, offsets = zero_pose(skeleton), np.array(skeleton.offsets, float)
     count = len(places)
     still = np.broadcast_to(np.eye(3), (count, 3, 3))
-    body = bodies.describe(skeleton)
-    ends = body.ends(places, still)
-    lift = np.array([0.0, float((body.radii - ends[..., 1]).max()), 0.0])
-    places, ends = places + lift, ends + lift
-    offsets[0] = lift
-    buffer, colors = _Buffer(), sorted(set(body.colors))
-    primitives = _primitives(body, ends, buffer, colors)
+    body = mannequin.describe(skeleton)
+    offsets[0] = [0.0, -float(body.skin(places, still)[0][:, 1].min()), 0.0]
+    # For who knows no skins the mesh stands, too.
+    lift = np.array([0.0, -float(body.vertices[:, 1].min()), 0.0])
+    body = dataclasses.replace(
+        body,
+        vertices=(body.vertices + lift).astype(np.float32),
+        bind_position=body.bind_position + lift,
+    )
+    buffer, colors = _Buffer(), np.unique(body.materials).tolist()
+    primitives = _primitives(body, buffer, colors)
     # Column by column; the translation is the last one.
     inverse = np.tile(np.eye(4), (count, 1, 1))
-    inverse[:, 3, :3] = -places
+    inverse[:, :, :3] = np.swapaxes(body.inverse_bind, 1, 2)
     bind = buffer.add(inverse.reshape(count, 16))
     nodes = []
     for joint, name in enumerate(skeleton.names):
@@ -159,7 +158,7 @@ def to_glb(skeleton: Skeleton, motion: Motion) -> bytes:
         "materials": [
             {
                 "pbrMetallicRoughness": {
-                    "baseColorFactor": _linear(color),
+                    "baseColorFactor": _linear(body.palette[color]),
                     "metallicFactor": 0.0,
                     "roughnessFactor": 0.8,
                 }

@@ -262,7 +262,8 @@ def t_pose(
     Args:
       sides: See `find_anatomy`.
       motion: World rotations [F, J, 3, 3]. Where the zero pose does not stand, nothing
-        else tells how arms are turned about themselves: the elbows bend ahead.
+        else tells how limbs are turned about themselves: elbows bend ahead, knees
+        back, and feet are level on average.
 
     Returns:
       Positions [J, 3], meters, the root at the origin; world rotations [J, 3, 3].
@@ -271,10 +272,11 @@ def t_pose(
     parents = skeleton.parents
     found = find_anatomy(skeleton, sides)
     wanted: dict[int, tuple[int, np.ndarray]] = {}
-    turn = np.eye(3)
+    turn = chest = np.eye(3)
     if found.legs:
         places = zero_pose(skeleton)
         turn = _root_turn(found, places)
+        chest = _chest_turn(skeleton, found, turn, places) @ turn
         for leg in found.legs:
             wanted[leg.upper] = (leg.middle, np.array([0.0, -1.0, 0.0]))
             wanted[leg.middle] = (leg.end, np.array([0.0, -1.0, 0.0]))
@@ -290,22 +292,36 @@ def t_pose(
             out = np.array([1.0 if left else -1.0, 0.0, 0.0])
             joints = [*arm.before[-1:], arm.upper, arm.middle, arm.end, *arm.after[:1]]
             for joint, child in zip(joints, joints[1:], strict=False):
-                bone = turn @ (places[child] - places[joint])
+                bone = chest @ (places[child] - places[joint])
                 # A clavicle keeps its slope.
                 if joint not in arm.before or unit(bone) @ out < 0.6:
                     wanted[joint] = (child, out)
+    above = _above_pelvis(skeleton, found)
     turns = np.zeros((len(parents), 3, 3))
     for joint, parent in enumerate(parents):
         turns[joint] = turn if parent < 0 else turns[parent]
+        if joint == above:
+            turns[joint] = chest
         if joint in wanted:
             child, direction = wanted[joint]
             bone = turns[joint] @ offsets[child]
             axis = np.array([0.0, 0.0, 1.0])
             turns[joint] = _swing(bone, direction, axis) @ turns[joint]
     if motion is not None and not found.upright:
-        for arm in found.arms:
-            below = [j for j in range(len(parents)) if arm.upper in chain(parents, j)]
-            turns[below] = _elbow_turn(arm, wanted, turns, motion) @ turns[below]
+        below = lambda top: [  # noqa: E731
+            j for j in range(len(parents)) if top in chain(parents, j)
+        ]
+        for limb in (*found.arms, *found.legs):
+            bone = wanted[limb.upper][1]
+            bend = np.array([0.0, 0.0, 1.0 if limb in found.arms else -1.0])
+            twist = _hinge_turn(limb, bone, bend, turns, motion)
+            turns[below(limb.upper)] = twist @ turns[below(limb.upper)]
+        for leg in found.legs:
+            if leg.after:
+                foot = below(leg.end)
+                turns[foot] = (
+                    _foot_turn(leg, wanted, turns, motion, offsets) @ turns[foot]
+                )
     points = np.zeros((len(parents), 3))
     for joint, parent in enumerate(parents):
         if parent >= 0:
@@ -313,19 +329,36 @@ def t_pose(
     return points, turns
 
 
-def _elbow_turn(
-    arm: Limb, wanted: dict, turns: np.ndarray, motion: np.ndarray
+def _hinge_turn(
+    limb: Limb,
+    bone: np.ndarray,
+    bend: np.ndarray,
+    turns: np.ndarray,
+    motion: np.ndarray,
 ) -> np.ndarray:
-    """Turns an arm about itself so that its elbow bends toward +z."""
-    upper, lower = (motion[:, j] @ turns[j].T for j in (arm.upper, arm.middle))
-    bend = np.swapaxes(upper, -1, -2) @ lower
-    skew = bend - np.swapaxes(bend, -1, -2)
+    """Turns a limb about itself so that its middle joint bends toward a direction."""
+    upper, lower = (motion[:, j] @ turns[j].T for j in (limb.upper, limb.middle))
+    bent = np.swapaxes(upper, -1, -2) @ lower
+    skew = bent - np.swapaxes(bent, -1, -2)
     hinge = 0.5 * np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1).mean(0)
-    out = wanted[arm.upper][1]
-    hinge = hinge - out * (hinge @ out)
+    hinge = hinge - bone * (hinge @ bone)
     if np.linalg.norm(hinge) < 0.05:  # hardly bent: nothing to go by
         return np.eye(3)
-    return _swing(hinge, np.cross(out, [0.0, 0.0, 1.0]), out)
+    return _swing(hinge, np.cross(bone, bend), bone)
+
+
+def _foot_turn(
+    leg: Limb, wanted: dict, turns: np.ndarray, motion: np.ndarray, offsets: np.ndarray
+) -> np.ndarray:
+    """Turns a foot ahead again, and about itself so that it is level on average."""
+    toe, ahead = wanted[leg.end]
+    up = np.array([0.0, 1.0, 0.0])
+    first = _swing(turns[leg.end] @ offsets[toe], ahead, up)
+    above = first @ turns[leg.end] @ motion[:, leg.end, 1].mean(axis=0)
+    across = lambda v: v - ahead * (v @ ahead)  # noqa: E731
+    if np.linalg.norm(across(above)) < 0.2:  # it points down all the time
+        return first
+    return _swing(across(above), across(up), ahead) @ first
 
 
 def kinematics(skeleton: Skeleton, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
@@ -424,6 +457,29 @@ def mixamo_names(skeleton: Skeleton, *, prefix: str = "mixamorig:") -> tuple[str
         prefix + names[j] if j in names else name
         for j, name in enumerate(skeleton.names)
     )
+
+
+def _above_pelvis(skeleton: Skeleton, found: Anatomy) -> int | None:
+    """The trunk's first joint above the legs; None where there is none."""
+    if not found.legs:
+        return None
+    pelvis = found.trunk.index(skeleton.parents[found.legs[0].first])
+    return found.trunk[pelvis + 1] if pelvis + 1 < len(found.trunk) else None
+
+
+def _chest_turn(
+    skeleton: Skeleton, found: Anatomy, turn: np.ndarray, places: np.ndarray
+) -> np.ndarray:
+    """Turns the spine so that shoulders are above the hips, not across them."""
+    roots = {arm.side: turn @ places[arm.first] for arm in found.arms}
+    above = _above_pelvis(skeleton, found)
+    chests = [chain(skeleton.parents, arm.first) for arm in found.arms]
+    if set(roots) != {LEFT, RIGHT} or any(above not in chest for chest in chests):
+        return np.eye(3)
+    across = (roots[LEFT] - roots[RIGHT]) * [1.0, 0.0, 1.0]
+    if unit(across)[0] > 0.9 or np.linalg.norm(across) < 1e-6:
+        return np.eye(3)  # as a person's; a performer is never quite even
+    return _swing(across, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
 
 
 def _root_turn(found: Anatomy, places: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFilter, ImageFont
 
-from jaxmotion.viz import body as bodies
 from jaxmotion.viz import camera as cameras
 from jaxmotion.viz import figure as drawing
 from jaxmotion.viz import raster
@@ -19,13 +18,6 @@ _PATH_COLORS = (drawing.COMMANDED, drawing.WALKED)
 _TOUCH, _BALL = "#2fae4a", "#e8e4da"
 _GHOST = "#8fa3b8"
 _SHADOW = 0.3
-# Trunk, head and feet are of many capsules: meters over which their light is smoothed.
-_SOFT = {
-    bodies.MIDDLE: 0.07,
-    bodies.SKIN: 0.02,
-    bodies.LEFT_DARK: 0.02,
-    bodies.RIGHT_DARK: 0.02,
-}
 _TONES = 4
 _MARK = 0.05  # radius of the mark of a joint in contact, meters
 # Drawn so many times larger in both directions, then averaged.
@@ -119,28 +111,25 @@ class _Shot:
     """A stage before a camera.
 
     Attributes:
-      ends: [C, F, S, 2, 3] of the bodies; of the ghosts, or None.
       paths: Ground paths [C, F, 3], and their colors.
     """
 
     page: _Page
     camera: cameras.Camera
     stage: Stage
-    ends: np.ndarray
-    ghosts: np.ndarray | None
     paths: tuple[tuple[np.ndarray, str], ...]
 
     @functools.cached_property
-    def colors(self) -> list[str]:
-        """What has shades."""
-        more = set() if self.stage.ball is None else {_TOUCH, _BALL}
-        more |= set() if self.ghosts is None else {_GHOST}
-        return sorted({*self.stage.body.colors} | more)
+    def colors(self) -> tuple[str, ...]:
+        """What has shades: the body's palette first."""
+        more = () if self.stage.ball is None else (_TOUCH, _BALL)
+        more += () if self.stage.ghost is None else (_GHOST,)
+        return self.stage.body.palette + more
 
     @property
     def reach(self) -> float:
         """How far around the target the ground is drawn, meters."""
-        return 0.85 * self.camera.distance
+        return 0.65 * self.camera.distance
 
 
 def _fade(shot: _Shot, points: np.ndarray, frame: int) -> np.ndarray:
@@ -195,73 +184,92 @@ def _draw_lines(
             pen.line(end, fill=ramp[level], width=width)
 
 
-def _capsules(
-    shot: _Shot, frame: int, *, ghost: bool = False
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Ends [S, 2, 3] and radii [S, 2] of all bodies, or ghosts, and colors.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Solid:
+    """Triangles in the world: vertices [V, 3], normals, colors [V], faces [T, 3]."""
 
-    With the bodies come the ball and the marks of what touches it.
-    """
-    stage = shot.stage
-    body, ball = stage.body, stage.ball
-    shown = shot.ghosts if ghost else shot.ends
-    ends = [shown[:, frame].reshape(-1, 2, 3)]
-    radii = [np.tile(body.radii, (len(shown), 1))]
+    vertices: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+    faces: np.ndarray
+
+
+def _joined(solids: list[_Solid]) -> _Solid:
+    starts = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
+    pairs = zip(solids, starts, strict=False)
+    return _Solid(
+        vertices=np.concatenate([solid.vertices for solid in solids]),
+        normals=np.concatenate([solid.normals for solid in solids]),
+        colors=np.concatenate([solid.colors for solid in solids]),
+        faces=np.concatenate([solid.faces + start for solid, start in pairs]),
+    )
+
+
+def _ball(center: np.ndarray, radius: float, color: int) -> _Solid:
+    vertices, faces = raster.sphere()
+    return _Solid(
+        vertices=center + radius * vertices,
+        normals=vertices,
+        colors=np.full(len(vertices), color),
+        faces=faces,
+    )
+
+
+def _solid(shot: _Shot, frame: int, *, ghost: bool = False) -> _Solid:
+    """All bodies, the ball, and marks of what touches it; or all ghosts."""
+    stage, body = shot.stage, shot.stage.body
+    pose = stage.ghost_pose if ghost else (stage.positions, stage.rotations)
+    vertices, normals = body.skin(*(values[:, frame] for values in pose))
+    colors = body.materials
     if ghost:
-        return ends[0], radii[0], [_GHOST] * len(ends[0])
-    colors = list(body.colors) * len(shown)
-    if ball is not None:
-        marks = stage.positions[0, frame, ball.touching(frame)].reshape(-1, 3)
-        ends += [np.stack([marks, marks], axis=1), ball.position[[frame, frame]][None]]
-        radii += [np.full((len(marks), 2), _MARK), np.full((1, 2), ball.radius)]
-        colors += [_TOUCH] * len(marks) + [_BALL]
-    return np.concatenate(ends), np.concatenate(radii), colors
+        colors = np.full(len(colors), shot.colors.index(_GHOST))
+    found = [
+        _Solid(vertices=v, normals=n, colors=colors, faces=body.faces)
+        for v, n in zip(vertices, normals, strict=True)
+    ]
+    if stage.ball is not None and not ghost:
+        for joint in stage.ball.touching(frame):
+            touch = shot.colors.index(_TOUCH)
+            found.append(_ball(stage.positions[0, frame, joint], _MARK, touch))
+        place, radius = stage.ball.position[frame], stage.ball.radius
+        found.append(_ball(place, radius, shot.colors.index(_BALL)))
+    return _joined(found)
 
 
-def _draw_shadow(shot: _Shot, frame: int, picture: Image.Image) -> None:
+def _draw_shadow(shot: _Shot, frame: int, picture: Image.Image, solid: _Solid) -> None:
     """What the light casts on the ground, soft."""
-    ends, radii, _ = _capsules(shot, frame)
     light = shot.camera.axes.T @ raster.LIGHT
-    ground = (ends - ends[..., 1:2] / light[1] * light)[..., [0, 2]]
-    along = ground[:, 1] - ground[:, 0]
-    angles = np.arctan2(along[:, 1], along[:, 0])[:, None]
-    angles = angles + np.linspace(-0.5, 0.5, 7) * np.pi
-    arc = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    far = ground[:, 1, None] + radii[:, 1, None, None] * arc
-    near = ground[:, 0, None] - radii[:, 0, None, None] * arc
-    rims = np.concatenate([far, near], axis=1)
-    points = np.stack([rims[..., 0], 0 * rims[..., 0], rims[..., 1]], axis=-1)
-    pixels = shot.camera.project(points, frame)[0]
-    mask = Image.new("L", picture.size)
-    pen = ImageDraw.Draw(mask)
-    for polygon in pixels.reshape(len(pixels), -1).tolist():
-        pen.polygon(polygon, fill=round(255 * _SHADOW))
+    ground = solid.vertices - solid.vertices[:, 1:2] / light[1] * light
+    pixels = shot.camera.project(ground, frame)[0]
+    points = np.concatenate([pixels, 0 * pixels[:, :1]], axis=1)
+    mask = raster.covered(
+        points, solid.faces, width=picture.width, height=picture.height
+    )
+    mask = Image.fromarray(np.where(mask, round(255 * _SHADOW), 0).astype(np.uint8))
     mask = mask.filter(ImageFilter.GaussianBlur(picture.height / 120))
     # Few steps: a shadow of many would cost more bytes than the body.
     picture.paste(_INK, mask=mask.point([16 * round(v / 16) for v in range(256)]))
 
 
-def _draw_bodies(
-    shot: _Shot, frame: int, picture: Image.Image, *, ghost: bool = False
+def _draw_solid(
+    shot: _Shot, frame: int, picture: Image.Image, solid: _Solid, *, opacity: int = 255
 ) -> None:
-    """Bodies, marks of touching joints, and ball; or ghosts, which one sees through."""
-    ends, radii, colors = _capsules(shot, frame, ghost=ghost)
-    number = {color: i for i, color in enumerate(shot.colors)}
-    pixels, scale, near = shot.camera.project(ends, frame)
+    """What stands on the ground; one sees through ghosts."""
+    pixels, _, near = shot.camera.project(solid.vertices, frame)
     usual = shot.camera.focal / shot.camera.distance
-    seen = raster.capsules(
-        _FINE * np.concatenate([pixels, near[..., None] * usual], axis=-1),
-        _FINE * radii * scale,
-        np.array([number[color] for color in colors]),
-        width=picture.width,
-        height=picture.height,
-        soft={number[c]: _FINE * m * usual for c, m in _SOFT.items() if c in number},
+    size = dict(width=picture.width, height=picture.height)
+    points = _FINE * np.concatenate([pixels, usual * near[:, None]], axis=-1)
+    codes = raster.codes(
+        raster.triangles(points, solid.faces, **size),
+        solid.normals @ shot.camera.axes.T,
+        solid.colors,
+        solid.faces,
+        **size,
     )
     shades = [raster.shades(_rgb(color)) for color in shot.colors]
     table = np.round(np.concatenate([np.zeros((1, 3)), *shades])).astype(np.uint8)
-    opacity = 110 if ghost else 255
-    mask = Image.fromarray(np.where(seen > 0, opacity, 0).astype(np.uint8))
-    picture.paste(Image.fromarray(table[seen]), mask=mask)
+    mask = Image.fromarray(np.where(codes > 0, opacity, 0).astype(np.uint8))
+    picture.paste(Image.fromarray(table[codes]), mask=mask)
 
 
 def _draw(shot: _Shot, frame: int) -> Image.Image:
@@ -269,7 +277,8 @@ def _draw(shot: _Shot, frame: int) -> Image.Image:
     page = shot.page
     picture = Image.new("RGB", (page.width, page.height), _GROUND)
     _draw_tiles(ImageDraw.Draw(picture), shot, frame)
-    _draw_shadow(shot, frame, picture)
+    solid = _solid(shot, frame)
+    _draw_shadow(shot, frame, picture, solid)
     fine = (_FINE * page.width, _FINE * page.height)
     picture = picture.resize(fine, Image.Resampling.NEAREST)
     pen = ImageDraw.Draw(picture)
@@ -280,9 +289,10 @@ def _draw(shot: _Shot, frame: int) -> Image.Image:
                 _draw_lines(pen, shot, frame, rest, color, strength=0.6, width=_FINE)
             done = line[: frame + 1]
             _draw_lines(pen, shot, frame, done, color, strength=1.0, width=2 * _FINE)
-    if shot.ghosts is not None:
-        _draw_bodies(shot, frame, picture, ghost=True)
-    _draw_bodies(shot, frame, picture)
+    if shot.stage.ghost is not None:
+        pale = _solid(shot, frame, ghost=True)
+        _draw_solid(shot, frame, picture, pale, opacity=110)
+    _draw_solid(shot, frame, picture, solid)
     picture = picture.reduce(_FINE)
     pen = ImageDraw.Draw(picture)
     for key, color in page.keys:
@@ -300,7 +310,8 @@ def _palette(shot: _Shot) -> np.ndarray:
     found = [_mix(_GROUND, _GROUND, 0.0)]
     found += [_mix(_GROUND, c, i / n) for c, n in ramps for i in range(1, n + 1)]
     found += [_mix(_GROUND, _INK, _SHADOW * i / 4) for i in range(1, 5)]
-    for color in shot.colors:
+    used = {shot.colors[i] for i in np.unique(shot.stage.body.materials)}
+    for color in sorted(used | {*shot.colors[len(shot.stage.body.palette) :]}):
         table = raster.shades(_rgb(color))
         found += [*table, 0.5 * (table[1] + _rgb(_GROUND))]
         if color == _GHOST:
@@ -359,26 +370,23 @@ def save_gif(
     keys = [line[:2] for line in shown]
     keys += [] if stage.ghost is None else [("plan", _GHOST)]
     page = _page(title, caption, keys, width, height)
-    ends, ghosts = stage.ends, stage.ghost_ends
+    many = len(stage.positions) > 3
     camera = cameras.follow(
-        ends if ghosts is None else np.concatenate([ends, ghosts]),
-        stage.body.radii,
+        stage.outline,
         fps=stage.fps,
         azimuth=cameras.toward(stage.walked) if azimuth is None else azimuth,
-        elevation=(16.0 if len(ends) < 4 else 28.0) if elevation is None else elevation,
+        elevation=(28.0 if many else 16.0) if elevation is None else elevation,
         box=page.box,
     )
     shot = _Shot(
         page=page,
         camera=camera,
         stage=stage,
-        ends=ends,
-        ghosts=ghosts,
         paths=tuple((_on_ground(line), color) for _, color, line in shown),
     )
     palette = Image.new("P", (1, 1))
     palette.putpalette(_palette(shot).astype(np.uint8).ravel().tolist())
-    frames = range(0, ends.shape[1], every)
+    frames = range(0, stage.positions.shape[1], every)
     images = [
         _draw(shot, frame).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in frames

@@ -91,8 +91,7 @@ def smooth(values: np.ndarray, frames: float) -> np.ndarray:
 
 
 def follow(
-    ends: np.ndarray,
-    radii: np.ndarray,
+    points: np.ndarray,
     *,
     fps: float,
     azimuth: float,
@@ -102,28 +101,22 @@ def follow(
     """The nearest camera that has all bodies whole in a box in all frames.
 
     Args:
-      ends: [characters, F, S, 2, 3] of their capsules, world, meters.
-      radii: [S, 2] meters.
+      points: [characters, F, P, 3] between which they are, world, meters.
       azimuth: Degrees about +y; 0 looks along -z.
       elevation: Degrees above the ground.
       box: Left, top, right and bottom, pixels.
     """
     axes = view_axes(azimuth=azimuth, elevation=elevation)
-    frames = ends.shape[1]
-    points = np.moveaxis(ends, 1, 0).reshape(frames, -1, 3)
-    radii = np.tile(radii.ravel(), len(ends))
-    low = (points - radii[:, None]).min(axis=1)
-    high = (points + radii[:, None]).max(axis=1)
-    middle = 0.5 * (low + high)
+    points = np.moveaxis(points, 1, 0).reshape(points.shape[1], -1, 3)
+    middle = 0.5 * (points.min(axis=1) + points.max(axis=1))
     level = smooth(middle[:, [0, 2]], 0.35 * fps)
     up = smooth(middle[:, 1:2], 1.0 * fps)
     targets = np.concatenate([level[:, :1], up, level[:, 1:]], axis=-1)
     local = (points - targets[:, None]) @ axes.T
     half = 0.5 * np.array([box[2] - box[0], box[3] - box[1]])
     focal = _FOCAL * 2 * half[1]
-    # A ball's picture is a little wider than its radius at its middle.
-    reach = np.abs(local[..., :2]) + 1.05 * radii[:, None]
-    needed = local[..., 2:] + radii[:, None] + focal * reach / half
+    # A little more than they reach: points between them may stand out.
+    needed = local[..., 2:] + 1.02 * focal * np.abs(local[..., :2]) / half
     return Camera(
         axes=axes,
         targets=targets,

@@ -1,8 +1,8 @@
 """A self-contained page that plays a stage: no network, no library, WebGL.
 
 Drag to turn, wheel to zoom, slider or arrow keys to scrub, space to pause. The page has
-the joints' rotations and the capsules of `body.describe`; the kinematics are done
-there.
+the joints' rotations and the mesh of `mannequin.describe`; kinematics and skinning are
+done there.
 """
 
 import base64
@@ -10,12 +10,14 @@ import html as escaping
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.viz import camera as cameras
 from jaxmotion.viz import figure as drawing
+from jaxmotion.viz.mannequin import Mannequin
 from jaxmotion.viz.stage import Stage
 
 _PAGE = """<!doctype html>
@@ -42,14 +44,8 @@ p { font-size: 11px; margin: 4px 12px; color: #707884; }
 <script>
 const data = __DATA__;
 const element = id => document.getElementById(id);
-const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer;
-const floats = text => text && new Float32Array(bytes(text));
-const joints = data.parents.length, capsules = data.capsules.length;
+const joints = data.parents.length;
 const [characters, frames] = data.shape;
-const poses = m => m && {root: floats(m.root), turn: new Int16Array(bytes(m.turn))};
-const body = poses(data.motion), ghost = poses(data.ghost);
-const targets = floats(data.targets), ball = data.ball;
-if (ball) ball.place = floats(ball.position);
 
 const canvas = element("view"), slider = element("time"), button = element("play");
 const gl = canvas.getContext("webgl2", {antialias: true, stencil: true, alpha: false});
@@ -57,7 +53,12 @@ if (!gl) {
   element("clock").textContent = "This browser has no WebGL 2: nothing can be drawn.";
   throw new Error("no WebGL 2");
 }
-__CAPSULES__
+__MANNEQUIN__
+const floats = text => text && new Float32Array(bytes(text));
+const poses = m => m && {root: floats(m.root), turn: new Int16Array(bytes(m.turn))};
+const body = poses(data.motion), ghost = poses(data.ghost);
+const targets = floats(data.targets), ball = data.ball;
+if (ball) ball.place = floats(ball.position);
 // World position (3) and rotation (9, three columns) of all joints.
 const world = new Float32Array(12 * joints);
 function kinematics(pose, character, frame) {
@@ -86,35 +87,34 @@ function place(joint, p, out, to) {
     + world[joint + 3 + i] * p[0] + world[joint + 6 + i] * p[1]
     + world[joint + 9 + i] * p[2];
 }
-const more = ball ? 1 + joints : 0;
-const shapes = new Float32Array(WIDTH * (characters * capsules + more));
-const colors = data.capsules.map(c => rgb(c[6]));
-function assemble(pose, frame, paint) {
-  let count = 0;
-  const shape = (ra, rb, color) => {
-    shapes.set([ra, rb, ...color], WIDTH * count++ + 6);
-  };
+const mesh = bodyMesh(data.body, characters);
+const pale = ghost && bodyMesh(data.body, characters);
+function assemble(pose, frame, mesh) {
   for (let who = 0; who < characters; who++) {
     kinematics(pose, who, frame);
-    for (let s = 0; s < capsules; s++) {
-      const [a, b, pa, pb, ra, rb] = data.capsules[s];
-      place(12 * a, pa, shapes, WIDTH * count);
-      place(12 * b, pb, shapes, WIDTH * count + 3);
-      shape(ra, rb, paint || colors[s]);
-    }
+    for (let j = 0; j < joints; j++)
+      bindMatrix(world, 12 * j, data.body.inverse, 12 * j,
+                 mesh.matrices, 12 * (who * joints + j));
   }
-  if (ball && !paint) {
-    const sphere = (from, at, radius, color) => {
-      for (let i = 0; i < 6; i++) shapes[WIDTH * count + i] = from[at + i % 3];
-      shape(radius, radius, rgb(color));
-    };
-    sphere(ball.place, 3 * frame, ball.radius, "#e8e4da");
-    for (const j of ball.touching[frame]) sphere(world, 12 * j, 0.05, "#2fae4a");
-  }
-  return count;
+  bring(mesh);
+}
+// The ball, and marks where it is touched: place, radius, color of each.
+const spheres = [];
+function gather(frame) {
+  const found = [];
+  if (!ball) return found;
+  found.push([ball.place.slice(3 * frame, 3 * frame + 3), ball.radius, "#e8e4da"]);
+  for (const j of ball.touching[frame])
+    found.push([world.slice(12 * j, 12 * j + 3), 0.05, "#2fae4a"]);
+  while (spheres.length < found.length) spheres.push(sphereMesh(24, 16));
+  found.forEach(([place, radius], i) => {
+    spheres[i].matrices.set([radius, 0, 0, place[0], 0, radius, 0, place[1],
+                             0, 0, radius, place[2]]);
+    bring(spheres[i]);
+  });
+  return found;
 }
 
-const mesh = characters > 8 ? capsuleMesh(8, 2) : capsuleMesh(24, 6);
 const flat = program(`
 in vec3 corner; uniform mat4 view; uniform vec3 target; uniform float reach;
 out vec3 p;
@@ -134,8 +134,7 @@ void main() {
 }`);
 const plane = gl.createVertexArray();
 gl.bindVertexArray(plane);
-upload(new Float32Array([-1, 0, -1, 1, 0, -1, -1, 0, 1, 1, 0, 1]));
-attribute(0, 3, 3, 0, 0);
+attribute(0, 3, new Float32Array([-1, 0, -1, 1, 0, -1, -1, 0, 1, 1, 0, 1]));
 // Paths are ribbons on the ground.
 function ribbons(path, high) {
   if (!path) return null;
@@ -150,7 +149,7 @@ function ribbons(path, high) {
                path[at] + dz, high, path[at + 1] - dx], 3 * at);
   }
   const made = gl.createVertexArray();
-  gl.bindVertexArray(made); upload(found); attribute(0, 3, 3, 0, 0);
+  gl.bindVertexArray(made); attribute(0, 3, found);
   return made;
 }
 const paths = data.paths.map(([name, color, values], i) =>
@@ -211,14 +210,16 @@ function draw() {
     gl.uniform4f(flat.at("paint"), ...rgb(color), 1);
     gl.drawArrays(gl.TRIANGLE_STRIP, start, 2 * now + 2);
   }
-  useCapsules(mesh, view, data.light);
-  const count = assemble(body, now);
-  bring(mesh, shapes);
-  drawCapsules(mesh, count);
+  useMeshes(view, data.light, data.body.palette);
+  assemble(body, now, mesh);
+  const round = gather(now);
+  drawShadow(mesh);
+  round.forEach((_, i) => drawShadow(spheres[i]));
+  drawMesh(mesh);
+  round.forEach(([, , color], i) => drawMesh(spheres[i], rgb(color)));
   if (ghost) {
-    const pale = assemble(ghost, now, PALE);
-    bring(mesh, shapes);
-    drawGhost(mesh, pale);
+    assemble(ghost, now, pale);
+    drawGhost(pale);
   }
   slider.value = now;
   element("clock").textContent = (now / data.fps).toFixed(2) + " s of " +
@@ -261,8 +262,7 @@ canvas.addEventListener("wheel", e => {
 requestAnimationFrame(loop);
 </script></body></html>
 """
-# What the live page draws with as well.
-CAPSULES = Path(__file__).with_name("capsules.js").read_text(encoding="utf-8")
+_MANNEQUIN = Path(__file__).with_name("mannequin.js").read_text(encoding="utf-8")
 # Where the light is, seen from the first view; as in GIFs.
 _LIGHT = np.array([-0.42, 0.78, 0.46])
 
@@ -282,6 +282,30 @@ def _pose(stage: Stage, motion: Motion) -> dict[str, str]:
     return {"root": _floats(np.asarray(motion.root_position)), "turn": packed}
 
 
+def _base64(values: np.ndarray) -> str:
+    return base64.b64encode(values.tobytes()).decode("ascii")
+
+
+def _body(body: Mannequin) -> dict[str, Any]:
+    """The mesh in few bytes: a place to 1/65535 of the height, weights to 1/255."""
+    low = body.vertices.min(axis=0)
+    step = float(np.ptp(body.vertices, axis=0).max()) / 65535
+    weights = np.round(255 * body.weights).astype(int)
+    weights[:, 0] += 255 - weights.sum(axis=1)
+    return {
+        "low": low.tolist(),
+        "step": step,
+        "places": _base64(np.round((body.vertices - low) / step).astype("<u2")),
+        "normals": _base64(np.round(127 * body.normals).astype("i1")),
+        "joints": _base64(body.joints.astype("<u2")),
+        "weights": _base64(weights.astype("u1")),
+        "materials": _base64(body.materials.astype("u1")),
+        "faces": _base64(body.faces.astype("<u2")),
+        "inverse": np.round(body.inverse_bind, 5).ravel().tolist(),
+        "palette": body.palette,
+    }
+
+
 def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
     """The page as text.
 
@@ -290,40 +314,32 @@ def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
       title: Above the picture, in one line; escaped, like the caption.
       caption: Below it, small: the source of the data and its license.
     """
-    body, ends = stage.body, stage.ends
-    seen = ends if stage.ghost is None else np.concatenate([ends, stage.ghost_ends])
-    low, high = seen.min(axis=(0, 2, 3)), seen.max(axis=(0, 2, 3))
+    seen = stage.outline
+    low, high = seen.min(axis=(0, 2)), seen.max(axis=(0, 2))
     targets = cameras.smooth(0.5 * (low + high), 0.5 * stage.fps)
-    away = np.linalg.norm(seen - targets[:, None, None], axis=-1)
-    many = len(ends) > 3
+    away = np.linalg.norm(seen - targets[:, None], axis=-1)
+    many = len(stage.positions) > 3
     azimuth = np.deg2rad(cameras.toward(stage.walked))
     elevation = np.deg2rad(28.0 if many else 16.0)
     axes = cameras.view_axes(
         azimuth=float(np.rad2deg(azimuth)), elevation=float(np.rad2deg(elevation))
     )
-    shapes = zip(
-        body.joints.tolist(),
-        np.round(body.places, 4).tolist(),
-        np.round(body.radii, 4).tolist(),
-        body.colors,
-        strict=True,
-    )
     paths = [("walked", drawing.WALKED, _floats(stage.walked))]
     if stage.wanted is not None:
         paths.insert(0, ("commanded", drawing.COMMANDED, _floats(stage.wanted)))
     data = {
-        "shape": ends.shape[:2],
+        "shape": stage.positions.shape[:2],
         "fps": stage.fps,
         "parents": stage.skeleton.parents,
         "offsets": np.round(np.asarray(stage.skeleton.offsets, float), 5).tolist(),
-        "capsules": [[*j, *p, *r, color] for j, p, r, color in shapes],
+        "body": _body(stage.body),
         "motion": _pose(stage, stage.motion),
         "ghost": None if stage.ghost is None else _pose(stage, stage.ghost),
         "paths": paths,
         "ball": None,
         "targets": _floats(targets),
-        "reach": round(float((away + body.radii).max()), 4),
-        "size": round(float(np.ptp(ends[0, 0, ..., 1])), 3),
+        "reach": round(1.02 * float(away.max()), 4),
+        "size": round(float(np.ptp(seen[0, 0, :, 1])), 3),
         "azimuth": round(float(azimuth), 4),
         "elevation": round(float(elevation), 4),
         "light": (axes.T @ _LIGHT / np.linalg.norm(_LIGHT)).round(4).tolist(),
@@ -332,7 +348,7 @@ def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
         data["ball"] = {
             "position": _floats(stage.ball.position),
             "radius": stage.ball.radius,
-            "touching": [stage.ball.touching(f) for f in range(ends.shape[1])],
+            "touching": [stage.ball.touching(f) for f in range(len(targets))],
         }
     # "</" would end the script element wherever it stands.
     text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
@@ -340,11 +356,11 @@ def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
         "__TITLE__": escaping.escape(title),
         "__CAPTION__": escaping.escape(caption),
         "__DATA__": text,
-        "__CAPSULES__": CAPSULES,
+        "__MANNEQUIN__": _MANNEQUIN,
     }
     # In one pass: a title may contain the name of the other slot.
     return re.sub(
-        "__(TITLE|CAPTION|DATA|CAPSULES)__", lambda slot: filled[slot.group()], _PAGE
+        "__(TITLE|CAPTION|DATA|MANNEQUIN)__", lambda slot: filled[slot.group()], _PAGE
     )
 
 

@@ -1,10 +1,12 @@
-"""Shaded capsules with a depth buffer, in NumPy: pixels to entries of a palette."""
+"""Shaded triangles with a depth buffer, in NumPy: pixels to entries of a palette."""
+
+import dataclasses
+import functools
 
 import numpy as np
-from PIL import Image, ImageFilter
 
 # Shades of each color, dark to light.
-LEVELS = 6
+LEVELS = 12
 # Where the light is from the camera: left of, above and behind it.
 LIGHT = np.array([-0.42, 0.78, 0.46])
 
@@ -18,91 +20,191 @@ def shades(color: tuple[int, int, int] | np.ndarray) -> np.ndarray:
     return dark + low * (base - dark) + high * (light - base)
 
 
-def capsules(
-    ends: np.ndarray,
-    radii: np.ndarray,
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Seen:
+    """Pixels that show something, and what.
+
+    Attributes:
+      pixels: [n] row by row.
+      faces: [n] which triangle.
+      parts: [n, 3] how much of each of its corners.
+    """
+
+    pixels: np.ndarray
+    faces: np.ndarray
+    parts: np.ndarray
+
+    def mean(self, values: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Values [n, d] there of those at vertices [V, d]."""
+        found = values[faces[self.faces]]
+        return np.einsum("nk,nkd->nd", self.parts, found)
+
+
+def _spans(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whole numbers from each low to below each high, and which range each is of."""
+    count = np.maximum(high - low, 0)
+    which = np.repeat(np.arange(len(low)), count)
+    first = np.cumsum(count) - count
+    return low[which] + np.arange(len(which)) - first[which], which
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Inside:
+    """Pixels inside of triangles, each as often as it is in one.
+
+    Attributes:
+      row, column: [n].
+      of: [n] which of `which`.
+      which: [m] triangles that have pixels.
+      corner: [m, 3, 3] their corners.
+      scale: [m] one over twice their signed area.
+    """
+
+    row: np.ndarray
+    column: np.ndarray
+    of: np.ndarray
+    which: np.ndarray
+    corner: np.ndarray
+    scale: np.ndarray
+
+
+def _inside(
+    points: np.ndarray, faces: np.ndarray, width: int, height: int, two_sided: bool
+) -> _Inside:
+    corner = points.astype(np.float64)[faces]
+    one, two = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    area = two[:, 0] * one[:, 1] - one[:, 0] * two[:, 1]
+    low, high = corner.min(axis=1), corner.max(axis=1)
+    useful = (np.abs(area) if two_sided else area) > 1e-9
+    useful &= (high[:, :2] >= 0).all(axis=1)
+    useful &= (low[:, :2] <= [width - 1, height - 1]).all(axis=1)
+    which = np.flatnonzero(useful)
+    corner, area = corner[which], area[which]
+    top = np.ceil(np.maximum(low[which, 1], 0)).astype(int)
+    end = np.floor(np.minimum(high[which, 1], height - 1)).astype(int) + 1
+    row, of = _spans(top, end)
+    left, right = np.zeros(len(row)), np.full(len(row), width - 1.0)
+    for i in range(3):
+        p, q = corner[:, i], corner[:, (i + 1) % 3]
+        rise = (p[:, 1] - q[:, 1]) * np.sign(area)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slope = (q[:, 0] - p[:, 0]) / (q[:, 1] - p[:, 1])
+            start = p[:, 0] - slope * p[:, 1]
+            x = start[of] + row * slope[of]
+        np.fmax(left, np.where((rise < 0)[of], x, left), out=left)
+        np.fmin(right, np.where((rise > 0)[of], x, right), out=right)
+    first = np.ceil(left - 1e-4).astype(int)
+    column, span = _spans(first, np.floor(right + 1e-4).astype(int) + 1)
+    return _Inside(
+        row=row[span],
+        column=column,
+        of=of[span],
+        which=which,
+        corner=corner,
+        scale=1.0 / area,
+    )
+
+
+def covered(
+    points: np.ndarray, faces: np.ndarray, *, width: int, height: int
+) -> np.ndarray:
+    """Whether each pixel [height, width] is in a triangle, seen from whichever side.
+
+    Args:
+      points: [V, 2 or more] right and down, pixels.
+      faces: [T, 3].
+    """
+    inside = _inside(points, faces, width, height, two_sided=True)
+    found = np.zeros((height, width), bool)
+    found[inside.row, inside.column] = True
+    return found
+
+
+def triangles(
+    points: np.ndarray, faces: np.ndarray, *, width: int, height: int
+) -> Seen:
+    """What is nearest in each pixel.
+
+    Args:
+      points: [V, 3] right, down and toward the viewer, pixels.
+      faces: [T, 3] counterclockwise for who sees them; others are not drawn.
+    """
+    inside = _inside(points, faces, width, height, two_sided=False)
+    a, one, two = (
+        inside.corner[:, i] - (i > 0) * inside.corner[:, 0] for i in range(3)
+    )
+    # Shares of the second and third corner, and the depth, are linear in the pixel.
+    scale = inside.scale
+    second = np.stack([-two[:, 1] * scale, two[:, 0] * scale], axis=-1)
+    third = np.stack([one[:, 1] * scale, -one[:, 0] * scale], axis=-1)
+    slope = second * one[:, 2:] + third * two[:, 2:]
+    start = a[:, 2] - np.sum(slope * a[:, :2], axis=-1)
+    of, row, column = inside.of, inside.row, inside.column
+    depth = start[of] + slope[of, 0] * column + slope[of, 1] * row
+    pixel = row * width + column
+    nearest = np.full(width * height, -np.inf)
+    np.maximum.at(nearest, pixel, depth)
+    winner = np.full(width * height, -1)
+    ahead = np.flatnonzero(depth == nearest[pixel])
+    winner[pixel[ahead]] = ahead
+    shown = np.flatnonzero(winner >= 0)
+    winner = winner[shown]
+    of = of[winner]
+    away = np.stack([column[winner], row[winner]], axis=-1) - a[of, :2]
+    b = np.clip(np.sum(away * second[of], axis=-1), 0.0, 1.0)
+    c = np.clip(np.sum(away * third[of], axis=-1), 0.0, 1.0 - b)
+    return Seen(
+        pixels=shown,
+        faces=inside.which[of],
+        parts=np.stack([1.0 - b - c, b, c], axis=-1),
+    )
+
+
+@functools.cache
+def sphere() -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [T, 3] of a unit sphere: a cube that was blown up."""
+    side = np.tan(np.linspace(-1, 1, 9) * np.pi / 4)
+    u, v = (x.ravel() for x in np.meshgrid(side, side, indexing="ij"))
+    corner = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
+    face = corner[:, None] + [0, 9, 10, 0, 10, 1]
+    vertices, faces = [], []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            plane = np.stack([u * sign, v, np.full(81, 1.0)], axis=-1)
+            plane[:, 2] = sign
+            faces.append(face.reshape(-1, 3) + 81 * len(vertices))
+            vertices.append(np.roll(plane, axis, axis=1))
+    found = np.concatenate(vertices)
+    found /= np.linalg.norm(found, axis=1, keepdims=True)
+    return found, np.concatenate(faces)
+
+
+def codes(
+    seen: Seen,
+    normals: np.ndarray,
     colors: np.ndarray,
+    faces: np.ndarray,
     *,
     width: int,
     height: int,
-    soft: dict[int, float],
 ) -> np.ndarray:
     """Which shade of which color each pixel shows.
 
-    Depth, like the rest, is in pixels: a parallel projection around the body.
-
     Args:
-      ends: [S, 2, 3] right, down and toward the viewer.
-      radii: [S, 2].
-      colors: [S] number of the color.
-      soft: Over how many pixels the light is smoothed, of colors where it is.
+      seen: From `triangles`.
+      normals: [V, 3] right, up and toward the viewer.
+      colors: [V] number of the color.
+      faces: [T, 3].
 
     Returns:
       [height, width] 1 + color * LEVELS + shade; 0 where nothing is.
     """
-    seen = np.zeros((height, width), np.uint8)
-    bright = np.zeros((height, width), np.uint8)
-    depth = np.full((height, width), -np.inf, np.float32)
-    # Seen along its axis, a tapered capsule is the ball at its thick end.
-    steep = np.abs(np.diff(radii)[:, 0]) > 0.35 * np.linalg.norm(
-        ends[:, 1, :2] - ends[:, 0, :2], axis=-1
-    )
-    balls = [ends[steep][:, [i, i]] for i in (0, 1)]
-    ends = np.concatenate([ends, *balls])
-    radii = np.concatenate([radii, *(radii[steep][:, [i, i]] for i in (0, 1))])
-    colors = np.concatenate([colors, colors[steep], colors[steep]])
-    low = np.floor((ends[..., :2] - radii[..., None]).min(axis=1)).astype(int)
-    high = np.ceil((ends[..., :2] + radii[..., None]).max(axis=1)).astype(int) + 1
-    low, high = np.maximum(low, 0), np.minimum(high, [width, height])
-    light = (LIGHT / np.linalg.norm(LIGHT)).astype(np.float32)
-    across, down = np.arange(width, dtype=np.float32), np.arange(height, dtype="f4")
-    down = down[:, None]
-    for s in range(len(ends)):
-        (x0, y0), (x1, y1) = low[s], high[s]
-        if x0 >= x1 or y0 >= y1:
-            continue
-        place = np.s_[y0:y1, x0:x1]
-        (ax, ay, az), (dx, dy, dz) = ends[s, 0], ends[s, 1] - ends[s, 0]
-        r0, dr = radii[s, 0], radii[s, 1] - radii[s, 0]
-        px, py = across[x0:x1] - np.float32(ax), down[y0:y1] - np.float32(ay)
-        flat = max(dx * dx + dy * dy, 1e-6)
-        # Where the ray of a pixel passes the axis, and from there to the surface.
-        t = px * np.float32(dx / flat) + py * np.float32(dy / flat)
-        if dz * dz > 1e-4 * flat:
-            m = px * np.float32(dy) - py * np.float32(dx)
-            r = np.float32(r0) + np.float32(dr) * np.clip(t, 0, 1)
-            m = r * r - m * m / np.float32(flat)
-            k = dz / np.sqrt(flat * (flat + dz * dz))
-            t += np.float32(k) * np.sqrt(np.maximum(m, 0))
-        np.clip(t, 0, 1, out=t)
-        r = np.float32(r0) + np.float32(dr) * t
-        px = px - np.float32(dx) * t
-        py = py - np.float32(dy) * t
-        h = r * r - px * px - py * py
-        inside = h > 0
-        h = np.sqrt(np.maximum(h, 0))
-        z = np.float32(az) + np.float32(dz) * t + h
-        inside &= z > depth[place]
-        facing = (px * light[0] - py * light[1] + h * light[2]) / r
-        value = np.clip(facing * 158 + 107, 0, 255).astype(np.uint8)
-        np.copyto(depth[place], z, where=inside)
-        np.copyto(bright[place], value, where=inside)
-        np.copyto(seen[place], np.uint8(1 + colors[s]), where=inside)
-    for color, blur in soft.items():
-        _soften(bright, seen == 1 + color, blur)
-    codes = np.uint8(LEVELS) * (seen - (seen > 0)) + (bright // -(-256 // LEVELS)) + 1
-    return np.where(seen > 0, codes, 0).astype(np.uint8)
-
-
-def _soften(bright: np.ndarray, where: np.ndarray, blur: float) -> None:
-    """Smooths the light on one color, in place: many capsules become one surface."""
-    rows, columns = where.any(axis=1).nonzero()[0], where.any(axis=0).nonzero()[0]
-    if not len(rows):
-        return
-    place = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    inside = where[place]
-    mean = lambda x: np.asarray(  # noqa: E731
-        Image.fromarray(x.astype(np.uint8)).filter(ImageFilter.GaussianBlur(blur)), "f4"
-    )
-    level = 255 * mean(np.where(inside, bright[place], 0)) / mean(255 * inside).clip(1)
-    np.copyto(bright[place], level.clip(0, 255).astype(np.uint8), where=inside)
+    found = np.zeros(width * height, np.uint8)
+    normal = seen.mean(normals.astype(np.float32), faces)
+    length = np.linalg.norm(normal, axis=-1)
+    facing = normal @ (LIGHT / np.linalg.norm(LIGHT)) / np.maximum(length, 1e-6)
+    bright = np.clip(0.42 + 0.62 * facing, 0.0, 0.999)
+    shade = (bright * LEVELS).astype(np.uint8)
+    color = colors[faces[seen.faces, 0]].astype(np.uint8)
+    found[seen.pixels] = 1 + color * np.uint8(LEVELS) + shade
+    return found.reshape(height, width)

@@ -1,6 +1,7 @@
 """What pictures, pages and files show: characters with bodies, their paths, a ball."""
 
 import dataclasses
+import functools
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,11 +9,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxmotion.motion.anatomy import kinematics
 from jaxmotion.motion.skeleton import Motion, Skeleton
-from jaxmotion.viz import body as bodies
-from jaxmotion.viz.body import Body
+from jaxmotion.viz import mannequin
+from jaxmotion.viz.mannequin import Mannequin
 
 # Characters that start nearer to each other than this are set apart, meters.
 _OVERLAP, _APART = 0.4, 1.6
+# So many characters are small in a picture: fewer vertices do.
+_CROWD = 4
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,7 +57,7 @@ class Stage:
     """
 
     skeleton: Skeleton
-    body: Body
+    body: Mannequin
     motion: Motion
     positions: Float[np.ndarray, "characters frames joints 3"]
     rotations: Float[np.ndarray, "characters frames joints 3 3"]
@@ -72,17 +75,18 @@ class Stage:
         """Ground paths of the roots, meters."""
         return self.positions[:, :, 0, ::2]
 
-    @property
-    def ends(self) -> Float[np.ndarray, "characters frames capsules 2 3"]:
-        """Of the bodies' capsules, world, meters."""
-        return self.body.ends(self.positions, self.rotations)
+    @functools.cached_property
+    def ghost_pose(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Positions and rotations of the ghosts' joints; None without."""
+        return None if self.ghost is None else kinematics(self.skeleton, self.ghost)
 
-    @property
-    def ghost_ends(self) -> Float[np.ndarray, "characters frames capsules 2 3"] | None:
-        """The same of the ghosts; None without."""
-        if self.ghost is None:
-            return None
-        return self.body.ends(*kinematics(self.skeleton, self.ghost))
+    @functools.cached_property
+    def outline(self) -> Float[np.ndarray, "characters frames points 3"]:
+        """Points between which all bodies and ghosts are, world, meters."""
+        poses = [(self.positions, self.rotations)]
+        poses += [] if self.ghost_pose is None else [self.ghost_pose]
+        some = self.body.outline
+        return np.concatenate([self.body.skin(*pose, only=some)[0] for pose in poses])
 
 
 def make_stage(
@@ -101,7 +105,7 @@ def make_stage(
       motion: [frames, ...] or [characters, frames, ...], world.
       wanted: [frames, 2] or [characters, frames, 2] commanded paths (x, z), meters.
       ghost: As many poses as the motion has, drawn pale.
-      sides: Left and right; see `body.describe`.
+      sides: Left and right; see `mannequin.describe`.
       apart: Many characters are set so far apart, in a square, meters. None: where
         they would start within each other; 0: never.
 
@@ -147,7 +151,12 @@ def make_stage(
     positions, rotations = kinematics(skeleton, motion)
     return Stage(
         skeleton=skeleton,
-        body=bodies.describe(skeleton, sides),
+        body=mannequin.describe(
+            skeleton,
+            sides,
+            rotations=rotations[0],
+            detail="fine" if count < _CROWD else "crowd",
+        ),
         motion=motion,
         positions=positions,
         rotations=rotations,

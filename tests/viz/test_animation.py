@@ -143,21 +143,18 @@ def test_text_is_shrunk_before_it_is_elided():
 @pytest.mark.parametrize("turn, elevation", [(0.0, 16.0), (1.2, 16.0), (-2.5, 40.0)])
 def test_the_whole_body_is_in_the_picture_in_all_frames(turn, elevation):
     shown = stage.make_stage(*samples.person(turn=turn))
-    positions, ends = shown.positions[0], shown.ends
+    positions = shown.positions[0]
     box = (16, 40, 464, 330)
     view = camera.follow(
-        ends,
-        shown.body.radii,
+        shown.outline,
         fps=samples.FPS,
         azimuth=35.0,
         elevation=elevation,
         box=box,
     )
     now = np.arange(len(positions))[:, None]
-    places = np.concatenate([ends[0].reshape(len(positions), -1, 3), positions], axis=1)
-    radii = np.concatenate([shown.body.radii.ravel(), np.zeros(positions.shape[1])])
-    pixels, scale, _ = view.project(places, now)
-    low, high = pixels - (radii * scale)[..., None], pixels + (radii * scale)[..., None]
+    pixels = view.project(shown.body.skin(positions, shown.rotations[0])[0], now)[0]
+    low = high = pixels
     assert np.all(low >= [box[:2]]) and np.all(high <= [box[2:]])
     # And no farther than that needs: somewhere it touches the box.
     gap = min((low - box[:2]).min(), (box[2:] - high).min())

@@ -1,3 +1,4 @@
+import base64
 import html.parser
 import json
 import re
@@ -9,7 +10,6 @@ import pytest
 
 from jaxmotion.viz import html as page
 from jaxmotion.viz import stage
-from jaxmotion.viz.figure import LEFT
 from tests.viz import samples
 
 
@@ -94,7 +94,7 @@ BROWSER = """
 const drawn = [];
 const special = {getShaderParameter: () => true, getProgramParameter: () => true,
   drawArrays: (mode, start, count) => drawn.push(count),
-  drawArraysInstanced: (mode, start, count, many) => drawn.push([many])};
+  drawElementsInstanced: (m, count, kind, start, many) => drawn.push([count, many])};
 const fake = new Proxy(special, {get: (t, name) =>
   t[name] ?? (/^[A-Z_0-9]+$/.test(name) ? 1 : () => ({}))});
 const parts = {};
@@ -109,14 +109,15 @@ let next; globalThis.requestAnimationFrame = f => { next = f; };
 # own, as in real browsers.
 PLAY = """
 next(-16); next(84);
-const count = assemble(body, 3);
-console.log(JSON.stringify(
-  [drawn, parts.time.value, count, Array.from(shapes.slice(0, WIDTH * count))]));
+assemble(body, 3, mesh);
+const matrices = Array.from(mesh.matrices);
+const round = gather(3).map(([place, radius]) => [...place, radius]);
+console.log(JSON.stringify([drawn, parts.time.value, matrices, round]));
 """
 
 
 def test_the_script_draws_the_same_body(tmp_path):
-    """The kinematics in the page give the capsules that Python computes."""
+    """The page's matrices, with its mesh, put vertices where Python has them."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed")
@@ -135,21 +136,28 @@ def test_the_script_draws_the_same_body(tmp_path):
     script.write_text(BROWSER + source + PLAY)
     done = subprocess.run([node, script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    drawn, frame, count, values = json.loads(done.stdout)
-    number = len(shown.body.colors)
-    assert frame == 3 and count == number + 2, "a ball, and a mark where it is touched"
-    values = np.array(values).reshape(count, 11)
-    ends = values[:number, :6].reshape(-1, 2, 3)
-    np.testing.assert_allclose(ends, shown.ends[0, 3], atol=1e-3)
-    np.testing.assert_allclose(values[:number, 6:8], shown.body.radii, atol=1e-4)
-    blue = [round(255 * x) for x in values[shown.body.colors.index(LEFT), 8:]]
-    assert "#" + "".join(f"{x:02x}" for x in blue) == LEFT
-    np.testing.assert_allclose(values[number, [0, 1, 2, 6]], [0.5, 0.5, 0.5, 0.2])
-    np.testing.assert_allclose(values[-1, :3], shown.positions[0, 3, 4], atol=1e-3)
-    # Shadow and bodies, twice the ghost; the ground, and three times a path.
-    last = drawn[len(drawn) // 2 :]
-    solid = [made[0] for made in last if isinstance(made, list)]
-    assert solid == [number + 2, number + 2, number, number]
+    drawn, frame, matrices, round_ = json.loads(done.stdout)
+    assert frame == 3
+    told = data_of((tmp_path / "a.html").read_text())["body"]
+    array = lambda name, kind: np.frombuffer(base64.b64decode(told[name]), kind)  # noqa: E731
+    places = array("places", "<u2").reshape(-1, 3) * told["step"] + told["low"]
+    weights = array("weights", "u1").reshape(-1, 4) / 255
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    moved = np.array(matrices).reshape(-1, 3, 4)[array("joints", "<u2").reshape(-1, 4)]
+    four = np.concatenate([places, np.ones((len(places), 1))], axis=1)
+    found = np.einsum("vk,vkrc,vc->vr", weights, moved, four)
+    expected = shown.body.skin(shown.positions[0, 3], shown.rotations[0, 3])[0]
+    np.testing.assert_allclose(found, expected, atol=3e-3)
+    faces = array("faces", "<u2")
+    np.testing.assert_array_equal(faces, shown.body.faces.ravel())
+    assert told["palette"] == list(shown.body.palette)
+    assert len(round_) == 2, "a ball, and a mark where it is touched"
+    np.testing.assert_allclose(round_[0], [0.5, 0.5, 0.5, 0.2], atol=1e-6)
+    np.testing.assert_allclose(round_[1][:3], shown.positions[0, 3, 4], atol=1e-3)
+    # Body and ball as shadow and solid, twice the ghost; the ground, and paths.
+    last = drawn[len(drawn) - 1 - drawn[::-1].index(4) :]
+    solid = [made for made in last if isinstance(made, list)]
+    assert solid.count([len(faces), 1]) == 4 and len(solid) == 8
     assert [made for made in last if not isinstance(made, list)] == [4, 24, 8, 8]
 
 

@@ -1,44 +1,88 @@
 import numpy as np
 import pytest
+from matplotlib.path import Path
 
 from jaxmotion.viz import raster
 
-
-def draw(ends, radii, colors=(0,)):
-    ends, radii = np.array(ends, float), np.array(radii, float)
-    colors = np.array(colors)
-    return raster.capsules(ends, radii, colors, width=80, height=60, soft={})
+SIZE = dict(width=80, height=60)
 
 
-@pytest.mark.parametrize("depth", [0.0, 15.0, 400.0])
-@pytest.mark.parametrize("radii", [(8.0, 8.0), (5.0, 9.0), (3.0, 14.0)])
-@pytest.mark.parametrize("length", [0.0, 4.0, 30.0])
-def test_a_capsule_covers_the_discs_along_its_axis(depth, radii, length):
-    a, b = np.array([20.0, 25.0, 0.0]), np.array([20 + length, 30.0, depth])
-    found = draw([[a, b]], [radii]) > 0
+def draw(points, faces, colors=None, normals=None):
+    points, faces = np.array(points, float), np.array(faces)
+    seen = raster.triangles(points, faces, **SIZE)
+    colors = np.zeros(len(points), int) if colors is None else np.array(colors)
+    normals = np.tile([0.0, 0, 1], (len(points), 1)) if normals is None else normals
+    return seen, raster.codes(seen, normals, colors, faces, **SIZE)
+
+
+def triangles(number, seed):
+    """Random ones, as the viewer sees their front, and some beyond the edges."""
+    draw = np.random.default_rng(seed)
+    points = draw.uniform([-20, -20, 0], [100, 80, 50], (number, 3, 3))
+    one, two = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
+    back = two[:, 0] * one[:, 1] - one[:, 0] * two[:, 1] < 0
+    points[back] = points[back, ::-1]
+    return points
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_triangle_covers_the_pixels_that_matplotlib_finds_inside(seed):
     x, y = np.meshgrid(np.arange(80), np.arange(60))
-    nearest = np.full(x.shape, np.inf)
-    for part in np.linspace(0, 1, 201):
-        center, r = a + part * (b - a), radii[0] + part * (radii[1] - radii[0])
-        nearest = np.minimum(nearest, np.hypot(x - center[0], y - center[1]) - r)
-    # No holes, nothing beside it; a cone's side is a little inside its discs' hull.
-    assert not np.any(found & (nearest > 0.01))
-    assert not np.any(~found & (nearest < -1.2))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    for corner in triangles(4, seed):
+        _, codes = draw(corner, [[0, 1, 2]])
+        found = codes.ravel() > 0
+        flat = Path(corner[:, :2])
+        inner, outer = (
+            flat.contains_points(pixels, radius=r)
+            | flat.contains_points(pixels, radius=-r)
+            for r in (0.0, 1e-3)
+        )
+        assert not np.any(found & ~outer)
+        both = [flat.contains_points(pixels, radius=r) for r in (1e-3, -1e-3)]
+        assert not np.any(~found & both[0] & both[1])
+        covered = raster.covered(corner[::-1], np.array([[0, 1, 2]]), **SIZE)
+        np.testing.assert_array_equal(covered.ravel(), found)
+        assert not draw(corner[::-1], [[0, 1, 2]])[1].any(), "seen from behind"
+        assert inner.sum() <= outer.sum()
 
 
-def test_what_is_nearer_hides_what_is_farther():
-    ball = [[30.0, 30.0, 0.0]] * 2
-    bar = lambda z: [[5.0, 30.0, z], [55.0, 30.0, z]]  # noqa: E731
-    color = lambda seen: (int(seen[30, 30]) - 1) // raster.LEVELS  # noqa: E731
-    for order in ((0, 1), (1, 0)):
-        for z, front in ((20.0, 1), (-20.0, 0)):
-            shapes = np.array([ball, bar(z)])[list(order)]
-            radii = np.array([[6.0, 6.0], [4.0, 4.0]])[list(order)]
-            assert color(draw(shapes, radii, order)) == front
+def test_each_pixel_shows_the_nearest_triangle_and_its_own_mixture():
+    corner = triangles(12, 7)
+    seen, codes = draw(
+        corner.reshape(-1, 3), np.arange(36).reshape(-1, 3), np.repeat(np.arange(12), 3)
+    )
+    planes = []
+    for a, b, c in corner:
+        solved = np.linalg.solve(
+            np.stack([a, b, c])[:, [0, 1]] @ np.eye(2, 3) + [0, 0, 1.0],
+            [a[2], b[2], c[2]],
+        )
+        planes.append(solved)
+    y, x = np.divmod(seen.pixels, 80)
+    mixed = np.einsum("nk,nkd->nd", seen.parts, corner[seen.faces])
+    np.testing.assert_allclose(mixed[:, 0], x, atol=1e-2)
+    np.testing.assert_allclose(mixed[:, 1], y, atol=1e-2)
+    np.testing.assert_allclose(seen.parts.sum(axis=1), 1.0)
+    for i, (a, b, c) in enumerate(planes):
+        flat = Path(corner[i][:, :2])
+        safe = [
+            flat.contains_points(np.stack([x, y], -1), radius=r) for r in (0.1, -0.1)
+        ]
+        here = safe[0] & safe[1]
+        depth = a * x + b * y + c
+        assert np.all(mixed[here, 2] >= depth[here] - 1e-3), "nothing hides it"
+    color = (codes.ravel()[seen.pixels].astype(int) - 1) // raster.LEVELS
+    np.testing.assert_array_equal(color, seen.faces)
 
 
-def test_the_side_toward_the_light_is_lighter():
-    seen = draw([[[40.0, 30.0, 0.0]] * 2], [[20.0, 20.0]])
-    assert seen[18, 33] > seen[44, 48] > 0
+def test_a_closed_surface_has_no_holes_and_is_lit_from_the_left_above():
+    vertices, faces = raster.sphere()
+    pixels = 20 * vertices * [1, -1, 1] + [40.3, 30.1, 0]
+    _, codes = draw(pixels, faces, normals=vertices)
+    x, y = np.meshgrid(np.arange(80), np.arange(60))
+    away = np.hypot(x - 40.3, y - 30.1)
+    assert (codes[away < 19.5] > 0).all() and not codes[away > 20.01].any()
+    assert codes[18, 33] > codes[44, 48] > 0
     table = raster.shades((40, 120, 200)).sum(axis=1)
     assert np.all(np.diff(table) > 0)

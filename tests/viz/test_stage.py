@@ -19,9 +19,20 @@ def test_the_joints_are_those_of_the_kinematics():
     doubled = dataclasses.replace(motion, joint_rotation=2 * motion.joint_rotation)
     same = stage.make_stage(skeleton, doubled)
     np.testing.assert_allclose(same.positions, shown.positions, atol=1e-6)
-    assert shown.ghost_ends is None
-    ghost = stage.make_stage(skeleton, motion, ghost=motion).ghost_ends
-    np.testing.assert_allclose(ghost, shown.ends, atol=1e-9)
+    assert shown.ghost_pose is None
+    both = stage.make_stage(skeleton, motion, ghost=motion).outline
+    assert len(both) == 2 and len(shown.outline) == 1
+    np.testing.assert_allclose(both[1], shown.outline[0], atol=1e-6)
+
+
+def test_the_outline_is_around_the_whole_body():
+    skeleton, motion = samples.person(seconds=1.0)
+    shown = stage.make_stage(skeleton, motion)
+    vertices, _ = shown.body.skin(shown.positions, shown.rotations)
+    for axis in range(3):
+        for end in (np.min, np.max):
+            whole, rough = (end(x[..., axis]) for x in (vertices, shown.outline))
+            assert abs(whole - rough) < 0.02
 
 
 def test_characters_keep_their_places_unless_they_overlap():
