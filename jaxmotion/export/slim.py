@@ -54,6 +54,7 @@ def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:
 
     found = onnx.load_model_from_string(_folded(model))
     _clean(found.graph)
+    _tell_apart(found.graph, set())
     names = {x.name for x in found.graph.initializer}
     casts = []
     for tensor in found.graph.initializer:
@@ -103,6 +104,38 @@ def _clean(graph: Any) -> None:
         for attribute in node.attribute:
             if attribute.HasField("g"):
                 _clean(attribute.g)
+
+
+def _tell_apart(graph: Any, taken: set[str]) -> None:
+    """Gives each value of a loop's body a name that no other value has.
+
+    A body may hide names of the graph around it, but the browser's runtime refuses it.
+
+    Args:
+      taken: Names of the graphs around and before it; its own are added.
+    """
+    taken |= {x.name for x in (*graph.input, *graph.initializer)}
+    taken |= {name for node in graph.node for name in node.output if name}
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                body = attribute.g
+                own = {x.name for x in (*body.input, *body.initializer)}
+                own |= {name for x in body.node for name in x.output if name}
+                _rename(body, {x: _free(x, taken) for x in sorted(own & taken)})
+                _tell_apart(body, taken)
+
+
+def _rename(graph: Any, names: dict[str, str]) -> None:
+    """Changes names of values, also where bodies of loops in it read them."""
+    for value in (*graph.input, *graph.output, *graph.initializer):
+        value.name = names.get(value.name, value.name)
+    for node in graph.node:
+        for field in (node.input, node.output):
+            field[:] = [names.get(x, x) for x in field]
+        for attribute in node.attribute:
+            if attribute.HasField("g"):
+                _rename(attribute.g, names)
 
 
 def _is_half(values: np.ndarray) -> bool:
