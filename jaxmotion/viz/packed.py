@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxmotion.motion.anatomy import zero_pose
 from jaxmotion.motion.skeleton import Skeleton
-from jaxmotion.viz import body as bodies
+from jaxmotion.viz import mannequin
 
 
 def pack(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> bytes:
@@ -42,40 +41,34 @@ def body_arrays(skeleton: Skeleton) -> dict[str, np.ndarray]:
 
     Returns:
       positions [V, 3] float32 in the bind pose, meters; normals [V, 4] int8 (127 is 1);
-      joints, weights [V, 4] uint8 (255 is 1); colors [V, 4] uint8, sRGB; faces [3 T]
-      uint32; inverse [J, 12] float32, rows of the joints' inverse bind transforms.
+      joints, weights [V, 4] uint8 (a vertex's weights sum to 255); colors [V, 4] uint8,
+      sRGB; faces [3 T] uint32; inverse [J, 12] float32, rows of inverse bind
+      transforms.
+
+    Raises:
+      ValueError: if there are more than 256 joints.
     """
-    places = zero_pose(skeleton)
-    count = len(places)
-    still = np.broadcast_to(np.eye(3), (count, 3, 3))
-    body = bodies.describe(skeleton)
-    ends = body.ends(places, still)
-    shapes = [bodies.capsule_mesh(e, r) for e, r in zip(ends, body.radii, strict=True)]
-    starts = np.cumsum([0, *(len(shape[0]) for shape in shapes)])
-    joints = np.zeros((starts[-1], 4), np.uint8)
-    joints[:, 0] = np.concatenate(
-        [body.joints[s][shape[2]] for s, shape in enumerate(shapes)]
-    )
-    weights = np.zeros_like(joints)
-    weights[:, 0] = 255
-    colors = np.concatenate(
-        [
-            np.tile(rgba(color), (len(shape[0]), 1))
-            for color, shape in zip(body.colors, shapes, strict=True)
-        ]
-    )
-    normals = np.concatenate([shape[1] for shape in shapes])
-    faces = [shape[3] + start for shape, start in zip(shapes, starts, strict=False)]
-    inverse = np.concatenate([still, -places[..., None]], axis=-1)
+    body = mannequin.describe(skeleton)
+    count = len(body.bind_position)
+    if count > 256:
+        raise ValueError(f"{count} joints, expected at most 256 for the page")
+    palette = np.stack([rgba(color) for color in body.palette])
     return {
-        "positions": np.concatenate([shape[0] for shape in shapes]).astype(np.float32),
-        "normals": bytes_of(normals),
-        "joints": joints,
-        "weights": weights,
-        "colors": colors,
-        "faces": np.concatenate(faces).ravel().astype(np.uint32),
-        "inverse": inverse.reshape(count, 12).astype(np.float32),
+        "positions": np.asarray(body.vertices, np.float32),
+        "normals": bytes_of(body.normals),
+        "joints": body.joints.astype(np.uint8),
+        "weights": _whole(body.weights),
+        "colors": palette[body.materials],
+        "faces": body.faces.ravel().astype(np.uint32),
+        "inverse": body.inverse_bind.reshape(count, 12).astype(np.float32),
     }
+
+
+def _whole(weights: np.ndarray) -> np.ndarray:
+    """Weights [V, 4] as bytes that sum to 255: the largest has what rounding leaves."""
+    found = np.round(255 * weights).astype(int)
+    found[:, 0] += 255 - found.sum(axis=-1)
+    return found.astype(np.uint8)
 
 
 def bytes_of(normals: np.ndarray) -> np.ndarray:

@@ -164,9 +164,7 @@ def test_what_is_slow_to_load_is_loaded_when_used():
     """Only builders load tensorflow-datasets and only viz matplotlib: in functions."""
     inside = {"jaxmotion.data.builders": "builders", "jaxmotion.viz": "viz"}
     # What is drawn, which is NumPy alone.
-    light = tuple(
-        f"jaxmotion.viz.{x}" for x in ("body", "mannequin", "packed", "stage")
-    )
+    light = tuple(f"jaxmotion.viz.{x}" for x in ("mannequin", "packed", "stage"))
     wrong = [
         f"{relative(path)}:{line} imports {name}"
         for path in LIBRARY
