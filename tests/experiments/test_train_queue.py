@@ -141,7 +141,7 @@ def test_a_queue_that_is_killed_twice_ends_with_the_same_numbers(queue, tmp_path
 
 def test_what_fails_is_named_and_the_rest_is_made(queue, tmp_path):
     code, shown = finish(queue(f"--runs {tmp_path}/runs", "fail,9,0", "good,9,0"))
-    assert code == 2 and "fail: failed: no such thing" in shown
+    assert code == 1 and "fail: failed: no such thing" in shown
     assert shown.rstrip().splitlines()[-1].endswith("see their queue.log")
     assert len(numbers(tmp_path / "runs")) == 3
 
