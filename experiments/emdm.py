@@ -66,12 +66,16 @@ class Train:
       recon: Weight R of the features' error; else 1, or 100.
       geometry: Of the losses (released: root).
       fade_geometry: Losses of joints count less at noisy steps (ours).
+      weigh_levels: Of noise in all errors: alike (published), or as the posterior
+        weighs the discriminator's verdict.
       weight_position: Of joint positions; with actions.
       weight_velocity: Of frame differences; with actions.
       weight_foot: Of standing feet that slide; with actions.
-      learning_rate: Of generators (Muon).
+      optimizer: Of generators: muon, or adam at a constant rate (published: 2e-5).
+      learning_rate: Of generators.
       ddpm_rate: Of rows without a discriminator (Muon).
-      discriminator_rate: Of the discriminator (Adam).
+      discriminator_rate: Of the discriminator (Adam), which falls as the generator's
+        does (published: constant, 6 times the generator's).
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with other settings than before.
     """
@@ -110,9 +114,11 @@ class Train:
     recon: cli.Optional[float] = None
     geometry: Literal["root", "world"] = "world"
     fade_geometry: bool = False
+    weigh_levels: Literal["alike", "posterior"] = "alike"
     weight_position: float = 1.0
     weight_velocity: float = 1.0
     weight_foot: float = 1.0
+    optimizer: Literal["muon", "adam"] = "muon"
     learning_rate: float = 2e-3
     ddpm_rate: float = 2e-3
     discriminator_rate: float = 5e-4
@@ -265,7 +271,10 @@ def train(args: Train) -> None:
                 budget, steps=args.ddpm_steps, learning_rate=args.ddpm_rate
             )
         discriminator = dataclasses.replace(
-            budget, optimizer="adam", learning_rate=args.discriminator_rate
+            budget,
+            optimizer="adam",
+            learning_rate=args.discriminator_rate,
+            constant=args.optimizer == "adam",
         )
         emdm_training.train_row(
             task, row, generator=budget, discriminator=discriminator

@@ -358,6 +358,22 @@ def q_step(
 
 
 @jax.jit
+def posterior_weight(
+    schedule: Schedule, t: Int[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    """How much the mean of x_{t-1} moves with x_0: 1 at t = 1, little at noisy steps.
+
+    Steps out of 1..T clamp.
+
+    Source: Ho et al. 2020, eq. 7: the factor of x_0.
+    """
+    t = jnp.clip(t, 1, schedule.num_steps)
+    beta = schedule.beta[t]
+    total = beta + _alpha(schedule, t) * schedule.one_minus_alpha_bar[t - 1]
+    return beta / total * jnp.exp(0.5 * schedule.log_alpha_bar[t - 1])
+
+
+@jax.jit
 def posterior(
     schedule: Schedule,
     x_0: Float[Array, "*shape"],
@@ -389,7 +405,7 @@ def posterior(
     before = schedule.one_minus_alpha_bar[t - 1]
     # 1 - alpha_bar_t, written so that it is beta_1 to the last bit at t = 1.
     total = beta + alpha * before
-    from_x_0 = beta / total * jnp.exp(0.5 * schedule.log_alpha_bar[t - 1])
+    from_x_0 = posterior_weight(schedule, t)
     from_x_t = before / total * jnp.sqrt(alpha)
     mean = _expand(from_x_0, x_0) * x_0 + _expand(from_x_t, x_t) * x_t
     return Gaussian(mean, _expand(beta * (before / total), x_0))

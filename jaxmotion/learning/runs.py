@@ -306,8 +306,9 @@ class Budget:
       steps: Updates.
       batch: Samples per update (papers: 64).
       optimizer: "muon" or "adamw" with warm-up and cosine decay, or AAMDM's "radam" or
-        EMDM's "adam" at a constant rate.
+        EMDM's "adam", which by default have a constant rate.
       learning_rate: Rate of the optimizer; where it varies, its peak.
+      constant: Whether the rate stays as it is; None: of radam and adam alone.
       warmup: Updates of linear rise; None for a tenth of them, 100 at most.
       final: Rate at the end of the decay, as a fraction of the peak.
       max_norm: Gradients are clipped to this global norm; 0 for no clipping.
@@ -323,6 +324,7 @@ class Budget:
     batch: int = 64
     optimizer: OptimizerName = "muon"
     learning_rate: float = 2e-3
+    constant: bool | None = None
     warmup: int | None = None
     final: float = 0.05
     max_norm: float = 0.0
@@ -353,7 +355,10 @@ _FREE = ("devices", "chunk", "save_every", "override")
 def make_optimizer(budget: Budget) -> training.Optimizer:
     """The optimizer of a budget."""
     clip = budget.max_norm or None
-    if budget.optimizer in ("radam", "adam"):
+    constant = budget.constant
+    if constant is None:
+        constant = budget.optimizer in ("radam", "adam")
+    if constant:
         return training.make_optimizer(
             budget.optimizer, learning_rate=budget.learning_rate, max_norm=clip
         )
@@ -505,6 +510,8 @@ def fit(
     mesh = jax.make_mesh((devices,), ("data",)) if devices > 1 else None
     state = training.replicate(state, mesh)
     own = {k: v for k, v in dataclasses.asdict(budget).items() if k not in _FREE}
+    if budget.constant is None:  # as checkpoints of before have it
+        del own["constant"]
     how = own | {"files": run.files} | (settings or {})
     if checkpoint.latest_step(run.checkpoints(stage)) is not None:
         _check_resumed(run, stage, model, how, budget)

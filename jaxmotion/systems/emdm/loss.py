@@ -85,26 +85,32 @@ def geometric_loss(
       geometry: None if the three last weights are 0.
 
     Returns:
-      The loss, and its terms, unweighted but for `config.fade_geometry`.
+      The loss, and its terms, unweighted but for `config.fade_geometry` and
+      `config.weigh_levels`.
 
     Source: EMDM, eq. 11-12; MDM, eq. 3-5.
     """
-    mask = batch.mask
+    mask, features = batch.mask, batch.x_0
     average = "frames" if config.mask_frames else "samples"
-    error = losses.masked_mse(prediction, batch.x_0, mask, average=average)
+    geometric = (prediction, features)
+    if config.weigh_levels == "posterior":  # errors are squared
+        count = jnp.sqrt(schedule.posterior_weight(config.table(), t))[:, None, None]
+        prediction, features = count * prediction, count * features
+    error = losses.masked_mse(prediction, features, mask, average=average)
     terms = {"recon": error}
     weights = {"recon": config.weight_recon}
     if geometry is not None:
         weights["position"] = config.weight_position
         weights["velocity"] = config.weight_velocity
         weights["foot"] = config.weight_foot
-        features = batch.x_0
-        found, truth = geometry.positions(prediction), geometry.positions(features)
+        found, truth = map(geometry.positions, geometric)
         feet = jnp.asarray(geometry.feet)
         stands = contact.foot_contacts(
             truth[..., feet, :], geometry.fps, max_speed=geometry.contact_speed
         )
-        if config.fade_geometry:  # errors are squared
+        if config.weigh_levels == "posterior":
+            found, truth = count[..., None] * found, count[..., None] * truth
+        if config.fade_geometry:
             fade = jnp.sqrt(config.table().alpha_bar[t])[:, None, None]
             prediction, features = fade * prediction, fade * features
             found, truth = fade[..., None] * found, fade[..., None] * truth

@@ -75,6 +75,10 @@ class Config:
       fade_geometry: Whether those losses count alpha_bar_t times as much at step t
         (ours): at noisy steps, where x_0 can only be guessed, they outweigh the
         features' error and bend its mean.
+      weigh_levels: How much the errors (all but the discriminator's verdict) count at
+        each step: "alike" (published), or as much as x_{t-1} moves with the prediction
+        ("posterior", ours), by which the verdict's gradient is weighted, too: 1 at t =
+        1, 0.01 at t = 10. Else the mean wins where a latent could choose.
       weight_r1: gamma of the gradient penalty gamma / 2 |grad D|^2.
       r1_every: Updates from one penalty to the next; it is not scaled up by them.
     """
@@ -106,6 +110,7 @@ class Config:
     weight_foot: float = 1.0
     geometry: Literal["root", "world"] = "root"
     fade_geometry: bool = False
+    weigh_levels: Literal["alike", "posterior"] = "alike"
     weight_r1: float = 0.02
     r1_every: int = 15
 

@@ -228,7 +228,10 @@ def train_row(
         gan_update(optimizers, config=config, geometry=geometry, ema=generator.ema),
         sample,
         task.data,
-        settings={"discriminator_rate": discriminator.learning_rate},
+        settings={
+            "discriminator_rate": discriminator.learning_rate,
+            "discriminator_constant": discriminator.constant,
+        },
         show=("loss", "discriminator/loss"),
         **common,
     )

@@ -9,6 +9,7 @@ import numpy as np
 import optax
 import pytest
 
+from jaxmotion.diffusion import gan
 from jaxmotion.learning import adversarial, training
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
@@ -467,6 +468,29 @@ def test_losses_of_joints_fade_with_the_noise():
             np.testing.assert_allclose(found[name], part * plain[name], rtol=1e-4)
             expected += weight * part * plain[name]
         np.testing.assert_allclose(total, expected, rtol=1e-4)
+
+
+def test_errors_count_as_the_posterior_weighs_the_verdict():
+    """The gradient of x_{t-1} in the prediction, by automatic differentiation."""
+    data = batch(6, 6)
+    prediction = guess(data)
+    _, plain = terms_of(prediction, data)
+    config = dataclasses.replace(CONFIG, weigh_levels="posterior")
+    x_t = jnp.zeros_like(prediction)
+    for t in (1, 2, 3):
+        step = jnp.full(2, t)
+        draw = functools.partial(
+            gan.posterior_sample, config.table(), jax.random.key(0), x_t=x_t, t=step
+        )
+        weight = jax.grad(lambda x, draw=draw: draw(x_0=x).mean())(prediction)
+        weight = float(weight.mean() * prediction.size)
+        _, found = terms_of(prediction, data, config, t)
+        for name in plain:
+            np.testing.assert_allclose(found[name], weight * plain[name], rtol=1e-4)
+    both = dataclasses.replace(config, fade_geometry=True)
+    _, found = terms_of(prediction, data, both, 3)
+    part = weight * float(config.table().alpha_bar[3])
+    np.testing.assert_allclose(found["foot"], part * plain["foot"], rtol=1e-4)
 
 
 # --- MDM ---------------------------------------------------------------------------
