@@ -58,6 +58,7 @@ class Train:
       weight_foot: Weight of the errors of slow toes' velocities over the ground beside
         them (paper: 0).
       gan_window: Frames of the windows of the GANs (paper: 10).
+      levels: Steps that each network learns: its own, or all.
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
       distributed: One of several processes: "auto", or address, number, index.
@@ -86,7 +87,8 @@ class Train:
     polisher_batch: int = 128
     weight_pose: float = 1.0
     weight_foot: float = 5.0
-    gan_window: int = 3
+    gan_window: int = 10
+    levels: Literal["own", "all"] = "own"
     previous_noise: float = 0.5
     distributed: cli.Distributed = ()
     seed: int = 0
@@ -183,6 +185,7 @@ def train(args: Train) -> None:
         weight_pose=args.weight_pose,
         weight_foot=args.weight_foot,
         gan_window=args.gan_window,
+        levels=args.levels,
         previous_noise=args.previous_noise,
     )
 

@@ -57,6 +57,7 @@ class Sizes:
       weight_pose: Weight of the poses' errors in their loss.
       weight_foot: Weight of slow toes' errors beside these.
       gan_window: Frames of the windows of AAMDM's GANs.
+      levels: Steps that each of AAMDM's networks learns; the row "frame" all (paper).
       previous_noise: Noise on given previous frames in training, for all rows alike.
     """
 
@@ -65,7 +66,8 @@ class Sizes:
     window: int = 4
     weight_pose: float = 1.0
     weight_foot: float = 5.0
-    gan_window: int = 3
+    gan_window: int = 10
+    levels: Literal["all", "own"] = "own"
     previous_noise: float = 0.5
 
 
@@ -111,6 +113,7 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
                 window=sizes.window,
                 weight_pose=sizes.weight_pose,
                 weight_foot=sizes.weight_foot,
+                levels=sizes.levels,
             )
         return aamdm_model.Config(
             **common,

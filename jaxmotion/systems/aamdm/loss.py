@@ -10,10 +10,11 @@ poses are ours.
 """
 
 from collections.abc import Callable
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxmotion.diffusion import gan, schedule
 from jaxmotion.systems.aamdm import model as aamdm_model
@@ -46,6 +47,17 @@ def random_noise(
     return size * jax.random.normal(key_noise, shape)
 
 
+def _draw_steps(
+    key: Key,
+    shape: tuple[int, ...],
+    config: Config,
+    network: Literal["generator", "polisher"],
+) -> Int[Array, "*shape"]:
+    """Steps that a network learns, uniformly."""
+    first, last = config.steps(network)
+    return jax.random.randint(key, shape, first, last + 1)
+
+
 def polisher_loss(
     params: Params,
     key: Key,
@@ -57,7 +69,7 @@ def polisher_loss(
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """Loss of the diffusion model on windows, fed with its own predictions.
 
-    The first frame is given. Each further frame is noised to a random step and
+    The first frame is given. Each further frame is noised to a step of its own and
     predicted from it and from the prediction of the frame before; the gradient runs
     through the whole window.
 
@@ -91,7 +103,7 @@ def polisher_loss(
         first = _shaken(key_shake, windows[:, 0], config)
         windows = windows.at[:, 0].set(first)
     key_t, key_noise = jax.random.split(key)
-    steps = jax.random.randint(key_t, (frames, size), 1, config.num_steps + 1)
+    steps = _draw_steps(key_t, (frames, size), config, "polisher")
     noise = jnp.swapaxes(jax.random.normal(key_noise, windows.shape), 0, 1)
 
     def predict(previous: Array, given: tuple[Array, ...]) -> tuple[Array, Array]:
@@ -194,7 +206,7 @@ def _pairs(
     previous, frame = rows(previous), rows(jnp.swapaxes(windows[:, 2:], 0, 1))
 
     table = config.table()
-    t = jax.random.randint(keys[0], frame.shape[:1], 1, config.num_steps + 1)
+    t = _draw_steps(keys[0], frame.shape[:1], config, "generator")
     x_prev, x_t = gan.q_pair(table, keys[1], frame, t)
     draft = aamdm_model.draft(generator, previous, config=config, change=change)
     prediction = draft(keys[2], x_t, t)
@@ -238,7 +250,7 @@ def _own(
 ) -> Array:
     """The generator's prediction of a frame from a noised one and the frame before."""
     key_t, key_noise, key_latent = jax.random.split(key, 3)
-    t = jax.random.randint(key_t, frame.shape[:1], 1, config.num_steps + 1)
+    t = _draw_steps(key_t, frame.shape[:1], config, "generator")
     noise = jax.random.normal(key_noise, frame.shape)
     x_t = schedule.q_sample(config.table(), frame, t, noise)
     draft = aamdm_model.draft(generator, before, config=config, change=change)

@@ -52,6 +52,8 @@ class Config:
       depth: Hidden layers.
       window: Frames that the diffusion model predicts in a row in training (paper).
       gan_window: Frames of the windows of the GAN, at least three (paper: 10).
+      levels: Steps that each network learns: "all", or its "own" (ours), those that
+        the chain asks it for: the first drafts, or the last polishes.
       weight_velocity: Weight of the differences of neighboring frames.
       weight_pose: Weight of the errors of the poses that the polisher's frames mean, as
         the autoencoder measures them; ours.
@@ -75,6 +77,7 @@ class Config:
     depth: int = 4
     window: int = 10
     gan_window: int = 3
+    levels: Literal["all", "own"] = "all"
     weight_velocity: float = 0.1
     weight_pose: float = 0.0
     weight_foot: float = 0.0
@@ -86,6 +89,19 @@ class Config:
     def num_steps(self) -> int:
         """T, the steps of the whole chain."""
         return self.drafts + self.polishes
+
+    def steps(self, network: Literal["generator", "polisher"]) -> tuple[int, int]:
+        """First and last step that a network learns."""
+        if self.levels == "all":
+            return 1, self.num_steps
+        return (
+            (1, self.polishes)
+            if network == "polisher"
+            else (
+                self.polishes + 1,
+                self.num_steps,
+            )
+        )
 
     def table(self) -> Schedule:
         """The noise schedule of the chain."""

@@ -1,8 +1,9 @@
 """How AAMDM is trained: poses and paths of clips, and its three stages.
 
-autoencoder                             poses to embeddings
-embedded/T<n>/polisher, .../generator   both networks of chains of n steps
-full_pose/T<n>/...                      the same without the embedding
+autoencoder                                  poses to embeddings
+embedded/P<p>_D<d>/polisher, .../generator   both networks of a chain
+embedded/T<n>/...                            of all chains of n steps (`levels="all"`)
+full_pose/...                                the same without the embedding
 """
 
 import dataclasses
@@ -324,19 +325,17 @@ def load_space(run: Run, name: SpaceName) -> Space:
     )
 
 
-def chain_stage(space: SpaceName, *, num_steps: int, predict: str) -> str:
-    """Name that the stages of a chain share.
-
-    Args:
-      space: Its space.
-      num_steps: T.
-      predict: What its networks predict.
-    """
-    return f"{space}/T{num_steps}" + ("" if predict == "change" else f"_{predict}")
+def chain_stage(
+    space: SpaceName, *, drafts: int, polishes: int, predict: str, levels: str
+) -> str:
+    """Name that the stages of a chain share: with all chains of its length, or none."""
+    name = f"T{drafts + polishes}" if levels == "all" else f"P{polishes}_D{drafts}"
+    return f"{space}/{name}" + ("" if predict == "change" else f"_{predict}")
 
 
 def _stage(space: SpaceName, config: aamdm_model.Config, network: str) -> str:
-    chain = chain_stage(space, num_steps=config.num_steps, predict=config.predict)
+    names = ("drafts", "polishes", "predict", "levels")
+    chain = chain_stage(space, **{name: getattr(config, name) for name in names})
     return f"{chain}/{network}"
 
 
@@ -488,9 +487,19 @@ def load_networks(
       CheckpointError: if a stage that it needs is missing, or of another kind.
       ValueError: if a stage was trained for another space.
     """
-    chain = chain_stage(name, num_steps=drafts + polishes, predict=predict)
-    stage = f"{chain}/{'polisher' if polishes else 'generator'}"
     own = {"drafts": drafts, "polishes": polishes}
+    network = "polisher" if polishes else "generator"
+    chains = [
+        chain_stage(name, predict=predict, levels=levels, **own)
+        for levels in ("own", "all")
+    ]
+    there = (
+        x
+        for x in chains
+        if checkpoint.latest_step(run.record.checkpoints(f"{x}/{network}")) is not None
+    )
+    chain = next(there, chains[0])
+    stage = f"{chain}/{network}"
     config = runs.stage_config(run.record, stage, aamdm_model.Config, **own)
     if config.features != space.num_features:
         raise ValueError(
