@@ -28,8 +28,8 @@ SETTINGS = (
 )
 STAGES = (
     "autoencoder",
-    "embedded/T5/polisher",
-    "embedded/T5/generator",
+    "embedded/P2_D3/polisher",
+    "embedded/P2_D3/generator",
     "embedded/lmm",
 )
 
@@ -198,7 +198,7 @@ BAD = [
     ),
     (
         "train --data {data} --out {run} {settings} --width 48",
-        "T5/polisher: of another model: width is 32, given 48",
+        "P2_D3/polisher: of another model: width is 32, given 48",
     ),
     ("train --data {data} --out {run} {settings} --seed 1", "seed is 0, given 1"),
     (
@@ -219,7 +219,7 @@ BAD = [
     ("rollout --run {empty}", "{empty}"),
     ("rollout --run {run} --row amdm6", "unknown row 'amdm6'"),
     ("rollout --run {run} --row mvae", "full_pose.*no checkpoint"),
-    ("rollout --run {run} --row polish1_draft3", "T4.*no checkpoint"),
+    ("rollout --run {run} --row polish1_draft3", "P1_D3.*no checkpoint"),
     ("rollout --run {run} --seconds 0", "--seconds is 0.0, expected"),
 ]
 
@@ -233,7 +233,7 @@ def test_what_is_wrong_is_said_in_one_line(
     (tmp_path / "plain").write_text("")
     (tmp_path / "empty").mkdir()
     begun = tmp_path / "begun"
-    shutil.copytree(trained, begun, ignore=shutil.ignore_patterns("T5", "lmm"))
+    shutil.copytree(trained, begun, ignore=shutil.ignore_patterns("P2_D3", "lmm"))
     places = dict(
         begun=begun,
         gone=tmp_path / "gone.npz",

@@ -334,3 +334,35 @@ def test_players_are_given_the_generators_frames_through_a_window(
         expected = data[:, :1] + changes
     expected = np.swapaxes(expected, 0, 1).reshape(-1, 3)
     np.testing.assert_allclose(seen[0], expected, atol=1e-5)
+
+
+# --- levels of noise ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("levels", ["all", "own"])
+def test_networks_learn_the_steps_that_the_chain_asks_them_for(monkeypatch, levels):
+    seen = []
+
+    class Watched:
+        def apply(self, params, x_t, t, previous, latent=None):
+            jax.debug.callback(lambda t: seen.extend(np.ravel(t).tolist()), t)
+            return jnp.zeros_like(x_t)
+
+    monkeypatch.setattr(aamdm_model, "network", lambda config: Watched())
+    monkeypatch.setattr(
+        aamdm_model, "discriminator", lambda config: Constant(jnp.zeros((1,)))
+    )
+    config = dataclasses.replace(CONFIG, levels=levels)
+    windows = normal(400, 6, 3)
+    for loss, own in (
+        (aamdm_loss.polisher_loss, range(1, config.polishes + 1)),
+        (
+            functools.partial(aamdm_loss.discriminator_loss, {}),
+            range(config.polishes + 1, config.num_steps + 1),
+        ),
+    ):
+        seen.clear()
+        jax.block_until_ready(loss({}, jax.random.key(0), windows, config=config))
+        jax.effects_barrier()
+        every = range(1, config.num_steps + 1)
+        assert set(seen) == set(own if levels == "own" else every)

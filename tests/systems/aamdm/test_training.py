@@ -255,6 +255,18 @@ def test_a_chain_in_a_folder_of_another_length_is_named(run, space, chain):
         aamdm_training.load_chain(run, "full_pose", space, drafts=5, polishes=2)
 
 
+def test_chains_of_own_levels_share_no_networks(run, space, chain):
+    """Of one length, but with other drafts; and beside a chain of all levels."""
+    config = dataclasses.replace(CONFIG, levels="own", drafts=3, polishes=2)
+    aamdm_training.train_polisher(run, "full_pose", space, config, BUDGET)
+    aamdm_training.train_generator(run, "full_pose", space, config, BUDGET)
+    load = functools.partial(aamdm_training.load_networks, run, "full_pose", space)
+    assert load(drafts=3, polishes=2)[1].levels == "own"
+    assert load(drafts=2, polishes=3)[1].levels == "all"
+    shutil.rmtree(run.record.folder / "full_pose" / "P2_D3")
+    assert load(drafts=3, polishes=2)[1].levels == "all"
+
+
 # --- windows -----------------------------------------------------------------------
 
 
