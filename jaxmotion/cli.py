@@ -89,6 +89,8 @@ LIMITS: dict[str, Range] = {
     "frame_kernel": Range(0, 255),
     **dict.fromkeys(("noise_levels", "guided_steps"), Range(1, 1000)),
     "gan_window": Range(3, 1000),
+    "given": Range(1, 10),
+    "smooth": Range(0, 100),
     "window": Range(1, 1000),
     "balance": Range(0, 1),
     **dict.fromkeys(("diffusion_steps", "visit"), Range(1, 1000)),

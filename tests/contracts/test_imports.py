@@ -68,6 +68,7 @@ DOORS = {
     "orbax": ("jaxmotion/learning/checkpoint.py",),
     "tensorflow_datasets": ("jaxmotion/data/builders/",),
     "scipy": (
+        "experiments/next_frame.py",
         "jaxmotion/data/",
         "jaxmotion/evaluation/sequential.py",
         "jaxmotion/evaluation/statistics.py",

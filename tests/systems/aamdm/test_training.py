@@ -1,6 +1,7 @@
 """Folders of AAMDM: prepared once, loaded or refused, and the chains in them."""
 
 import dataclasses
+import functools
 import shutil
 
 import jax
