@@ -185,6 +185,26 @@ def _write(path: Path, content: bytes) -> str:
     return f"{path}: {len(small) / 1e6:.2f} MB ({len(content) / 1e6:.2f} unpacked)"
 
 
+def packages(cache: Path) -> Path:
+    """The folder with the page's packages of npm, which is filled if need be.
+
+    Args:
+      cache: It lies there, one for each lock file.
+
+    Raises:
+      ValueError: if Node is missing, or npm fails.
+    """
+    check()
+    lock = (SOURCES / "package-lock.json").read_bytes()
+    place = cache / hashlib.sha256(lock).hexdigest()[:16]
+    if not (place / "node_modules" / ".package-lock.json").exists():
+        place.mkdir(parents=True, exist_ok=True)
+        for name in ("package.json", "package-lock.json"):
+            shutil.copyfile(SOURCES / name, place / name)
+        _run(["npm", "ci", "--no-audit", "--no-fund"], place)
+    return place
+
+
 def write_page(
     folder: Path,
     models: list[str],
@@ -203,14 +223,7 @@ def write_page(
       OSError: if a file cannot be written.
       ValueError: if Node is missing, or npm or esbuild fails.
     """
-    check()
-    lock = (SOURCES / "package-lock.json").read_bytes()
-    place = cache / hashlib.sha256(lock).hexdigest()[:16]
-    if not (place / "node_modules" / ".package-lock.json").exists():
-        place.mkdir(parents=True, exist_ok=True)
-        for name in ("package.json", "package-lock.json"):
-            shutil.copyfile(SOURCES / name, place / name)
-        _run(["npm", "ci", "--no-audit", "--no-fund"], place)
+    place = packages(cache)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=place) as build:
         for path in SOURCES.iterdir():
