@@ -147,7 +147,15 @@ export function start(source) {
     mix(frame.from, frame.to, Math.min(1, (now - frame.time) * frame.to.fps / 1000));
 
   let before = performance.now(), lastPlot = 0, fitted = 0, world = null, people = null;
-  let rolled = [];
+  let rolled = [], finer = 1, pace = 0, since = 0;
+  // Fewer pixels where pictures come too slowly, more where they come easily.
+  function adapt(began, interval) {
+    pace += 0.1 * (Math.min(interval, 500) - pace);
+    if (began - since < 1500) return;
+    since = began;
+    if (pace > 45 && finer > 0.5) finer *= 0.8;
+    else if (pace < 20 && finer < 1) finer = Math.min(1, 1.25 * finer);
+  }
   function draw(now) {
     requestAnimationFrame(draw);
     const began = performance.now();
@@ -155,9 +163,10 @@ export function start(source) {
     advance(began);
     // A still picture is drawn once.
     if (began - lastNews > 1000 && !due.length) return;
-    const seconds = Math.min(1, (now - before) / 1000); before = now;
+    const seconds = Math.min(1, (now - before) / 1000);
+    adapt(began, now - before); before = now;
     input.turn(seconds);
-    const ratio = Math.min(devicePixelRatio || 1, 2);
+    const ratio = finer * Math.min(devicePixelRatio || 1, 2);
     const w = Math.round(view.clientWidth * ratio), h = Math.round(view.clientHeight * ratio);
     if (view.width !== w || view.height !== h) { view.width = w; view.height = h; }
     const pose = frame && between(began), n = frame ? frame.to.n : 0;

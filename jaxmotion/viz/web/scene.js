@@ -1,7 +1,7 @@
 // What is seen: people as skinned meshes, balls, ground, soft shadow, figures on the
 // ground. WebGL 2, no library.
 
-const SHADOW = 512, LIGHT = [-0.46, 0.80, -0.38];
+const SHADOW = 256, LIGHT = [-0.46, 0.80, -0.38];
 export const PALE = [0.49, 0.62, 0.84];
 const SKY = [0.865, 0.888, 0.915];
 
@@ -66,11 +66,11 @@ const BLUR = `
 in vec2 uv; uniform sampler2D image; uniform vec2 way; out vec4 pixel;
 void main() {
   vec2 sum = vec2(0.0), all = vec2(0.0);
-  for (int i = -6; i <= 6; i++) {
+  for (int i = -4; i <= 4; i++) {
     float x = float(i);
-    vec2 w = exp(-x * x / vec2(16.0, 5.0));
-    sum.x += w.x * texture(image, uv + 1.9 * x * way).x;
-    sum.y += w.y * texture(image, uv + 0.55 * x * way).y;
+    vec2 w = exp(-x * x / vec2(8.0, 5.0));
+    sum.x += w.x * texture(image, uv + 1.4 * x * way).x;
+    sum.y += w.y * texture(image, uv + 0.45 * x * way).y;
     all += w;
   }
   pixel = vec4(sum / all, 0.0, 1.0);
