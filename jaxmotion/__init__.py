@@ -16,7 +16,7 @@ from jaxmotion import (
     networks,
     systems,
 )
-from jaxmotion.face import commands, load, rollout, sample, save, show
+from jaxmotion.face import commands, load, retarget, rollout, sample, save, show
 
 __version__ = "0.1.0"
 
@@ -31,6 +31,7 @@ __all__ = [
     "load",
     "motion",
     "networks",
+    "retarget",
     "rollout",
     "sample",
     "save",

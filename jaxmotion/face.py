@@ -16,7 +16,7 @@ What is slow to import (Flax, Orbax, matplotlib) is imported by those who need i
 
 import dataclasses
 import html as escaping
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from jaxmotion.motion import anatomy
 from jaxmotion.motion.contact import foot_contacts
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
 from jaxmotion.motion.trajectory import Command, integrate_path
+from jaxmotion.retarget import transfer
 from jaxmotion.systems import registry
 from jaxmotion.typing import Key
 from jaxmotion.viz.stage import Ball, Stage, make_stage
@@ -332,6 +333,75 @@ def _save_csv(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     files.write_text(path, "\n".join(lines) + "\n")
 
 
+def read_skeleton(path: str | Path) -> transfer.Rest:
+    """The skeleton of a rig, for `retarget`: .glb, .gltf, .vrm, .fbx or .bvh.
+
+    Raises:
+      ModuleNotFoundError: for FBX without the extra [fbx].
+      OSError: if it cannot be read.
+      ValueError: if it is damaged, of another kind, or no person's; names the file.
+    """
+    return _read_rest(path, None)
+
+
+def _read_rest(path: str | Path, roles: Any) -> transfer.Rest:
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind in RIGS:
+        from jaxmotion.export import rig
+
+        return rig.read_rig(path).rest(roles)
+    if kind not in (".bvh", ".fbx"):
+        raise ValueError(
+            f"{path}: unknown suffix {path.suffix!r}, expected one of "
+            f"{', '.join((*RIGS, '.bvh', '.fbx'))}"
+        )
+    from jaxmotion.data import fbx, own
+
+    read = own.read_bvh if kind == ".bvh" else fbx.read_fbx
+    recording = read(str(path), files.read_bytes(path))
+    skeleton, motion = own.as_recorded(recording)
+    rotations = anatomy.kinematics(skeleton, motion)[1]
+    try:
+        return transfer.rest(skeleton, given=roles, rotations=rotations)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def retarget(
+    source: Skeleton,
+    target: Skeleton | transfer.Rest | str | Path,
+    *,
+    roles: Mapping[str, str] | str | Path | None = None,
+    motion: Motion | None = None,
+) -> transfer.Retarget:
+    """The function that brings motions of one skeleton onto another.
+
+    It may be jitted, and takes motions of one character or of many, of a frame or of
+    a clip: `target_motion = retarget(model.skeleton, "hero.glb")(frames.motion)`.
+
+    Args:
+      source: Such as `model.skeleton`.
+      target: A skeleton, or a rig's file; see `read_skeleton`.
+      roles: Joints of some of the target's roles, by the names of
+        `retarget.roles.ROLES`, or a JSON file of them; None for what its names and
+        shape say.
+      motion: Any second of the source's, where its zero pose does not tell how its
+        limbs are turned about themselves: LaFAN1, Bandai Namco, the walker.
+
+    Raises:
+      OSError: if a file cannot be read.
+      ValueError: if either is no person's skeleton; says what was found and missing.
+    """
+    if isinstance(target, str | Path):
+        target = _read_rest(target, roles)
+        roles = None
+    return transfer.retarget(source, target, roles=roles, motion=motion)
+
+
+# Rigs that motion is written onto as they are.
+RIGS = (".glb", ".gltf", ".vrm")
+
 SAVERS: dict[str, Callable[[Path, Skeleton, Frame | Motion], None]] = {
     ".bvh": _save_bvh,
     ".csv": _save_csv,
@@ -349,6 +419,8 @@ def save(
     *,
     t_pose: bool = False,
     mixamo: bool = False,
+    onto: str | Path | None = None,
+    roles: Mapping[str, str] | str | Path | None = None,
 ) -> None:
     """Writes motion in the format of the suffix.
 
@@ -362,6 +434,9 @@ def save(
       t_pose: Rotations are against the T-pose instead of the skeleton's own zero pose;
         in .glb they always are.
       mixamo: Joints are named as Mixamo's characters have them.
+      onto: A rig's file (see `read_skeleton`) whose skeleton the motion is brought
+        onto; a .glb is then that rig, animated.
+      roles: Joints of some of its roles; see `retarget`.
 
     Raises:
       OSError: if the file cannot be written.
@@ -379,6 +454,20 @@ def save(
     if mixamo:
         names = anatomy.mixamo_names(skeleton)
         skeleton = dataclasses.replace(skeleton, names=names)
+    if onto is not None:
+        if t_pose or mixamo:
+            raise ValueError("onto a rig, `t_pose` and `mixamo` say nothing")
+        motion = _one(frames)
+        if path.suffix.lower() == ".glb" and Path(onto).suffix.lower() in RIGS:
+            from jaxmotion.export import rig
+
+            rig.save_onto(path, rig.read_rig(onto), skeleton, motion, roles=roles)
+            return
+        function = transfer.Retarget(
+            transfer.rest(skeleton, rotations=anatomy.kinematics(skeleton, motion)[1]),
+            _read_rest(onto, roles),
+        )
+        skeleton, frames = function.target.skeleton, function(motion)
     path.parent.mkdir(parents=True, exist_ok=True)
     SAVERS[path.suffix.lower()](path, skeleton, frames)
 

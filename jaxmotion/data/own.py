@@ -190,6 +190,20 @@ def _motion(recording: Recording, scale: float, up: str) -> Motion:
     )
 
 
+def as_recorded(recording: Recording) -> tuple[Skeleton, Motion]:
+    """One file with all its joints, in meters, y up; its bones are of mean lengths.
+
+    Raises:
+      ValueError: if neither y nor z is up, or no bone has a length.
+    """
+    scale, _ = _unit(recording)
+    skeleton = dataclasses.replace(
+        recording.skeleton(),
+        offsets=jnp.asarray(scale * recording.offsets().mean(axis=0), jnp.float32),
+    )
+    return skeleton, _motion(recording, scale, _up(recording)[0])
+
+
 def _bones(part: Recording, scale: float, tolerance: float) -> np.ndarray:
     """Offsets [J, 3] of a file, meters, which must not change within it."""
     every = scale * part.offsets()

@@ -253,6 +253,8 @@ def t_pose(
     skeleton: Skeleton,
     sides: tuple[str, ...] | None = None,
     motion: np.ndarray | None = None,
+    *,
+    found: Anatomy | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The skeleton standing with its arms level to the sides, facing +z.
 
@@ -261,16 +263,17 @@ def t_pose(
 
     Args:
       sides: See `find_anatomy`.
-      motion: World rotations [F, J, 3, 3]. Where the zero pose does not stand, nothing
-        else tells how limbs are turned about themselves: elbows bend ahead, knees
-        back, and feet are level on average.
+      motion: World rotations [F, J, 3, 3]. Where the zero pose does not stand, or a
+        motion's limbs are turned about themselves against it, nothing else tells how:
+        elbows bend ahead, knees back, and feet are level on average.
+      found: What the joints are, where it is known; `sides` then say nothing.
 
     Returns:
       Positions [J, 3], meters, the root at the origin; world rotations [J, 3, 3].
     """
     offsets = np.asarray(skeleton.offsets, float)
     parents = skeleton.parents
-    found = find_anatomy(skeleton, sides)
+    found = find_anatomy(skeleton, sides) if found is None else found
     wanted: dict[int, tuple[int, np.ndarray]] = {}
     turn = chest = np.eye(3)
     if found.legs:
@@ -307,17 +310,21 @@ def t_pose(
             bone = turns[joint] @ offsets[child]
             axis = np.array([0.0, 0.0, 1.0])
             turns[joint] = _swing(bone, direction, axis) @ turns[joint]
-    if motion is not None and not found.upright:
+    if motion is not None:
         below = lambda top: [  # noqa: E731
             j for j in range(len(parents)) if top in chain(parents, j)
         ]
+        turned = []
         for limb in (*found.arms, *found.legs):
             bone = wanted[limb.upper][1]
             bend = np.array([0.0, 0.0, 1.0 if limb in found.arms else -1.0])
             twist = _hinge_turn(limb, bone, bend, turns, motion)
-            turns[below(limb.upper)] = twist @ turns[below(limb.upper)]
+            # A zero pose that stands is believed, unless limbs would bend backward.
+            if not found.upright or np.trace(twist) < 1.0:
+                turns[below(limb.upper)] = twist @ turns[below(limb.upper)]
+                turned.append(limb)
         for leg in found.legs:
-            if leg.after:
+            if leg.after and leg in turned:
                 foot = below(leg.end)
                 turns[foot] = (
                     _foot_turn(leg, wanted, turns, motion, offsets) @ turns[foot]

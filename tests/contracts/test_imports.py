@@ -41,12 +41,14 @@ MAY_IMPORT = {
     },
     # control: the live page (viewer.py).
     "viz": {"typing", "motion", "control"},
+    "retarget": {"typing", "files", "motion"},
     # Functions and shapes of whatever system; a graph's noise is an input.
     # motion, viz: the skinned body of a .glb.
-    "export": {"typing", "files", "diffusion", "motion", "viz"},
+    # retarget: motion onto other people's rigs.
+    "export": {"typing", "files", "diffusion", "motion", "viz", "retarget"},
     # The face composes what stands below it.
     "face.py": BASE
-    | {"motion", "control", "data", "learning", "systems", "viz", "export"},
+    | {"motion", "control", "data", "learning", "systems", "viz", "export", "retarget"},
     # learning: versions, as run folders have them.
     "reporting.py": BASE | {"motion", "data", "evaluation", "viz", "learning"},
     # learning: what a training that diverges raises ends a script with one line.

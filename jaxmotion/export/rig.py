@@ -1,0 +1,519 @@
+"""Rigged characters of others as binary glTF: their skeletons, and motion onto them.
+
+A file is read as JSON and bytes, without a package; what is not known of it here
+(materials, textures, extensions) is written back as it was. A rig's zero pose
+is its nodes' rest pose; joints' axes there are those of the world.
+
+Source: glTF 2.0 specification (Khronos), sections 3.5 to 3.7 and 4.4; VRM 0 and 1.
+"""
+
+import base64
+import binascii
+import copy
+import dataclasses
+import json
+import struct
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmotion import files
+from jaxmotion.motion.anatomy import kinematics
+from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton, check_skeleton
+from jaxmotion.retarget import roles as names
+from jaxmotion.retarget import transfer
+from jaxmotion.retarget.transfer import Rest
+
+_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_FLOAT = 5126
+_MAX_NODES = 20_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Rig:
+    """A rigged character.
+
+    Attributes:
+      name: Its file.
+      content: The file's JSON.
+      data: The bytes of its only buffer.
+      skeleton: In the file's units, its zero pose the rest pose.
+      nodes: Node of each joint.
+      turns: World rotations [J, 3, 3] of the nodes at rest.
+      above: [4, 4] what is above the root.
+      roles: Of joints, as a VRM file says; else empty.
+      sole: Ankles over the lowest vertex at rest; None where no mesh can be read.
+    """
+
+    name: str
+    content: dict[str, Any]
+    data: bytes
+    skeleton: Skeleton
+    nodes: tuple[int, ...]
+    turns: np.ndarray
+    above: np.ndarray
+    roles: dict[str, str]
+    sole: float | None
+
+    def rest(self, roles: Any = None) -> Rest:
+        """For `transfer.retarget`.
+
+        Args:
+          roles: Joints of some roles; see `roles.find_roles`.
+
+        Raises:
+          OSError, ValueError: see `transfer.rest`; names the file.
+        """
+        try:
+            given = self.roles if roles is None else roles
+            return transfer.rest(self.skeleton, given=given, sole=self.sole)
+        except ValueError as error:
+            raise ValueError(f"{self.name}: {error}") from None
+
+
+def _chunks(name: str, raw: bytes) -> tuple[Any, bytes]:
+    """JSON and bytes of a .glb, or the JSON of a .gltf."""
+    if raw[:4] != b"glTF":
+        text, data = raw, b""
+    else:
+        if len(raw) < 20 or struct.unpack_from("<I", raw, 4)[0] != 2:
+            raise ValueError(f"{name}: expected binary glTF of version 2")
+        size, kind = struct.unpack_from("<I4s", raw, 12)
+        if kind != b"JSON" or 20 + size > len(raw):
+            raise ValueError(f"{name}: the first chunk is {kind!r} of {size} bytes")
+        text, data, at = raw[20 : 20 + size], b"", 20 + size
+        if at + 8 <= len(raw):
+            size, kind = struct.unpack_from("<I4s", raw, at)
+            if kind == b"BIN\0":
+                if at + 8 + size > len(raw):
+                    raise ValueError(f"{name}: the second chunk is cut off")
+                data = raw[at + 8 : at + 8 + size]
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueError(f"{name}: no glTF: its JSON cannot be read") from None
+    if not isinstance(content, dict):
+        raise ValueError(f"{name}: no glTF: its JSON is no object")
+    return content, data
+
+
+def _objects(name: str, content: dict, key: str) -> list[dict]:
+    found = content.get(key, [])
+    if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
+        raise ValueError(f"{name}: {key!r} should be a list of objects")
+    return found
+
+
+def _index(name: str, value: Any, count: int, what: str) -> int:
+    if type(value) is not int or not 0 <= value < count:
+        raise ValueError(f"{name}: {what} is {value!r}, expected in 0..{count - 1}")
+    return value
+
+
+def _one_buffer(path: Path, content: dict, data: bytes) -> bytes:
+    """All buffers as one, to which the views in `content` are made to point."""
+    name, starts, whole = str(path), [], bytearray()
+    for number, buffer in enumerate(_objects(name, content, "buffers")):
+        uri = buffer.get("uri")
+        if uri is None:
+            found = data
+        elif not isinstance(uri, str):
+            raise ValueError(f"{name}: uri of buffer {number} is no text")
+        elif uri.startswith("data:"):
+            try:
+                found = base64.b64decode(uri.partition(",")[2], validate=True)
+            except (ValueError, binascii.Error):
+                raise ValueError(f"{name}: buffer {number} is no base64") from None
+        else:
+            beside = Path(unquote(uri))
+            if beside.is_absolute() or ".." in beside.parts or ":" in uri:
+                raise ValueError(f"{name}: buffer {number} is outside of its folder")
+            found = files.read_bytes(path.parent / beside)
+        size = buffer.get("byteLength")
+        if type(size) is not int or not 0 <= size <= len(found):
+            raise ValueError(
+                f"{name}: buffer {number} states {size!r} bytes, has {len(found)}"
+            )
+        whole += b"\0" * (-len(whole) % 4)
+        starts.append(len(whole))
+        whole += found[:size]
+    for number, view in enumerate(_objects(name, content, "bufferViews")):
+        which = _index(
+            name, view.get("buffer"), len(starts), f"buffer of view {number}"
+        )
+        offset = view.get("byteOffset", 0)
+        if type(offset) is not int or offset < 0:
+            raise ValueError(f"{name}: byteOffset of view {number} is {offset!r}")
+        view |= {"buffer": 0, "byteOffset": offset + starts[which]}
+    content["buffers"] = [{"byteLength": len(whole)}]
+    return bytes(whole)
+
+
+def _array(name: str, content: dict, data: bytes, index: Any) -> np.ndarray:
+    """An accessor's values [count, width]."""
+    accessors = _objects(name, content, "accessors")
+    index = _index(name, index, len(accessors), "an accessor")
+    accessor = accessors[index]
+    kind, width = accessor.get("componentType"), accessor.get("type")
+    kind = _TYPES.get(kind) if isinstance(kind, int) else None
+    width = _WIDTHS.get(width) if isinstance(width, str) else None
+    count = accessor.get("count")
+    if kind is None or width is None or type(count) is not int or count < 0:
+        raise ValueError(f"{name}: accessor {index} has an unknown type or count")
+    if "sparse" in accessor or "bufferView" not in accessor:
+        raise ValueError(f"{name}: accessor {index} is sparse or has no view")
+    views = _objects(name, content, "bufferViews")
+    view = views[_index(name, accessor["bufferView"], len(views), "a view")]
+    size = np.dtype(kind).itemsize * width
+    step, inner = view.get("byteStride", size), accessor.get("byteOffset", 0)
+    if type(step) is not int or type(inner) is not int or step < size or inner < 0:
+        raise ValueError(f"{name}: accessor {index} has a wrong stride or offset")
+    start = view["byteOffset"] + inner
+    end = start + step * (count - 1) + size if count else start
+    if end > len(data):
+        raise ValueError(f"{name}: accessor {index} ends beyond the buffer")
+    if not count:
+        return np.zeros((0, width))
+    found = np.lib.stride_tricks.as_strided(
+        np.frombuffer(data, "u1")[start:], (count, size), (step, 1)
+    )
+    values = np.ascontiguousarray(found).view(kind).reshape(count, width)
+    if accessor.get("normalized") and values.dtype.kind in "iu":
+        return values / np.iinfo(values.dtype).max
+    return values.astype(float) if values.dtype.kind == "f" else values
+
+
+def _numbers(name: str, values: Any, count: int, what: str) -> np.ndarray:
+    try:
+        found = np.array(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        found = np.zeros(0)
+    if found.shape != (count,) or not (np.abs(found) <= MAX_METERS).all():
+        raise ValueError(f"{name}: {what} should be {count} numbers")
+    return found
+
+
+def _local(name: str, number: int, node: dict) -> np.ndarray:
+    """Matrix [4, 4] of a node in its parent's frame."""
+    what = f"of node {number}"
+    if "matrix" in node:
+        return _numbers(name, node["matrix"], 16, f"matrix {what}").reshape(4, 4).T
+    move = _numbers(name, node.get("translation", [0, 0, 0]), 3, f"translation {what}")
+    turn = _numbers(name, node.get("rotation", [0, 0, 0, 1]), 4, f"rotation {what}")
+    size = _numbers(name, node.get("scale", [1, 1, 1]), 3, f"scale {what}")
+    if not np.linalg.norm(turn) > 1e-6:
+        raise ValueError(f"{name}: rotation {what} is zero")
+    x, y, z, w = turn / np.linalg.norm(turn)
+    found = np.eye(4)
+    found[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    found[:3, :3] *= size
+    found[:3, 3] = move
+    return found
+
+
+def _rotation(name: str, number: int, matrix: np.ndarray) -> np.ndarray:
+    """The turn of a world matrix that only moves, turns and scales evenly."""
+    size = np.linalg.norm(matrix[:3, :3], axis=0)
+    if not size.min() > 1e-9:
+        raise ValueError(f"{name}: node {number} has the scale zero")
+    turn = matrix[:3, :3] / size
+    if (
+        size.max() > 1.02 * size.min()
+        or np.abs(turn.T @ turn - np.eye(3)).max() > 1e-2
+        or np.linalg.det(turn) < 0
+    ):
+        raise ValueError(f"{name}: node {number} is mirrored, sheared or uneven")
+    return turn
+
+
+def _parents(name: str, nodes: list[dict]) -> list[int]:
+    """Parent of each node; -1 for none."""
+    parents = [-1] * len(nodes)
+    for number, node in enumerate(nodes):
+        children = node.get("children", [])
+        if not isinstance(children, list):
+            raise ValueError(f"{name}: children of node {number} are no list")
+        for child in children:
+            child = _index(name, child, len(nodes), f"a child of node {number}")
+            if parents[child] >= 0:
+                raise ValueError(f"{name}: node {child} has two parents")
+            parents[child] = number
+    for start in range(len(nodes)):
+        seen, node = 0, start
+        while node >= 0:
+            node, seen = parents[node], seen + 1
+            if seen > len(nodes):
+                raise ValueError(f"{name}: node {start} is above itself")
+    return parents
+
+
+def _joints(name: str, content: dict, parents: list[int]) -> list[int]:
+    """Nodes of the skeleton, parents first: the skins' joints and what joins them."""
+    skins = _objects(name, content, "skins")
+    if not skins:
+        raise ValueError(f"{name}: no skin: expected a character with a skeleton")
+    paths: dict[int, list[int]] = {}
+    for number, skin in enumerate(skins):
+        joints = skin.get("joints")
+        if not isinstance(joints, list) or not joints:
+            raise ValueError(f"{name}: skin {number} has no joints")
+        for joint in joints:
+            path = [_index(name, joint, len(parents), f"a joint of skin {number}")]
+            while parents[path[-1]] >= 0:
+                path.append(parents[path[-1]])
+            paths[path[0]] = path[::-1]
+    roots = {path[0] for path in paths.values()}
+    if len(roots) > 1:
+        raise ValueError(
+            f"{name}: {len(skins)} skins of {len(roots)} skeletons, expected one"
+        )
+    common = set.intersection(*({*path} for path in paths.values()))
+    top = max(common, key=lambda node: paths[next(iter(paths))].index(node))
+    found = {n for path in paths.values() for n in path[path.index(top) :]}
+    depth = {n: path.index(n) for path in paths.values() for n in path}
+    return sorted(found, key=lambda node: (depth[node], node))
+
+
+def _vrm_roles(content: dict) -> dict[str, int]:
+    """Nodes of roles, as VRM 1 or 0 has them."""
+    extensions = content.get("extensions")
+    if not isinstance(extensions, dict):
+        return {}
+    found = {}
+    for key in ("VRMC_vrm", "VRM"):
+        about = extensions.get(key)
+        human = about.get("humanoid") if isinstance(about, dict) else None
+        bones = human.get("humanBones") if isinstance(human, dict) else None
+        if isinstance(bones, dict):
+            bones = [{"bone": b, **v} for b, v in bones.items() if isinstance(v, dict)]
+        for bone in bones if isinstance(bones, list) else ():
+            if isinstance(bone, dict) and type(bone.get("node")) is int:
+                found[str(bone.get("bone"))] = bone["node"]
+    return found
+
+
+def read_rig(path: str | Path) -> Rig:
+    """A character of a .glb, .gltf or .vrm file.
+
+    Raises:
+      OSError: if it or a buffer beside it cannot be read.
+      ValueError: if it is damaged, has no skeleton or several, or one that cannot be
+        animated; names the file.
+    """
+    path = Path(path)
+    name = str(path)
+    content, data = _chunks(name, files.read_bytes(path))
+    data = _one_buffer(path, content, data)
+    nodes = _objects(name, content, "nodes")
+    if len(nodes) > _MAX_NODES:
+        raise ValueError(f"{name}: {len(nodes)} nodes, more than {_MAX_NODES}")
+    upper = _parents(name, nodes)
+    joints = _joints(name, content, upper)
+    local = [_local(name, number, node) for number, node in enumerate(nodes)]
+    world = {}
+    for number in range(len(nodes)):
+        path_up, node = [], number
+        while node >= 0 and node not in world:
+            path_up.append(node)
+            node = upper[node]
+        for node in reversed(path_up):
+            above = world[upper[node]] if upper[node] >= 0 else np.eye(4)
+            world[node] = above @ local[node]
+    turns = np.stack([_rotation(name, joint, world[joint]) for joint in joints])
+    above = np.eye(4) if upper[joints[0]] < 0 else world[upper[joints[0]]]
+    if upper[joints[0]] >= 0:
+        _rotation(name, upper[joints[0]], above)
+    places = np.stack([world[joint][:3, 3] for joint in joints])
+    parents = (-1, *(joints.index(upper[joint]) for joint in joints[1:]))
+    offsets = places - places[[max(parent, 0) for parent in parents]]
+    titles: list[str] = []
+    for joint in joints:
+        title = nodes[joint].get("name")
+        title = title if isinstance(title, str) and title else f"node {joint}"
+        titles.append(title if title not in titles else f"{title} ({joint})")
+    try:
+        check_skeleton(offsets=offsets, parents=parents, names=titles, feet=())
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+    told = {
+        role: titles[joints.index(node)]
+        for role, node in _vrm_roles(content).items()
+        if role in names.ROLES and node in joints and role not in ("chest", "neck")
+    }
+    skeleton = Skeleton(
+        offsets=jnp.asarray(offsets, jnp.float32), parents=parents, names=tuple(titles)
+    )
+    rig = Rig(
+        name=name,
+        content=content,
+        data=data,
+        skeleton=skeleton,
+        nodes=tuple(joints),
+        turns=turns,
+        above=above,
+        roles=told,
+        sole=None,
+    )
+    lowest = _lowest(rig, world)
+    if lowest is None:
+        return rig
+    try:
+        found = names.anatomy_of(skeleton, names.find_roles(skeleton, told))
+    except ValueError:
+        return rig  # who wants its roles is told what is missing
+    ankles = float(np.mean([places[leg.end, 1] for leg in found.legs]))
+    leg = float(
+        np.mean([np.ptp(places[[x.upper, x.middle, x.end], 1]) for x in found.legs])
+    )
+    sole = ankles - lowest
+    fits = found.upright and 0.02 * leg < sole < 0.4 * leg
+    return dataclasses.replace(rig, sole=sole if fits else None)
+
+
+def _lowest(rig: Rig, world: dict[int, np.ndarray]) -> float | None:
+    """Height of the lowest skinned vertex at rest; None where meshes are packed."""
+    found = []
+    skins, meshes = rig.content["skins"], _objects(rig.name, rig.content, "meshes")
+    for node in rig.content["nodes"]:
+        if "skin" not in node or "mesh" not in node:
+            continue
+        try:
+            skin = skins[_index(rig.name, node["skin"], len(skins), "a skin")]
+            mesh = meshes[_index(rig.name, node["mesh"], len(meshes), "a mesh")]
+            moves = np.stack([world[joint] for joint in skin["joints"]])
+            if "inverseBindMatrices" in skin:
+                get = (rig.name, rig.content, rig.data)
+                bind = _array(*get, skin["inverseBindMatrices"]).reshape(-1, 4, 4)
+                moves = moves @ np.swapaxes(bind, 1, 2)[: len(moves)]
+            for part in _objects(rig.name, mesh, "primitives"):
+                have = part.get("attributes", {})
+                get = (rig.name, rig.content, rig.data)
+                points = _array(*get, have["POSITION"])
+                which = _array(*get, have["JOINTS_0"]).astype(int)
+                weights = _array(*get, have["WEIGHTS_0"]).astype(float)
+                rows = moves[which, 1]  # what becomes y
+                four = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+                heights = np.einsum("vk,vkc,vc->v", weights, rows, four)
+                heights = heights / np.maximum(weights.sum(axis=1), 1e-6)
+                found.append(float(heights.min()))
+        except (ValueError, KeyError, IndexError, TypeError, AttributeError):
+            return None
+    found = [height for height in found if np.isfinite(height)]
+    return min(found, default=None)
+
+
+def _quaternions(matrices: np.ndarray) -> np.ndarray:
+    """[F, 3, 3] as x, y, z, w, neighbors on the same side."""
+    from jaxmotion.motion.rotation import quaternion_from_matrix
+
+    found = np.array(quaternion_from_matrix(jnp.asarray(matrices, jnp.float32)), float)
+    found = found[..., [1, 2, 3, 0]]
+    flips = np.sum(found[1:] * found[:-1], axis=-1) < 0
+    found[1:] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[..., None]
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+
+
+def to_glb(rig: Rig, motion: Motion) -> bytes:
+    """The rig's own file with one animation, in place of those that it had.
+
+    Args:
+      motion: Of `rig.skeleton`, one character.
+
+    Raises:
+      ValueError: if a frame is not finite.
+    """
+    positions, turned = kinematics(rig.skeleton, motion)
+    if not np.isfinite(positions).all() or not np.isfinite(turned).all():
+        bad = ~np.isfinite(positions).all(axis=(1, 2))
+        raise ValueError(f"frame {int(bad.argmax())} of the motion is not finite")
+    world = turned @ rig.turns
+    content, data = copy.deepcopy(rig.content), bytearray(rig.data)
+    views = content.setdefault("bufferViews", [])
+    accessors = content.setdefault("accessors", [])
+
+    def add(values: np.ndarray, kind: str, *, ends: bool = False) -> int:
+        data.extend(b"\0" * (-len(data) % 4))
+        packed = np.ascontiguousarray(values, "<f4")
+        view = {"buffer": 0, "byteOffset": len(data), "byteLength": packed.nbytes}
+        views.append(view)
+        data.extend(packed.tobytes())
+        accessor = {
+            "bufferView": len(views) - 1,
+            "componentType": _FLOAT,
+            "count": len(packed),
+            "type": kind,
+        }
+        if ends:
+            accessor |= {"min": [float(packed[0])], "max": [float(packed[-1])]}
+        accessors.append(accessor)
+        return len(accessors) - 1
+
+    times = add(np.arange(len(world)) / motion.fps, "SCALAR", ends=True)
+    samplers, channels = [], []
+
+    def track(node: int, path: str, values: np.ndarray) -> None:
+        output = add(values, f"VEC{values.shape[1]}")
+        channels.append(
+            {"sampler": len(samplers), "target": {"node": node, "path": path}}
+        )
+        samplers.append({"input": times, "output": output})
+
+    back = np.linalg.inv(rig.above)
+    frame = rig.above[:3, :3] / np.linalg.norm(rig.above[:3, :3], axis=0)
+    for j, (node, parent) in enumerate(
+        zip(rig.nodes, rig.skeleton.parents, strict=True)
+    ):
+        _plain(content["nodes"][node])
+        over = frame if parent < 0 else world[:, parent]
+        track(node, "rotation", _quaternions(np.swapaxes(over, -1, -2) @ world[:, j]))
+    root = positions[:, 0] @ back[:3, :3].T + back[:3, 3]
+    track(rig.nodes[0], "translation", root)
+    content["animations"] = [
+        {"name": "motion", "samplers": samplers, "channels": channels}
+    ]
+    content["buffers"] = [{"byteLength": len(data)}]
+    text = json.dumps(content, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    data.extend(b"\0" * (-len(data) % 4))
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _plain(node: dict) -> None:
+    """Makes of a node's matrix what may be animated, in place."""
+    if "matrix" not in node:
+        return
+    matrix = np.array(node.pop("matrix"), float).reshape(4, 4).T
+    size = np.linalg.norm(matrix[:3, :3], axis=0)
+    node["translation"] = matrix[:3, 3].tolist()
+    node["rotation"] = _quaternions(matrix[None, :3, :3] / size)[0].tolist()
+    node["scale"] = size.tolist()
+
+
+def save_onto(
+    path: str | Path, rig: Rig, skeleton: Skeleton, motion: Motion, *, roles: Any = None
+) -> None:
+    """Writes a rig's file, animated by the motion of another skeleton.
+
+    Args:
+      roles: Joints of some of the rig's roles; see `roles.find_roles`.
+
+    Raises:
+      OSError, ValueError: see `transfer.rest` and `to_glb`.
+    """
+    world = kinematics(skeleton, motion)[1]
+    function = transfer.Retarget(
+        transfer.rest(skeleton, rotations=world), rig.rest(roles)
+    )
+    content = to_glb(rig, function(motion))
+    with files.replacing(path) as file:
+        file.write(content)

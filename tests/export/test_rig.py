@@ -1,0 +1,252 @@
+"""jaxmotion.export.rig: rigs of others in and out, against pygltflib and SciPy."""
+
+import json
+
+import numpy as np
+import pygltflib
+import pytest
+from scipy.spatial.transform import Rotation
+
+import jaxmotion as jm
+from jaxmotion.export import rig as rigging
+from jaxmotion.motion import anatomy
+from jaxmotion.motion.skeleton import joint_positions
+from tests.export.test_gltf import VALIDATE, accessor, validator  # noqa: F401
+from tests.retarget import rigs
+from tests.viz import samples
+
+
+@pytest.fixture(scope="module")
+def hero(tmp_path_factory):
+    """A Mixamo rig of a child, in an A-pose."""
+    path = tmp_path_factory.mktemp("rig") / "hero.glb"
+    path.write_bytes(rigs.glb(rigs.person("child")))
+    return path
+
+
+def worlds(content, frame=None):
+    """World matrices of all nodes, at rest or in a frame, as pygltflib has them."""
+    animated = {}
+    if frame is not None:
+        animation = content.animations[0]
+        for channel in animation.channels:
+            values = accessor(content, animation.samplers[channel.sampler].output)
+            animated[channel.target.node, channel.target.path] = values[frame]
+    parent = {c: n for n, node in enumerate(content.nodes) for c in node.children or []}
+    found = {}
+
+    def world(number):
+        if number not in found:
+            node = content.nodes[number]
+            local = np.eye(4)
+            get = lambda key, default: animated.get(  # noqa: E731
+                (number, key), getattr(node, key) or default
+            )
+            local[:3, :3] = Rotation.from_quat(
+                get("rotation", [0, 0, 0, 1])
+            ).as_matrix()
+            local[:3, :3] *= get("scale", [1, 1, 1])
+            local[:3, 3] = get("translation", [0, 0, 0])
+            up = parent.get(number)
+            found[number] = local if up is None else world(up) @ local
+        return found[number]
+
+    return {n: world(n) for n in range(len(content.nodes))}
+
+
+def test_a_rig_is_read_where_pygltflib_has_its_joints(hero):
+    found = rigging.read_rig(hero)
+    content = pygltflib.GLTF2().load(str(hero))
+    world = worlds(content)
+    expected = np.stack([world[node][:3, 3] for node in found.nodes])
+    expected = expected - expected[0]
+    np.testing.assert_allclose(anatomy.zero_pose(found.skeleton), expected, atol=1e-5)
+    assert found.skeleton.names == tuple(content.nodes[n].name for n in found.nodes)
+    rest = found.rest()
+    straight = anatomy.t_pose(rigs.person("child"))[0]
+    by_name = [rigs.person("child").names.index(n) for n in found.skeleton.names]
+    np.testing.assert_allclose(rest.places, straight[by_name], atol=2e-3)
+    # The mesh says where the ground is: the mannequin's own soles.
+    assert abs(found.sole - 0.0579) < 0.004
+
+
+def test_the_users_own_mesh_walks(hero, tmp_path):
+    skeleton, motion = samples.person(seconds=1.0)
+    jm.save(tmp_path / "walk.glb", skeleton, motion, onto=hero)
+    content = pygltflib.GLTF2().load(str(tmp_path / "walk.glb"))
+    before = pygltflib.GLTF2().load(str(hero))
+    assert content.extras == {"made": "in the tests"}
+    assert [m.name for m in content.materials] == [m.name for m in before.materials]
+    for one, other in zip(
+        before.meshes[0].primitives, content.meshes[0].primitives, strict=True
+    ):
+        for name in ("POSITION", "WEIGHTS_0"):
+            np.testing.assert_array_equal(
+                accessor(before, getattr(one.attributes, name)),
+                accessor(content, getattr(other.attributes, name)),
+            )
+    target = rigging.read_rig(hero)
+    function = jm.retarget(skeleton, hero, motion=motion)
+    expected = np.asarray(joint_positions(target.skeleton, function(motion)))
+    for frame in (0, 13, 29):
+        world = worlds(content, frame)
+        found = np.stack([world[node][:3, 3] for node in target.nodes])
+        np.testing.assert_allclose(found, expected[frame], atol=2e-4)
+    # Skinned by hand, it stands on the ground.
+    skin, world = content.skins[0], worlds(content, 13)
+    bind = accessor(content, skin.inverseBindMatrices).reshape(-1, 4, 4)
+    moves = np.stack([world[j] for j in skin.joints]) @ np.swapaxes(bind, 1, 2)
+    low = []
+    for part in content.meshes[0].primitives:
+        get = lambda name: accessor(content, getattr(part.attributes, name))  # noqa: B023, E731
+        four = np.concatenate([get("POSITION"), get("POSITION")[:, :1] * 0 + 1], 1)
+        joints = get("JOINTS_0")
+        low.append(
+            np.einsum("vk,vkc,vc->v", get("WEIGHTS_0"), moves[joints, 1], four).min()
+        )
+    assert -0.01 < min(low) < 0.02
+
+
+@pytest.mark.parametrize("suffix", [".bvh", ".npz", ".csv"])
+def test_other_formats_have_the_rigs_skeleton(hero, tmp_path, suffix):
+    skeleton, motion = samples.person(seconds=0.3)
+    jm.save(tmp_path / f"a{suffix}", skeleton, motion, onto=hero)
+    text = (tmp_path / f"a{suffix}").read_bytes()
+    assert b"mixamorig" in text or suffix == ".npz"
+    if suffix == ".bvh":
+        # And a BVH is a rig, too.
+        target = jm.retarget(skeleton, tmp_path / "a.bvh").target
+        assert abs(target.leg - rigging.read_rig(hero).rest().leg) < 1e-3
+
+
+def test_a_gltf_with_a_buffer_beside_it_and_a_vrm_are_rigs(hero, tmp_path):
+    content, data = rigs.split(hero.read_bytes())
+    (tmp_path / "hero data.bin").write_bytes(data)
+    content["buffers"] = [{"uri": "hero%20data.bin", "byteLength": len(data)}]
+    (tmp_path / "hero.gltf").write_text(json.dumps(content))
+    plain = rigging.read_rig(hero)
+    found = rigging.read_rig(tmp_path / "hero.gltf")
+    np.testing.assert_array_equal(found.skeleton.offsets, plain.skeleton.offsets)
+    # A VRM says itself which joint is which, whatever they are called.
+    content, data = rigs.split(hero.read_bytes())
+    index = {node["name"]: n for n, node in enumerate(content["nodes"])}
+    roles = plain.rest().roles
+    for node in content["nodes"]:
+        node["name"] = f"n{index[node['name']]}"
+    roles = {r: n for r, n in roles.items() if r not in ("neck", "chest")}
+    bones = {role: {"node": index[name]} for role, name in roles.items()}
+    for extension, human in (
+        ("VRMC_vrm", bones),
+        ("VRM", [{"bone": b, **v} for b, v in bones.items()]),
+    ):
+        content["extensions"] = {extension: {"humanoid": {"humanBones": human}}}
+        (tmp_path / "a.vrm").write_bytes(rigs.joined(content, data))
+        told = rigging.read_rig(tmp_path / "a.vrm").rest().roles
+        for role, name in roles.items():
+            assert int(told[role][1:]) == index[name], role
+
+
+def changed(hero, tmp_path, change):
+    content, data = rigs.split(hero.read_bytes())
+    change(content)
+    path = tmp_path / "bad.glb"
+    path.write_bytes(rigs.joined(content, data))
+    return path
+
+
+def two_skins(content):
+    count = len(content["nodes"])
+    content["nodes"] += [{"name": "other", "children": [count + 1]}, {"name": "tip"}]
+    content["skins"].append({"joints": [count, count + 1]})
+
+
+def cycle(content):
+    content["nodes"][3]["children"] = [0]
+    content["nodes"][-1]["children"] = []
+
+
+def set_node(**values):
+    return lambda content: content["nodes"][2].update(values)
+
+
+BAD = {
+    "no skin: expected a character": lambda c: c.pop("skins"),
+    "2 skins of 2 skeletons, expected one": two_skins,
+    "node 0 is above itself": cycle,
+    "node 2 has the scale zero": set_node(scale=[0, 0, 0]),
+    "node 2 is mirrored, sheared or uneven": set_node(scale=[1, 2, 1]),
+    "node [0-9]+ is mirrored": set_node(scale=[-1, 1, 1]),
+    "translation of node 2 should be 3 numbers": set_node(translation=[1, "x", 2]),
+    "rotation of node 2 is zero": set_node(rotation=[0, 0, 0, 0]),
+    "a child of node 2 is 999, expected in": set_node(children=[999]),
+    "a joint of skin 0 is -1": lambda c: c["skins"][0].update(joints=[-1]),
+    "skin 0 has no joints": lambda c: c["skins"][0].update(joints=[]),
+    "'nodes' should be a list of objects": lambda c: c.update(nodes=[1]),
+    "buffer of view 0 is 7": lambda c: c["bufferViews"][0].update(buffer=7),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_what_cannot_be_animated_is_told_in_one_line(message, hero, tmp_path):
+    path = changed(hero, tmp_path, BAD[message])
+    with pytest.raises(ValueError, match=message) as caught:
+        rigging.read_rig(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_other_files_are_refused(tmp_path):
+    for content, message in (
+        (b"", "no glTF: its JSON cannot be read"),
+        (b"glTF" + b"\2\0\0\0" + b"\0" * 20, "the first chunk is"),
+        (b"glTF", "expected binary glTF of version 2"),
+        (b"[]", "its JSON is no object"),
+    ):
+        path = tmp_path / "a.glb"
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=message):
+            rigging.read_rig(path)
+    with pytest.raises(OSError, match=r"none\.glb"):
+        rigging.read_rig(tmp_path / "none.glb")
+    with pytest.raises(ValueError, match=r"unknown suffix '\.obj', expected one of"):
+        jm.retarget(rigs.walker(), tmp_path / "a.obj")
+    beside = {"buffers": [{"uri": "../secret.bin", "byteLength": 1}]}
+    path.write_text(json.dumps(beside))
+    with pytest.raises(ValueError, match="buffer 0 is outside of its folder"):
+        rigging.read_rig(path)
+
+
+def test_a_rig_without_legs_is_told_what_is_missing(tmp_path):
+    base = rigs.person("child")
+    keep = [
+        j
+        for j, n in enumerate(base.names)
+        if not any(w in n for w in ("Leg", "Foot", "Toe"))
+    ]
+    cut = rigs.plain(
+        np.asarray(base.offsets)[keep],
+        [-1 if base.parents[j] < 0 else keep.index(base.parents[j]) for j in keep],
+        tuple(base.names[j] for j in keep),
+    )
+    path = tmp_path / "ghost.glb"
+    path.write_bytes(rigs.glb(cut, arms_down=0.0))
+    with pytest.raises(
+        ValueError, match=r"ghost\.glb: no person: missing leftUpperLeg"
+    ):
+        jm.retarget(base, path)
+
+
+@pytest.mark.slow
+def test_the_validator_of_khronos_accepts_the_animated_rig(hero, tmp_path, validator):  # noqa: F811
+    import subprocess
+
+    skeleton, motion = samples.person(seconds=0.5)
+    jm.save(tmp_path / "walk.glb", skeleton, motion, onto=hero)
+    done = subprocess.run(
+        ["node", "-e", VALIDATE, str(tmp_path / "walk.glb")],
+        cwd=validator,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    issues = json.loads(done.stdout)["issues"]
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]

@@ -1,0 +1,254 @@
+"""Rigs of others that nobody made: our mannequin as their files have it."""
+
+import dataclasses
+import json
+import struct
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxmotion.data.walker import walker_skeleton
+from jaxmotion.export import gltf
+from jaxmotion.motion import anatomy
+from jaxmotion.motion.skeleton import Motion, Skeleton
+
+# Lengths of legs, arms and trunk beside the walker's.
+BODIES = {
+    "child": (0.62, 0.6, 0.72),
+    "giant": (1.5, 1.45, 1.5),
+    "long arms": (0.9, 1.5, 1.05),
+}
+
+
+def proportioned(legs=1.0, arms=1.0, trunk=1.0, skeleton=None):
+    """A skeleton with limbs of other lengths."""
+    skeleton = skeleton or walker_skeleton()
+    found = anatomy.find_anatomy(skeleton)
+    scale = np.full(skeleton.num_joints, trunk)
+    for limbs, size in ((found.legs, legs), (found.arms, arms)):
+        for limb in limbs:
+            for joint in range(skeleton.num_joints):
+                above = anatomy.chain(skeleton.parents, joint)
+                if limb.upper in above and joint != limb.upper:
+                    scale[joint] = size
+    offsets = np.asarray(skeleton.offsets) * scale[:, None]
+    return dataclasses.replace(skeleton, offsets=jnp.asarray(offsets, jnp.float32))
+
+
+def named(skeleton, convention):
+    """The walker's joints in the words of a tool."""
+    words = CONVENTIONS[convention]
+    return dataclasses.replace(skeleton, names=tuple(words))
+
+
+def _both(pattern, limbs):
+    return [pattern.format(side, limb) for side in ("Left", "Right") for limb in limbs]
+
+
+def _in_walkers_order(trunk, arms, legs):
+    half = len(arms) // 2, len(legs) // 2
+    left = [*arms[: half[0]], *arms[half[0] :]]
+    return [*trunk, *left, *legs]
+
+
+_T = ("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head")
+_AM = ("Shoulder", "Arm", "ForeArm", "Hand")
+_LM = ("UpLeg", "Leg", "Foot", "ToeBase")
+
+
+def _sided(pattern, words, sides):
+    return [pattern.format(s, w) for s in sides for w in words]
+
+
+def _names(trunk, pattern, arms, legs, sides):
+    return _in_walkers_order(
+        trunk, _sided(pattern, arms, sides), _sided(pattern, legs, sides)
+    )
+
+
+CONVENTIONS = {
+    "Mixamo": [
+        f"mixamorig:{n}" for n in _names(_T, "{}{}", _AM, _LM, ("Left", "Right"))
+    ],
+    "Mixamo without colon": [
+        f"mixamorig{n}" for n in _names(_T, "{}{}", _AM, _LM, ("Left", "Right"))
+    ],
+    "HumanIK": [
+        f"Character1_{n}" for n in _names(_T, "{}{}", _AM, _LM, ("Left", "Right"))
+    ],
+    "Unreal": _names(
+        ("pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head"),
+        "{1}_{0}",
+        ("clavicle", "upperarm", "lowerarm", "hand"),
+        ("thigh", "calf", "foot", "ball"),
+        ("l", "r"),
+    ),
+    "VRoid": _names(
+        [
+            f"J_Bip_C_{n}"
+            for n in ("Hips", "Spine", "Chest", "UpperChest", "Neck", "Head")
+        ],
+        "J_Bip_{}_{}",
+        ("Shoulder", "UpperArm", "LowerArm", "Hand"),
+        ("UpperLeg", "LowerLeg", "Foot", "ToeBase"),
+        ("L", "R"),
+    ),
+    "VRM": _names(
+        ("hips", "spine", "chest", "upperChest", "neck", "head"),
+        "{}{}",
+        ("Shoulder", "UpperArm", "LowerArm", "Hand"),
+        ("UpperLeg", "LowerLeg", "Foot", "Toes"),
+        ("left", "right"),
+    ),
+    "SMPL": _names(
+        ("pelvis", "spine1", "spine2", "spine3", "neck", "head"),
+        "{}_{}",
+        ("collar", "shoulder", "elbow", "wrist"),
+        ("hip", "knee", "ankle", "foot"),
+        ("left", "right"),
+    ),
+    "CMU": _names(
+        ("root", "lowerback", "upperback", "thorax", "upperneck", "head"),
+        "{}{}",
+        ("clavicle", "humerus", "radius", "wrist"),
+        ("femur", "tibia", "foot", "toes"),
+        ("l", "r"),
+    ),
+    "LaFAN1": _names(
+        _T, "{}{}", _AM, ("UpLeg", "Leg", "Foot", "Toe"), ("Left", "Right")
+    ),
+    "Bandai Namco": _names(
+        ("Hips", "Spine", "Chest", "Chest2", "Neck", "Head"),
+        "{1}_{0}",
+        ("Shoulder", "UpperArm", "LowerArm", "Hand"),
+        ("UpperLeg", "LowerLeg", "Foot", "Toes"),
+        ("L", "R"),
+    ),
+    "O3DE": _names(
+        [
+            f"C_{n}_JNT"
+            for n in ("pelvis", "spine_01", "spine_02", "spine_03", "neck_01", "head")
+        ],
+        "{}_{}_JNT",
+        ("clavicle", "uparm", "loarm", "hand"),
+        ("upleg", "loleg", "foot", "ball"),
+        ("l", "r"),
+    ),
+    "3ds Max": _names(
+        [f"Bip01 {n}" for n in ("Pelvis", "Spine", "Spine1", "Spine2", "Neck", "Head")],
+        "Bip01 {} {}",
+        ("Clavicle", "UpperArm", "Forearm", "Hand"),
+        ("Thigh", "Calf", "Foot", "Toe0"),
+        ("L", "R"),
+    ),
+    "Blender": _names(
+        ("spine", "spine.001", "spine.002", "spine.003", "spine.004", "head"),
+        "{1}.{0}",
+        ("shoulder", "upper_arm", "forearm", "hand"),
+        ("thigh", "shin", "foot", "toe"),
+        ("L", "R"),
+    ),
+    "Unitree": _names(
+        ("pelvis", "waist_yaw_link", "waist_roll_link", "torso_link", "neck", "head"),
+        "{}_{}_link",
+        ("shoulder_pitch", "shoulder_yaw", "elbow", "wrist_yaw"),
+        ("hip_yaw", "knee", "ankle_pitch", "toe"),
+        ("left", "right"),
+    ),
+}
+
+
+def still(skeleton, frames=1, fps=30.0):
+    """A motion that stays in the zero pose."""
+    columns = np.zeros((frames, skeleton.num_joints, 6), np.float32)
+    columns[..., 0] = columns[..., 4] = 1.0
+    return Motion(
+        root_position=jnp.zeros((frames, 3)),
+        joint_rotation=jnp.asarray(columns),
+        fps=fps,
+    )
+
+
+def split(raw):
+    """JSON and bytes of a .glb."""
+    size = struct.unpack_from("<I", raw, 12)[0]
+    return json.loads(raw[20 : 20 + size]), bytearray(raw[28 + size :])
+
+
+def joined(content, data):
+    """A .glb of JSON and bytes."""
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    content["buffers"] = [{"byteLength": len(data)}]
+    body = struct.pack("<I4s", len(text), b"JSON") + text
+    body += struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def glb(skeleton, *, arms_down=45.0, seed=0, unit=100.0, turn=90.0):
+    """A rig as artists' tools write it.
+
+    Its rest pose is an A, joints have axes of their own, and an armature of the scale
+    1 / unit, turned about x, is above it.
+    """
+    content, data = split(gltf.to_glb(skeleton, still(skeleton)))
+    found = anatomy.find_anatomy(skeleton)
+    count = skeleton.num_joints
+    offsets = np.asarray(skeleton.offsets, float).copy()
+    offsets[0] = content["nodes"][0]["translation"]
+    draw = np.random.default_rng(seed)
+    axes = Rotation.random(count, rng=draw).as_matrix()
+    posed = np.tile(np.eye(3), (count, 1, 1))
+    for arm in found.arms:
+        sign = -1.0 if arm.side == anatomy.LEFT else 1.0
+        angle = np.deg2rad(sign * arms_down)
+        about = Rotation.from_rotvec([0, 0, angle]).as_matrix()
+        for joint in range(count):
+            if arm.upper in anatomy.chain(skeleton.parents, joint):
+                posed[joint] = about
+    armature = Rotation.from_euler("x", -turn, degrees=True)
+    for joint, parent in enumerate(skeleton.parents):
+        own = posed[joint] @ axes[joint]
+        above = posed[parent] @ axes[parent] if parent >= 0 else armature.as_matrix()
+        node = content["nodes"][joint]
+        move = axes[parent].T @ offsets[joint] if parent >= 0 else above.T @ offsets[0]
+        node["translation"] = (unit * move).tolist()
+        node["rotation"] = Rotation.from_matrix(above.T @ own).as_quat().tolist()
+    # Inverse binds: into the joints' own axes and units.
+    accessor = content["accessors"][content["skins"][0]["inverseBindMatrices"]]
+    start = content["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    bind = np.frombuffer(data, "<f4", 16 * count, start).reshape(count, 4, 4)
+    bind = np.swapaxes(bind, 1, 2).astype(float)
+    turned = np.tile(np.eye(4), (count, 1, 1))
+    turned[:, :3, :3] = unit * np.swapaxes(axes, 1, 2)
+    bind = np.swapaxes(turned @ bind, 1, 2)
+    bind[:, 3, 3], bind[:, :3, 3] = 1.0, 0.0
+    data[start : start + 64 * count] = bind.astype("<f4").tobytes()
+    content["nodes"].append(
+        {
+            "name": "Armature",
+            "children": [0],
+            "rotation": armature.as_quat().tolist(),
+            "scale": [1 / unit] * 3,
+        }
+    )
+    content["scenes"][0]["nodes"] = [count, count + 1]
+    content["skins"][0].pop("skeleton", None)
+    content["extras"] = {"made": "in the tests"}
+    return joined(content, data)
+
+
+def person(name="child", convention="Mixamo"):
+    """A skeleton of other proportions with the names of a convention."""
+    return named(proportioned(*BODIES[name]), convention)
+
+
+def walker():
+    return walker_skeleton()
+
+
+def plain(offsets, parents, words):
+    return Skeleton(
+        offsets=jnp.asarray(offsets, jnp.float32), parents=tuple(parents), names=words
+    )
