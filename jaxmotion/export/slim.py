@@ -1,9 +1,9 @@
 """ONNX files made small, as onnxruntime-web takes them: few nodes, shared weights.
 
-A model is folded by native onnxruntime; the shapes of inner values, of which the
-converter writes wrong ones that the browser's runtime refuses, go; numbers that are
-the same as 16-bit floats are kept as such; and large constants move to a file that all
-graphs of a character share.
+A model is folded by native onnxruntime, so that the browser's need not do it; the
+shapes of inner values, of which the converter writes wrong ones that the browser's
+runtime refuses, go; and large constants move to a file that all graphs of a character
+share, packed as 16-bit floats where those are the same numbers.
 """
 
 import hashlib
@@ -22,24 +22,41 @@ class Weights:
 
     Attributes:
       name: Name of the file, by which the graphs refer to it.
+      parts: Of the packed file, in its order: whether it has 16-bit floats, which are
+        32-bit ones in the file that the graphs refer to, and its bytes there.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self._bytes = bytearray()
+        self.parts: list[tuple[bool, int]] = []
+        self._whole, self._packed = bytearray(), bytearray()
         self._places: dict[bytes, int] = {}
 
-    def add(self, raw: bytes) -> int:
-        """Where a constant begins in the file."""
+    def add(self, values: np.ndarray, *, half: bool) -> tuple[int, int]:
+        """Where a constant begins in the file, and its length there, bytes.
+
+        Args:
+          half: Pack it as 16-bit floats; its values there are those, widened.
+        """
+        small = values.astype(np.float16) if half else values
+        raw = np.ascontiguousarray(small.astype(values.dtype)).tobytes()
         digest = hashlib.sha256(raw).digest()
         if digest not in self._places:
-            self._bytes += b"\0" * (-len(self._bytes) % 64)
-            self._places[digest] = len(self._bytes)
-            self._bytes += raw
-        return self._places[digest]
+            self._places[digest] = len(self._whole)
+            self._whole += raw + b"\0" * (-len(raw) % 4)
+            packed = np.ascontiguousarray(small).tobytes()
+            packed += b"\0" * (-len(packed) % (2 if half else 4))
+            self.parts.append((half, len(packed)))
+            self._packed += packed
+        return self._places[digest], len(raw)
 
     def content(self) -> bytes:
-        return bytes(self._bytes)
+        """The file that the graphs refer to."""
+        return bytes(self._whole)
+
+    def packed(self) -> bytes:
+        """The file that is written; `parts` say how to unpack it."""
+        return bytes(self._packed)
 
 
 def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:
@@ -55,26 +72,11 @@ def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:
     found = onnx.load_model_from_string(_folded(model))
     _clean(found.graph)
     _tell_apart(found.graph, set())
-    names = {x.name for x in found.graph.initializer}
-    casts = []
     for tensor in found.graph.initializer:
         values = onnx.numpy_helper.to_array(tensor)
-        if values.nbytes < LEAST_BYTES:
-            continue
-        if values.dtype == np.float32 and (half or _is_half(values)):
-            tensor.data_type = onnx.TensorProto.FLOAT16
-            values = values.astype(np.float16)
-            wide, tensor.name = tensor.name, _free(tensor.name + ".half", names)
-            casts.append(
-                onnx.helper.make_node(
-                    "Cast", [tensor.name], [wide], to=onnx.TensorProto.FLOAT
-                )
-            )
-        raw = np.ascontiguousarray(values).tobytes()
-        _refer(tensor, weights.name, weights.add(raw), len(raw))
-    nodes = [*casts, *found.graph.node]
-    del found.graph.node[:]
-    found.graph.node.extend(nodes)
+        if values.nbytes >= LEAST_BYTES:
+            fits = values.dtype == np.float32 and (half or _is_half(values))
+            _refer(tensor, weights.name, *weights.add(values, half=fits))
     return found.SerializeToString()
 
 

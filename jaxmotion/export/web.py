@@ -148,11 +148,12 @@ def write_character(
         "scales": list(character.tuning.scales),
         "lockable": character.tuning.lockable,
         "patience": character.tuning.patience,
-        "plan": _plan_arrays(names),
-        "weights": WEIGHTS,
+        "plan": _arrays(names, ".plan.", cursor=True),
+        "past": _arrays(names, ".past."),
+        "weights": {"file": WEIGHTS, "parts": weights.parts},
     }
     arrays = starts | packed.body_arrays(character.skeleton)
-    say(_write(folder / WEIGHTS, weights.content()))
+    say(_write(folder / WEIGHTS, weights.packed()))
     say(_write(folder / "character.bin", packed.pack(about, arrays)))
 
 
@@ -160,18 +161,15 @@ def _ports(ports: tuple[graph.Port, ...]) -> list[dict[str, Any]]:
     return [{"name": x.name, "dtype": x.dtype, "shape": x.shape} for x in ports]
 
 
-def _plan_arrays(names: list[str]) -> dict[str, str] | None:
-    """Where the state has its plan; None for characters without one."""
-    find = lambda end: next((x for x in names if x.endswith(end)), None)  # noqa: E731
+def _arrays(names: list[str], part: str, **more: bool) -> dict[str, str] | None:
+    """Where the state has poses; None for characters without such a part."""
+    ends = {"root": "root_position", "rotation": "joint_rotation"}
     found = {
-        "root": next(
-            (x for x in names if ".plan." in x and x.endswith("root_position")), None
-        ),
-        "rotation": next(
-            (x for x in names if ".plan." in x and x.endswith("joint_rotation")), None
-        ),
-        "cursor": find(".cursor"),
+        key: next((x for x in names if part in x and x.endswith(end)), None)
+        for key, end in ends.items()
     }
+    for key in more:
+        found[key] = next((x for x in names if x.endswith(f".{key}")), None)
     return found if all(found.values()) else None
 
 

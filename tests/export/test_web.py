@@ -199,7 +199,8 @@ def test_slim_graphs_are_what_they_were():
     one = graph.make("run", Exported(run, ("x",), ("y", "path")), {"x": jnp.ones(40)})
     content, weights = onnx.content(one), slim.Weights("weights.bin")
     small = slim.slim(content, weights)
-    assert len(weights.content()) == 40 * 40 * (2 + 4) and len(small) < 10_000
+    assert len(weights.packed()) == 40 * 40 * (2 + 4) and len(small) < 10_000
+    assert sorted(weights.parts) == [(False, 6400), (True, 3200)]
     options = runtime.SessionOptions()
     options.add_external_initializers_from_files_in_memory(
         ["weights.bin"], [weights.content()], [len(weights.content())]
@@ -210,7 +211,7 @@ def test_slim_graphs_are_what_they_were():
         np.testing.assert_allclose(a, b, atol=1e-5)
     # The same constant of another graph is not kept twice.
     slim.slim(content, weights)
-    assert len(weights.content()) == 40 * 40 * (2 + 4)
+    assert len(weights.packed()) == 40 * 40 * (2 + 4)
 
 
 @NODE
@@ -255,9 +256,9 @@ def test_a_sampler_of_emdm_opens_in_the_browsers_runtime(packages, tmp_path):
         (tmp_path / f"{name}.onnx.gz").write_bytes(gzip.compress(small))
         graphs[name] = {"file": f"{name}.onnx", "inputs": [], "outputs": []}
     about = {"graphs": graphs, "runs": {1: list(graphs)}, "steps": [1]}
-    about |= {"weights": web.WEIGHTS}
+    about |= {"weights": {"file": web.WEIGHTS, "parts": weights.parts}}
     content = web.packed.pack(about, {})
     (tmp_path / "character.bin.gz").write_bytes(gzip.compress(content))
-    (tmp_path / "weights.bin.gz").write_bytes(gzip.compress(weights.content()))
+    (tmp_path / "weights.bin.gz").write_bytes(gzip.compress(weights.packed()))
     said = play(packages, tmp_path)
     assert said["graphs"] == list(graphs) and "error" not in said

@@ -14,6 +14,7 @@ from jaxmotion.control import steering
 from jaxmotion.control.steering import Inputs, Wish
 from jaxmotion.data import bvh as bvh_motion
 from jaxmotion.data import bvh_text
+from jaxmotion.export import slim
 from jaxmotion.motion.skeleton import global_transforms, joint_positions
 from jaxmotion.viz import packed, page, viewer
 from tests import tiny
@@ -198,3 +199,17 @@ def test_the_pages_glb_is_what_was_shown(tmp_path):
     values = np.frombuffer(content[start : start + view["byteLength"]], "<f4")
     roots = np.asarray(motion.root_position).ravel()
     np.testing.assert_allclose(values, roots, atol=1e-5)
+
+
+def test_half_precision_constants_are_widened():
+    """All 16-bit floats, between others."""
+    halves = np.arange(65536, dtype=np.uint16).view(np.float16)
+    halves = np.where(np.isnan(halves), 0, halves)
+    others = np.arange(3, dtype=np.int64)
+    weights = slim.Weights("weights.bin")
+    weights.add(others, half=False)
+    weights.add(halves.astype(np.float32), half=True)
+    given = data(weights.packed())
+    calls = ({"bytes": given["base64"]}, weights.parts)
+    (found,) = run("player.js", "widen", calls)
+    assert base64.b64decode(found["base64"]) == weights.content()

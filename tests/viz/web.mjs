@@ -9,6 +9,7 @@ const found = await import(pathToFileURL(`${process.argv[2]}/${module}`));
 // Typed arrays go in as {"float32": [...]} and come out as lists, bytes as base64.
 const KINDS = { float32: Float32Array, float64: Float64Array };
 const inward = (_, x) => {
+  if (x && x.bytes) return new Uint8Array(Buffer.from(x.bytes, "base64"));
   if (x && x.base64) return new Uint8Array(Buffer.from(x.base64, "base64")).buffer;
   for (const kind of Object.keys(KINDS)) if (x && x[kind]) return KINDS[kind].from(x[kind]);
   return x;

@@ -19,43 +19,89 @@ function oneLine(error) {
   return text.length > 160 ? `... ${text.slice(-150)}` : text;
 }
 
+// Milliseconds in which a graph is made without anybody noticing.
+const QUICK = 700;
 const KINDS = { float32: Float32Array, int32: Int32Array, bool: Uint8Array };
 const size = shape => shape.reduce((a, b) => a * b, 1);
+
+// Constants as the graphs refer to them: `parts` of 16-bit floats become 32-bit ones, of
+// which each begins at a multiple of four bytes, as the others do.
+export function widen(packed, parts) {
+  const sizes = parts.map(([half, bytes]) => (half ? 2 * bytes : bytes));
+  const made = new Uint8Array(sizes.reduce((a, b) => a + b, 0));
+  const view = new DataView(packed.buffer, packed.byteOffset, packed.byteLength);
+  const wide = new Float32Array(made.buffer);
+  let from = 0, to = 0;
+  parts.forEach(([half, bytes], i) => {
+    if (half)
+      for (let k = 0; k < bytes; k += 2) wide[(to + 2 * k) / 4] = float(view.getUint16(from + k, true));
+    else made.set(packed.subarray(from, from + bytes), to);
+    from += bytes; to += sizes[i];
+  });
+  return made;
+}
+
+// A 16-bit float.
+function float(bits) {
+  const sign = bits & 0x8000 ? -1 : 1, exponent = (bits >> 10) & 31, part = bits & 1023;
+  if (exponent === 0) return sign * part * 2 ** -24;
+  if (exponent === 31) return part ? NaN : sign * Infinity;
+  return sign * (1024 + part) * 2 ** (exponent - 25);
+}
 
 export class Model {
   // ort: onnxruntime-web; read: (file name) -> promise of its bytes, unpacked; draw:
   // (count) -> noise.
   constructor(ort, read, draw = normals) {
-    Object.assign(this, { ort, read, draw, graphs: {} });
+    Object.assign(this, { ort, read, draw, graphs: {}, left: [] });
   }
 
   // Reads the character and what it needs first; rejects with an Error in one line.
   async open(name) {
     this.name = name;
     this.about = unpack((await this.read("character.bin")).buffer);
-    this.weights = await this.read(this.about.weights);
+    const { file, parts } = this.about.weights;
+    this.weights = widen(await this.read(file), parts);
     return this;
   }
 
-  // The graphs for a number of diffusion steps, made where there are none yet.
-  async prepare(steps) {
-    for (const name of this.about.runs[steps]) {
-      if (this.graphs[name]) continue;
-      const { file, inputs, outputs } = this.about.graphs[name];
-      const bytes = await this.read(file);
-      let session;
-      try {
-        session = await this.ort.InferenceSession.create(bytes, {
-          executionProviders: ["wasm"], graphOptimizationLevel: "basic",
-          logSeverityLevel: 4,
-          externalData: [{ path: this.about.weights, data: this.weights }],
-        });
-      } catch (error) {
-        throw new Error(`${this.name}/${file} is no graph that runs here: ${oneLine(error)}`);
-      }
-      const taken = new Set(session.inputNames);
-      this.graphs[name] = { session, outputs, inputs: inputs.filter(x => taken.has(x.name)) };
+  // The graphs for a number of diffusion steps, made where there are none yet. With
+  // `first`, dearer planners than the first may be left for later, where making that one
+  // took so short that nobody sees the others being made.
+  async prepare(steps, first = false) {
+    const names = this.about.runs[steps].filter(name => !this.graphs[name]);
+    const dear = names.filter(name => /^plan_\d/.test(name));
+    let took = 0;
+    for (const name of names.filter(name => !dear.includes(name))) {
+      const began = performance.now();
+      await this.make(name);
+      took = Math.max(took, performance.now() - began);
     }
+    this.left = first && took < QUICK ? dear : [];
+    for (const name of dear) if (!this.left.includes(name)) await this.make(name);
+  }
+
+  // Makes what `prepare` left.
+  async finish() {
+    while (this.left.length) await this.make(this.left.shift());
+  }
+
+  async make(name) {
+    const { file, inputs, outputs } = this.about.graphs[name];
+    const bytes = await this.read(file);
+    let session;
+    try {
+      session = await this.ort.InferenceSession.create(bytes, {
+        executionProviders: ["wasm"], logSeverityLevel: 4,
+        // It was optimized when it was written.
+        graphOptimizationLevel: "disabled",
+        externalData: [{ path: this.about.weights.file, data: this.weights }],
+      });
+    } catch (error) {
+      throw new Error(`${this.name}/${file} is no graph that runs here: ${oneLine(error)}`);
+    }
+    const taken = new Set(session.inputNames);
+    this.graphs[name] = { session, outputs, inputs: inputs.filter(x => taken.has(x.name)) };
   }
 
   // How a character of a label starts: its arrays by name.
@@ -112,6 +158,7 @@ export class Model {
   }
 
   async plan(level, steps, state, told) {
+    if (level > 1) await this.finish();
     await this.call(`plan${level > 1 ? `_${level}` : ""}@${steps}`, state, told);
   }
 
@@ -124,6 +171,15 @@ export class Model {
       root: made["frame.root_position"].data, rotation: made["frame.joint_rotation"].data,
       ball: ball ? ball.data : null,
     };
+  }
+
+  // The pose of a start, which is there before any graph is; null where none is stored.
+  pose(state) {
+    const names = this.about.past;
+    if (!names) return null;
+    const rotation = state[names.rotation].data, joints = this.about.skeleton.names.length;
+    const root = state[names.root].data.slice(-3);
+    return { root, rotation: rotation.slice(-6 * joints), ball: null };
   }
 
   // What is left of the plan: its path [ticks, 2] and its last pose; null without a plan.

@@ -6,7 +6,7 @@ import { Crowd } from "./crowd.js";
 import { Model } from "./player.js";
 
 // Ticks to be ahead: at least so many, and never more.
-const LEAST = 2, MOST = 15, MOST_CHARACTERS = 64, SPEEDS = [0.3, 4.0];
+const LEAST = 2, MOST = 15, AHEAD = 30, MOST_CHARACTERS = 64, SPEEDS = [0.3, 4.0];
 const state = {
   model: "", label: 0, speed: 1.4, num_steps: 1, scale: 1, foot_lock: true,
   characters: 1, plan: false, paused: false, engine: 0, models: [], labels: [], fps: 0,
@@ -51,23 +51,26 @@ async function open(message) {
   base = message.base;
   if (typeof WebAssembly !== "object" || !WebAssembly.validate(new Uint8Array(SIMD)))
     throw new Error("this browser has no WebAssembly SIMD: plans cannot be made here");
-  note("loading the runtime");
-  const [about, binary] = await Promise.all([
-    fetched("models.json"), fetched("ort.wasm.gz")]);
-  ort.env.wasm.numThreads = 1;
-  ort.env.wasm.wasmBinary = binary;
+  note("loading");
+  // Both at once; who fails first is told.
+  const runtime = fetched("ort.wasm.gz").then(binary => {
+    ort.env.wasm.numThreads = 1;
+    ort.env.wasm.wasmBinary = binary;
+  });
+  runtime.catch(() => {});
+  const about = await fetched("models.json");
   state.models = JSON.parse(new TextDecoder().decode(about)).models;
   const wish = message.settings || {};
-  await choose(wish.model || state.models[0], wish);
+  await choose(wish.model || state.models[0], wish, runtime);
 }
 
 // Another model; settings that it does not have are those it was made with.
-async function choose(name, wish = {}) {
+async function choose(name, wish = {}, runtime = null) {
   if (!state.models.includes(name))
     throw new Error(`unknown model ${name}, expected one of ${state.models.join(", ")}`);
   note(`loading ${name}`);
   if (!opened.has(name)) {
-    const read = file => fetched(`${name}/${file}.gz`);
+    const read = kept(file => fetched(`${name}/${file}.gz`));
     opened.set(name, await new Model(ort, read).open(name));
   }
   const next = opened.get(name), { about } = next;
@@ -77,18 +80,41 @@ async function choose(name, wish = {}) {
     num_steps: about.steps.includes(steps) ? steps : about.steps[about.steps.length - 1],
     scale: about.scale, foot_lock: "foot_lock" in wish ? wish.foot_lock : true,
   };
-  await next.prepare(given.num_steps);
   model = next;
+  crowd = null;
   Object.assign(state, given, {
     model: name, labels: about.labels, fps: about.fps, source: about.source,
     steps: about.steps, scales: about.scales, lockable: about.lockable,
-    planning: Boolean(about.plan), engine: state.engine + 1, note: "",
+    planning: Boolean(about.plan), engine: state.engine + 1,
   });
   for (const key of ["speed", "characters", "plan"])
     if (key in wish) state[key] = wish[key];
-  begin();
+  // Somebody stands there before anything can walk.
+  const waiting = new Crowd(next, state);
+  waiting.resize(state.characters);
   postMessage({ body: await next.read("character.bin"), engine: state.engine });
+  const poses = waiting.people.map(one => next.pose(one.state));
+  if (poses.every(Boolean)) show(waiting.pack(poses, 0, 0), performance.now());
+  for (const name of about.runs[state.num_steps])  // all at once, not one by one
+    next.read(about.graphs[name].file).catch(() => {});
+  await runtime;
+  await next.prepare(state.num_steps, true);
+  state.note = "";
+  begin();
   tell();
+}
+
+// Files of a model, each fetched once.
+function kept(read) {
+  const found = new Map();
+  return name => {
+    if (!found.has(name)) found.set(name, read(name));
+    return found.get(name);
+  };
+}
+
+function show(data, time) {
+  postMessage({ frame: data, due: performance.timeOrigin + time }, [data.buffer]);
 }
 
 function begin() {
@@ -111,7 +137,8 @@ const CHANGES = {
 async function obey(message) {
   if (message.base) return open(message);
   if (message.held) { inputs = message; return; }
-  if (!crowd) return;
+  // Where one model does not load, another one may.
+  if (!crowd && !(message.set && message.set.model)) return;
   if (message.do === "reset") begin();
   if (message.do === "step") single += 1;
   for (const [name, value] of Object.entries(message.set || {})) {
@@ -134,15 +161,19 @@ async function work() {
     if (!crowd || (state.paused && !single) || state.note.startsWith("error")) break;
     const tick = 1000 / state.fps, now = performance.now();
     const slow = Math.ceil((crowd.planMs + 2 * crowd.tickMs) / tick);
-    const depth = Math.min(Math.max(LEAST, slow + 1), MOST);
+    const depth = model.left.length ? AHEAD : Math.min(Math.max(LEAST, slow + 1), MOST);
     if (due < now) due = now;  // too slow: time stands still rather than jumps
     const early = due - now - (depth - 1) * tick;
-    if (early > 1 && !single) { await later(Math.min(early, tick)); continue; }
+    if (early > 1 && !single) {
+      // There are enough frames to make what was left when it began.
+      if (model.left.length) await model.finish().catch(fail);
+      else await later(Math.min(early, tick));
+      continue;
+    }
     try {
       const data = await crowd.next(inputs, due - now + tick);
       single = Math.max(single - 1, 0);
-      postMessage({ frame: data, due: performance.timeOrigin + due },
-        [data.buffer]);
+      show(data, due);
       due += tick;
     } catch (error) { fail(error); }
     await later(0);
