@@ -198,12 +198,17 @@ def _sources(source: Rest, target: Rest) -> tuple[np.ndarray, list[int]]:
     return rows, leader
 
 
+# Computed here, once: the compiler would do it again in each place that needs it.
+_settled = jax.lax.optimization_barrier
+
+
+# Written out: products of 3 x 3 matrices then compile into the loops around them.
 def _times(a: Array, b: Array) -> Array:
-    return jnp.einsum("...ij,...jk->...ik", a, b, precision="highest")
+    return sum(a[..., :, k, None] * b[..., None, k, :] for k in range(3))
 
 
-def _turned(a: Array, v: Array) -> Array:
-    return jnp.einsum("...ij,...j->...i", a, v, precision="highest")
+def _turned(a: Array, v: np.ndarray | Array) -> Array:
+    return sum(a[..., :, k] * v[k] for k in range(3))
 
 
 def _orthonormal(matrices: Array) -> Array:
@@ -308,33 +313,35 @@ class Retarget:
             self.source.skeleton, root_position, joint_rotation
         )
         rows, leader = self._rows
+        leaders = sorted({*leader} - {-1})
         back = jnp.asarray(np.swapaxes(self.source.turns, -1, -2), turns.dtype)
-        delta = _times(turns, back)
-        turned = jnp.einsum(
-            "ts,...sij->...tij",
-            jnp.asarray(rows, turns.dtype),
-            delta,
+        mixed = jnp.einsum(
+            "ts,sij->tij",
+            jnp.asarray(rows[leaders], turns.dtype),
+            _times(turns, back),
             precision="highest",
         )
-        still = np.array([j for j, up in enumerate(leader) if up < 0], int)
-        turned = turned.at[still].set(jnp.eye(3, dtype=turns.dtype)[None])
-        turned = _orthonormal(turned)
-        middle, goals = self._goals(places, turned)
+        mixed, places = _settled((_orthonormal(mixed), places))
+        # By joint of the target: those that have a role.
+        turned = {joint: mixed[i] for i, joint in enumerate(leaders)}
+        middle, goals = _settled(self._goals(places, turned))
         turned = self._legs(places, turned, middle, goals)
         turned = self._arms(places, turned)
-        turned = self._twists(turned)
+        turned[-1] = jnp.eye(3, dtype=turns.dtype)  # above the hips
+        twists = self._twists(turned)
+        turned = [twists.get(j, turned[up]) for j, up in enumerate(leader)]
+        hips = turned[self.target.joint("hips")]
+        turned = _settled(jnp.stack(turned))
         world = _times(turned, jnp.asarray(self.target.turns, turns.dtype))
         parents = np.maximum(self.target.skeleton.parents, 0)
-        above = jnp.swapaxes(world[..., parents, :, :], -1, -2)
-        local = _times(above, world)
-        local = jnp.concatenate([world[..., :1, :, :], local[..., 1:, :, :]], axis=-3)
-        hips = self.target.joint("hips")
-        offset = self._hip_middle - self.target.places[hips]
-        root = middle - _turned(turned[..., hips, :, :], jnp.asarray(offset, "float32"))
+        local = _times(jnp.swapaxes(world[parents], -1, -2), world)
+        local = jnp.concatenate([world[:1], local[1:]])
+        number = self.target.joint("hips")
+        offset = self._hip_middle - self.target.places[number]
+        root = middle - _turned(hips, offset.astype(np.float32))
         # What is above the hips does not turn.
-        return root - self.target.places[hips].astype(np.float32), (
-            rotation.rot6d_from_matrix(local)
-        )
+        root = root - self.target.places[number].astype(np.float32)
+        return root, rotation.rot6d_from_matrix(local)
 
     @functools.cached_property
     def _hip_middle(self) -> np.ndarray:
@@ -359,7 +366,9 @@ class Retarget:
             both.append((found[0], found[1]))
         return both
 
-    def _goals(self, places: Array, turned: Array) -> tuple[Array, list[Array]]:
+    def _goals(
+        self, places: Array, turned: dict[int, Array]
+    ) -> tuple[Array, list[Array]]:
         """Where the middle of the hips and the ankles go."""
         source, target = self.source, self.target
         pairs = self._pairs("legs")
@@ -371,11 +380,11 @@ class Retarget:
             heights.append(
                 float(np.mean([one.places[leg.end, 1] for leg in limbs])) - one.sole
             )
-        middle = 0.5 * sum(places[..., leg.upper, :] for leg, _ in pairs)
+        middle = 0.5 * sum(places[leg.upper] for leg, _ in pairs)
         middle = self._scaled(middle, *heights)
         goals, drops = [], []
         for yours, mine in pairs:
-            foot = turned[..., mine.end, :, :]
+            foot = turned[mine.end]
             ankle = target.places[mine.end]
             # Heel and the sole under the ball, from the ankle.
             low = [np.array([0.0, target.sole - ankle[1], -_HEEL * target.leg / _LEG])]
@@ -383,18 +392,18 @@ class Retarget:
                 ball = target.places[mine.after[0]] - ankle
                 own = float(ankle[1] + ball[1] - target.sole)
                 other = float(source.places[yours.after[0], 1] - source.sole)
-                goal = self._scaled(places[..., yours.after[0], :], other, own)
-                goal = goal - _turned(foot, jnp.asarray(ball, foot.dtype))
+                goal = self._scaled(places[yours.after[0]], other, own)
+                goal = goal - _turned(foot, ball.astype(np.float32))
                 low.append(ball - [0.0, own, 0.0])
             else:
-                goal = self._scaled(places[..., yours.end, :], *heights)
+                goal = self._scaled(places[yours.end], *heights)
             # Neither heel nor ball below the ground, or below the source's own.
             reach = np.array([0.0, source.sole - source.places[yours.end, 1], 0.0])
             heel = reach - [0.0, 0.0, _HEEL * source.leg / _LEG]
-            floor = _turned(foot, jnp.asarray(heel, foot.dtype))[..., 1]
-            floor = jnp.minimum(self.scale * (places[..., yours.end, 1] + floor), 0.0)
+            floor = _turned(foot, heel.astype(np.float32))[..., 1]
+            floor = jnp.minimum(self.scale * (places[yours.end, 1] + floor), 0.0)
             under = [
-                floor - goal[..., 1] - _turned(foot, jnp.asarray(p, foot.dtype))[..., 1]
+                floor - goal[..., 1] - _turned(foot, p.astype(np.float32))[..., 1]
                 for p in low
             ]
             lift = jnp.maximum(jnp.max(jnp.stack(under), axis=0), 0.0)
@@ -409,60 +418,56 @@ class Retarget:
         middle = middle.at[..., 1].add(-jnp.maximum(*drops))
         return middle, goals
 
-    def _hip(self, turned: Array, middle: Array, leg: Limb) -> Array:
+    def _hip(self, turned: dict[int, Array], middle: Array, leg: Limb) -> Array:
         """The target's hip joint."""
         hips = self.target.joint("hips")
         offset = self.target.places[leg.upper] - self._hip_middle
-        return middle + _turned(
-            turned[..., hips, :, :], jnp.asarray(offset, middle.dtype)
-        )
+        return middle + _turned(turned[hips], offset.astype(np.float32))
 
-    def _aimed(self, turned: Array, joint: int, child: int, direction: Array) -> Array:
+    def _aimed(
+        self, turned: dict[int, Array], joint: int, child: int, direction: Array
+    ) -> dict[int, Array]:
         """All turns after a joint's bone was swung to a direction."""
         bone = anatomy.unit(self.target.places[child] - self.target.places[joint])
-        now = _turned(turned[..., joint, :, :], jnp.asarray(bone, turned.dtype))
+        now = _turned(turned[joint], bone.astype(np.float32))
         swing = _swing(now, _unit(direction))
-        mine = self._followers(joint)
-        moved = _times(swing[..., None, :, :], turned[..., mine, :, :])
-        return turned.at[..., mine, :, :].set(moved)
+        return turned | {joint: _settled(_times(swing, turned[joint]))}
 
     def _limb(
         self,
-        turned: Array,
+        turned: dict[int, Array],
         places: Array,
         yours: Limb,
         mine: Limb,
         start: Array,
         goal: Array,
         ahead: float,
-    ) -> Array:
+    ) -> dict[int, Array]:
         """All turns after a limb of two bones has reached for a goal."""
         a, b = self.target.lengths(mine)
-        upper, middle, end = (
-            places[..., j, :] for j in (yours.upper, yours.middle, yours.end)
-        )
+        upper, middle, end = (places[j] for j in (yours.upper, yours.middle, yours.end))
         way = _unit(end - upper)
         bent = middle - upper
         bent = bent - way * jnp.sum(bent * way, axis=-1, keepdims=True)
         straight = _PULL * sum(self.source.lengths(yours)) * ahead
-        pole = bent + straight * turned[..., mine.upper, :, 2]
+        pole = bent + straight * turned[mine.upper][:, 2]
         joint = two_bones(start, goal, pole, a, b)
         turned = self._aimed(turned, mine.upper, mine.middle, joint - start)
         # From where the middle joint is to the goal, or to as far as it can be.
         return self._aimed(turned, mine.middle, mine.end, goal - joint)
 
     def _legs(
-        self, places: Array, turned: Array, middle: Array, goals: list[Array]
-    ) -> Array:
+        self, places: Array, turned: dict[int, Array], middle: Array, goals: list[Array]
+    ) -> dict[int, Array]:
         for (yours, mine), goal in zip(self._pairs("legs"), goals, strict=True):
             hip = self._hip(turned, middle, mine)
             turned = self._limb(turned, places, yours, mine, hip, goal, 1.0)
         return turned
 
-    def _arms(self, places: Array, turned: Array) -> Array:
+    def _arms(self, places: Array, turned: dict[int, Array]) -> dict[int, Array]:
         for yours, mine in self._pairs("arms"):
             part = sum(self.target.lengths(mine)) / sum(self.source.lengths(yours))
-            goal = part * (places[..., yours.end, :] - places[..., yours.upper, :])
+            goal = part * (places[yours.end] - places[yours.upper])
             start = jnp.zeros_like(goal)
             turned = self._limb(turned, places, yours, mine, start, goal, -1.0)
         return turned
@@ -491,7 +496,9 @@ class Retarget:
                         found.append((int(twist), joint, a, b, min(part, 1.0) + shift))
         return found
 
-    def _twists(self, turned: Array) -> Array:
+    def _twists(self, turned: dict[int, Array]) -> dict[int, Array]:
+        """Turns of the twist bones."""
+        found = {}
         for twist, joint, a, b, part in self._twist_bones:
             child = next(
                 limb.middle if limb.upper == joint else limb.end
@@ -499,21 +506,17 @@ class Retarget:
                 if joint in (limb.upper, limb.middle)
             )
             bone = anatomy.unit(self.target.places[child] - self.target.places[joint])
-            bone = jnp.asarray(bone, turned.dtype)
-            between = _times(
-                jnp.swapaxes(turned[..., a, :, :], -1, -2), turned[..., b, :, :]
-            )
-            skew = between - jnp.swapaxes(between, -1, -2)
-            about = jnp.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
-            trace = 1.0 + jnp.trace(between, axis1=-2, axis2=-1)
-            angle = part * 2.0 * jnp.arctan2(about @ bone, jnp.maximum(trace, 1e-6))
-            c, s = jnp.cos(angle)[..., None, None], jnp.sin(angle)[..., None, None]
-            x, y, z = bone
+            x, y, z = bone.astype(np.float32)
+            between = _times(turned[a].T, turned[b])
+            skew = between - between.T
+            about = skew[2, 1] * x + skew[0, 2] * y + skew[1, 0] * z
+            trace = jnp.maximum(1.0 + jnp.trace(between), 1e-6)
+            angle = part * 2.0 * jnp.arctan2(about, trace)
             cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            turn = c * jnp.eye(3) + s * cross + (1 - c) * jnp.outer(bone, bone)
-            moved = _times(turned[..., joint, :, :], turn)
-            turned = turned.at[..., twist, :, :].set(moved)
-        return turned
+            turn = jnp.cos(angle) * jnp.eye(3) + jnp.sin(angle) * cross
+            turn = turn + (1 - jnp.cos(angle)) * np.outer(bone, bone).astype("f4")
+            found[twist] = _times(turned[joint], turn)
+        return found
 
 
 def retarget(
