@@ -114,9 +114,9 @@ def export_page(args: Config) -> None:
     """Writes the folder of the page, for shipped models or a run."""
     web.check()
     loop.check_writable(args.out)
-    sources = (
-        dict.fromkeys(args.model) if args.run is None else {args.run.stem: args.run}
-    )
+    sources = {name: name for name in args.model}
+    if args.run is not None:
+        sources = {args.run.stem: args.run}
     say = lambda line: print(line, flush=True)  # noqa: E731
     loaded = {}
     for name, what in sources.items():  # before any work that takes long

@@ -32,8 +32,8 @@ export class Camera {
       r[0] * f[1] - r[1] * f[0]];
     const eye = this.eye = at.map((x, i) => x - distance * f[i]);
     const wide = canvas.width / Math.max(canvas.height, 1), near = 0.1, far = 200;
-    // On a narrow screen the person is as wide as on a square one.
-    const focal = FOCAL * Math.min(1, Math.max(wide * (1 - aside), 0.4));
+    // On a narrow screen there is room beside the person, too.
+    const focal = FOCAL * Math.min(1, Math.max(1.3 * wide * (1 - aside), 0.75));
     const dot = v => -(v[0] * eye[0] + v[1] * eye[1] + v[2] * eye[2]);
     const p = (far + near) / (near - far), q = 2 * far * near / (near - far);
     const row = [[...r, dot(r)].map(x => x * focal / wide),

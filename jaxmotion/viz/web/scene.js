@@ -50,6 +50,7 @@ void main() {
   // What is near the ground or looks down is darker: light does not get there.
   float open = mix(0.55, 1.0, smoothstep(-0.05, 0.5, place.y)) * mix(0.7, 1.0, sky);
   vec3 lit = base * (vec3(1.02, 0.97, 0.90) * (0.55 * sun + 0.35 * wrap)
+    + vec3(0.17, 0.18, 0.19) * max(dot(n, v), 0.0)  // from where one looks: no dark side
     + open * mix(vec3(0.30, 0.28, 0.27), vec3(0.40, 0.46, 0.55), sky));
   vec3 h = normalize(light + v);
   float rim = pow(1.0 - max(dot(n, v), 0.0), 4.0);
