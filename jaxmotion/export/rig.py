@@ -184,7 +184,8 @@ def _array(name: str, content: dict, data: bytes, index: Any) -> np.ndarray:
     values = np.ascontiguousarray(found).view(kind).reshape(count, width)
     if accessor.get("normalized") and values.dtype.kind in "iu":
         return values / np.iinfo(values.dtype).max
-    return values.astype(float) if values.dtype.kind == "f" else values
+    with np.errstate(invalid="ignore"):
+        return values.astype(float) if values.dtype.kind == "f" else values
 
 
 def _numbers(name: str, values: Any, count: int, what: str) -> np.ndarray:
@@ -313,6 +314,7 @@ def read_rig(path: str | Path) -> Rig:
     content, data = _chunks(name, files.read_bytes(path))
     data = _one_buffer(path, content, data)
     nodes = _objects(name, content, "nodes")
+    _objects(name, content, "accessors")
     if len(nodes) > _MAX_NODES:
         raise ValueError(f"{name}: {len(nodes)} nodes, more than {_MAX_NODES}")
     upper = _parents(name, nodes)
@@ -392,17 +394,19 @@ def _lowest(rig: Rig, world: dict[int, np.ndarray]) -> float | None:
             if "inverseBindMatrices" in skin:
                 get = (rig.name, rig.content, rig.data)
                 bind = _array(*get, skin["inverseBindMatrices"]).reshape(-1, 4, 4)
-                moves = moves @ np.swapaxes(bind, 1, 2)[: len(moves)]
+                with np.errstate(all="ignore"):
+                    moves = moves @ np.swapaxes(bind, 1, 2)[: len(moves)]
             for part in _objects(rig.name, mesh, "primitives"):
                 have = part.get("attributes", {})
                 get = (rig.name, rig.content, rig.data)
                 points = _array(*get, have["POSITION"])
-                which = _array(*get, have["JOINTS_0"]).astype(int)
+                which = _array(*get, have["JOINTS_0"])
                 weights = _array(*get, have["WEIGHTS_0"]).astype(float)
                 rows = moves[which, 1]  # what becomes y
                 four = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-                heights = np.einsum("vk,vkc,vc->v", weights, rows, four)
-                heights = heights / np.maximum(weights.sum(axis=1), 1e-6)
+                with np.errstate(all="ignore"):
+                    heights = np.einsum("vk,vkc,vc->v", weights, rows, four)
+                    heights = heights / np.maximum(weights.sum(axis=1), 1e-6)
                 found.append(float(heights.min()))
         except (ValueError, KeyError, IndexError, TypeError, AttributeError):
             return None

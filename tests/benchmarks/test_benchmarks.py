@@ -519,3 +519,14 @@ def test_ratios_are_of_the_same_round(load):
     assert status(threads=2, load=0.0) == 0
     assert status(threads=2, load=1.0) == 2
     assert status(threads=1, load=1.0) == 1
+
+
+@pytest.mark.slow
+def test_retarget(tmp_path):
+    arguments = ["--seconds", "1", "--characters", "1", "--repeats", "2"]
+    run_script("retarget", *arguments, "--out", tmp_path)
+    rows = json.loads((tmp_path / "retarget.json").read_text())["rows"]
+    assert len(rows) == 20 and {row["body"] for row in rows} >= {"child", "giant"}
+    for row in rows:
+        assert row["slide"] < 1.1 * row["slide_source"] + 1e-4
+        assert row["under"] < 1e-3 and row["trip"] < 0.01
