@@ -37,21 +37,28 @@ def pack(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> bytes:
 
 
 def body_arrays(skeleton: Skeleton) -> dict[str, np.ndarray]:
-    """The skinned mesh of a skeleton.
+    """The skinned mesh of a skeleton, and under "crowd." a plainer one.
 
     Returns:
       positions [V, 3] float32 in the bind pose, meters; normals [V, 4] int8 (127 is 1);
       joints, weights [V, 4] uint8 (a vertex's weights sum to 255); colors [V, 4] uint8,
-      sRGB; faces [3 T] uint32; inverse [J, 12] float32, rows of inverse bind
+      sRGB; faces [3 T] uint16; inverse [J, 12] float32, rows of inverse bind
       transforms.
 
     Raises:
       ValueError: if there are more than 256 joints.
     """
-    body = mannequin.describe(skeleton)
-    count = len(body.bind_position)
+    count = len(skeleton.parents)
     if count > 256:
         raise ValueError(f"{count} joints, expected at most 256 for the page")
+    fine = mannequin.describe(skeleton)
+    crowd = _mesh(mannequin.describe(skeleton, detail="crowd"))
+    inverse = fine.inverse_bind.reshape(count, 12).astype(np.float32)
+    plainer = {f"crowd.{name}": values for name, values in crowd.items()}
+    return _mesh(fine) | {"inverse": inverse} | plainer
+
+
+def _mesh(body: mannequin.Mannequin) -> dict[str, np.ndarray]:
     palette = np.stack([rgba(color) for color in body.palette])
     return {
         "positions": np.asarray(body.vertices, np.float32),
@@ -59,8 +66,7 @@ def body_arrays(skeleton: Skeleton) -> dict[str, np.ndarray]:
         "joints": body.joints.astype(np.uint8),
         "weights": _whole(body.weights),
         "colors": palette[body.materials],
-        "faces": body.faces.ravel().astype(np.uint32),
-        "inverse": body.inverse_bind.reshape(count, 12).astype(np.float32),
+        "faces": body.faces.ravel().astype(np.uint16),
     }
 
 

@@ -150,7 +150,10 @@ def test_a_packed_body_is_unpacked():
         np.testing.assert_allclose(got, values.ravel(), rtol=1e-6)
     weights = arrays["weights"].astype(int)
     assert (weights.sum(axis=-1) == 255).all()
-    assert arrays["faces"].max() < len(arrays["positions"])
+    for part in ("", "crowd."):
+        count = len(arrays[f"{part}positions"])
+        assert arrays[f"{part}faces"].max() == count - 1
+    assert count < len(arrays["positions"]) / 2
 
 
 def takes(frames=20):

@@ -37,6 +37,13 @@ export class Crowd {
     this.homes.length = number;
   }
 
+  // How many characters can be moved in real time, from what the last ticks took.
+  bears() {
+    const { fps, patience } = this.model.about, n = this.people.length;
+    const plan = patience ? this.planMs / patience : 0;
+    return Math.floor(900 / fps / (this.tickMs / n + plan));
+  }
+
   command(wish) {
     const { label, scale, foot_lock } = this.settings;
     return this.model.told({ ...wish, label, scale, locks: foot_lock });

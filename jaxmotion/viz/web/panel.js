@@ -152,7 +152,7 @@ export class Panel {
     pen.moveTo(0, y(budget)); pen.lineTo(w, y(budget)); pen.stroke();
     const planned = history.filter(x => x[1]).map(x => x[0]).sort((a, b) => a - b);
     const plan = planned.length ? planned[planned.length >> 1].toFixed(0) : "-";
-    const plans = history.reduce((sum, x) => sum + x[1], 0) * fps / history.length;
+    const plans = history.reduce((sum, x) => sum + x[1], 0) * rate / history.length;
     $("numbers").textContent = `plan ${plan} ms · ${plans.toFixed(1)} plans/s · ` +
       `${rate.toFixed(0)} of ${fps.toFixed(0)} frames/s`;
   }

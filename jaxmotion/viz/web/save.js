@@ -59,8 +59,8 @@ export function glb(body, fps, roots, rotations) {
     WEIGHTS_0: add(weights, FLOAT, "VEC4", count, {}, VERTEX),
     COLOR_0: add(colors, FLOAT, "VEC4", count, {}, VERTEX),
   };
-  const faces = new Uint32Array(arrays.faces);
-  const indices = add(faces, 5125, "SCALAR", faces.length, {}, INDEX);
+  const faces = new Uint16Array(arrays.faces);
+  const indices = add(faces, 5123, "SCALAR", faces.length, {}, INDEX);
   // Column by column, of rows.
   const inverse = new Float32Array(16 * joints);
   for (let j = 0; j < joints; j++) for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++)

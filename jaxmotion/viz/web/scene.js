@@ -1,6 +1,8 @@
 // What is seen: people as skinned meshes, balls, ground, soft shadow, figures on the
 // ground. WebGL 2, no library.
 
+// More people than these have plainer bodies.
+const MANY = 4;
 const SHADOW = 256, LIGHT = [-0.46, 0.80, -0.38];
 export const PALE = [0.49, 0.62, 0.84];
 const SKY = [0.865, 0.888, 0.915];
@@ -138,28 +140,39 @@ export class Scene {
     this.ball = this.mesh(sphere());
   }
 
-  // Takes over the skinned mesh of an unpacked body.
-  show(body) {
-    if (this.body) this.gl.deleteVertexArray(this.body.array);
-    this.body = this.mesh(body.arrays);
+  // Takes over the skinned meshes of an unpacked body.
+  show({ arrays }) {
+    for (const mesh of [this.body, this.plain]) if (mesh) mesh.free();
+    const crowd = {};
+    for (const name of Object.keys(arrays))
+      if (name.startsWith("crowd.")) crowd[name.slice(6)] = arrays[name];
+    this.body = this.mesh(arrays);
+    this.plain = this.mesh(crowd);
   }
 
   mesh({ positions, normals, joints, weights, colors, faces }) {
-    const gl = this.gl, array = gl.createVertexArray();
+    const gl = this.gl, array = gl.createVertexArray(), buffers = [];
+    const buffer = (target, values) => {
+      buffers.push(gl.createBuffer());
+      gl.bindBuffer(target, buffers[buffers.length - 1]);
+      gl.bufferData(target, values, gl.STATIC_DRAW);
+    };
     gl.bindVertexArray(array);
     for (const [name, values, size, kind, unit] of [
       ["position", positions, 3, gl.FLOAT, false], ["normal", normals, 4, gl.BYTE, true],
       ["joints", joints, 4, gl.UNSIGNED_BYTE, false],
       ["weights", weights, 4, gl.UNSIGNED_BYTE, true],
       ["color", colors, 4, gl.UNSIGNED_BYTE, true]]) {
-      gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-      gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+      buffer(gl.ARRAY_BUFFER, values);
       attribute(gl, this.skinned, name, size, kind, 0, 0, unit);
     }
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(faces), gl.STATIC_DRAW);
+    buffer(gl.ELEMENT_ARRAY_BUFFER, new Uint16Array(faces));
     gl.bindVertexArray(null);
-    return { array, corners: faces.length };
+    const free = () => {
+      gl.deleteVertexArray(array);
+      for (const one of buffers) gl.deleteBuffer(one);
+    };
+    return { array, corners: faces.length, free };
   }
 
   // Draws a picture of
@@ -170,9 +183,11 @@ export class Scene {
   draw({ camera, people, ghosts, balls, joints, figures, reach }) {
     const gl = this.gl, { width, height } = this.canvas;
     const square = [camera.at[0], camera.at[2], reach, 0];
-    const crowd = [[this.body, people, joints], [this.ball, balls, 1]].filter(
+    const many = people && people.length > MANY * 12 * joints;
+    const seen = mesh => [[mesh, people, joints], [this.ball, balls, 1]].filter(
       ([mesh, moved]) => mesh && moved && moved.length);
-    this.cast(crowd, square);
+    const crowd = seen(many ? this.plain : this.body);
+    this.cast(seen(this.plain), square);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
     gl.clearColor(...SKY, 1);
@@ -258,7 +273,7 @@ export class Scene {
       moved);
     gl.uniform1i(this.skinned.at.bones, 1);
     gl.bindVertexArray(mesh.array);
-    gl.drawElementsInstanced(gl.TRIANGLES, mesh.corners, gl.UNSIGNED_INT, 0, count);
+    gl.drawElementsInstanced(gl.TRIANGLES, mesh.corners, gl.UNSIGNED_SHORT, 0, count);
   }
 }
 

@@ -148,6 +148,17 @@ async function obey(message) {
   if (message.set) tell();
 }
 
+// Offers as many characters as this device bears, now and then.
+let measured = 0;
+function measure() {
+  if (crowd.tick < 90 || performance.now() - measured < 3000) return;
+  measured = performance.now();
+  const most = Math.min(Math.max(crowd.bears(), state.characters, 2), MOST_CHARACTERS);
+  if (Math.abs(most - state.most_characters) < 0.2 * state.most_characters) return;
+  state.most_characters = most;
+  tell();
+}
+
 // Messages are obeyed in their order, between two ticks.
 const queue = [];
 onmessage = event => { queue.push(event.data); work(); };
@@ -174,6 +185,7 @@ async function work() {
       const data = await crowd.next(inputs, due - now + tick);
       single = Math.max(single - 1, 0);
       show(data, due);
+      measure();
       due += tick;
     } catch (error) { fail(error); }
     await later(0);
