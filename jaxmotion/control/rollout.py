@@ -97,9 +97,17 @@ def _select(keep: Array, old: State, new: State) -> State:
     return jax.tree.map(choose, old, new)
 
 
-def _batch_tick(
+def batch_tick(
     controller: Controller, keys: Array, states: State, commands: Commands
 ) -> tuple[State, Frame]:
+    """One tick of many characters: the most expensive plan that any of them needs.
+
+    Args:
+      controller: Its three functions.
+      keys: One a character; consumed.
+      states: Batch axis first.
+      commands: What the user wants of each now.
+    """
     need = jax.vmap(controller.plan_level)(states, commands)
     states = _plan(controller, keys, states, commands, need)
     return jax.vmap(controller.advance)(states, commands)
@@ -237,7 +245,7 @@ def _scan(
         def body(states: State, xs: tuple) -> tuple[State, Frame]:
             i, commands = xs
             tick_keys = jax.vmap(lambda k: jax.random.fold_in(k, i))(keys)
-            return _batch_tick(controller, tick_keys, states, commands)
+            return batch_tick(controller, tick_keys, states, commands)
 
         over_time = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), commands)
         ticks = jax.tree.leaves(over_time)[0].shape[0]

@@ -1,0 +1,419 @@
+"""Goals on the ground: paths, places with times, persons to follow, without collisions.
+
+Each goal is a function of one walker, made of arrays, that says which velocity to ask
+for now; `vmap` makes many. `goal_rollouts` closes the loop: what characters are asked
+for in a tick depends on where they have come, in one compiled program.
+
+* A path is pursued: the walker heads for the point of it that lies a little ahead of
+  the nearest one, at the speed that the path has there (pure pursuit).
+* A place is reached at a time: the speed is that with which the time suffices if the
+  last meters slow down exponentially; who would have to creep waits first.
+* Who is followed is followed at a distance, with his velocity.
+* Walkers who would collide choose another velocity, each half of the way round the
+  other: of sampled ones the cheapest by its difference from the wanted one and by how
+  soon it would collide.
+
+Source: Coulter 1992, "Implementation of the Pure Pursuit Path Tracking Algorithm"; van
+den Berg, Lin and Manocha 2008, "Reciprocal Velocity Obstacles for Real-Time Multi-Agent
+Navigation". Speeds and distances are ours.
+"""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from jaxmotion.control import rollout, steering
+from jaxmotion.control.frame import Frame
+from jaxmotion.control.steering import ARRIVE, HEADING_STEP, SPEED_STEP, Character
+from jaxmotion.motion import ground
+from jaxmotion.motion.trajectory import Command
+from jaxmotion.typing import Key, Params
+
+# A path is looked at so many seconds ahead, and so many meters at least; the nearest
+# point of it is sought within so many meters of the last one.
+AHEAD, NEAREST, REACH = 0.35, 0.25, 1.0
+# Nobody is asked to go slower or faster, m/s, but to stop; nor to be nearer than this
+# to a place, where he stands, meters. Times count to the last distance. Who is asked
+# to stop goes on for so many seconds.
+SLOWEST, FASTEST, THERE, TIMELY, LAG = 0.6, 3.5, 0.05, 0.1, 0.25
+# Radius of a walker, meters; collisions within so many seconds count; what a collision
+# in one second is worth in m/s.
+RADIUS, HORIZON, FEAR = 0.35, 3.0, 1.0
+_ANGLES, _PARTS = 16, (0.35, 0.7, 1.0)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Walker:
+    """Where somebody is and how he moves on the ground (x, z), meters and seconds."""
+
+    position: Float[Array, "*batch 2"]
+    velocity: Float[Array, "*batch 2"]
+    facing: Float[Array, "*batch 2"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Path:
+    """Points to walk along, and where it ends to stand.
+
+    Attributes:
+      points: (x, z), meters; two at least, no two in a row the same.
+      speed: At each point, m/s; linear between them.
+    """
+
+    points: Float[Array, "*batch points 2"]
+    speed: Float[Array, "*batch points"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Place:
+    """Where to stand from when on.
+
+    Attributes:
+      position: (x, z), meters.
+      facing: Unit; taken up at the place.
+      seconds: When to arrive, from the beginning.
+    """
+
+    position: Float[Array, "*batch 2"]
+    facing: Float[Array, "*batch 2"]
+    seconds: Float[Array, "*batch"]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Follow:
+    """Whom to follow.
+
+    Attributes:
+      leader: Index of another walker.
+      distance: Meters.
+    """
+
+    leader: Int[Array, "*batch"]
+    distance: Float[Array, "*batch"]
+
+
+Goal = Path | Place | Follow
+
+
+def _length(vector: Array) -> Array:
+    return jnp.sqrt(jnp.sum(jnp.square(vector), axis=-1) + 1e-12)
+
+
+def _along(path: Path, way: Array) -> tuple[Array, Array, Array]:
+    """Point and speed of a path after a way along it, meters, and its whole length."""
+    steps = _length(jnp.diff(path.points, axis=0))
+    marks = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
+    point = jnp.stack(
+        [jnp.interp(way, marks, path.points[:, i]) for i in (0, 1)], axis=-1
+    )
+    return point, jnp.interp(way, marks, path.speed), marks[-1]
+
+
+def pursue(
+    path: Path, walker: Walker, way: Float[Array, ""]
+) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+    """Velocity along a path.
+
+    Args:
+      path: The path.
+      walker: Who walks it.
+      way: How far along it he was, meters: he never goes back, so that a path may
+        cross itself.
+
+    Returns:
+      The velocity, and the new way.
+    """
+    ways = way + jnp.linspace(0.0, REACH, 41)
+    points, _, length = _along(path, ways)
+    near = jnp.argmin(_length(points - walker.position[None]))
+    way = jnp.minimum(ways[near], length)
+    _, speed, _ = _along(path, way)
+    goal, _, _ = _along(path, way + jnp.maximum(AHEAD * speed, NEAREST))
+    # Slower to the end.
+    left = length - way + _length(path.points[-1] - walker.position) * (way >= length)
+    left = jnp.maximum(left - LAG * _length(walker.velocity), 0.0)
+    speed = jnp.minimum(speed, left / ARRIVE)
+    speed = jnp.where(left < THERE, 0.0, speed)
+    heading = ground.unit(goal - walker.position, walker.facing)
+    return speed * heading, way
+
+
+def _seconds_to(distance: Array, speed: Array) -> Array:
+    """How long it takes at a speed that falls with the distance in the end."""
+    slow = jnp.minimum(distance, speed * ARRIVE)
+    end = ARRIVE * jnp.log(jnp.maximum(slow, TIMELY) / TIMELY)
+    return (distance - slow) / speed + end
+
+
+def arrive(
+    place: Place, walker: Walker, seconds: Float[Array, ""]
+) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """Velocity and facing of who is to be at a place at a time.
+
+    Args:
+      place: Where and when.
+      walker: Who.
+      seconds: Now.
+
+    Returns:
+      The velocity, and the direction to face.
+    """
+    gap = place.position - walker.position - LAG * walker.velocity
+    distance, left = _length(gap), place.seconds - seconds
+    slow, fast = jnp.float32(SLOWEST), jnp.float32(FASTEST)
+
+    def halve(ends: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        middle = 0.5 * (ends[0] + ends[1])
+        late = _seconds_to(distance, middle) > left
+        return (
+            jnp.where(late, middle, ends[0]),
+            jnp.where(late, ends[1], middle),
+        ), None
+
+    (_, speed), _ = jax.lax.scan(halve, (slow, fast), None, length=16)
+    moving = _length(walker.velocity) > 0.5 * SLOWEST
+    waits = ~moving & (_seconds_to(distance, slow) < left)
+    there = distance < jnp.where(moving, THERE, 2 * THERE)
+    speed = jnp.minimum(speed, distance / ARRIVE) * ~(waits | there)
+    heading = ground.unit(gap, walker.facing)
+    near = distance < 0.5 * ARRIVE
+    facing = jnp.where(near, place.facing, jnp.where(waits, walker.facing, heading))
+    return speed * heading, facing
+
+
+def follow(
+    leader: Walker, walker: Walker, distance: Float[Array, ""]
+) -> Float[Array, "2"]:
+    """Velocity of who keeps his distance behind another."""
+    gap = leader.position - walker.position
+    back = ground.unit(leader.velocity, ground.unit(gap))
+    wish = leader.velocity + (gap - distance * back) / ARRIVE
+    # Who is near enough to one who stands stands, too.
+    rest = _length(leader.velocity) < 0.5 * SLOWEST
+    slack = _length(gap) - distance
+    wish = jnp.where(rest, ground.unit(gap) * slack / ARRIVE, wish)
+    speed = jnp.minimum(_length(wish), FASTEST)
+    speed = jnp.where(rest & (slack < 2 * THERE), 0.0, speed)
+    return speed * ground.unit(wish, walker.facing)
+
+
+def _collides(gap: Array, velocity: Array, radius: Array) -> Float[Array, "..."]:
+    """Seconds until a gap that changes with a velocity is as small as a radius."""
+    a = jnp.sum(jnp.square(velocity), axis=-1) + 1e-9
+    b = jnp.sum(gap * velocity, axis=-1)
+    c = jnp.sum(jnp.square(gap), axis=-1) - radius**2
+    root = b * b - a * c
+    when = (-b - jnp.sqrt(jnp.maximum(root, 0.0))) / a
+    hits = (root > 0.0) & (b < 0.0)
+    # Who is too near already only minds what brings him nearer.
+    when = jnp.where(c < 0.0, jnp.where(b < 0.0, 0.05, jnp.inf), when)
+    return jnp.where(hits | (c < 0.0), jnp.maximum(when, 0.05), jnp.inf)
+
+
+def avoid(
+    wanted: Float[Array, "walkers 2"],
+    walkers: Walker,
+    circles: Float[Array, "circles 3"] | None = None,
+    *,
+    radius: float = RADIUS,
+) -> Float[Array, "walkers 2"]:
+    """Velocities near those wanted with which nobody runs into anybody.
+
+    Args:
+      wanted: Velocities, m/s.
+      walkers: All of them.
+      circles: Center (x, z) and radius of what stands around, meters.
+      radius: Of a walker, meters.
+
+    Returns:
+      The velocities.
+
+    Source: van den Berg et al. 2008, sections IV and V.
+    """
+    number = len(wanted)
+    turns = jnp.linspace(-jnp.pi, jnp.pi, _ANGLES, endpoint=False)
+    base = jnp.maximum(_length(wanted), SLOWEST)[:, None] * ground.unit(
+        wanted, walkers.facing
+    )
+    moves = [
+        ground.turn(part * base, jnp.full(number, turn))
+        for turn in turns
+        for part in _PARTS
+    ]
+    choices = jnp.stack([wanted, jnp.zeros_like(wanted), *moves], axis=1)
+
+    def penalty(i: Array, choices: Array) -> Array:
+        gap = walkers.position[i][None] - walkers.position  # from each other one
+        # Each goes half of the way round: the other is taken to do the other half.
+        both = walkers.velocity[i][None] + walkers.velocity
+        mean = 2.0 * choices[:, None] - both[None]
+        times = _collides(gap[None], mean, jnp.float32(2 * radius))
+        times = jnp.where(jnp.arange(number)[None] == i, jnp.inf, times)
+        soon = jnp.min(times, axis=1)
+        if circles is not None:
+            away = walkers.position[i][None] - circles[:, :2]
+            own = _collides(away[None], choices[:, None], circles[None, :, 2] + radius)
+            soon = jnp.minimum(soon, jnp.min(own, axis=1))
+        danger = jnp.where(soon < HORIZON, FEAR / soon, 0.0)
+        # To the right, if both sides are as good.
+        side = wanted[i, 0] * choices[:, 1] - wanted[i, 1] * choices[:, 0]
+        return danger + _length(choices - wanted[i][None]) - 0.02 * jnp.sign(side)
+
+    costs = jax.vmap(penalty)(jnp.arange(number), choices)
+    best = jnp.argmin(costs, axis=1)
+    # Who wants to stand stands, if nobody comes.
+    return jnp.take_along_axis(choices, best[:, None, None], axis=1)[:, 0]
+
+
+def _wish(
+    goal: Goal, walkers: Walker, memory: Array, seconds: Array
+) -> tuple[Array, Array, Array]:
+    """Velocity, facing and memory of each walker."""
+    if isinstance(goal, Path):
+        velocity, memory = jax.vmap(pursue)(goal, walkers, memory)
+    elif isinstance(goal, Place):
+        now = jnp.broadcast_to(seconds, memory.shape)
+        velocity, facing = jax.vmap(arrive)(goal, walkers, now)
+        return velocity, facing, memory
+    else:
+        leaders = jax.tree.map(lambda x: x[goal.leader], walkers)
+        velocity = jax.vmap(follow)(leaders, walkers, goal.distance)
+    return velocity, ground.unit(velocity, walkers.facing), memory
+
+
+def hold(told: Command, wanted: Command) -> Command:
+    """The command that was told, unless what is wanted differs by enough.
+
+    New commands cost new plans: directions count from `steering.HEADING_STEP` on,
+    speeds from `steering.SPEED_STEP` on, and to stop at once.
+    """
+    old, new = _length(told.velocity), _length(wanted.velocity)
+    stops = (new < 1e-3) != (old < 1e-3)
+    turned = jnp.abs(ground.angle_from_to(told.velocity, wanted.velocity))
+    faced = jnp.abs(ground.angle_from_to(told.facing, wanted.facing))
+    turned = jnp.where((old > 1e-3) & (new > 1e-3), turned, 0.0)
+    differs = stops | (jnp.abs(new - old) > SPEED_STEP)
+    differs |= jnp.maximum(turned, faced) > HEADING_STEP
+    differs |= told.label != wanted.label
+    choose = lambda a, b: jnp.where(  # noqa: E731
+        differs.reshape(differs.shape + (1,) * (a.ndim - differs.ndim)), b, a
+    )
+    return jax.tree.map(choose, told, wanted)
+
+
+def goal_rollouts(
+    character: Character,
+    key: Key,
+    states: Any,
+    goal: Goal,
+    *,
+    seconds: float,
+    places: Float[Array, "characters 2"] | None = None,
+    labels: Int[Array, " characters"] | None = None,
+    avoiding: bool = False,
+    circles: Float[Array, "circles 3"] | None = None,
+) -> Frame:
+    """Frames of characters who go after goals, as one compiled program.
+
+    Args:
+      character: What moves them.
+      key: Consumed; character c draws from `fold_in(key, c)`.
+      states: From `character.start`: at the origin, facing +z.
+      goal: One kind of goal, arrays with the characters' axis first.
+      seconds: Length.
+      places: Where each starts, (x, z) meters, instead of the origin.
+      labels: Style of each; None for the first.
+      avoiding: Whether they keep clear of each other.
+      circles: Center (x, z) and radius of what they keep clear of, meters.
+
+    Returns:
+      Frames [characters, ticks, ...]. Root positions are in the goals' world; what a
+      system has as `extra` stays relative to each one's start.
+
+    Raises:
+      ValueError: if goals, states and places are of different numbers of characters,
+        or a label is none of the model's.
+    """
+    number = jax.tree.leaves(states)[0].shape[0]
+    places = jnp.zeros((number, 2)) if places is None else jnp.asarray(places)
+    labels = jnp.zeros(number, jnp.int32) if labels is None else jnp.asarray(labels)
+    for what, found in (
+        ("goals", jax.tree.leaves(goal)[0].shape[0]),
+        ("places", places.shape[0]),
+        ("labels", labels.shape[0]),
+    ):
+        if found != number:
+            raise ValueError(f"{found} {what} for {number} characters")
+    steering.check_labels(labels, character.labels)
+    return _rollouts(
+        character.params,
+        key,
+        states,
+        goal,
+        places.astype(jnp.float32),
+        labels,
+        circles,
+        method=character.method,
+        ticks=round(seconds * character.fps),
+        fps=character.fps,
+        avoiding=avoiding or circles is not None,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("method", "ticks", "fps", "avoiding"))
+def _rollouts(
+    params: Params,
+    key: Key,
+    states: Any,
+    goal: Goal,
+    places: Array,
+    labels: Array,
+    circles: Array | None,
+    *,
+    method: steering.Method,
+    ticks: int,
+    fps: float,
+    avoiding: bool,
+) -> Frame:
+    controller, number = method(params), len(places)
+    keys = jax.vmap(lambda c: jax.random.fold_in(key, c))(jnp.arange(number))
+    ahead = jnp.broadcast_to(jnp.array([0.0, 1.0]), (number, 2))
+    rest = jnp.zeros((number, 2))
+    walkers = Walker(position=places, velocity=rest, facing=ahead)
+    told = Command(velocity=rest, facing=ahead, label=labels)
+    # Hips sway: velocities are averaged over a fifth of a second.
+    keep = 0.5 ** (1.0 / (0.1 * fps))
+
+    def body(carry: tuple, tick: Array) -> tuple[tuple, Frame]:
+        states, walkers, told, memory = carry
+        velocity, facing, memory = _wish(goal, walkers, memory, tick / fps)
+        if avoiding:
+            clear = avoid(velocity, walkers, circles)
+            moved = _length(clear - velocity)[:, None] > 1e-3
+            facing = jnp.where(moved, ground.unit(clear, walkers.facing), facing)
+            velocity = clear
+        told = hold(told, Command(velocity=velocity, facing=facing, label=labels))
+        now = jax.vmap(lambda k: jax.random.fold_in(k, tick))(keys)
+        states, frame = rollout.batch_tick(controller, now, states, told)
+        position = frame.root_position[:, ::2] + places
+        moved = (position - walkers.position) * fps
+        walkers = Walker(
+            position=position,
+            velocity=keep * walkers.velocity + (1.0 - keep) * moved,
+            facing=told.facing,
+        )
+        root = frame.root_position.at[:, ::2].set(position)
+        frame = dataclasses.replace(frame, root_position=root)
+        return (states, walkers, told, memory), frame
+
+    start = (states, walkers, told, jnp.zeros(number))
+    _, frames = jax.lax.scan(body, start, jnp.arange(ticks))
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), frames)

@@ -1,0 +1,196 @@
+"""Goals on the ground: closed forms, walkers who obey, and a shipped model."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmotion as jm
+from jaxmotion.control import goals
+from jaxmotion.motion.trajectory import Command
+
+FPS = 30.0
+
+
+def walker(position, velocity=(0.0, 0.0), facing=(0.0, 1.0)):
+    made = [jnp.asarray(x, jnp.float32) for x in (position, velocity, facing)]
+    return goals.Walker(position=made[0], velocity=made[1], facing=made[2])
+
+
+def walk(wish, start, seconds, *, memory=0.0):
+    """Who obeys as a character does: velocities follow with a half-life of 0.15 s."""
+
+    @jax.jit
+    def step(now, tick):
+        own, memory = now
+        velocity, memory = wish(own, memory, tick / FPS)
+        keep = 0.5 ** (1 / (0.15 * FPS))
+        velocity = keep * own.velocity + (1 - keep) * velocity
+        position = own.position + velocity / FPS
+        own = dataclasses.replace(own, position=position, velocity=velocity)
+        return (own, memory), (position, velocity)
+
+    ticks = jnp.arange(round(seconds * FPS))
+    return map(np.asarray, jax.lax.scan(step, (start, memory), ticks)[1])
+
+
+def test_a_path_that_crosses_itself_is_walked_to_its_end():
+    turn = np.linspace(0, 2 * np.pi, 80)
+    points = 3.0 * np.stack([np.sin(2 * turn), 2 * np.sin(turn)], axis=1)
+    path = goals.Path(points=jnp.asarray(points, jnp.float32), speed=jnp.full(80, 1.4))
+    wish = lambda own, way, _: goals.pursue(path, own, way)  # noqa: E731
+    positions, velocities = walk(wish, walker(points[0]), 40.0)
+    fine = np.linspace(0, 79, 8000)
+    fine = np.stack([np.interp(fine, np.arange(80), x) for x in points.T], axis=1)
+    away = np.linalg.norm(positions[:, None] - fine[None], axis=-1)
+    assert away.min(axis=1).mean() < 0.05 and away.min(axis=1).max() < 0.2
+    # Forward all the way, once.
+    place = away.argmin(axis=1)[30:-60]
+    assert np.quantile(np.diff(place), 0.02) >= -2 and place[-1] > 7500
+    assert np.linalg.norm(positions[-1] - points[-1]) < 0.1
+    speed = np.linalg.norm(velocities, axis=1)
+    assert abs(np.median(speed[60:-120]) - 1.4) < 0.05 and speed[-1] < 0.05
+
+
+@pytest.mark.parametrize("seconds", [4.0, 6.0, 12.0])
+def test_a_place_is_reached_at_its_time(seconds):
+    place = goals.Place(
+        position=jnp.array([3.0, -4.0]),
+        facing=jnp.array([1.0, 0.0]),
+        seconds=jnp.float32(seconds),
+    )
+    wish = lambda own, memory, now: (goals.arrive(place, own, now)[0], memory)  # noqa: E731
+    positions, velocities = walk(wish, walker((0.0, 0.0)), seconds + 2.0)
+    away = np.linalg.norm(positions - np.array([3.0, -4.0]), axis=1)
+    first = np.argmax(away < 0.15) / FPS
+    assert abs(first - seconds) < 0.6 and away[-1] < 0.1
+    speed = np.linalg.norm(velocities, axis=1)
+    # Nobody creeps for twelve seconds: he waits, then walks.
+    assert speed.max() > 0.9 * goals.SLOWEST and speed.max() <= goals.FASTEST
+    end = walker(positions[-1], velocities[-1])
+    _, facing = goals.arrive(place, end, jnp.float32(seconds + 2.0))
+    np.testing.assert_allclose(facing, [1.0, 0.0], atol=1e-6)
+
+
+def test_who_cannot_come_in_time_runs():
+    place = goals.Place(
+        position=jnp.array([0.0, 30.0]),
+        facing=jnp.array([0.0, 1.0]),
+        seconds=jnp.float32(1.0),
+    )
+    velocity, _ = goals.arrive(place, walker((0.0, 0.0)), jnp.float32(0.0))
+    np.testing.assert_allclose(velocity, [0.0, goals.FASTEST], rtol=1e-3)
+
+
+def test_a_follower_keeps_his_distance():
+    def wish(own, memory, now):
+        leader = walker((0.0, 0.0))
+        where = jnp.stack([jnp.sin(0.3 * now) * 4.0, 1.2 * jnp.minimum(now, 10.0)])
+        pace = jnp.stack([jnp.cos(0.3 * now) * 1.2, 1.2 * (now < 10.0)])
+        leader = dataclasses.replace(leader, position=where, velocity=pace)
+        return goals.follow(leader, own, jnp.float32(1.5)), memory
+
+    positions, _ = walk(wish, walker((0.0, -4.0)), 10.0)
+    now = np.arange(300) / FPS
+    leader = np.stack([np.sin(0.3 * now) * 4.0, 1.2 * now], axis=1)
+    away = np.linalg.norm(positions - leader, axis=1)[150:]
+    assert np.abs(away - 1.5).max() < 0.45
+    still = goals.follow(walker((0.0, 1.5)), walker((0.0, 0.0)), jnp.float32(1.5))
+    np.testing.assert_array_equal(still, 0.0)
+
+
+@pytest.mark.parametrize("number", [2, 8])
+def test_walkers_who_change_places_do_not_touch(number):
+    turn = np.linspace(0, 2 * np.pi, number, endpoint=False)
+    start = 4.0 * np.stack([np.sin(turn), np.cos(turn)], axis=1)
+
+    def wish(own, memory, _):
+        gap = -jnp.asarray(start, jnp.float32) - own.position
+        far = jnp.linalg.norm(gap, axis=1, keepdims=True)
+        wanted = 1.3 * gap / jnp.maximum(far, 1.0)
+        return goals.avoid(wanted, own), memory
+
+    zero = np.zeros((number, 2))
+    positions, _ = walk(wish, walker(start, zero, -start / 4.0), 16.0)
+    gaps = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
+    gaps = gaps + 10.0 * np.eye(number)
+    assert gaps.min() > 1.6 * goals.RADIUS
+    assert np.linalg.norm(positions[-1] + start, axis=1).max() < 0.4
+
+
+def test_nobody_walks_through_a_circle():
+    circles = jnp.array([[0.1, 3.0, 0.8]])
+
+    def wish(own, memory, _):
+        gap = jnp.array([[0.0, 6.0]]) - own.position
+        far = jnp.linalg.norm(gap, axis=1, keepdims=True)
+        return goals.avoid(1.3 * gap / jnp.maximum(far, 1.0), own, circles), memory
+
+    start = walker([[0.0, 0.0]], [[0.0, 0.0]], [[0.0, 1.0]])
+    positions, _ = walk(wish, start, 10.0)
+    away = np.linalg.norm(positions[:, 0] - np.array([0.1, 3.0]), axis=1)
+    assert away.min() > 0.8 + 0.5 * goals.RADIUS
+    assert np.linalg.norm(positions[-1, 0] - np.array([0.0, 6.0])) < 0.2
+
+
+def test_alone_nobody_leaves_his_way():
+    wanted = jnp.array([[1.0, 0.5], [0.0, 0.0]])
+    far = walker([[0.0, 0.0], [50.0, 0.0]], np.zeros((2, 2)), [[0.0, 1.0]] * 2)
+    np.testing.assert_array_equal(goals.avoid(wanted, far), wanted)
+
+
+def test_small_differences_are_not_told():
+    make = lambda velocity, facing=(0.0, 1.0): Command(  # noqa: E731
+        velocity=jnp.array([velocity]),
+        facing=jnp.array([facing]),
+        label=jnp.zeros(1, jnp.int32),
+    )
+    told = make((0.0, 1.0))
+    same = functools.partial(goals.hold, told)
+    assert same(make((0.05, 1.05))).velocity.tolist() == [[0.0, 1.0]]
+    for other in (make((0.0, 1.3)), make((0.3, 1.0)), make((0.0, 0.0))):
+        found = same(other)
+        np.testing.assert_array_equal(found.velocity, other.velocity)
+    turned = make((0.0, 1.0), (1.0, 0.0))
+    np.testing.assert_array_equal(same(turned).facing, turned.facing)
+
+
+def test_numbers_of_goals_and_characters_agree():
+    model = jm.load("walker")
+    place = goals.Place(
+        position=jnp.zeros((3, 2)), facing=jnp.ones((3, 2)), seconds=jnp.ones(3)
+    )
+    with pytest.raises(ValueError, match="3 goals for 2 characters"):
+        goals.goal_rollouts(
+            model, jax.random.key(0), model.start(2), place, seconds=1.0
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["locomotion", "locomotion_fast", "dribble", "walker"])
+def test_shipped_models_reach_their_places(name):
+    """Also that a character's way does not depend on who walks elsewhere."""
+    model, far = jm.load(name), np.array([[2.0, 3.0], [-2.0, 2.0]])
+    place = goals.Place(
+        position=jnp.asarray(far, jnp.float32),
+        facing=jnp.array([[0.0, 1.0]] * 2),
+        seconds=jnp.array([5.0, 5.0]),
+    )
+    roll = functools.partial(goals.goal_rollouts, seconds=8.0)
+    frames = roll(model, jax.random.key(0), model.start(2), place)
+    end = np.asarray(frames.root_position[:, -1, ::2])
+    assert np.linalg.norm(end - far, axis=1).max() < 0.4
+    moved = roll(
+        model,
+        jax.random.key(0),
+        model.start(2),
+        dataclasses.replace(place, position=place.position + jnp.array([[5.0, 1.0]])),
+        places=jnp.array([[5.0, 1.0]] * 2),
+    )
+    shift = np.asarray(moved.root_position - frames.root_position)[..., ::2]
+    np.testing.assert_allclose(
+        shift, np.broadcast_to([5.0, 1.0], shift.shape), atol=0.02
+    )
