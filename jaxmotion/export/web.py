@@ -152,7 +152,11 @@ def write_character(
         "past": _arrays(names, ".past."),
         "weights": {"file": WEIGHTS, "parts": weights.parts},
     }
-    arrays = starts | packed.body_arrays(character.skeleton)
+    poses = None
+    if about["past"]:
+        poses = starts[about["past"]["rotation"]]
+        poses = poses.reshape(-1, *poses.shape[-2:])
+    arrays = starts | packed.body_arrays(character.skeleton, poses)
     say(_write(folder / WEIGHTS, weights.packed()))
     say(_write(folder / "character.bin", packed.pack(about, arrays)))
 

@@ -9,9 +9,11 @@ import json
 import struct
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.motion.anatomy import find_anatomy
+from jaxmotion.motion.skeleton import Skeleton, global_transforms
 from jaxmotion.viz import mannequin
 
 
@@ -36,8 +38,14 @@ def pack(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> bytes:
     return struct.pack("<I", len(text)) + text + bytes(data)
 
 
-def body_arrays(skeleton: Skeleton) -> dict[str, np.ndarray]:
+def body_arrays(
+    skeleton: Skeleton, poses: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """The skinned mesh of a skeleton, and under "crowd." a plainer one.
+
+    Args:
+      poses: Some rotations [frames, joints, 6] as `Motion` has them, which tell how
+        limbs are turned where the zero pose does not stand; see `mannequin.describe`.
 
     Returns:
       positions [V, 3] float32 in the bind pose, meters; normals [V, 4] int8 (127 is 1);
@@ -51,8 +59,14 @@ def body_arrays(skeleton: Skeleton) -> dict[str, np.ndarray]:
     count = len(skeleton.parents)
     if count > 256:
         raise ValueError(f"{count} joints, expected at most 256 for the page")
-    fine = mannequin.describe(skeleton)
-    crowd = _mesh(mannequin.describe(skeleton, detail="crowd"))
+    rotations = None
+    # A few standing poses say less than a zero pose that stands.
+    if poses is not None and not find_anatomy(skeleton).upright:
+        root = jnp.zeros((len(poses), 3))
+        turns = global_transforms(skeleton, root, jnp.asarray(poses))[1]
+        rotations = np.asarray(turns)
+    fine = mannequin.describe(skeleton, rotations=rotations)
+    crowd = _mesh(mannequin.describe(skeleton, rotations=rotations, detail="crowd"))
     inverse = fine.inverse_bind.reshape(count, 12).astype(np.float32)
     plainer = {f"crowd.{name}": values for name, values in crowd.items()}
     return _mesh(fine) | {"inverse": inverse} | plainer

@@ -300,10 +300,11 @@ class Page:
 
     def _pack(self, engine: int) -> None:
         """Makes the file of an engine's body, if it is not made yet."""
-        skeleton = self.session.skeleton
+        skeleton, poses = self.session.skeleton, self.session.poses
         if self._body[0] != engine:
             about = {"skeleton": packed.skeleton_json(skeleton)}
-            self._body = engine, packed.pack(about, packed.body_arrays(skeleton))
+            arrays = packed.body_arrays(skeleton, poses)
+            self._body = engine, packed.pack(about, arrays)
 
     async def _obey(self, client: "_Client", text: str | bytes) -> None:
         message, session = read_message(text), self.session

@@ -110,6 +110,8 @@ class Engine:
     ) -> None:
         """Compiles nothing yet."""
         self.character, self.num_steps, self.number = character, num_steps, number
+        # Rotations [characters, joints, 6] of the first tick; None until there was one.
+        self.poses: np.ndarray | None = None
         tuning = character.tuning
         patience = 0 if tuning is None else tuning.patience
         at_most = number if not patience else math.ceil(number / patience)
@@ -326,6 +328,11 @@ class Session:
         return None if self._engine is None else self._engine.character.skeleton
 
     @property
+    def poses(self) -> np.ndarray | None:
+        """Some rotations [characters, joints, 6] of whoever is drawn."""
+        return None if self._engine is None else self._engine.poses
+
+    @property
     def fps(self) -> float:
         """Ticks per second; 0 until a model is loaded."""
         return 0.0 if self._engine is None else self._engine.character.fps
@@ -499,6 +506,7 @@ class Session:
             made = Engine(character, num_steps=key[1], number=key[2], show_plan=key[3])
             crowd = made.start(0, self._seed)
             done = made.step(crowd, Wish(), settings, seed=0, n=0)
+            made.poses = np.asarray(done[1][1])
             made.step(done[0], Wish(), settings, seed=0, n=1)
             self._programs[key] = made
             while len(self._programs) > _KEPT_PROGRAMS:

@@ -13,7 +13,7 @@ import pytest
 from jaxmotion.control import steering
 from jaxmotion.control.steering import Inputs, Wish
 from jaxmotion.data import bvh as bvh_motion
-from jaxmotion.data import bvh_text
+from jaxmotion.data import bvh_text, walker
 from jaxmotion.export import slim
 from jaxmotion.motion.skeleton import global_transforms, joint_positions
 from jaxmotion.viz import packed, page, viewer
@@ -216,3 +216,10 @@ def test_half_precision_constants_are_widened():
     calls = ({"bytes": given["base64"]}, weights.parts)
     (found,) = run("player.js", "widen", calls)
     assert base64.b64decode(found["base64"]) == weights.content()
+
+
+def test_a_zero_pose_that_stands_needs_no_poses():
+    skeleton = walker.walker_skeleton()
+    poses = np.tile(np.array([1.0, 0, 0, 0, 1, 0], np.float32), (2, 22, 1))
+    found = packed.body_arrays(skeleton, poses)["inverse"]
+    np.testing.assert_array_equal(found, packed.body_arrays(skeleton)["inverse"])
