@@ -255,6 +255,18 @@ def test_settings_and_a_link_that_holds_them(browser, address):
         tab.wait_for_function("shown.roots[14] > 2", timeout=PATIENCE)
 
 
+def test_where_one_model_does_not_load_another_one_does(browser, address):
+    with opened(browser, address) as tab:
+        tab.select_option("#model", "broken")
+        tab.wait_for_selector("#note.bad", state="visible", timeout=PATIENCE)
+        assert "broken/advance.onnx.gz is damaged" in tab.inner_text("#note")
+        tab.select_option("#model", "strider")
+        tab.wait_for_selector("#note", state="hidden", timeout=PATIENCE)
+        tab.keyboard.down("w")
+        walks(tab, (0, 1))
+        tab.wait_for_function("location.hash.includes('model=strider')")
+
+
 def test_the_last_seconds_are_saved_as_they_were_shown(browser, address, tmp_path):
     with opened(browser, address) as tab:
         tab.keyboard.down("d")

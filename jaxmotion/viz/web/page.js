@@ -51,7 +51,7 @@ function mix(from, to, part) {
 
 export function start(source) {
   const view = $("view"), camera = new Camera(), hash = readHash(location.hash);
-  let body = null, number = 0, told = "", trail = [];
+  let body = null, number = 0, told = "", trail = [], remembering = 0;
   let frame = null;  // shown: from, to, when it was due
   const due = [], history = [], arrivals = [], kept = [];
   const spent = window.spent = [];
@@ -108,7 +108,9 @@ export function start(source) {
           && (x !== "model" || state.models.includes(hash[x])));
         for (const x of first) say({ set: { [x]: hash[x] } });
       }
-      panel.show(state); remember(); news();
+      panel.show(state); news();
+      // Browsers refuse an address that changes too often, as with a slider.
+      clearTimeout(remembering); remembering = setTimeout(remember, 400);
     },
     body(buffer, engine) {
       body = unpack(buffer); number = engine;
@@ -284,6 +286,7 @@ export function start(source) {
       window.history.replaceState(null, "", `#${text}`);
   }
   async function copyLink() {
+    remember();
     const { azimuth, elevation, distance } = camera;
     const view = [azimuth, elevation, distance].map(x => x.toFixed(2));
     const text = `${location.href.split("&az=")[0]}&az=${view[0]}&el=${view[1]}&far=${view[2]}`;
