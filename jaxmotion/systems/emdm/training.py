@@ -35,6 +35,8 @@ ROWS: dict[str, dict[str, Any]] = {
     "recon_1": dict(weight_recon=1.0, **_FLAT),
     "recon_10": dict(weight_recon=10.0, **_FLAT),
     "recon_100": dict(weight_recon=100.0, **_FLAT),
+    "recon_1000": dict(weight_recon=1000.0, **_FLAT),
+    "no_condition": dict(discriminator_condition=False),
     "no_r1": dict(weight_r1=0.0),
     "no_gan": dict(weight_adversarial=0.0),
 }
