@@ -392,9 +392,9 @@ def save_gif(
         for frame in frames
     ]
     times = _durations(len(images), every / stage.fps)
-    images[0].save(
-        path, save_all=True, append_images=images[1:], duration=times, loop=0
-    )
+    # Unchanged pixels as they are: as holes, which is the default, they take more bytes.
+    options = dict(save_all=True, duration=times, loop=0, optimize=False)
+    images[0].save(path, append_images=images[1:], **options)
 
 
 def _on_ground(paths: np.ndarray) -> np.ndarray:
