@@ -23,6 +23,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import report
 import tqdm
@@ -127,8 +128,7 @@ def needed(args: Config, sources: list[Source]) -> int:
     return min(there + ("not decided" in made), args.most)
 
 
-@dataclasses.dataclass
-class Running:
+class Running(NamedTuple):
     """A training that this queue started.
 
     Attributes:

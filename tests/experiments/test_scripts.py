@@ -20,6 +20,7 @@ WRONG = {
     "emdm": ("evaluate --run {gone}", "gone"),
     "evaluator": ("show {gone}", "gone"),
     "export": ("--model locomotion --format fbx --out {out}", "onnx, stablehlo"),
+    "next_frame": ("--run {gone} --out {out}", "gone"),
     "prepare_data": ("lafan1 --manual-dir {gone} --out {out}.npz", "gone"),
     "quickstart": ("--out {file}/below", "file/below"),
     "report": ("--runs {gone}", "gone"),
@@ -27,6 +28,7 @@ WRONG = {
     "steer": ("--run {gone} --port 0 --no-open", "gone"),
     "smgdiff": ("evaluate --run {gone}", "gone"),
     "squ9": ("--out {file}/below", "file/below"),
+    "train_queue": ("--runs {file}/below --only aamdm", "file/below"),
     "step_sweep": ("--system mdm --out {out}", "system: unknown"),
 }
 SCRIPTS = sorted(path.stem for path in FOLDER.glob("*.py"))
