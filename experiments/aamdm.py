@@ -58,7 +58,7 @@ class Train:
       weight_foot: Weight of the errors of slow toes' velocities over the ground beside
         them (paper: 0).
       gan_window: Frames of the windows of the GANs (paper: 10).
-      levels: Steps that each network learns: its own, or all.
+      levels: Steps that each network learns: all, or its own.
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data.
       distributed: One of several processes: "auto", or address, number, index.
@@ -87,8 +87,8 @@ class Train:
     polisher_batch: int = 128
     weight_pose: float = 1.0
     weight_foot: float = 5.0
-    gan_window: int = 10
-    levels: Literal["own", "all"] = "own"
+    gan_window: int = 3
+    levels: Literal["all", "own"] = "all"
     previous_noise: float = 0.5
     distributed: cli.Distributed = ()
     seed: int = 0

@@ -66,8 +66,8 @@ class Sizes:
     window: int = 4
     weight_pose: float = 1.0
     weight_foot: float = 5.0
-    gan_window: int = 10
-    levels: Literal["all", "own"] = "own"
+    gan_window: int = 3
+    levels: Literal["all", "own"] = "all"
     previous_noise: float = 0.5
 
 

@@ -17,9 +17,10 @@ Training, in `experiments/aamdm.py`:
 * 20,000 updates of AdamW (autoencoder), 5,000 of Muon (polisher) and 8,000 of RAdam at
   2e-4 (both players of the GAN), with averaged parameters; published: above.
 * 256 channels, a cosine schedule, a latent of 64.
-* `levels="own"`: each network learns the steps that the chain asks it for; published,
-  as far as one can tell, all.
-* windows of four for the polisher, in batches of 128; published: ten, 64.
+* windows of four for the polisher, in batches of 128, and of three for the GAN;
+  published: ten, 64.
+* `Config(levels="own")` is an option: each network learns the steps that the chain asks
+  it for; published, as far as one can tell, all.
 * noise on the given previous frames (`previous_noise=0.5`), so that a rollout comes
   back after leaving the data; published: none.
 * half of the GAN's previous frames are the generator's own (`own_previous`), with an R1
