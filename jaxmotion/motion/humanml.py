@@ -206,6 +206,17 @@ def _delayed(steps: Array) -> Array:
     return jnp.concatenate([0.0 * steps[..., :1, :], steps[..., :-1, :]], axis=-2)
 
 
+def _added(a: Array, b: Array) -> Array:
+    """Half of a yaw and half of another, within a quarter turn of 0.
+
+    A sum over minutes of turning would lose the digits that the path needs.
+    """
+    total = a + b
+    turns = jnp.round(total / jnp.pi)
+    # Pi in two parts, of which the first times a few turns is exact.
+    return total - turns * 3.140625 - turns * (jnp.pi - 3.140625)
+
+
 @jax.jit
 def joints_from_features(
     features: Float[Array, "*batch frames features"], layout: Layout
@@ -228,7 +239,9 @@ def joints_from_features(
     Source: Guo et al. 2022 (HumanML3D), released code.
     """
     parts = unpack(layout.channels, features)
-    half = jnp.cumsum(_delayed(parts["root_yaw_velocity"]), axis=-2)
+    half = jax.lax.associative_scan(
+        _added, _delayed(parts["root_yaw_velocity"]), axis=features.ndim - 2
+    )
     facing = jnp.concatenate([-jnp.sin(2.0 * half), jnp.cos(2.0 * half)], axis=-1)
     # A velocity is in the axes of the frame that it leads to.
     step = ground.out_of_frame(_delayed(parts["root_velocity"]), facing)
