@@ -210,7 +210,7 @@ BAD = [
     ("rollout --run {empty}", "{empty}"),
     ("rollout --run {run} --row amdm6", "unknown row 'amdm6'"),
     ("rollout --run {run} --row mvae", "full_pose.*no checkpoint"),
-    ("rollout --run {run} --row polish1_draft3", "P1_D3.*no checkpoint"),
+    ("rollout --run {run} --row polish1_draft3", "T4.*no checkpoint"),
     ("rollout --run {run} --seconds 0", "--seconds is 0.0, expected"),
 ]
 

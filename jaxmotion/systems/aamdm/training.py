@@ -498,7 +498,7 @@ def load_networks(
         for x in chains
         if checkpoint.latest_step(run.record.checkpoints(f"{x}/{network}")) is not None
     )
-    chain = next(there, chains[0])
+    chain = next(there, chains[-1])
     stage = f"{chain}/{network}"
     config = runs.stage_config(run.record, stage, aamdm_model.Config, **own)
     if config.features != space.num_features:

@@ -124,8 +124,9 @@ def test_rows_are_changes_of_the_base():
         "ddim_10": dict(num_steps=1000, **mdm),
         "no_r1": dict(weight_r1=0.0),
         "no_gan": dict(weight_adversarial=0.0),
+        "no_condition": dict(discriminator_condition=False),
     }
-    for weight in (0, 1, 10, 100):
+    for weight in (0, 1, 10, 100, 1000):
         expected[f"recon_{weight}"] = dict(weight_recon=float(weight), **flat)
     assert set(expected) == {*emdm_training.ROWS, *emdm_training.SAMPLERS}
     for row, changes in expected.items():
