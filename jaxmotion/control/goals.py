@@ -240,15 +240,17 @@ def avoid(
     """
     number = len(wanted)
     turns = jnp.linspace(-jnp.pi, jnp.pi, _ANGLES, endpoint=False)
-    base = jnp.maximum(_length(wanted), SLOWEST)[:, None] * ground.unit(
-        wanted, walkers.facing
+    speed = jnp.maximum(_length(wanted), SLOWEST)[:, None, None]
+    base = speed * ground.unit(wanted, walkers.facing)[:, None]
+    shape = (number, _ANGLES)
+    turned = ground.turn(
+        jnp.broadcast_to(base, (*shape, 2)), jnp.broadcast_to(turns, shape)
     )
-    moves = [
-        ground.turn(part * base, jnp.full(number, turn))
-        for turn in turns
-        for part in _PARTS
-    ]
-    choices = jnp.stack([wanted, jnp.zeros_like(wanted), *moves], axis=1)
+    parts = jnp.array(_PARTS).reshape(1, 1, -1, 1)
+    moves = (turned[:, :, None] * parts).reshape(number, -1, 2)
+    choices = jnp.concatenate(
+        [jnp.stack([wanted, 0.0 * wanted], axis=1), moves], axis=1
+    )
 
     def penalty(i: Array, choices: Array) -> Array:
         gap = walkers.position[i][None] - walkers.position  # from each other one
@@ -269,7 +271,6 @@ def avoid(
 
     costs = jax.vmap(penalty)(jnp.arange(number), choices)
     best = jnp.argmin(costs, axis=1)
-    # Who wants to stand stands, if nobody comes.
     return jnp.take_along_axis(choices, best[:, None, None], axis=1)[:, 0]
 
 
