@@ -421,6 +421,7 @@ def save(
     mixamo: bool = False,
     onto: str | Path | None = None,
     roles: Mapping[str, str] | str | Path | None = None,
+    robot: str | Path | None = None,
 ) -> None:
     """Writes motion in the format of the suffix.
 
@@ -436,14 +437,29 @@ def save(
       mixamo: Joints are named as Mixamo's characters have them.
       onto: A rig's file (see `read_skeleton`) whose skeleton the motion is brought
         onto; a .glb is then that rig, animated.
-      roles: Joints of some of its roles; see `retarget`.
+      roles: Joints of some of its roles, or bodies of the robot's; see `retarget`.
+      robot: MJCF or URDF of a humanoid that the motion is brought onto, 50 frames per
+        second; the .npz is then what mjlab's motion tracking reads (see
+        `retarget.robot_motion.RobotMotion.to_arrays`), with what the robot cannot do.
 
     Raises:
+      ModuleNotFoundError: for robots without the extra [robot].
       OSError: if the file cannot be written.
       ValueError: if the suffix is unknown, frames are not those of one character, or
         the skeleton has no arms and legs to be named.
     """
     path = Path(path)
+    if robot is not None:
+        if path.suffix.lower() != ".npz" or t_pose or mixamo or onto is not None:
+            raise ValueError(f"{path}: a robot's motion is an .npz, without `onto`")
+        from jaxmotion.retarget import robot as robots
+        from jaxmotion.retarget import robot_motion
+
+        read = robots.read_robot(robot, roles)
+        made = robot_motion.follow(read, skeleton, _one(frames))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        files.write_arrays(path, made.to_arrays())
+        return
     if path.suffix.lower() not in SAVERS:
         raise ValueError(
             f"{path}: unknown suffix {path.suffix!r}, expected one of "

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import io
+from collections.abc import Iterable
 from pathlib import Path
 
 import matplotlib
@@ -394,6 +395,34 @@ def save_gif(
     ]
     times = _durations(len(images), every / stage.fps)
     path.write_bytes(_encoded(images, times))
+
+
+def save_pictures(
+    path: str | Path, pictures: Iterable[np.ndarray], *, fps: float
+) -> None:
+    """Writes pictures [height, width, 3] of another renderer as an animated GIF.
+
+    Args:
+      fps: Pictures per second; a GIF's times are hundredths of a second.
+
+    Raises:
+      ValueError: if there are none.
+      OSError: if the file cannot be written.
+    """
+    path = drawing.check_writable(path)
+    images = [Image.fromarray(picture) for picture in pictures]
+    if not images:
+        raise ValueError(f"{path}: no pictures")
+    # One palette for all: colors that change from one picture to the next flicker.
+    some = images[:: max(len(images) // 8, 1)]
+    sheet = Image.new("RGB", (images[0].width, images[0].height * len(some)))
+    for number, image in enumerate(some):
+        sheet.paste(image, (0, number * image.height))
+    palette = sheet.quantize(128, Image.Quantize.MEDIANCUT)
+    images = [
+        image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
+    ]
+    path.write_bytes(_encoded(images, _durations(len(images), 1.0 / fps)))
 
 
 def _encoded(images: list[Image.Image], times: list[int]) -> bytes:

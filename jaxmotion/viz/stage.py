@@ -98,6 +98,7 @@ def make_stage(
     ball: Ball | None = None,
     sides: tuple[str, ...] | None = None,
     apart: float | None = None,
+    body: Mannequin | None = None,
 ) -> Stage:
     """A stage of one character or of many.
 
@@ -149,14 +150,14 @@ def make_stage(
     place = _places(motion, apart)
     motion = _moved(motion, place)
     positions, rotations = kinematics(skeleton, motion)
+    if body is None:
+        detail = "fine" if count < _CROWD else "crowd"
+        body = mannequin.describe(
+            skeleton, sides, rotations=rotations[0], detail=detail
+        )
     return Stage(
         skeleton=skeleton,
-        body=mannequin.describe(
-            skeleton,
-            sides,
-            rotations=rotations[0],
-            detail="fine" if count < _CROWD else "crowd",
-        ),
+        body=body,
         motion=motion,
         positions=positions,
         rotations=rotations,

@@ -75,6 +75,7 @@ DOORS = {
         "jaxmotion/evaluation/sequential.py",
         "jaxmotion/evaluation/statistics.py",
     ),
+    **dict.fromkeys(("mink", "mujoco"), ("jaxmotion/retarget/robot",)),
     "ufbx": ("jaxmotion/data/fbx.py",),
     "matplotlib": ("jaxmotion/viz/",),
     "PIL": ("jaxmotion/viz/",),
