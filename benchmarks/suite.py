@@ -231,7 +231,7 @@ def report(
       SystemExit: with status 1, if the gate finds something worse.
     """
     args.out.mkdir(parents=True, exist_ok=True)
-    here = environment()
+    here = environment() | {"git_commit": reporting.git_commit()}
     value = {
         "benchmark": name,
         "environment": here,

@@ -13,7 +13,6 @@ Examples:
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
@@ -67,18 +66,6 @@ class Stage:
     values: dict[str, np.ndarray]
 
 
-def seconds_of(rows: list[dict[str, Any]]) -> np.ndarray:
-    """Seconds of training at each row of losses.
-
-    The first row waits for the compiler: it counts as the median of the others does.
-    """
-    updates = np.diff([0, *(row["step"] for row in rows)])
-    each = 1 / np.array([row["steps_per_second"] for row in rows], np.float64)
-    if len(each) > 1:
-        each[0] = min(each[0], np.median(each[1:]))
-    return np.cumsum(updates * each)
-
-
 def read_stage(path: Path) -> Stage:
     """Reads a losses.jsonl.
 
@@ -98,7 +85,7 @@ def read_stage(path: Path) -> Stage:
                 raise ValueError(f"{path}: step {row['step']}: {name} is {found!r}")
     return Stage(
         updates=np.array([row["step"] for row in rows]),
-        seconds=seconds_of(rows),
+        seconds=loop.seconds_of(rows),
         values={name: np.array([row[name] for row in rows], float) for name in names},
     )
 

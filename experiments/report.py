@@ -4,18 +4,23 @@ Gathers what the `evaluate` commands (and step_sweep.py) left in run folders, an
 report.md, report.json and a picture of each table. What was not run is named with the
 command that would run it.
 
+With --keep it stores what one evaluation left behind in experiments/results instead, and
+with --write-docs it writes the tables, plots and figures of all pages from there.
+
 Examples:
   python experiments/report.py
   python experiments/report.py --runs runs --out runs/report
   python experiments/report.py --seeds 3 --out runs/report
   python experiments/report.py --elsewhere aamdm=runs/a0,runs/a1,runs/a2 --out runs/report
+  python experiments/report.py --keep runs/steering/metrics.json --name camdm/steering
+  python experiments/report.py --write-docs
 """  # noqa: E501
 
 import dataclasses
 from pathlib import Path
 
 import tyro
-from reports import markdown, results, writing
+from reports import markdown, pages, results, stored, writing
 from reports.claims import Source
 
 from jaxmotion import cli, reporting
@@ -34,12 +39,21 @@ class Config:
       elsewhere: Run folders that do not lie in `runs` under the names that
         experiments/papers gives them, as in smgdiff=runs/other; several, with commas
         between, are several trainings.
+      keep: Instead of a report: a metrics.json (or a sweep's table.json) to store.
+      name: What it is stored as, system/table; of a further training, with _seed1 and
+        so on at its end.
+      title: What the stored table answers; "" for that of the file it replaces.
+      write_docs: Instead of a report: write the pages' tables, plots and figures.
     """
 
     runs: Path = Path("runs")
     out: Path = Path("runs/report")
     seeds: int = 1
     elsewhere: tuple[str, ...] = ()
+    keep: Path | None = None
+    name: str = ""
+    title: str = ""
+    write_docs: bool = False
 
 
 def folders_of(args: Config) -> dict[Source, tuple[Path, ...]]:
@@ -107,9 +121,23 @@ def report(args: Config) -> None:
     print(f"wrote report.md, report.json and pictures to {args.out}")
 
 
+def keep_and_write(args: Config) -> None:
+    """Stores a result, writes the pages, or both; says what was written."""
+    if args.keep is not None:
+        made = stored.keep(stored.FOLDER, args.keep, args.name, args.title)
+        print(f"wrote {made}")
+    if args.write_docs:
+        for path in pages.write():
+            print(f"wrote {path}")
+
+
 def main() -> None:
-    """Parses the command line and writes the report."""
-    report(cli.check(tyro.cli(Config, description=__doc__)))
+    """Parses the command line and does what it says."""
+    args = cli.check(tyro.cli(Config, description=__doc__))
+    if args.keep is not None or args.write_docs:
+        keep_and_write(args)
+    else:
+        report(args)
 
 
 if __name__ == "__main__":

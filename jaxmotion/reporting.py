@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from jaxmotion import files
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.evaluation import bench, columns, table
-from jaxmotion.learning import checkpoint, runs
+from jaxmotion.learning import checkpoint, loop, runs
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.viz.stage import Ball, make_stage
@@ -226,8 +226,8 @@ def provenance(arguments: Any = None) -> dict[str, Any]:
 
     Returns:
       Versions, hardware, commit, command and date, and the "arguments", as a JSON
-      object; where these name a run folder, also its "seeds", its "data" and the
-      "training" of its stages.
+      object; where these name a run folder, also its "seeds", its "data", the
+      "training" of its stages, and its "minutes", without compiling.
     """
     given = {} if arguments is None else {"arguments": arguments_json(arguments)}
     if (run := getattr(arguments, "run", None)) is not None and run.is_dir():
@@ -258,7 +258,19 @@ def _training(folder: Path) -> dict[str, Any]:
         "seeds": {"training": sorted(seeds)},
         "data": config.get("files"),
         "training": settings,
+        "minutes": _minutes(folder),
     }
+
+
+def _minutes(folder: Path) -> dict[str, float]:
+    """Minutes of training of a run's stages; without those whose losses are damaged."""
+    found = {}
+    for path in sorted(folder.glob("**/losses.jsonl")):
+        with contextlib.suppress(ValueError, KeyError, TypeError, IndexError):
+            seconds = loop.seconds_of(loop.read_losses(path))
+            stage = path.parent.relative_to(folder).as_posix()
+            found[stage] = round(float(seconds[-1]) / 60, 1)
+    return found
 
 
 def arguments_json(arguments: Any) -> dict[str, Any]:

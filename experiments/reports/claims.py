@@ -25,11 +25,13 @@ class Source:
       run: Name of the run folder, and of the option that moves it.
       file: Path below that folder.
       commands: "{run}" stands for the folder.
+      name: In its file of experiments/papers, and of its file in experiments/results.
     """
 
     run: str
     file: str
     commands: tuple[str, ...]
+    name: str = ""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -230,7 +232,7 @@ def read_paper(system: registry.System) -> Paper:
     whole = tomllib.loads(path.read_text())
     try:
         sources = {
-            name: Source(**value | {"commands": tuple(value["commands"])})
+            name: Source(name=name, **value | {"commands": tuple(value["commands"])})
             for name, value in whole.pop("source").items()
         }
         known = {k: _column(value) for k, value in whole.pop("column").items()}

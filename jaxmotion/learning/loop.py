@@ -161,6 +161,18 @@ def read_losses(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def seconds_of(rows: list[dict[str, Any]]) -> np.ndarray:
+    """Seconds of training at each row of losses.
+
+    The first row waits for the compiler: it counts as the median of the others does.
+    """
+    updates = np.diff([0, *(row["step"] for row in rows)])
+    each = 1 / np.array([row["steps_per_second"] for row in rows], np.float64)
+    if len(each) > 1:
+        each[0] = min(each[0], np.median(each[1:]))
+    return np.cumsum(updates * each)
+
+
 def _forget_lost_steps(path: Path, done: int) -> None:
     """Drops rows after the checkpoint that a run goes on from, and a torn last row."""
     if not path.exists():

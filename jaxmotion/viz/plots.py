@@ -5,9 +5,12 @@ a notebook changed.
 """
 
 import dataclasses
+import io
 import math
+import re
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
@@ -141,6 +144,53 @@ def write_dots(
         if place % across == 0:
             axes[0].set_yticks(range(len(methods)), methods, fontsize=8)
     canvas.savefig(path)
+
+
+def dots_svg(
+    rows: dict[str, Float[np.ndarray, "_ 3"]],
+    *,
+    references: tuple[str, ...] = (),
+    title: str,
+    xlabel: str,
+    logarithmic: bool = False,
+    description: str = "",
+) -> str:
+    """Draws values with intervals, one line per row, as SVG that equal values repeat.
+
+    Args:
+      rows: Value, lower and upper end by row, one per training.
+      references: Rows of data, with a dashed line through their first value.
+      title: Above the picture.
+      xlabel: Below it.
+      logarithmic: Axis of the values.
+      description: In the file's metadata.
+    """
+    with matplotlib.rc_context({"svg.hashsalt": "jaxmotion", "svg.fonttype": "path"}):
+        canvas = Figure(figsize=(7.2, 0.9 + 0.32 * len(rows)), layout="constrained")
+        axes = canvas.subplots()
+        for line, (name, values) in enumerate(rows.items()):
+            color = figure.COMMANDED if name in references else figure.LEFT
+            apart = np.linspace(-0.16, 0.16, len(values)) * (len(values) > 1)
+            for (value, low, high), off in zip(values, apart, strict=True):
+                axes.errorbar(
+                    value, line + off, xerr=[[value - low], [high - value]], fmt="o",
+                    markersize=5, color=color, capsize=3, lw=1.4,
+                )  # fmt: skip
+            if name in references and len(values):
+                axes.axvline(values[0, 0], color=color, lw=1, ls="--", alpha=0.6)
+        axes.set_yticks(range(len(rows)), list(rows), fontsize=9)
+        axes.set_ylim(len(rows) - 0.5, -0.5)
+        axes.set_xlabel(xlabel, fontsize=9, parse_math=False)
+        axes.set_title(title, fontsize=10, parse_math=False)
+        axes.tick_params(axis="x", labelsize=8)
+        if logarithmic:
+            axes.set_xscale("log")
+        axes.grid(alpha=0.3, axis="x")
+        axes.spines[["top", "right", "left"]].set_visible(False)
+        text = io.StringIO()
+        about = {"Date": None, "Creator": None, "Description": description}
+        canvas.savefig(text, format="svg", metadata=about)
+    return re.sub(r"[ \t]+\n", "\n", text.getvalue())
 
 
 def pareto_front(

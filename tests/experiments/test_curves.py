@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jaxmotion.learning import loop
+
 RATES = [2.0, 10.0, 20.0, 10.0, 5.0]
 
 
@@ -38,11 +40,11 @@ def put(folder, stages, rows=None, system="emdm", rates=RATES, **about):
     return folder
 
 
-def test_seconds_add_up_without_the_compiling(load):
+def test_seconds_add_up_without_the_compiling():
     rows = [dict(step=50 * i, steps_per_second=r) for i, r in enumerate(RATES, 1)]
     # 50 updates each at 10 (the median of the others), 10, 20, 10 and 5 per second.
     expected = np.cumsum([5.0, 5.0, 2.5, 5.0, 10.0])
-    seconds_of = load("curves").seconds_of
+    seconds_of = loop.seconds_of
     np.testing.assert_allclose(seconds_of(rows), expected)
     np.testing.assert_allclose(seconds_of(rows[:1]), [25.0])
     # A fast first row stays as it is.

@@ -50,7 +50,7 @@ from jaxmotion.typing import Exported, Key, Objective, Params
 # Strength of the guidance, epsilon of eq. 13; ours.
 SCALE = 3.0
 # How many steps at the chain's end are guided; ours. The paper guides all: what earlier
-# ones add is denoised away (experiments/README.md), and each costs a gradient.
+# ones add is denoised away (experiments/results/findings.md), at a gradient each.
 GUIDED_STEPS = 1
 
 

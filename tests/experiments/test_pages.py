@@ -1,0 +1,311 @@
+"""experiments/reports: stored results, and pages that are what these make of them."""
+
+import json
+import math
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.stats
+
+ROOT = Path(__file__).parents[2]
+SYSTEMS = ("camdm", "aamdm", "emdm", "smgdiff")
+
+
+@pytest.fixture(scope="module")
+def pages(load):
+    return load("reports.pages")
+
+
+@pytest.fixture(scope="module")
+def stored(load):
+    return load("reports.stored")
+
+
+@pytest.fixture
+def checkout(tmp_path, pages):
+    """A copy of what pages are made from, and of the pages."""
+    shutil.copytree(ROOT / "experiments/results", tmp_path / "experiments/results")
+    for page in pages.pages():
+        place = tmp_path / page.relative_to(ROOT)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(page, place)
+    return tmp_path
+
+
+def metrics(path, rows, **about):
+    made = dict(command="python a.py --run /home/me/runs/a", git_commit="abc")
+    cells = {
+        row: {k: dict(value=v, low=None, high=None, samples=3) for k, v in x.items()}
+        for row, x in rows.items()
+    }
+    path.write_text(json.dumps(made | about | {"rows": cells}))
+    return path
+
+
+# --- what is committed --------------------------------------------------------------
+
+
+def test_pages_equal_what_their_results_make_of_them(pages):
+    """Else: python experiments/report.py --write-docs."""
+    assert pages.stale() == []
+
+
+def test_a_changed_digit_is_noticed_wherever_it_is(pages, checkout):
+    assert pages.stale(checkout) == []
+    path = checkout / "experiments/results/camdm/camdm.json"
+    text = path.read_text()
+    changed = text.replace('"value": 0.191', '"value": 0.192', 1)
+    assert changed != text
+    path.write_text(changed)
+    stale = {x.relative_to(checkout).as_posix() for x in pages.stale(checkout)}
+    assert stale == {"README.md", "experiments/results/camdm.md"}
+    # A plot's, too.
+    path.write_text(text)
+    path = checkout / "experiments/results/aamdm/shipped.json"
+    text = path.read_text()
+    path.write_text(text.replace('"value": 22.5', '"value": 22.4', 1))
+    stale = {x.name for x in pages.stale(checkout)}
+    assert stale == {"aamdm.md", "locomotion_fast.md", "shipped.svg"}
+
+
+def test_writing_is_idempotent_and_mends_what_was_edited(pages, checkout):
+    page = checkout / "experiments/results/emdm.md"
+    text = page.read_text()
+    page.write_text(text.replace("0.191", "0.091"))
+    (checkout / "experiments/results/emdm/actions_bandai.svg").unlink()
+    assert {x.name for x in pages.write(checkout)} == {"emdm.md", "actions_bandai.svg"}
+    assert page.read_text() == text
+    assert pages.write(checkout) == []
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_a_systems_page_is_short_and_begins_with_data(system):
+    text = (ROOT / f"experiments/results/{system}.md").read_text()
+    assert len(text.splitlines()) <= 150
+    first = re.search(r"\n\|[-|]+\|\n\| (.*?) \|", text)[1]
+    assert re.search("takes|clips|data", first), first
+    assert "What falls short" in text and ".svg)" in text
+
+
+def test_the_experiments_page_is_short():
+    text = (ROOT / "experiments/README.md").read_text()
+    assert len(text.splitlines()) <= 200
+
+
+def test_every_stored_result_is_whole_and_shown(pages, stored):
+    shown = "".join(page.read_text() for page in pages.pages())
+    shown += (ROOT / "experiments/results/headline.toml").read_text()
+    folder = ROOT / "experiments/results"
+    for path in sorted(folder.glob("*/*.json")):
+        name = path.relative_to(folder).with_suffix("").as_posix()
+        table = stored.read(folder, re.sub(r"_seed\d+$", "", name))
+        assert table.measured.rows
+        # A path of somebody's machine would be one.
+        assert not re.search(r'[" ]/(home|root|srv|tmp|Users)/', path.read_text()), path
+        claimed = name.partition("/")[0] in SYSTEMS
+        assert re.sub(r"_seed\d+$", "", name) in shown or claimed, name
+
+
+# --- storing ------------------------------------------------------------------------
+
+
+def test_what_is_kept_of_an_evaluation(stored, tmp_path):
+    source = metrics(
+        tmp_path / "metrics.json",
+        {"rollouts": {"foot_slide": 0.123456789, "mine": 2}},
+        jax="0.10",
+        long={"not": "needed"},
+        arguments={"run": "/home/me/runs/a", "seed": 3},
+        seeds={"training": [3]},
+    )
+    path = stored.keep(tmp_path, source, "camdm/it", "A title")
+    made = json.loads(path.read_text())
+    assert path == tmp_path / "camdm/it.json"
+    assert made["title"] == "A title" and made["arguments"] == {"seed": 3}
+    assert made["measured"] == {
+        "command": "python a.py --run runs/a",
+        "git_commit": "abc",
+        "jax": "0.10",
+    }
+    assert made["columns"]["foot_slide"] == {
+        "title": "foot slide",
+        "unit": "m/s",
+        "better": "lower",
+    }
+    assert made["columns"]["mine"] == {"title": "mine", "better": ""}
+    cell = made["rows"]["rollouts"]["foot_slide"]
+    assert cell == {"value": 0.123457, "samples": 3}
+    # Again, with other numbers: the title and what people wrote stay.
+    path.write_text(
+        stored.to_text(made | {"names": {"rollouts": "walks"}, "interval": "none"})
+    )
+    metrics(source, {"rollouts": {"foot_slide": 0.2}})
+    again = json.loads(stored.keep(tmp_path, source, "camdm/it", "").read_text())
+    assert again["title"] == "A title" and again["names"] == {"rollouts": "walks"}
+    assert again["interval"] == "none" and list(again["columns"]) == ["foot_slide"]
+
+
+def test_what_is_kept_of_a_benchmark(stored, tmp_path):
+    made = dict(command="python b.py", git_commit="abc", cpu="a processor")
+    names = {"emdm batch=1 p50": 2.0, "emdm batch=1 frames": 9.0}
+    metrics_ = [dict(name=k, value=v, unit="", direction="") for k, v in names.items()]
+    report = dict(benchmark="b", environment=made, metrics=metrics_, settings={})
+    source = tmp_path / "b.json"
+    source.write_text(json.dumps(report))
+    stored.keep(tmp_path, source, "timings/b", "A benchmark")
+    found = stored.read(tmp_path, "timings/b")
+    assert [x.value for x in found.cells("emdm batch=1", "p50")] == [2.0]
+    assert found.columns["frames"].title == "frames per second"
+    assert found.columns["p50"].kind == "time"
+
+
+@pytest.mark.parametrize(
+    ("name", "title", "about", "message"),
+    [
+        ("camdm", "t", {}, "name: 'camdm', expected system/table"),
+        ("a/../b", "t", {}, "expected system/table"),
+        ("camdm/it", "", {}, "title: expected one"),
+        ("camdm/it", "t", {"git_commit": None}, "git_commit missing"),
+    ],
+)
+def test_what_cannot_be_kept_is_named(stored, tmp_path, name, title, about, message):
+    source = metrics(tmp_path / "metrics.json", {"a": {"fid": 1.0}}, **about)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        stored.keep(tmp_path, source, name, title)
+    assert not list(tmp_path.glob("*/*.json"))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"transcribed": None, "measured": None}, "neither"),
+        ({"measured": {"command": "c", "git_commit": "a"}}, "measured and transcribed"),
+        ({"columns": {}}, "columns lack fid"),
+        ({"title": None}, "'title' is missing"),
+        ({"names": {"b": "B"}}, "names of no row: b"),
+        ({"surprise": 1}, "unknown fields surprise"),
+        ({"columns": {"fid": {"titel": "FID"}}}, "columns"),
+    ],
+)
+def test_a_damaged_file_is_named(stored, tmp_path, change, message):
+    whole = {
+        "title": "t",
+        "transcribed": "a text",
+        "columns": {"fid": {"title": "FID"}},
+        "rows": {"a": {"fid": {"value": 1.0, "samples": 1}}},
+    } | change
+    whole = {k: v for k, v in whole.items() if v is not None}
+    path = tmp_path / "camdm/it.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps(whole))
+    with pytest.raises(ValueError, match=f"it.json: .*{message}"):
+        stored.read(tmp_path, "camdm/it")
+
+
+# --- pages --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def store(pages, stored, tmp_path):
+    """One table of three trainings, and one of counts."""
+
+    def put(name, rows, **columns):
+        path = tmp_path / f"{name}.json"
+        path.parent.mkdir(exist_ok=True)
+        whole = dict(title="t", transcribed="x", columns=columns, rows=rows)
+        path.write_text(stored.to_text(whole))
+
+    fid = {"title": "FID", "better": "lower"}
+    for end, value in (("", 1.0), ("_seed1", 2.0), ("_seed10", 4.0)):
+        cell = {"value": value, "samples": 5}
+        same = {"value": 0.5, "low": 0.25, "high": 0.75, "samples": 5}
+        put(f"emdm/three{end}", {"a": {"fid": cell}, "data": {"fid": same}}, fid=fid)
+    lost = {"title": "lost", "kind": "count", "better": "lower"}
+    put("emdm/count", {"a": {"lost": {"value": 3.0, "samples": 16}}}, lost=lost)
+    return pages.Store(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("reference", "text"),
+    [
+        ("emdm/three | a | fid", "1 / 2 / 4"),
+        ("emdm/three | data | fid", "0.5"),
+        ("emdm/three | data | fid | interval", "0.5 [0.25, 0.75]"),
+        ("emdm/count | a | lost", "3 of 16"),
+    ],
+)
+def test_a_figure_in_a_sentence(pages, store, tmp_path, reference, text):
+    page = tmp_path / "page.md"
+    found = pages.written(page, f"It is <!-- = {reference} -->?<!-- / --> here.", store)
+    assert found == f"It is <!-- = {reference} -->{text}<!-- / --> here."
+
+
+@pytest.mark.parametrize(
+    ("marker", "message"),
+    [
+        (
+            "<!-- = emdm/three | b | fid -->x<!-- / -->",
+            "no row 'b', expected",
+        ),
+        ("<!-- = emdm/three | a | jerk -->x<!-- / -->", "no column 'jerk'"),
+        ("<!-- = emdm/three | a -->x<!-- / -->", "expected table | row | column"),
+        ("<!-- table emdm/none -->\n<!-- end -->", "none.json"),
+        ("<!-- table emdm/three\nrows = [-->\n<!-- end -->", "table emdm/three"),
+    ],
+)
+def test_a_wrong_marker_is_named_with_its_page(pages, store, tmp_path, marker, message):
+    with pytest.raises(ValueError, match=rf"page.md: .*{re.escape(message)}"):
+        pages.written(tmp_path / "page.md", marker, store)
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "text"),
+    [
+        (0.0873, 0.0869, 0.0881, "0.0873 [0.0869, 0.0881]"),
+        (0.002, 0.001, 0.003, "0.002 [0.001, 0.003]"),
+        (5.0, 4.9, 5.1, "5 [4.9, 5.1]"),
+        (1410.0, 1270.0, 1550.0, "1,410 [1,270, 1,550]"),
+        (math.nan, None, None, "–"),
+    ],
+)
+def test_digits_follow_the_interval(load, pages, value, low, high, text):
+    columns, table = (
+        load("jaxmotion.evaluation.columns"),
+        load("jaxmotion.evaluation.table"),
+    )
+    cell = table.Cell(value=value, low=low, high=high)
+    assert pages.text_of([cell], columns.COLUMNS["fid"]) == text
+
+
+def test_claims_are_decided_from_stored_trainings(pages, checkout):
+    """The mean over trainings and its interval, by SciPy, and the verdict's word."""
+    folder = checkout / "experiments/results"
+    values = [
+        json.loads((folder / f"emdm/emdm_action{end}.json").read_text())["rows"]["emdm"]
+        for end in ("", "_seed1", "_seed2")
+    ]
+    values = np.array([x["fid"]["value"] for x in values])
+    low, high = scipy.stats.t.interval(0.95, 2, values.mean(), scipy.stats.sem(values))
+    text = (folder / "claims.md").read_text()
+    assert f"EMDM (Ours) {values.mean():.3g} [{low:.2f}, {high:.2f}]" in text
+    count = int(re.search(r"(\d+) claims: ", text)[1])
+    rows = re.findall(
+        r"\| (reproduced|not reproduced|not decided|not run)[^|]*\|\n", text
+    )
+    assert len(rows) == count > 60
+
+
+def test_the_command_stores_and_writes(load, checkout, monkeypatch, capsys):
+    report, pages_ = load("report"), load("reports.pages")
+    folder = checkout / "experiments/results"
+    monkeypatch.setattr(report.stored, "FOLDER", folder)
+    monkeypatch.setattr(pages_.write, "__defaults__", (checkout,))
+    source = metrics(checkout / "metrics.json", {"walker": {"foot_slide": 0.5}})
+    words = f"--keep {source} --name camdm/new --title New --write-docs"
+    monkeypatch.setattr(sys, "argv", ["report.py", *words.split()])
+    report.main()
+    assert capsys.readouterr().out == f"wrote {folder / 'camdm/new.json'}\n"
