@@ -67,9 +67,15 @@ def test_a_run_folder_says_what_was_trained_on_what(tmp_path):
     # Neither a stage that is made without training nor one that has just begun.
     checkpoint.save(tmp_path / "space" / "checkpoints", 0, {"x": np.ones(2)}, {})
     (tmp_path / "begun" / "checkpoints").mkdir(parents=True)
+    # 120 updates at 1 per second; a damaged file of losses costs no evaluation.
+    rows = [{"step": 60 * i, "steps_per_second": 1.0} for i in (1, 2)]
+    text = "".join(f"{json.dumps(row)}\n" for row in rows)
+    (tmp_path / "motion" / "losses.jsonl").write_text(text)
+    (tmp_path / "other" / "losses.jsonl").write_text("[]\n")
     found = json.loads(json.dumps(reporting.provenance(Arguments(tmp_path))))
     assert found["seeds"] == {"training": [3, 5]}
     assert found["training"] == dict.fromkeys(
         ("motion", "deep/er", "other"), {"steps": 9}
     )
     assert found["data"] == {"train.npz": "f00d"}
+    assert found["minutes"] == {"motion": 2.0}
