@@ -95,6 +95,8 @@ class Robot:
       axes: Its left, up and ahead in MuJoCo's world in the zero pose, as columns.
       speeds: Largest of each joint that the file states, rad/s or m/s; else infinite.
       used: [joints, 2] what of its limits is used: knees bend, if ever so little.
+      apart: Pairs of geometries that the limits keep apart: of forearms and hands, and
+        of trunk and legs.
       costs: [nv] of angles that are not the zero pose's: wrists are left as they are.
     """
 
@@ -109,6 +111,7 @@ class Robot:
     axes: np.ndarray
     speeds: np.ndarray
     used: np.ndarray
+    apart: list[tuple[list[int], list[int]]]
     costs: np.ndarray
 
     @property
@@ -140,6 +143,10 @@ def load(path: Path) -> Any:
     """MuJoCo's editable model of a file; a URDF gets the free joint that it lacks."""
     mujoco, _ = packages()
     text = files.read_bytes(path)
+    try:
+        text.decode()
+    except UnicodeDecodeError:
+        raise ValueError(f"{path}: no MJCF or URDF: not text in UTF-8") from None
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except Exception as error:
@@ -367,6 +374,35 @@ def _used(
     return found
 
 
+def _apart(zero: _Zero, moved: dict[str, int]) -> list[tuple[list[int], list[int]]]:
+    """Pairs of geometries that arms could push into each other and do not at rest."""
+    mujoco, _ = packages()
+    model = zero.model
+    arms = [moved[side + "LowerArm"] for side in (LEFT, RIGHT)]
+    upper = [moved[side + "UpperArm"] for side in (LEFT, RIGHT)]
+    own: dict[str, list[int]] = {"arms": [], "rest": []}
+    for geom in range(model.ngeom):
+        body = int(model.geom_bodyid[geom])
+        way = _path(model.body_parentid, body)
+        solid = model.geom_contype[geom] or model.geom_conaffinity[geom]
+        if not solid or body not in zero.tree or model.geom_rbound[geom] <= 0:
+            continue
+        if {*arms} & {*way}:
+            own["arms"].append(geom)
+        elif not {*upper} & {*way}:
+            own["rest"].append(geom)
+    found = []
+    for arm in own["arms"]:
+        near = [
+            geom
+            for geom in own["rest"]
+            if mujoco.mj_geomDistance(model, zero.data, arm, geom, 1.0, None) > 0.005
+        ]
+        if near:
+            found.append(([arm], near))
+    return found
+
+
 def _velocities(path: Path, model: Any, joints: np.ndarray) -> np.ndarray:
     """What a URDF's limits and MJCF's velocity servos state, rad/s; else infinite."""
     mujoco, _ = packages()
@@ -450,6 +486,7 @@ def read_robot(
         axes=axes,
         speeds=_velocities(path, model, joints),
         used=_used(zero, bodies, points, joints),
+        apart=_apart(zero, moved),
         costs=costs,
     )
 

@@ -42,10 +42,12 @@ _COSTS = {
 # The hips' the second time; a foot's turn in the air.
 _AGAIN, _AIR = (25.0, 5.0), 0.5
 # Of a joint's angle from the frame before (1/rad).
-_CHANGE, _DAMPING = 0.05, 1e-6
+_CHANGE, _DAMPING = 0.15, 1e-6
 # Programs a frame at most, and for the first one; when it is met, and the largest step
 # of one, radians.
 _ROUNDS, _FIRST, _STILL, _STEP = 10, 200, 1e-4, 0.2
+# How far hands stay from what is no arm, meters.
+_APART = 0.005
 # How long a leg may be, in its length: straight ones jerk.
 _REACH = 0.985
 # How near to its limit a joint is at it, radians.
@@ -479,6 +481,16 @@ def _solve(
     state[root : root + 3] = WORLD @ goals.places["hips"][0]
     configuration = mink.Configuration(model, q=state)
     limit = mink.ConfigurationLimit(model, gain=1.0)
+    limits = [limit]
+    if robot.apart:
+        limits.append(
+            mink.CollisionAvoidanceLimit(
+                model,
+                robot.apart,
+                minimum_distance_from_collisions=_APART,
+                collision_detection_distance=_APART + 0.5 * _STEP,
+            )
+        )
     found = np.zeros((len(goals.planted), model.nq))
     misses, middle = np.zeros((len(found), 2)), np.zeros((len(found), 3))
     for frame in range(len(found)):
@@ -506,7 +518,7 @@ def _solve(
                 1.0,
                 "daqp",
                 _DAMPING,
-                limits=[limit],
+                limits=limits,
             )
             state = configuration.integrate(velocity, 1.0)
             state[columns] = np.clip(state[columns], least, most)

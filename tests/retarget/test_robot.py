@@ -109,6 +109,19 @@ def test_feet_stay_where_they_are_planted_and_limits_are_kept(ours, walked):
     np.testing.assert_allclose(walked.soles[..., 2], np.array(edges)[..., 0], atol=1e-5)
 
 
+def test_hands_do_not_go_through_the_body(ours, walked):
+    model = mujoco.MjModel.from_xml_path(str(ours))
+    data, deepest = mujoco.MjData(model), 0.0
+    for state in walked.qpos:
+        data.qpos[:] = state
+        mujoco.mj_forward(model, data)
+        for contact in data.contact:
+            bodies = model.geom_bodyid[[contact.geom1, contact.geom2]]
+            if any("elbow" in model.body(body).name for body in bodies):
+                deepest = min(deepest, contact.dist)
+    assert deepest > -2e-3
+
+
 def test_it_goes_where_the_person_goes_in_lengths_of_the_leg(walk, walked):
     skeleton, motion = walk
     function = jm.retarget(skeleton, walked.robot.rest, motion=motion)
