@@ -3,7 +3,7 @@
 It steers a character for ten seconds (stand, walk, turn, run, stop) and writes what it
 shows to player.bvh. `experiments/export.py` puts a copy beside the graphs.
 
-Usage: python player.py [folder] [label]
+Usage: python player.py [folder [label]]
 """
 
 import json

@@ -1,6 +1,6 @@
 """SMGDiff's trajectory generator: a small transformer from commands to a ground path.
 
-Tokens: [time 1] [skill 1] [target 1] [past path] [noisy future path]; the last ones go
+Tokens: time (1), skill (1), target (1), past path, noisy future path; the last ones go
 through a linear layer and are the predicted path. The paper concatenates its noise with
 the conditions; here the noise is the noisy path of the last diffusion step, which is
 the same thing at T = 1 and makes T >= 2 the same network.
