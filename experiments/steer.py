@@ -6,6 +6,7 @@ a click or a drag on the ground sends the character there.
 Examples:
   python experiments/steer.py
   python experiments/steer.py --run runs/smgdiff --characters 4
+  python experiments/steer.py --rig hero.glb
 """
 
 import asyncio
@@ -13,6 +14,7 @@ import dataclasses
 import functools
 import time
 import webbrowser
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -22,7 +24,9 @@ import jaxmotion
 from jaxmotion import cli, files
 from jaxmotion.control.foot_lock import lock_feet
 from jaxmotion.control.steering import Character, steered
-from jaxmotion.viz import page, viewer
+from jaxmotion.export import rig, rig_mesh
+from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.viz import packed, page, viewer
 
 # Those that are steered.
 SHIPPED = tuple(
@@ -40,6 +44,9 @@ class Config:
       run: Name of a shipped model, run folder of a system whose characters are
         steered (CAMDM, AAMDM, SMGDiff), or file of `camdm.py export`. The shipped
         models can be chosen on the page as well.
+      rig: A .glb, .gltf or .vrm that is steered in the place of the mannequin; drawn at
+        the size at which its legs are as long as the model's.
+      roles: JSON file of the rig's joints by role, where names say too little.
       characters: To begin with, 1 to 64.
       host: Address to listen on. Anyone who reaches it can steer: there is no
         authentication.
@@ -51,6 +58,8 @@ class Config:
     """
 
     run: str = "locomotion"
+    rig: cli.Optional[Path] = None
+    roles: cli.Optional[Path] = None
     characters: int = 1
     host: str = "127.0.0.1"
     port: int = 8080
@@ -66,7 +75,40 @@ def load(run: str) -> Character:
     return lock_feet(character) if character.skeleton.feet else character
 
 
-async def listen(args: Config, session: viewer.Session) -> None:
+def dress(args: Config) -> tuple[Callable, Callable]:
+    """What makes a model's body of the rig, and what saves takes of it.
+
+    Raises:
+      OSError, ValueError: if the file cannot be read, is no person's, or shows nothing.
+    """
+    found = rig.read_rig(args.rig)
+    target = found.rest(args.roles)
+    mesh = rig_mesh.rig_mesh(found)
+    print(
+        f"{args.rig}: {found.skeleton.num_joints} joints, {len(mesh.faces)} triangles"
+    )
+
+    def wear(character: Character, motion: Motion) -> viewer.Dress:
+        function = jaxmotion.retarget(character.skeleton, target, motion=motion)
+        scale = 1.0 / function.scale
+        return viewer.Dress(
+            skeleton=found.skeleton,
+            wear=function.pose,
+            scale=scale,
+            packed=packed.pack(*rig_mesh.page_body(found, mesh, scale)),
+        )
+
+    def save(path: Path, skeleton: Skeleton, motion: Motion) -> None:
+        if path.suffix != ".glb":
+            return jaxmotion.save(path, skeleton, motion)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with files.replacing(path) as file:
+            file.write(rig.to_glb(found, motion))
+
+    return wear, save
+
+
+async def listen(args: Config, session: viewer.Session, save: Callable) -> None:
     """Serves until SIGINT or SIGTERM."""
 
     def ready(port: int) -> None:
@@ -76,9 +118,7 @@ async def listen(args: Config, session: viewer.Session) -> None:
         if args.open:
             webbrowser.open(address)
 
-    serve = page.Page(
-        session, out=args.out, save=jaxmotion.save, is_local=cli.is_local
-    ).serve
+    serve = page.Page(session, out=args.out, save=save, is_local=cli.is_local).serve
     await serve(args.host, args.port, stop=cli.until_stopped(), ready=ready)
 
 
@@ -99,6 +139,7 @@ def steer(args: Config) -> None:
     cli.check_address(args.host, args.port)
     if not jax.config.jax_compilation_cache_dir:
         jax.config.update("jax_compilation_cache_dir", str(args.cache))
+    wear, save = (None, jaxmotion.save) if args.rig is None else dress(args)
     begin = time.perf_counter()
     first = load(args.run)
     print(f"{args.run} loaded in {time.perf_counter() - begin:.0f} s", flush=True)
@@ -109,9 +150,10 @@ def steer(args: Config) -> None:
         characters=args.characters,
         # Runs begin with what the network makes, as `jaxmotion.load` has it.
         foot_locks={args.run: args.run in SHIPPED},
+        dress=wear,
         seed=args.seed,
     )
-    asyncio.run(listen(args, session))
+    asyncio.run(listen(args, session, save))
 
 
 def main() -> None:

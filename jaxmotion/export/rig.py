@@ -101,14 +101,14 @@ def _chunks(name: str, raw: bytes) -> tuple[Any, bytes]:
     return content, data
 
 
-def _objects(name: str, content: dict, key: str) -> list[dict]:
-    found = content.get(key, [])
+def objects(name: str, content: dict, field: str) -> list[dict]:
+    found = content.get(field, [])
     if not isinstance(found, list) or not all(isinstance(x, dict) for x in found):
-        raise ValueError(f"{name}: {key!r} should be a list of objects")
+        raise ValueError(f"{name}: {field!r} should be a list of objects")
     return found
 
 
-def _index(name: str, value: Any, count: int, what: str) -> int:
+def index(name: str, value: Any, count: int, what: str) -> int:
     if type(value) is not int or not 0 <= value < count:
         raise ValueError(f"{name}: {what} is {value!r}, expected in 0..{count - 1}")
     return value
@@ -117,7 +117,7 @@ def _index(name: str, value: Any, count: int, what: str) -> int:
 def _one_buffer(path: Path, content: dict, data: bytes) -> bytes:
     """All buffers as one, to which the views in `content` are made to point."""
     name, starts, whole = str(path), [], bytearray()
-    for number, buffer in enumerate(_objects(name, content, "buffers")):
+    for number, buffer in enumerate(objects(name, content, "buffers")):
         uri = buffer.get("uri")
         if uri is None:
             found = data
@@ -141,10 +141,8 @@ def _one_buffer(path: Path, content: dict, data: bytes) -> bytes:
         whole += b"\0" * (-len(whole) % 4)
         starts.append(len(whole))
         whole += found[:size]
-    for number, view in enumerate(_objects(name, content, "bufferViews")):
-        which = _index(
-            name, view.get("buffer"), len(starts), f"buffer of view {number}"
-        )
+    for number, view in enumerate(objects(name, content, "bufferViews")):
+        which = index(name, view.get("buffer"), len(starts), f"buffer of view {number}")
         offset = view.get("byteOffset", 0)
         if type(offset) is not int or offset < 0:
             raise ValueError(f"{name}: byteOffset of view {number} is {offset!r}")
@@ -153,29 +151,29 @@ def _one_buffer(path: Path, content: dict, data: bytes) -> bytes:
     return bytes(whole)
 
 
-def _array(name: str, content: dict, data: bytes, index: Any) -> np.ndarray:
+def array(name: str, content: dict, data: bytes, number: Any) -> np.ndarray:
     """An accessor's values [count, width]."""
-    accessors = _objects(name, content, "accessors")
-    index = _index(name, index, len(accessors), "an accessor")
-    accessor = accessors[index]
+    accessors = objects(name, content, "accessors")
+    number = index(name, number, len(accessors), "an accessor")
+    accessor = accessors[number]
     kind, width = accessor.get("componentType"), accessor.get("type")
     kind = _TYPES.get(kind) if isinstance(kind, int) else None
     width = _WIDTHS.get(width) if isinstance(width, str) else None
     count = accessor.get("count")
     if kind is None or width is None or type(count) is not int or count < 0:
-        raise ValueError(f"{name}: accessor {index} has an unknown type or count")
+        raise ValueError(f"{name}: accessor {number} has an unknown type or count")
     if "sparse" in accessor or "bufferView" not in accessor:
-        raise ValueError(f"{name}: accessor {index} is sparse or has no view")
-    views = _objects(name, content, "bufferViews")
-    view = views[_index(name, accessor["bufferView"], len(views), "a view")]
+        raise ValueError(f"{name}: accessor {number} is sparse or has no view")
+    views = objects(name, content, "bufferViews")
+    view = views[index(name, accessor["bufferView"], len(views), "a view")]
     size = np.dtype(kind).itemsize * width
     step, inner = view.get("byteStride", size), accessor.get("byteOffset", 0)
     if type(step) is not int or type(inner) is not int or step < size or inner < 0:
-        raise ValueError(f"{name}: accessor {index} has a wrong stride or offset")
+        raise ValueError(f"{name}: accessor {number} has a wrong stride or offset")
     start = view["byteOffset"] + inner
     end = start + step * (count - 1) + size if count else start
     if end > len(data):
-        raise ValueError(f"{name}: accessor {index} ends beyond the buffer")
+        raise ValueError(f"{name}: accessor {number} ends beyond the buffer")
     if not count:
         return np.zeros((0, width))
     found = np.lib.stride_tricks.as_strided(
@@ -188,7 +186,7 @@ def _array(name: str, content: dict, data: bytes, index: Any) -> np.ndarray:
         return values.astype(float) if values.dtype.kind == "f" else values
 
 
-def _numbers(name: str, values: Any, count: int, what: str) -> np.ndarray:
+def numbers(name: str, values: Any, count: int, what: str) -> np.ndarray:
     try:
         found = np.array(values, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -202,10 +200,10 @@ def _local(name: str, number: int, node: dict) -> np.ndarray:
     """Matrix [4, 4] of a node in its parent's frame."""
     what = f"of node {number}"
     if "matrix" in node:
-        return _numbers(name, node["matrix"], 16, f"matrix {what}").reshape(4, 4).T
-    move = _numbers(name, node.get("translation", [0, 0, 0]), 3, f"translation {what}")
-    turn = _numbers(name, node.get("rotation", [0, 0, 0, 1]), 4, f"rotation {what}")
-    size = _numbers(name, node.get("scale", [1, 1, 1]), 3, f"scale {what}")
+        return numbers(name, node["matrix"], 16, f"matrix {what}").reshape(4, 4).T
+    move = numbers(name, node.get("translation", [0, 0, 0]), 3, f"translation {what}")
+    turn = numbers(name, node.get("rotation", [0, 0, 0, 1]), 4, f"rotation {what}")
+    size = numbers(name, node.get("scale", [1, 1, 1]), 3, f"scale {what}")
     if not np.linalg.norm(turn) > 1e-6:
         raise ValueError(f"{name}: rotation {what} is zero")
     x, y, z, w = turn / np.linalg.norm(turn)
@@ -235,7 +233,7 @@ def _rotation(name: str, number: int, matrix: np.ndarray) -> np.ndarray:
     return turn
 
 
-def _parents(name: str, nodes: list[dict]) -> list[int]:
+def parents_of(name: str, nodes: list[dict]) -> list[int]:
     """Parent of each node; -1 for none."""
     parents = [-1] * len(nodes)
     for number, node in enumerate(nodes):
@@ -243,7 +241,7 @@ def _parents(name: str, nodes: list[dict]) -> list[int]:
         if not isinstance(children, list):
             raise ValueError(f"{name}: children of node {number} are no list")
         for child in children:
-            child = _index(name, child, len(nodes), f"a child of node {number}")
+            child = index(name, child, len(nodes), f"a child of node {number}")
             if parents[child] >= 0:
                 raise ValueError(f"{name}: node {child} has two parents")
             parents[child] = number
@@ -256,9 +254,24 @@ def _parents(name: str, nodes: list[dict]) -> list[int]:
     return parents
 
 
+def world_of(name: str, nodes: list[dict], parents: list[int]) -> dict[int, np.ndarray]:
+    """World matrix [4, 4] of each node at rest."""
+    local = [_local(name, number, node) for number, node in enumerate(nodes)]
+    world: dict[int, np.ndarray] = {}
+    for number in range(len(nodes)):
+        path_up, node = [], number
+        while node >= 0 and node not in world:
+            path_up.append(node)
+            node = parents[node]
+        for node in reversed(path_up):
+            above = world[parents[node]] if parents[node] >= 0 else np.eye(4)
+            world[node] = above @ local[node]
+    return world
+
+
 def _joints(name: str, content: dict, parents: list[int]) -> list[int]:
     """Nodes of the skeleton, parents first: the skins' joints and what joins them."""
-    skins = _objects(name, content, "skins")
+    skins = objects(name, content, "skins")
     if not skins:
         raise ValueError(f"{name}: no skin: expected a character with a skeleton")
     paths: dict[int, list[int]] = {}
@@ -267,7 +280,7 @@ def _joints(name: str, content: dict, parents: list[int]) -> list[int]:
         if not isinstance(joints, list) or not joints:
             raise ValueError(f"{name}: skin {number} has no joints")
         for joint in joints:
-            path = [_index(name, joint, len(parents), f"a joint of skin {number}")]
+            path = [index(name, joint, len(parents), f"a joint of skin {number}")]
             while parents[path[-1]] >= 0:
                 path.append(parents[path[-1]])
             paths[path[0]] = path[::-1]
@@ -313,22 +326,13 @@ def read_rig(path: str | Path) -> Rig:
     name = str(path)
     content, data = _chunks(name, files.read_bytes(path))
     data = _one_buffer(path, content, data)
-    nodes = _objects(name, content, "nodes")
-    _objects(name, content, "accessors")
+    nodes = objects(name, content, "nodes")
+    objects(name, content, "accessors")
     if len(nodes) > _MAX_NODES:
         raise ValueError(f"{name}: {len(nodes)} nodes, more than {_MAX_NODES}")
-    upper = _parents(name, nodes)
+    upper = parents_of(name, nodes)
     joints = _joints(name, content, upper)
-    local = [_local(name, number, node) for number, node in enumerate(nodes)]
-    world = {}
-    for number in range(len(nodes)):
-        path_up, node = [], number
-        while node >= 0 and node not in world:
-            path_up.append(node)
-            node = upper[node]
-        for node in reversed(path_up):
-            above = world[upper[node]] if upper[node] >= 0 else np.eye(4)
-            world[node] = above @ local[node]
+    world = world_of(name, nodes, upper)
     turns = np.stack([_rotation(name, joint, world[joint]) for joint in joints])
     above = np.eye(4) if upper[joints[0]] < 0 else world[upper[joints[0]]]
     if upper[joints[0]] >= 0:
@@ -383,25 +387,25 @@ def read_rig(path: str | Path) -> Rig:
 def _lowest(rig: Rig, world: dict[int, np.ndarray]) -> float | None:
     """Height of the lowest skinned vertex at rest; None where meshes are packed."""
     found = []
-    skins, meshes = rig.content["skins"], _objects(rig.name, rig.content, "meshes")
+    skins, meshes = rig.content["skins"], objects(rig.name, rig.content, "meshes")
     for node in rig.content["nodes"]:
         if "skin" not in node or "mesh" not in node:
             continue
         try:
-            skin = skins[_index(rig.name, node["skin"], len(skins), "a skin")]
-            mesh = meshes[_index(rig.name, node["mesh"], len(meshes), "a mesh")]
+            skin = skins[index(rig.name, node["skin"], len(skins), "a skin")]
+            mesh = meshes[index(rig.name, node["mesh"], len(meshes), "a mesh")]
             moves = np.stack([world[joint] for joint in skin["joints"]])
             if "inverseBindMatrices" in skin:
                 get = (rig.name, rig.content, rig.data)
-                bind = _array(*get, skin["inverseBindMatrices"]).reshape(-1, 4, 4)
+                bind = array(*get, skin["inverseBindMatrices"]).reshape(-1, 4, 4)
                 with np.errstate(all="ignore"):
                     moves = moves @ np.swapaxes(bind, 1, 2)[: len(moves)]
-            for part in _objects(rig.name, mesh, "primitives"):
+            for part in objects(rig.name, mesh, "primitives"):
                 have = part.get("attributes", {})
                 get = (rig.name, rig.content, rig.data)
-                points = _array(*get, have["POSITION"])
-                which = _array(*get, have["JOINTS_0"])
-                weights = _array(*get, have["WEIGHTS_0"]).astype(float)
+                points = array(*get, have["POSITION"])
+                which = array(*get, have["JOINTS_0"])
+                weights = array(*get, have["WEIGHTS_0"]).astype(float)
                 rows = moves[which, 1]  # what becomes y
                 four = np.concatenate([points, np.ones((len(points), 1))], axis=1)
                 with np.errstate(all="ignore"):

@@ -21,6 +21,7 @@ _SIDES = (
     re.compile(r"(left|right)", re.IGNORECASE),
     re.compile(r"(?:^|(?<=[_\-.: ]))([lr])(?=$|[_\-.: ])", re.IGNORECASE),
     re.compile(r"^([lrLR])(?=[A-Z])"),
+    re.compile(r"(?<=[a-z\d])([LR])$"),
 )
 _TIP = re.compile(r"end|top|site|nub|tip")
 # How far the sole's bone falls, per length, where the zero pose does not tell.

@@ -45,7 +45,7 @@ _WORDS = {
         *("shoulderyaw", "shoulderroll", "shoulderpitch", "shoulder"),
     ),
     "LowerArm": ("forearm", "lowerarm", "loarm", "radius", "elbow"),
-    "Hand": ("hand", "wristyaw", "wristpitch", "wristroll", "wrist"),
+    "Hand": ("hand", "wristyaw", "wristpitch", "wristroll", "wrist", "palm", "fist"),
 }
 _HEADS, _NECKS = ("head",), ("neck", "lowerneck", "upperneck")
 _NOISE = {
@@ -158,8 +158,14 @@ def _by_shape(skeleton: Skeleton) -> dict[str, int]:
     places = anatomy.zero_pose(skeleton)
     spine = anatomy.unit(places[found.trunk[-1]] - places[found.trunk[0]])
     limbs = [places[x.end] - places[x.upper] for x in (*found.arms, *found.legs)]
-    if abs(spine[1]) < 0.6 and all(anatomy.unit(x)[1] < -0.6 for x in limbs):
-        return {}  # it stands on four legs
+    hands, feet = (
+        np.mean([places[x.end, 1] for x in limbs]) for limbs in (found.arms, found.legs)
+    )
+    leg = np.mean([np.linalg.norm(x) for x in limbs[2:]])
+    # On four legs the trunk lies, or the neck rises and the hands are on the ground.
+    lies = abs(spine[1]) < 0.6 or hands - feet < 0.35 * leg
+    if lies and all(anatomy.unit(x)[1] < -0.6 for x in limbs):
+        return {}
     made: dict[str, int] = {}
     for limbs, parts in ((found.arms, _ARM), (found.legs, (None, *_LEG[:3]))):
         for limb in limbs:
@@ -212,7 +218,7 @@ def find_roles(
     missing = [role for role in missing if role != "hips"]
     if missing or not _in_order(skeleton, found):
         have = [f"{role} {skeleton.names[j]!r}" for role, j in found.items()]
-        lack = ", ".join(missing) or "an arm or leg whose joints follow each other"
+        lack = ", ".join(missing) or _unordered(skeleton, found)
         raise ValueError(
             f"no person: missing {lack}; found {_listed(have) or 'nothing'} among the "
             f"joints {_listed(skeleton.names)}"
@@ -223,6 +229,20 @@ def find_roles(
         if role not in told:
             found[role] = _lowest_common(skeleton, joints)
     return {role: skeleton.names[found[role]] for role in ROLES if role in found}
+
+
+def _unordered(skeleton: Skeleton, found: Mapping[str, int]) -> str:
+    """The first joint of a limb that is not below the one before."""
+    for side in (LEFT, RIGHT):
+        for parts in (_ARM[1:], _LEG[:3]):
+            for upper, lower in zip(parts, parts[1:], strict=False):
+                a, b = found[side + upper], found[side + lower]
+                if a == b or a not in anatomy.chain(skeleton.parents, b):
+                    return (
+                        f"{side}{lower} below {side}{upper} ({skeleton.names[b]!r} is "
+                        f"not below {skeleton.names[a]!r})"
+                    )
+    return "an arm or leg whose joints follow each other"
 
 
 def _listed(names: list[str] | tuple[str, ...]) -> str:

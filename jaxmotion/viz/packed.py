@@ -78,13 +78,13 @@ def _mesh(body: mannequin.Mannequin) -> dict[str, np.ndarray]:
         "positions": np.asarray(body.vertices, np.float32),
         "normals": bytes_of(body.normals),
         "joints": body.joints.astype(np.uint8),
-        "weights": _whole(body.weights),
+        "weights": whole(body.weights),
         "colors": palette[body.materials],
         "faces": body.faces.ravel().astype(np.uint16),
     }
 
 
-def _whole(weights: np.ndarray) -> np.ndarray:
+def whole(weights: np.ndarray) -> np.ndarray:
     """Weights [V, 4] as bytes that sum to 255: the largest has what rounding leaves."""
     found = np.round(255 * weights).astype(int)
     found[:, 0] += 255 - found.sum(axis=-1)

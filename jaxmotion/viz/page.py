@@ -301,7 +301,12 @@ class Page:
     def _pack(self, engine: int) -> None:
         """Makes the file of an engine's body, if it is not made yet."""
         skeleton, poses = self.session.skeleton, self.session.poses
-        if self._body[0] != engine:
+        if self._body[0] == engine:
+            return
+        dress = self.session.dress
+        if dress is not None:
+            self._body = engine, dress.packed
+        else:
             about = {"skeleton": packed.skeleton_json(skeleton)}
             arrays = packed.body_arrays(skeleton, poses)
             self._body = engine, packed.pack(about, arrays)

@@ -97,6 +97,25 @@ class Shown:
     milliseconds: float
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Dress:
+    """Another body than a character's own.
+
+    Attributes:
+      skeleton: Its own, on which takes are recorded.
+      wear: Root positions [..., 3] and rotations [..., joints, 6] of the character to
+        those of the body.
+      scale: Meters of the picture in one of the body's: its legs are as long as the
+        character's, so that what is told and where it walks agree.
+      packed: Its file; see `packed`.
+    """
+
+    skeleton: Skeleton
+    wear: Callable[[Any, Any], tuple[Any, Any]]
+    scale: float
+    packed: bytes
+
+
 class Engine:
     """The compiled tick of one model, number of characters and number of steps."""
 
@@ -112,6 +131,7 @@ class Engine:
         self.character, self.num_steps, self.number = character, num_steps, number
         # Rotations [characters, joints, 6] of the first tick; None until there was one.
         self.poses: np.ndarray | None = None
+        self.dress: Dress | None = None
         tuning = character.tuning
         patience = 0 if tuning is None else tuning.patience
         at_most = number if not patience else math.ceil(number / patience)
@@ -196,6 +216,7 @@ class Session:
         *,
         characters: int = 1,
         foot_locks: Mapping[str, bool] | None = None,
+        dress: Callable[[Character, Motion], Dress] | None = None,
         seed: int = 0,
         on_frame: Callable[[Shown], None] = lambda shown: None,
         on_change: Callable[[], None] = lambda: None,
@@ -206,6 +227,7 @@ class Session:
           models: What loads each model that can be chosen, the first one first.
           characters: To begin with.
           foot_locks: Whether a model begins with locked feet; True where not given.
+          dress: Makes another body for a model that has walked for a second.
           seed: Seeds starts and noise.
           on_frame: Called with every tick, in the session's thread.
           on_change: Called when `state` changed, in any thread.
@@ -216,6 +238,7 @@ class Session:
             )
         self._models, self._seed = dict(models), seed
         self._foot_locks = dict(foot_locks or {})
+        self._dress, self._dresses = dress, {}
         self.on_frame, self.on_change = on_frame, on_change
         self.settings = Settings(model=next(iter(models)), characters=characters)
         # Whether the model's own settings are still to be taken over.
@@ -313,7 +336,8 @@ class Session:
             self.take = Motion(
                 root_position=root, joint_rotation=rotation, fps=character.fps
             )
-            self.take_skeleton = character.skeleton
+            dress = engine.dress
+            self.take_skeleton = character.skeleton if dress is None else dress.skeleton
 
     def close(self) -> None:
         """Ends `run`."""
@@ -331,6 +355,11 @@ class Session:
     def poses(self) -> np.ndarray | None:
         """Some rotations [characters, joints, 6] of whoever is drawn."""
         return None if self._engine is None else self._engine.poses
+
+    @property
+    def dress(self) -> Dress | None:
+        """What is drawn instead of its own body."""
+        return None if self._engine is None else self._engine.dress
 
     @property
     def fps(self) -> float:
@@ -408,12 +437,19 @@ class Session:
         self._crowd, made, more = engine.step(
             self._crowd, self._told, settings, seed=self._seed, n=self._tick
         )
-        roots, rotations = jax.tree.map(np.asarray, made)
         ball, plan = more["ball"], more["plan"]
         shift = np.insert(self._home, 1, 0.0, axis=1)
+        leader = np.asarray(made[0])[0] + shift[0]
+        worn = roots, rotations = _worn(engine.dress, *made)
+        if engine.dress is not None:
+            roots = engine.dress.scale * roots
         roots = roots + shift
         if plan is not None:
             path, ghost = jax.tree.map(np.asarray, plan)
+            if engine.dress is not None:
+                end, ghost = _worn(engine.dress, path[-1:], ghost[None])
+                path = np.concatenate([path[:-1], engine.dress.scale * end])
+                ghost = ghost[0]
             plan = path + shift[0], ghost
         shown = Shown(
             engine=self.engine_number,
@@ -426,11 +462,12 @@ class Session:
             planned=int(more["planned"]),
             milliseconds=(time.perf_counter() - begin) * 1e3,
         )
-        self._leader = (float(roots[0, 0]), float(roots[0, 2]))
+        self._leader = (float(leader[0]), float(leader[2]))
         self._tick += 1
         with self._lock:
             if self._take is not None:
-                self._take.append((roots[0], rotations[0]))
+                own = worn[0][0] if engine.dress is not None else roots[0]
+                self._take.append((own, rotations[0]))
                 if len(self._take) >= LONGEST_TAKE * engine.character.fps:
                     self.record()
         self.on_frame(shown)
@@ -508,10 +545,33 @@ class Session:
             done = made.step(crowd, Wish(), settings, seed=0, n=0)
             made.poses = np.asarray(done[1][1])
             made.step(done[0], Wish(), settings, seed=0, n=1)
+            if self._dress is not None:
+                made.dress = self._dressed(name, made)
             self._programs[key] = made
             while len(self._programs) > _KEPT_PROGRAMS:
                 self._programs.pop(next(iter(self._programs)))
         return self._programs[key]
+
+    def _dressed(self, name: str, engine: Engine) -> Dress:
+        """A model's other body, and a tick of it, which compiles it."""
+        if name not in self._dresses:
+            crowd, frames = engine.start(0, self._seed), []
+            ahead = Wish(velocity=(0.0, 1.2))
+            for n in range(round(engine.character.fps)):
+                crowd, made, _ = engine.step(
+                    crowd, ahead, self.settings, seed=self._seed, n=n
+                )
+                frames.append([np.asarray(x)[0] for x in made])
+            roots, turns = (jnp.asarray(np.stack(x)) for x in zip(*frames, strict=True))
+            motion = Motion(
+                root_position=roots, joint_rotation=turns, fps=engine.character.fps
+            )
+            self._dresses[name] = self._dress(engine.character, motion)
+        dress = self._dresses[name]
+        joints = engine.character.skeleton.num_joints
+        for number in {1, engine.number}:
+            dress.wear(jnp.zeros((number, 3)), jnp.zeros((number, joints, 6)))
+        return dress
 
     def _swap(self) -> None:
         with self._lock:
@@ -525,6 +585,13 @@ class Session:
             self.engine_number += 1
             self._begin(new, keep=same)
         self.on_change()
+
+
+def _worn(dress: Dress | None, roots: Any, rotations: Any) -> tuple[Any, Any]:
+    """Poses as NumPy arrays, of the other body if there is one."""
+    if dress is not None:
+        roots, rotations = dress.wear(jnp.asarray(roots), jnp.asarray(rotations))
+    return np.asarray(roots), np.asarray(rotations)
 
 
 def _last(engine: Engine) -> int:

@@ -32,3 +32,12 @@ def test_too_many_characters(script):
         script.steer(script.Config(characters=65, port=0))
     with pytest.raises(ValueError, match="--characters is 0, expected"):
         script.steer(script.Config(characters=0, port=0))
+
+
+def test_a_rig_that_is_none(script, tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"gone\.glb"):
+        script.steer(script.Config(rig=tmp_path / "gone.glb", port=0))
+    path = tmp_path / "x.glb"
+    path.write_bytes(b"glTF")
+    with pytest.raises(ValueError, match=r"x\.glb: expected binary glTF"):
+        script.steer(script.Config(rig=path, port=0))

@@ -7,6 +7,7 @@ import pygltflib
 import pytest
 
 from jaxmotion.export import rig as rigging
+from jaxmotion.export import rig_mesh
 from jaxmotion.motion import anatomy
 from tests.export.test_rig import worlds
 from tests.fuzz import harness, mutations
@@ -51,10 +52,12 @@ def test_malformed_rigs(tmp_path, capsys):
         found = rigging.read_rig(path)
         made = rigging.to_glb(found, rigs.still(found.skeleton, 2))
         assert made[:4] == b"glTF"
-        try:
-            found.rest()
-        except ValueError as error:
-            assert "x.glb" in str(error) and "\n" not in str(error)
+        for more in (found.rest, lambda: rig_mesh.rig_mesh(found)):
+            try:
+                more()
+            except (OSError, ValueError) as error:
+                assert "\n" not in str(error)
+                assert "x.glb" in str(error) or isinstance(error, OSError)
         return found
 
     def confirm(data, found):

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import jax.numpy as jnp
@@ -146,3 +147,39 @@ def test_what_is_no_person_is_refused_in_one_line():
         with pytest.raises(ValueError, match=message) as caught:
             roles.find_roles(skeleton)
         assert "\n" not in str(caught.value) and len(str(caught.value)) < 900
+
+
+def test_a_horse_whose_head_is_high_is_no_person():
+    places, parents, names = [[0, 1.0, 0], [0, 1.0, 0.8], [0, 1.9, 1.1]], [-1, 0, 1], []
+    for side, x in (("Left", 0.2), ("Right", -0.2)):
+        for top, z in ((0, 0.0), (1, 0.8)):
+            above = top
+            for height in (0.9, 0.5, 0.1):
+                parents.append(above)
+                above = len(places)
+                places.append([x, height, z])
+                names.append(f"{side}_{above}")
+    offsets = np.array(places) - np.array(places)[[max(p, 0) for p in parents]]
+    horse = rigs.plain(offsets, parents, ("back", "front", "Head", *names))
+    with pytest.raises(ValueError, match="no person: missing leftUpperArm"):
+        roles.find_roles(horse)
+
+
+def test_sides_may_end_the_names_and_feet_must_be_on_legs():
+    skeleton = rigs.named(rigs.walker(), "Unreal")
+    ended = dataclasses.replace(
+        skeleton,
+        names=tuple(n.replace("_l", "L").replace("_r", "R") for n in skeleton.names),
+    )
+    found = roles.find_roles(ended)
+    same = roles.find_roles(skeleton)
+    index = {role: skeleton.names.index(name) for role, name in same.items()}
+    assert {role: ended.names.index(n) for role, n in found.items()} == index
+    # A foot of its own at the root, as rigs have that are driven by their feet.
+    foot = index["leftFoot"]
+    toes = [j for j, up in enumerate(skeleton.parents) if up == foot]
+    parents = tuple(0 if j == foot else up for j, up in enumerate(skeleton.parents))
+    loose = dataclasses.replace(ended, parents=parents)
+    assert toes
+    with pytest.raises(ValueError, match="'footL' is not below 'calfL'"):
+        roles.find_roles(loose)

@@ -1,5 +1,6 @@
 """What held keys ask for, the session's ticks, and what it records."""
 
+import dataclasses
 import math
 import threading
 import time
@@ -186,11 +187,12 @@ def test_a_frame_is_packed_as_the_page_reads_it():
 class Ticking:
     """A session on a character without a network, ticked by hand."""
 
-    def __init__(self, **options):
+    def __init__(self, dress=None, **options):
         self.character, self.traces = strider(**options)
         self.shown = []
         self.session = viewer.Session(
-            {"strider": lambda: self.character, "other": lambda: strider()[0]}
+            {"strider": lambda: self.character, "other": lambda: strider()[0]},
+            dress=dress,
         )
         self.session.on_frame = self.shown.append
         self.load()
@@ -280,6 +282,35 @@ def test_a_take_is_what_was_shown():
 
 
 @pytest.mark.slow
+def test_another_body_is_worn_at_the_size_of_the_model():
+    skeleton = strider()[0].skeleton
+    half = dataclasses.replace(skeleton, offsets=0.5 * skeleton.offsets)
+
+    def dress(character, motion):
+        assert motion.root_position.shape == (30, 3), "a second"
+        assert motion.root_position[-1, 2] > 0.5, "of walking"
+        return viewer.Dress(
+            skeleton=half,
+            wear=lambda root, turns: (0.5 * root, turns),
+            scale=2.0,
+            packed=b"body",
+        )
+
+    it, plain = Ticking(dress=dress), Ticking()
+    assert it.session.dress.packed == b"body"
+    it.session.record()
+    walked = it.tick("forward", times=20).roots[0]
+    it.session.record()
+    assert walked[2] > 0.2
+    same = plain.tick("forward", times=20).roots[0]
+    np.testing.assert_allclose(walked, same, atol=1e-5)
+    # Shown where the model is; recorded in the body's own meters.
+    assert it.session.take_skeleton is half
+    np.testing.assert_allclose(
+        it.session.take.root_position[-1], 0.5 * walked, atol=1e-5
+    )
+
+
 def test_the_plan_is_shown_to_its_end():
     it = Ticking()
     it.tick("forward", times=20)

@@ -59,8 +59,28 @@ export function glb(body, fps, roots, rotations) {
     WEIGHTS_0: add(weights, FLOAT, "VEC4", count, {}, VERTEX),
     COLOR_0: add(colors, FLOAT, "VEC4", count, {}, VERTEX),
   };
-  const faces = new Uint16Array(arrays.faces);
-  const indices = add(faces, 5123, "SCALAR", faces.length, {}, INDEX);
+  if (arrays.uv) attributes.TEXCOORD_0 = add(arrays.uv, FLOAT, "VEC2", count, {}, VERTEX);
+  const wide = arrays.faces instanceof Uint32Array;
+  const faces = wide ? arrays.faces : new Uint16Array(arrays.faces);
+  const look = { metallicFactor: 0, roughnessFactor: 0.8 };
+  const images = [], materials = [], primitives = [];
+  for (const [first, corners, name, cut] of body.parts || [[0, faces.length, null, 0]]) {
+    const some = faces.slice(first, first + corners);
+    const indices = add(some, wide ? 5125 : 5123, "SCALAR", corners, {}, INDEX);
+    let at = images.findIndex(image => image.name === name);
+    if (name && at < 0) {
+      const bytes = arrays[name], png = bytes[0] === 0x89;
+      views.push({ buffer: 0, byteOffset: length, byteLength: bytes.length });
+      parts.push(bytes, new Uint8Array(-bytes.length & 3));
+      length += bytes.length + (-bytes.length & 3);
+      at = images.push({ name, bufferView: views.length - 1,
+        mimeType: png ? "image/png" : "image/jpeg" }) - 1;
+    }
+    const pbrMetallicRoughness = name ? { ...look, baseColorTexture: { index: at } } : look;
+    materials.push({ pbrMetallicRoughness,
+      ...(cut ? { alphaMode: "MASK", alphaCutoff: cut } : {}) });
+    primitives.push({ attributes, indices, material: materials.length - 1 });
+  }
   // Column by column, of rows.
   const inverse = new Float32Array(16 * joints);
   for (let j = 0; j < joints; j++) for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++)
@@ -96,9 +116,10 @@ export function glb(body, fps, roots, rotations) {
   const text = JSON.stringify({
     asset: { version: "2.0", generator: "jaxmotion" }, scene: 0,
     scenes: [{ nodes: [0, joints] }], nodes,
-    meshes: [{ name: "body", primitives: [{ attributes, indices, material: 0 }] }],
+    meshes: [{ name: "body", primitives }],
     skins: [{ joints: names.map((_, j) => j), skeleton: 0, inverseBindMatrices: bind }],
-    materials: [{ pbrMetallicRoughness: { metallicFactor: 0, roughnessFactor: 0.8 } }],
+    materials,
+    ...(images.length ? { images, textures: images.map((_, source) => ({ source })) } : {}),
     animations: [{ name: "motion", samplers, channels }],
     accessors, bufferViews: views, buffers: [{ byteLength: length }],
   });

@@ -8,10 +8,10 @@ export const PALE = [0.49, 0.62, 0.84];
 const SKY = [0.865, 0.888, 0.915];
 
 const SKINNED = `
-in vec3 position, normal; in vec4 joints, weights, color;
+in vec3 position, normal; in vec4 joints, weights, color; in vec2 uv;
 uniform sampler2D bones; uniform mat4 view; uniform vec3 light;
 uniform vec4 square;  // of the shadow: middle (x, z), half its side; > 0 where it is cast
-out vec3 turned, place, kept; out vec4 paint;
+out vec3 turned, place, kept; out vec4 paint; out vec2 spot;
 void main() {
   vec4 p = vec4(position, 1.0), n = vec4(normal, 0.0);
   vec3 at = vec3(0.0), up = vec3(0.0);
@@ -24,15 +24,15 @@ void main() {
     at += weights[k] * vec3(dot(a, p), dot(b, p), dot(c, p));
     up += weights[k] * vec3(dot(a, n), dot(b, n), dot(c, n));
   }
-  turned = up; place = at; kept = normal; paint = color;
+  turned = up; place = at; kept = normal; paint = color; spot = uv;
   if (square.w > 0.0) {
     vec2 dark = at.xz - max(at.y, 0.0) / light.y * light.xz;
     gl_Position = vec4((dark - square.xy) / square.z, 0.0, 1.0);
   } else gl_Position = view * vec4(at, 1.0);
 }`;
 const LIT = `
-in vec3 turned, place, kept; in vec4 paint;
-uniform vec3 light, eye; uniform float alpha, patches; uniform vec4 tint, square;
+in vec3 turned, place, kept; in vec4 paint; in vec2 spot;
+uniform sampler2D cloth; uniform vec3 light, eye; uniform float alpha, patches, cut; uniform vec4 tint, square;
 out vec4 pixel;
 // A ball's twelve dark patches: the corners of an icosahedron.
 float patch_at(vec3 n) {
@@ -43,8 +43,10 @@ float patch_at(vec3 n) {
 }
 void main() {
   if (square.w > 0.0) { pixel = vec4(1.0, place.y < 0.45 ? 1.0 : 0.0, 0.0, 1.0); return; }
+  vec4 worn = paint * texture(cloth, spot);
+  if (worn.a < cut) discard;
   vec3 n = normalize(turned), v = normalize(eye - place);
-  vec3 base = mix(paint.rgb, tint.rgb, tint.a);
+  vec3 base = mix(worn.rgb, tint.rgb, tint.a);
   if (patches > 0.0) base = mix(base, vec3(0.05), patch_at(kept));
   base *= base;  // to linear, roughly
   float sun = max(dot(n, light), 0.0), wrap = max((dot(n, light) + 0.35) / 1.35, 0.0);
@@ -136,21 +138,26 @@ export class Scene {
     attribute(gl, this.flat, "paint", 4, gl.FLOAT, 28, 12);
     this.targets = [0, 1].map(() => target(gl));
     this.bones = texture(gl, gl.NEAREST);
+    this.white = texture(gl, gl.NEAREST);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE,
+      new Uint8Array(4).fill(255));
     this.body = null;
     this.ball = this.mesh(sphere());
   }
 
   // Takes over the skinned meshes of an unpacked body.
-  show({ arrays }) {
-    for (const mesh of [this.body, this.plain]) if (mesh) mesh.free();
+  show({ arrays, parts }) {
+    for (const mesh of new Set([this.body, this.plain])) if (mesh) mesh.free();
     const crowd = {};
     for (const name of Object.keys(arrays))
       if (name.startsWith("crowd.")) crowd[name.slice(6)] = arrays[name];
-    this.body = this.mesh(arrays);
-    this.plain = this.mesh(crowd);
+    this.body = this.mesh(arrays, parts);
+    this.plain = crowd.faces ? this.mesh(crowd) : this.body;
   }
 
-  mesh({ positions, normals, joints, weights, colors, faces }) {
+  // Parts are [first corner, corners, name of an image or null, least opacity].
+  mesh(arrays, parts = [[0, arrays.faces.length, null, 0]]) {
+    const { positions, normals, joints, weights, colors, faces } = arrays;
     const gl = this.gl, array = gl.createVertexArray(), buffers = [];
     const buffer = (target, values) => {
       buffers.push(gl.createBuffer());
@@ -166,13 +173,43 @@ export class Scene {
       buffer(gl.ARRAY_BUFFER, values);
       attribute(gl, this.skinned, name, size, kind, 0, 0, unit);
     }
-    buffer(gl.ELEMENT_ARRAY_BUFFER, new Uint16Array(faces));
+    if (arrays.uv) {
+      buffer(gl.ARRAY_BUFFER, arrays.uv);
+      attribute(gl, this.skinned, "uv", 2, gl.FLOAT, 0, 0);
+    }
+    const wide = faces instanceof Uint32Array;
+    buffer(gl.ELEMENT_ARRAY_BUFFER, wide ? faces : new Uint16Array(faces));
     gl.bindVertexArray(null);
+    const images = {};
+    for (const [, , name] of parts)
+      if (name && !(name in images)) images[name] = this.image(arrays[name]);
     const free = () => {
       gl.deleteVertexArray(array);
       for (const one of buffers) gl.deleteBuffer(one);
+      for (const one of Object.values(images)) gl.deleteTexture(one);
     };
-    return { array, corners: faces.length, free };
+    const drawn = parts.map(([first, count, name, cut]) => (
+      { start: first * (wide ? 4 : 2), count, cloth: images[name] || this.white, cut }));
+    return { array, kind: wide ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT, parts: drawn, free };
+  }
+
+  // A PNG or JPEG as a texture, white until the browser has read it.
+  image(bytes) {
+    const gl = this.gl, made = texture(gl, gl.LINEAR);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE,
+      new Uint8Array(4).fill(255));
+    const options = { premultiplyAlpha: "none", colorSpaceConversion: "none" };
+    createImageBitmap(new Blob([bytes]), options).then(image => {
+      if (!gl.isTexture(made)) return;
+      gl.activeTexture(gl.TEXTURE2);
+      gl.bindTexture(gl.TEXTURE_2D, made);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
+      gl.generateMipmap(gl.TEXTURE_2D);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+      for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T])
+        gl.texParameteri(gl.TEXTURE_2D, name, gl.REPEAT);
+    }).catch(() => {});
+    return made;
   }
 
   // Draws a picture of
@@ -273,7 +310,13 @@ export class Scene {
       moved);
     gl.uniform1i(this.skinned.at.bones, 1);
     gl.bindVertexArray(mesh.array);
-    gl.drawElementsInstanced(gl.TRIANGLES, mesh.corners, gl.UNSIGNED_SHORT, 0, count);
+    gl.activeTexture(gl.TEXTURE2);
+    gl.uniform1i(this.skinned.at.cloth, 2);
+    for (const part of mesh.parts) {
+      gl.bindTexture(gl.TEXTURE_2D, part.cloth);
+      gl.uniform1f(this.skinned.at.cut, part.cut);
+      gl.drawElementsInstanced(gl.TRIANGLES, part.count, mesh.kind, part.start, count);
+    }
   }
 }
 
