@@ -4,8 +4,9 @@ Both stand in the T-pose that `motion.anatomy` finds, whatever their rest poses 
 With D_j = R_j B_j^T a joint's turn from its T-pose B_j in the world:
 
 1. Every joint of the target takes the turn of the source's joint of its role; spines
-   and necks of other numbers of joints take the mean over what they overlap; what has
-   no role (fingers, a face, a skirt) stays as it is at its parent.
+   and necks of other numbers of joints take the mean over what they overlap, and the
+   spine swings until the chest is in the source's direction from the hips; what has no
+   role (fingers, a face, a skirt) stays as it is at its parent.
 2. The middle of the hips goes where the source's goes, scaled by the legs' lengths,
    from the height of the ankles over the ground.
 3. The ball of each foot goes where the source's goes, scaled alike, so what is planted
@@ -296,16 +297,22 @@ class Retarget:
         joint_rotation: Float[Array, "*batch source 6"],
     ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch target 6"]]:
         """Root positions and local rotations of the target, as `Motion` has them."""
-        batch = root_position.shape[:-1]
-        root, turns = self._program(
-            root_position.reshape(-1, 3),
-            joint_rotation.reshape(-1, *joint_rotation.shape[-2:]),
-        )
-        return root.reshape(*batch, 3), turns.reshape(*batch, *turns.shape[1:])
+        return self._program(root_position, joint_rotation)
 
     @functools.cached_property
     def _program(self) -> Callable[[Array, Array], tuple[Array, Array]]:
-        return jax.jit(jax.vmap(self._one))
+        many = jax.vmap(self._one)
+
+        # Reshapes inside: outside, each would cost as much as the rest.
+        def pose(root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
+            batch = root_position.shape[:-1]
+            root, turns = many(
+                root_position.reshape(-1, 3),
+                joint_rotation.reshape(-1, *joint_rotation.shape[-2:]),
+            )
+            return root.reshape(*batch, 3), turns.reshape(*batch, *turns.shape[1:])
+
+        return jax.jit(pose)
 
     def _one(self, root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
         """Of one character in one frame."""
@@ -324,6 +331,7 @@ class Retarget:
         mixed, places = _settled((_orthonormal(mixed), places))
         # By joint of the target: those that have a role.
         turned = {joint: mixed[i] for i, joint in enumerate(leaders)}
+        turned = self._spine(places, turned)
         middle, goals = _settled(self._goals(places, turned))
         turned = self._legs(places, turned, middle, goals)
         turned = self._arms(places, turned)
@@ -342,6 +350,34 @@ class Retarget:
         # What is above the hips does not turn.
         root = root - self.target.places[number].astype(np.float32)
         return root, rotation.rot6d_from_matrix(local)
+
+    def _spine(self, places: Array, turned: dict[int, Array]) -> dict[int, Array]:
+        """All turns after the chest was brought to where the source's is from the hips.
+
+        Means over spines of other numbers of joints bend a little less or more.
+        """
+        yours, mine = _trunk(self.source)[0], _trunk(self.target)[0]
+        if len(mine) < 3 or len(yours) < 2:
+            return turned
+        hips, at = turned[mine[0]], self.target.places[mine]
+        rest = np.diff(self.source.places[[yours[0], yours[-1]]], axis=0)[0]
+        own = at[-1] - at[0]
+        size = np.linalg.norm(own) / max(np.linalg.norm(rest), 1e-9)
+        if not 1e-6 < size < 1e6:
+            return turned
+        # From its direction in one T-pose to that in the other.
+        between = _swing(
+            jnp.asarray(anatomy.unit(rest)), jnp.asarray(anatomy.unit(own))
+        )
+        way = _times(hips, _times(between.astype(hips.dtype), hips.T))
+        goal = size * jnp.einsum("ij,j->i", way, places[yours[-1]] - places[yours[0]])
+        bones = np.diff(at, axis=0).astype(np.float32)
+        goal = goal - _turned(hips, bones[0])
+        now = sum(
+            _turned(turned[j], b) for j, b in zip(mine[1:-1], bones[1:], strict=True)
+        )
+        swing = _swing(_unit(now), _unit(goal))
+        return turned | {j: _settled(_times(swing, turned[j])) for j in mine[1:-1]}
 
     @functools.cached_property
     def _hip_middle(self) -> np.ndarray:
