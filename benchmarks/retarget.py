@@ -7,6 +7,7 @@ legs, arms and trunk of other lengths, or a rig's file.
 Example:
   python benchmarks/retarget.py
   python benchmarks/retarget.py --rig hero.glb
+  python benchmarks/retarget.py --robot g1.xml
 """
 
 import dataclasses
@@ -20,9 +21,11 @@ import suite
 
 import jaxmotion as jm
 from jaxmotion import cli
+from jaxmotion.control.steering import Character
 from jaxmotion.motion import anatomy
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
-from jaxmotion.retarget import transfer
+from jaxmotion.retarget import robot as robots
+from jaxmotion.retarget import robot_motion, transfer
 
 # Seconds, direction of travel and facing (degrees from +z toward +x), m/s, style.
 COURSES = {
@@ -52,6 +55,16 @@ COLUMNS = {
     "trip": "round trip m",
     "trip_95": "95 % below m",
 }
+ROBOT = {
+    "course": "course",
+    "at_limit": "frames at a limit",
+    "fastest": "fastest joint",
+    "fastest_velocity": "rad/s",
+    "slide": "slide m/s",
+    "under": "soles under m",
+    "miss": "planted feet off m",
+    "seconds": "s to solve",
+}
 COST = {"characters": "characters", "milliseconds": "ms a tick", "rate": "frames/s"}
 
 
@@ -61,12 +74,14 @@ class Config(suite.Settings):
 
     Attributes:
       rig: A rig's file to be measured instead of the bodies.
+      robot: MJCF or URDF of a humanoid to be measured instead.
       seconds: Length of each course.
       characters: Numbers of characters to time.
       repeats: Calls to time; the median counts.
     """
 
     rig: Path | None = None
+    robot: Path | None = None
     seconds: float = 6.0
     characters: tuple[int, ...] = (1, 64, 1024)
     repeats: int = 50
@@ -176,11 +191,42 @@ def cost(function: transfer.Retarget, motion: Motion, args: Config) -> list[dict
     return rows
 
 
+def measure_robot(args: Config, model: Character, motions: dict[str, Motion]) -> None:
+    """What a robot cannot do of each course, in a report."""
+    robot = robots.read_robot(args.robot)
+    rows = []
+    for course, motion in motions.items():
+        start = time.perf_counter()
+        found = robot_motion.follow(robot, model.skeleton, motion).report()
+        seconds = time.perf_counter() - start
+        rows.append({"course": course, **found, "seconds": seconds})
+    suite.print_table(rows, ROBOT)
+    metrics = [
+        suite.Metric(f"{row['course']}: at a limit", row["at_limit"], "of frames")
+        for row in rows
+    ]
+    suite.report("robot", metrics, args, rows=rows)
+
+
+def moving(model: Character, args: Config) -> dict[str, Motion]:
+    """The model on each course."""
+    found = {}
+    for course, segments in COURSES.items():
+        commands = jm.commands(segments, model, 1, seconds=args.seconds)
+        states = model.start(1, labels=segments[0][-1])
+        frames = jm.rollout(model, jax.random.key(0), states, commands)
+        found[course] = frames[0].motion
+    return found
+
+
 def main() -> None:
     """Measures and writes the report."""
     args = suite.parse(Config, __doc__)
     suite.at_least(args, repeats=1)
     model = jm.load("locomotion")
+    motions = moving(model, args)
+    if args.robot is not None:
+        return measure_robot(args, model, motions)
     bodies = {
         name: proportioned(model.skeleton, *sizes) for name, sizes in BODIES.items()
     }
@@ -190,11 +236,7 @@ def main() -> None:
         name: jm.retarget(model.skeleton, body) for name, body in bodies.items()
     }
     rows = []
-    for course, segments in COURSES.items():
-        commands = jm.commands(segments, model, 1, seconds=args.seconds)
-        states = model.start(1, labels=segments[0][-1])
-        frames = jm.rollout(model, jax.random.key(0), states, commands)
-        motion = frames[0].motion
+    for course, motion in motions.items():
         for name, function in functions.items():
             rows.append({"body": name, "course": course, **measure(function, motion)})
     rows.sort(key=lambda row: list(bodies).index(row["body"]))
