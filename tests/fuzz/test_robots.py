@@ -60,7 +60,8 @@ def mutate(random, text):
     return ElementTree.tostring(root)
 
 
-def test_malformed_robots(tmp_path, capsys):
+def test_malformed_robots(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file there
     person = samples.person(seconds=0.2, speed=1.0)
     whole = corpus()
 
