@@ -122,7 +122,7 @@ def check(args: Arguments) -> Arguments:
     Raises:
       ValueError: names the option, its value and what is expected.
     """
-    for field in dataclasses.fields(args):
+    for field in dataclasses.fields(args):  # pyright: ignore[reportArgumentType]
         value = getattr(args, field.name)
         if field.name == "rows" and not value:
             raise ValueError('--rows is empty, expected names of rows, or "all"')
@@ -261,7 +261,7 @@ def start(main: Callable[[], None]) -> None:
 def is_local(host: str | None) -> bool:
     """Whether only this machine reaches an address; False where it is not known."""
     with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
+        return ipaddress.ip_address(host or "").is_loopback
     return host == "localhost"
 
 

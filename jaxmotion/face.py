@@ -141,7 +141,7 @@ def commands(
       ValueError: if the course or a label is unknown, or numbers do not agree.
     """
     if np.ndim(speed) and number is None and (labels is None or np.ndim(labels) == 0):
-        number = len(speed)
+        number = len(np.asarray(speed))
     found = steering.label_indices(model.labels, labels, number)
     speeds = np.asarray(speed, float)
     if speeds.ndim > 1 or (speeds.ndim and len(speeds) != len(found)):

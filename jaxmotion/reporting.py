@@ -66,7 +66,7 @@ def write_rollout(
     if ball is not None:
         _write_ball(folder / f"{name}_ball.csv", ball, fps)
     stage = make_stage(skeleton, motion, wanted=wanted, ball=ball)
-    texts = dict(title=title, caption=caption)
+    texts: dict[str, Any] = dict(title=title, caption=caption)
     animation.save_gif(folder / f"{name}.gif", stage, **texts)
     html.save_html(folder / f"{name}.html", stage, **texts)
     print(f"wrote {name}.bvh, {name}.gif and {name}.html to {folder}")

@@ -480,7 +480,7 @@ def toe_offsets(
         moved = jnp.diff(o + path, axis=0)
         bent = jnp.diff(o, n=2, axis=0)
         terms = (jnp.sum(o**2), jnp.sum(weight * moved**2), smooth * jnp.sum(bent**2))
-        return sum(terms) / 2
+        return (terms[0] + terms[1] + terms[2]) / 2
 
     right = -jax.grad(cost)(jnp.zeros_like(path), path)
     return jax.scipy.sparse.linalg.cg(normal, right, tol=1e-6, maxiter=2000)[0]
@@ -591,8 +591,13 @@ class _Method:
 
     def __call__(self, params: Any) -> Controller:
         inner, skeleton = params
-        options = dict(fps=self.fps, lock=self.lock, enabled=self.enabled)
-        return locked(self.method(inner), skeleton, **options)
+        return locked(
+            self.method(inner),
+            skeleton,
+            fps=self.fps,
+            lock=self.lock,
+            enabled=self.enabled,
+        )
 
 
 def _tuning(inner: Tuning, fps: float, lock: FootLock) -> Tuning:

@@ -169,8 +169,8 @@ def crowd_tick(
     waited = jnp.where(need > 0, crowd.waited + 1, 0)
     _, chosen = jax.lax.top_k(waited, at_most)
     keys = jax.vmap(lambda c: jax.random.fold_in(key, c))(chosen)
-    part = jax.tree.map(lambda x: x[chosen], (crowd.states, commands))
-    planned = _plan(controller, keys, *part, need[chosen])
+    some, told = jax.tree.map(lambda x: x[chosen], (crowd.states, commands))
+    planned = _plan(controller, keys, some, told, need[chosen])
     put = lambda x, new: x.at[chosen].set(new)  # noqa: E731
     states = jax.tree.map(put, crowd.states, planned)
     heard = (need == 0).at[chosen].set(True)

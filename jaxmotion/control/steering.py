@@ -167,7 +167,8 @@ def label_indices(
     if number is not None and not (isinstance(number, int | np.integer) and number > 0):
         raise ValueError(f"number of characters is {number!r}, expected 1 or more")
     single = labels is None or isinstance(labels, str) or np.ndim(labels) == 0
-    given = [0 if labels is None else labels] if single else list(labels)
+    given: list[Any]
+    given = [0 if labels is None else labels] if single else list(labels)  # pyright: ignore[reportArgumentType]
     given = [x.item() if isinstance(x, np.ndarray | Array) else x for x in given]
     if single:
         given = given * (1 if number is None else number)
@@ -348,7 +349,7 @@ def _rollouts(
     mesh: Mesh | None,
 ) -> Frame:
     run = rollout.rollout
-    more = dict(first=first, chunk=chunk, mesh=mesh)
+    more: dict[str, Any] = dict(first=first, chunk=chunk, mesh=mesh)
     return run(method(params), key, states, commands, **more)[1]
 
 
@@ -443,8 +444,9 @@ def _pushed(
     stick: tuple[float, float] | None, azimuth: float
 ) -> tuple[float, float] | None:
     """A stick's angle in the world and how far it is pushed; None in its middle."""
-    far = 0.0 if stick is None else math.hypot(*stick)
-    return None if far < STICK else (azimuth - math.atan2(*stick), min(far, 1.0))
+    if stick is None or (far := math.hypot(*stick)) < STICK:
+        return None
+    return azimuth - math.atan2(*stick), min(far, 1.0)
 
 
 def _go(angle: float, speed: float, facing: tuple[float, float] | None = None) -> Wish:

@@ -346,10 +346,10 @@ def read_bvh(
     """
     if isinstance(source, bytes):
         data, default = source, "bvh"
-    elif hasattr(source, "read"):
-        data, default = source.read(), str(getattr(source, "name", "bvh"))
-    else:
+    elif isinstance(source, str | os.PathLike):
         data, default = files.read_bytes(source), os.fspath(source)
+    else:
+        data, default = source.read(), str(getattr(source, "name", "bvh"))
     name = default if name is None else name
     try:
         text = data.decode("utf-8")

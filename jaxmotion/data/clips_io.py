@@ -1,6 +1,7 @@
 """Clips on disk: one npz file without pickles, written whole or not at all."""
 
 import os
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -94,7 +95,7 @@ def read_fields(path: str | os.PathLike) -> dict[str, np.ndarray]:
       ValueError: if it is damaged, foreign, of another version, or lacks a field.
     """
     path = os.fspath(path)
-    about = dict(what="clips", format_name=_FORMAT, version=_VERSION)
+    about: dict[str, Any] = dict(what="clips", format_name=_FORMAT, version=_VERSION)
     try:
         fields = files.read_versioned(path, _FIELDS, **about)
     except FileNotFoundError as error:

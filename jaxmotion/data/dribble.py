@@ -253,7 +253,7 @@ def next_touches(
     keep &= nears * (1 + settings.restitution) >= settings.min_push
     if not keep.any():
         return found[keep], comes[keep]
-    found, way, seconds, comes = (x[keep] for x in (found, way, seconds, comes))
+    found, way, seconds, comes = found[keep], way[keep], seconds[keep], comes[keep]
     frames = (touches.frame[found] - first)[:, None]
     count = np.arange(frames.max() + 1)
     times = np.minimum(count / body.fps, seconds[:, None])

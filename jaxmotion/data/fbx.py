@@ -1,10 +1,12 @@
 """FBX files by ufbx: the joints of their animation in the file's world."""
 
+from typing import Literal
+
 import numpy as np
 
 from jaxmotion.data.own import Recording
 
-_UPS = {2: "y", 4: "z"}  # ufbx.CoordinateAxis
+_UPS: dict[int, Literal["y", "z"]] = {2: "y", 4: "z"}  # ufbx.CoordinateAxis
 
 
 def _matrix(transform) -> np.ndarray:

@@ -46,7 +46,7 @@ class Recording:
     rotations: np.ndarray
     fps: float
     unit: float | None = None
-    up: str | None = None
+    up: Literal["y", "z"] | None = None
 
     def part(self, joints: list[int]) -> "Recording":
         """Some joints, each with the nearest of them above it as its parent."""
@@ -141,7 +141,7 @@ def _unit(recording: Recording) -> tuple[float, str]:
     ], f"{word}: {reach:.4g} units from the root to the farthest joint"
 
 
-def _up(recording: Recording) -> tuple[str, str]:
+def _up(recording: Recording) -> tuple[Literal["y", "z"], str]:
     """The axis that is up, and why."""
     if recording.up is not None:
         return recording.up, "as the file says"
@@ -361,6 +361,7 @@ def clips_from_recordings(
                 up, why = _up(part)
                 notes.append(f"up       {up} ({why})")
             notes.append(f"joints   {len(joints)} of {len(recording.names)} are kept")
+        assert scale is not None and up is not None  # of the first file
         missing = [name for name in joints if name not in recording.names]
         if missing:
             raise ValueError(

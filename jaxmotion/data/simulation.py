@@ -141,7 +141,7 @@ def simulation_bone(skeleton: Skeleton, motion: Motion) -> Trajectory:
 
     def smooth(x: Float[np.ndarray, "f 2"], seconds: float) -> Float[np.ndarray, "f 2"]:
         window = max(_window(seconds, motion.fps), _DEGREE + 2)
-        return savgol_filter(x, window, _DEGREE, axis=0, mode="interp")
+        return np.asarray(savgol_filter(x, window, _DEGREE, axis=0, mode="interp"))
 
     position = smooth(positions[:, ::2], _POSITION)
     facing = smooth(facing, _FACING)

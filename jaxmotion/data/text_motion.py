@@ -12,6 +12,7 @@ import collections
 import dataclasses
 import os
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -163,8 +164,9 @@ def grouped_statistics(
     groups = layouts[features[0].shape[1]].channels.fields
     count = sum(len(clip) for clip in features)
     # Clip by clip in float64: the whole set in float64 would not fit in memory.
-    mean = sum(clip.sum(0, dtype=np.float64) for clip in features) / count
-    square = sum(((clip - mean) ** 2).sum(0) for clip in features) / count
+    none = np.zeros(features[0].shape[1])
+    mean = sum((clip.sum(0, dtype=np.float64) for clip in features), none) / count
+    square = sum((((clip - mean) ** 2).sum(0) for clip in features), none) / count
     std = np.sqrt(square)
     for name, start, stop in groups:
         std[start:stop] = std[start:stop].mean()
@@ -379,12 +381,12 @@ def load_text_motions(path: str | os.PathLike) -> TextMotions:
     for name in ("offsets", "caption_clip", "split"):
         fields[name] = fields[name].astype(np.int64)
     _check_fields(path, fields)
-    arrays = {
+    arrays: dict[str, Any] = {
         name: fields[name]
         for name, (_, axes) in _FIELDS.items()
         if name not in _TEXTS and axes > 0
     }
-    texts = {name: tuple(fields[name].tolist()) for name in _TEXTS}
+    texts: dict[str, Any] = {name: tuple(fields[name].tolist()) for name in _TEXTS}
     return TextMotions(
         **arrays, **texts, fps=float(fields["fps"]), source=str(fields["source"])
     )

@@ -273,7 +273,7 @@ def eval_windows(clips: Clips, *, stride: int, field: str) -> EvalWindows:
     facing = trajectory.smooth(path.facing, matrix)
     return EvalWindows(
         motion=motion,
-        velocity=jnp.gradient(position, axis=-2) * clips.fps,
+        velocity=jnp.asarray(jnp.gradient(position, axis=-2)) * clips.fps,
         facing=rotation.safe_normalize(facing, jnp.array([0.0, 1.0])),
         label=clips.labels[field][index.clips],
         group=index.clips,

@@ -107,7 +107,7 @@ def _check(tape: Tape, expected: Tape) -> None:
 
 
 def _is_key(value: Any) -> bool:
-    return jax.dtypes.issubdtype(value.aval.dtype, jax.dtypes.prng_key)
+    return jnp.issubdtype(value.aval.dtype, jax.dtypes.prng_key)
 
 
 def one_equation(eqn: core.JaxprEqn, jaxpr: core.Jaxpr, values: list) -> list:
@@ -197,7 +197,7 @@ def _run(traced: core.ClosedJaxpr, values: list, tape: Iterator) -> list:
 
 
 def _array(literal: core.Literal) -> jax.Array:
-    return jnp.asarray(literal.val, literal.aval.dtype)
+    return jnp.asarray(literal.val, literal.aval.dtype)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _role(eqn: core.JaxprEqn) -> str:

@@ -21,6 +21,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.typing import Gaussian
@@ -215,7 +216,7 @@ def schedule_from_betas(beta: Float[Array, " steps"]) -> Schedule:
     beta = jnp.asarray(beta)
     if beta.ndim != 1 or beta.shape[0] < 1:
         raise ValueError(f"beta has shape {beta.shape}, expected [T] with T >= 1")
-    if not isinstance(beta, jax.core.Tracer):
+    if not isinstance(beta, Tracer):
         valid = (beta > 0.0) & (beta < 1.0)
         valid = valid.at[-1].set((beta[-1] > 0.0) & (beta[-1] <= 1.0))
         if not bool(valid.all()):

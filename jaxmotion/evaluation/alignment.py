@@ -5,6 +5,7 @@ A walker's hips sway with every step. Where that is no fault, paths are compared
 """
 
 import functools
+import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -148,7 +149,9 @@ def path_offset(
     gap = position - wanted
     frame, last = np.arange(gap.shape[-2]), gap.shape[-2] - 1
     around = [np.clip(frame + i, 0, last) for i in range(-reach, reach + 1)]
-    return sum(gap[..., i, :] for i in around) / len(around)
+    return functools.reduce(operator.add, (gap[..., i, :] for i in around)) / len(
+        around
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("reach",))

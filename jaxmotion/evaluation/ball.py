@@ -256,7 +256,7 @@ def _event_distances(
         least = jnp.where(active, jnp.minimum(distance, after), jnp.inf)
         return least, least
 
-    frames = tuple(jnp.moveaxis(x, -1, 0) for x in (events.active, nearby))
+    frames = jnp.moveaxis(events.active, -1, 0), jnp.moveaxis(nearby, -1, 0)
     none = jnp.full_like(nearby[..., 0], jnp.inf)
     _, least = jax.lax.scan(back, none, frames, reverse=True)
     return events.starts, jnp.moveaxis(least, 0, -1)

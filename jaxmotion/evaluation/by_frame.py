@@ -7,6 +7,7 @@ as the frames at that place are averaged by themselves.
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +70,7 @@ def rough_sums(
     slide = jnp.sum(jnp.where(low, contact.foot_steps(toes) * fps, 0.0), axis=-1)
     times = jnp.sum(low, axis=-1).astype(float)
     mean = slide / jnp.maximum(times, 1.0)
-    at = {"num_places": num_places}
+    at: dict[str, Any] = {"num_places": num_places}
     return {
         "jerk": place_sums(jerk, place[..., 3:], **at),
         "foot_slide": place_sums(mean, place[..., 1:], weights=times, **at),

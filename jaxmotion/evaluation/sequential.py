@@ -102,6 +102,6 @@ def interval(samples: np.ndarray, *, level: float = 0.95) -> Interval:
         if excess(far, sign) <= 0.0:
             found.append(sign * np.inf)
             continue
-        shift = scipy.optimize.brentq(excess, 0.0, far, args=(sign,))
-        found.append(mean + sign * shift)
+        shift = scipy.optimize.brentq(excess, 0.0, far, args=(sign,), full_output=False)
+        found.append(mean + sign * float(shift))  # pyright: ignore[reportArgumentType]
     return Interval(mean, float(found[0]), float(found[1]))

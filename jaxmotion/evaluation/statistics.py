@@ -115,7 +115,7 @@ def bootstrap_interval(
         n_resamples=num_resamples,
         confidence_level=level,
         method="percentile",
-        random_state=np.random.default_rng(seed),
+        random_state=np.random.default_rng(seed),  # pyright: ignore[reportCallIssue]
     ).confidence_interval
     return Interval(
         estimate=float(statistic(samples)), low=float(found.low), high=float(found.high)

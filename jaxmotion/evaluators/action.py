@@ -18,6 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.evaluators.network import ActionClassifier
+from jaxmotion.networks import blocks
 from jaxmotion.typing import Key, Params
 
 
@@ -85,7 +86,7 @@ def classify(
       Features (for Fréchet distance and diversity), and logits.
     """
     state = _initial_state(key, x.shape[0], config)
-    return config.network.apply({"params": params}, x, state)
+    return blocks.apply(params, config.network, x, state)
 
 
 def loss(

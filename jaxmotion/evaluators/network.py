@@ -9,7 +9,7 @@ its training, for published weights.
 Source: released feature extractor of CAMDM (Chen et al. 2024).
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 import flax.linen as nn
 import jax
@@ -169,9 +169,9 @@ class ActionClassifier(nn.Module):
         Returns:
           Features in (-1, 1), and logits.
         """
-        x = self.lower(x, initial_carry=state[:, 0])
-        x = self.upper(x, initial_carry=state[:, 1])
-        features = jnp.tanh(self.feature(x[:, -1]))
+        lower = jnp.asarray(self.lower(x, initial_carry=state[:, 0]))
+        upper = jnp.asarray(self.upper(lower, initial_carry=state[:, 1]))
+        features = jnp.tanh(self.feature(upper[:, -1]))
         return features, self.out(features)
 
 
@@ -195,7 +195,7 @@ class MovementEncoder(nn.Module):
 
     def setup(self):
         """Makes the layers."""
-        halve = dict(
+        halve: dict[str, Any] = dict(
             strides=(2,),
             padding=((1, 1),),
             kernel_init=_XAVIER,

@@ -21,6 +21,7 @@ from jaxmotion.learning import training
 from jaxmotion.motion import rotation, trajectory
 from jaxmotion.motion.facing import body_facing, plain_names
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
+from jaxmotion.networks import blocks
 from jaxmotion.typing import Key, Params
 
 
@@ -203,8 +204,8 @@ def loss(
       The loss, and the accuracy.
     """
     x, labels = batch
-    _, logits = config.network.apply(
-        {"params": params}, x, train=True, rngs={"dropout": key}
+    _, logits = blocks.apply(
+        params, config.network, x, train=True, rngs={"dropout": key}
     )
     return cross_entropy(logits, labels)
 
@@ -225,7 +226,7 @@ def classify(
     Returns:
       Features (for Fréchet distances), and logits.
     """
-    return config.network.apply({"params": params}, x)
+    return blocks.apply(params, config.network, x)
 
 
 def train(

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.evaluators.network import UNIT, Matcher, Padding
 from jaxmotion.learning import training
+from jaxmotion.networks import blocks
 from jaxmotion.typing import Key, Params
 
 MARGIN = 10.0
@@ -155,8 +156,8 @@ def embed_motion(
     Returns:
       Embeddings, for every measure of text-to-motion.
     """
-    return config.network.apply(
-        {"params": params}, features, frames, padding=padding, method="embed_motion"
+    return blocks.apply(
+        params, config.network, features, frames, padding=padding, method="embed_motion"
     )
 
 
@@ -181,8 +182,8 @@ def embed_text(
     Returns:
       Embeddings.
     """
-    return config.network.apply(
-        {"params": params}, vectors, tags, words, method="embed_text"
+    return blocks.apply(
+        params, config.network, vectors, tags, words, method="embed_text"
     )
 
 
@@ -212,8 +213,9 @@ def matcher_loss(
     if count < 2:
         raise ValueError(f"a batch of {count}, expected at least 2 to mismatch pairs")
     key_drop, key_shift = jax.random.split(key)
-    text, motion = config.network.apply(
-        {"params": params},
+    text, motion = blocks.apply(
+        config.network,
+        params,
         *(batch.features, batch.frames, batch.vectors, batch.tags, batch.words),
         train=True,
         rngs={"dropout": key_drop},

@@ -18,7 +18,7 @@ from jax.extend import core
 
 from jaxmotion import files
 from jaxmotion.diffusion.noise import loop_parts, one_equation
-from jaxmotion.export.graph import ANY, Batch, Graph, Port
+from jaxmotion.export.graph import Batch, Graph, Port
 
 SUFFIX = ".onnx"
 _MISSING = (
@@ -89,7 +89,7 @@ def open_session(model: bytes, *, threads: int = 0) -> Any:
 
 def _try(model: Any, graph: Graph, batch: Batch) -> None:
     """Runs a model once: the checker takes shapes that do not fit for right."""
-    lead = () if batch is None else (2 if batch == ANY else batch,)
+    lead = () if batch is None else (batch if isinstance(batch, int) else 2,)
     zeros = {x.name: np.zeros((*lead, *x.shape), x.dtype) for x in graph.inputs}
     try:
         session = open_session(model.SerializeToString())
@@ -163,6 +163,11 @@ def _newest_first() -> Iterator[None]:
         setattr(output_binding, name, slow)
 
 
+def _aval(atom: Any) -> Any:
+    """Shape and type of a variable: all that is traced here are arrays."""
+    return atom.aval
+
+
 def _is_lost(eqn: core.JaxprEqn) -> bool:
     """Whether the converter gets an equation wrong; gradients are full of such.
 
@@ -173,10 +178,10 @@ def _is_lost(eqn: core.JaxprEqn) -> bool:
     if eqn.primitive.name == "dynamic_slice":
         return True
     if eqn.primitive.name == "select_n":
-        return eqn.invars[1].aval.dtype == bool and len(eqn.invars) == 3
+        return _aval(eqn.invars[1]).dtype == bool and len(eqn.invars) == 3
     if eqn.primitive.name == "dot_general":
         (first, _), batch = eqn.params["dimension_numbers"]
-        return batch == ((), ()) and eqn.invars[0].aval.ndim == 2 and first == (0,)
+        return batch == ((), ()) and _aval(eqn.invars[0]).ndim == 2 and first == (0,)
     return eqn.primitive.name == "scan" and eqn.params["reverse"]
 
 

@@ -45,10 +45,13 @@ def play(folder: Path, about: dict, label: int) -> tuple[np.ndarray, np.ndarray]
 
     roots, rotations = [], []
     for seconds, degrees, speed in COURSE:
-        way = np.float32([np.sin(np.radians(degrees)), np.cos(np.radians(degrees))])
-        command = {"velocity": np.float32(speed) * way, "facing": way}
-        command = {f"command.{name}": x for name, x in command.items()}
-        command["command.label"] = np.array(label, np.int32)
+        angle = np.radians(degrees)
+        way = np.array([np.sin(angle), np.cos(angle)], np.float32)
+        command = {
+            "command.velocity": np.float32(speed) * way,
+            "command.facing": way,
+            "command.label": np.array(label, np.int32),
+        }
         for _ in range(round(seconds * about["fps"])):
             if "step" in graphs:
                 frame = call("step", command)

@@ -169,11 +169,11 @@ def _arrays(names: list[str], part: str, **more: bool) -> dict[str, str] | None:
     """Where the state has poses; None for characters without such a part."""
     ends = {"root": "root_position", "rotation": "joint_rotation"}
     found = {
-        key: next((x for x in names if part in x and x.endswith(end)), None)
+        key: next((x for x in names if part in x and x.endswith(end)), "")
         for key, end in ends.items()
     }
     for key in more:
-        found[key] = next((x for x in names if x.endswith(f".{key}")), None)
+        found[key] = next((x for x in names if x.endswith(f".{key}")), "")
     return found if all(found.values()) else None
 
 

@@ -259,12 +259,12 @@ def restore_part(
         # steps have, and warns.
         reader = ocp.PyTreeCheckpointHandler()
         try:
-            stored = reader.metadata(saved).tree
+            stored = reader.metadata(saved).tree  # pyright: ignore[reportArgumentType]
             if within is not None:
                 stored = stored.get(within) or {}
             # Orbax would hand back what `like` has where the disk has nothing.
             _check_part(folder, step, like, {name: stored.get(name) for name in like})
-            found = reader.restore(saved, args=part)
+            found = reader.restore(saved, args=part)  # pyright: ignore[reportArgumentType]
         finally:
             reader.close()
     except CheckpointError:

@@ -296,7 +296,8 @@ def train(
             while made < length:
                 before = time.perf_counter()
                 count = min(pieces.size, length - made)
-                state, info = jax.block_until_ready(run_chunk(state, key, data, count))
+                made_now = run_chunk(state, key, data, count)  # pyright: ignore[reportCallIssue]
+                state, info = jax.block_until_ready(made_now)
                 infos.append({name: np.asarray(x)[:count] for name, x in info.items()})
                 check_finite(infos[-1], done + made + 1, checkpoints)
                 made += count

@@ -51,7 +51,7 @@ def _rig(
 
     `left` and `right` are patterns that make the name of a limb's joint on that side.
     """
-    rig = dict(zip(_TRUNK, trunk, strict=True))
+    rig: dict[str, tuple[str, ...]] = dict(zip(_TRUNK, trunk, strict=True))
     for side, pattern in (("left", left), ("right", right)):
         for limb, name in zip(_LIMBS, limbs, strict=True):
             rig[f"{side}_{limb}"] = (pattern.format(name),)

@@ -20,6 +20,7 @@ each other here, interleaved there.
 """
 
 import functools
+import operator
 
 import jax
 import jax.numpy as jnp
@@ -78,10 +79,14 @@ def _contacts(skeleton: Skeleton, motion: Motion) -> Array:
     velocity = _central(jnp.diff(feet, axis=0) * motion.fps)
     stands = jnp.linalg.norm(velocity, axis=-1) < CONTACT_SPEED
     size = max(round(_CONTACT_FILTER * motion.fps / 60.0), 1)
-    padded = jnp.pad(stands, ((size // 2, size - 1 - size // 2), (0, 0)), mode="edge")
+    padded = jnp.pad(
+        stands.astype(jnp.int32),
+        ((size // 2, size - 1 - size // 2), (0, 0)),
+        mode="edge",
+    )
     # The upper median of an even number: half of them standing is enough.
-    count = sum(padded[i : i + len(stands)].astype(jnp.int32) for i in range(size))
-    return (2 * count >= size).astype(jnp.float32)
+    parts = [padded[i : i + len(stands)] for i in range(size)]
+    return (2 * functools.reduce(operator.add, parts) >= size).astype(jnp.float32)
 
 
 def _local(skeleton: Skeleton, motion: Motion, bone: Trajectory) -> tuple[Array, Array]:

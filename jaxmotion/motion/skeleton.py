@@ -11,6 +11,7 @@ Units: meters, seconds; world axes y up, right-handed.
 
 import dataclasses
 import functools
+import operator
 from typing import Any
 
 import jax
@@ -146,7 +147,9 @@ def check_skeleton(*, offsets: Any, parents: Any, names: Any, feet: Any) -> None
 
 def _times(a: Array, b: Array) -> Array:
     """Product of matrices [rows, columns, batch]."""
-    return sum(a[:, i, None] * b[None, i] for i in range(3))
+    return functools.reduce(
+        operator.add, (a[:, i, None] * b[None, i] for i in range(3))
+    )
 
 
 def _transposed(a: Array) -> Array:
@@ -174,8 +177,8 @@ def _chain(
 def _chain_forward(
     parents: tuple[int, ...], local: Array, offsets: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
-    found = _chain(parents, local, offsets)
-    return found, (local, offsets, found[1])
+    places, turns = _chain(parents, local, offsets)  # pyright: ignore[reportGeneralTypeIssues]
+    return (places, turns), (local, offsets, turns)
 
 
 def _chain_backward(
@@ -229,7 +232,7 @@ def global_transforms(
         jnp.moveaxis(joint_rotation.reshape(-1, skeleton.num_joints, 6), (1, 2), (1, 0))
     )
     # [joints, rows, columns, batch]
-    moved, turned = _chain(
+    moved, turned = _chain(  # pyright: ignore[reportGeneralTypeIssues]
         skeleton.parents, jnp.moveaxis(local, 2, 0), skeleton.offsets
     )
     back = lambda x: jnp.moveaxis(x, -1, 0).reshape(*batch, *x.shape[:-1])  # noqa: E731

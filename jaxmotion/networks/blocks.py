@@ -17,13 +17,28 @@ It is cut in two, `project` and `attend`, so that a sampler can keep the project
 tokens that do not change between steps, and can skip the rows that nobody reads.
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
+
+from jaxmotion.typing import Params
+
+
+def apply(params: Params, module: Any, *args: Any, **options: Any) -> Any:
+    """What a module makes of its parameters and arguments.
+
+    Args:
+      params: Its parameters.
+      module: Flax module without collections but these; or what has its `apply`.
+      *args: Of its method.
+      **options: Of its method; Flax's own `method` and `rngs`.
+    """
+    return module.apply({"params": params}, *args, **options)
 
 
 def known_labels(
@@ -37,7 +52,7 @@ def known_labels(
     Raises:
       ValueError: names the range, `what`, and the labels found.
     """
-    if not isinstance(labels, jax.core.Tracer):
+    if not isinstance(labels, Tracer):
         found = np.asarray(labels)
         low, high = found.min(), found.max()
         if low < 0 or high >= number:

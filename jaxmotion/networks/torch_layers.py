@@ -39,11 +39,11 @@ class Layers:
         Raises:
           ValueError: if it is missing, has another number of axes, or is empty.
         """
-        found = self.weights[name].shape if name in self.weights else "nothing"
-        if name not in self.weights or len(found) != axes or 0 in found:
+        found = self.weights[name].shape if name in self.weights else None
+        if found is None or len(found) != axes or 0 in found:
             raise ValueError(
                 f"{self.path} does not fit {self.what}; {name} should have {axes} "
-                f"axes, found {found}"
+                f"axes, found {'nothing' if found is None else found}"
             )
         return found
 

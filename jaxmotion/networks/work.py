@@ -62,21 +62,26 @@ def count(function: Callable, *arguments: Any) -> Work:
     return Work(*_work(traced.jaxpr))
 
 
+def _aval(atom: Any) -> Any:
+    """Shape and type of a variable: all that is traced here are arrays."""
+    return atom.aval
+
+
 def _work(jaxpr: Jaxpr) -> tuple[int, int]:
     calls = flops = 0
     for equation in jaxpr.eqns:
         name, given = equation.primitive.name, equation.params
         if name == "name" and given["name"].startswith(_MARK):
             one = int(given["name"].removeprefix(_MARK))
-            calls += equation.outvars[0].aval.size // one
+            calls += _aval(equation.outvars[0]).size // one
         elif name == "dot_general":
             (contracted, _), _ = given["dimension_numbers"]
-            left, out = equation.invars[0].aval.shape, equation.outvars[0].aval.size
+            left, out = _aval(equation.invars[0]).shape, _aval(equation.outvars[0]).size
             flops += 2 * out * math.prod(left[i] for i in contracted)
         elif name == "conv_general_dilated":
-            kernel = equation.invars[1].aval
+            kernel = _aval(equation.invars[1])
             channels = kernel.shape[given["dimension_numbers"].rhs_spec[0]]
-            out = equation.outvars[0].aval.size
+            out = _aval(equation.outvars[0]).size
             flops += 2 * out * kernel.size // channels
         inner = [_work(part) for part in jaxprs_in_params(given)]
         if not inner:

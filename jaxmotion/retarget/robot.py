@@ -413,7 +413,7 @@ def _velocities(path: Path, model: Any, joints: np.ndarray) -> np.ndarray:
         for joint in ElementTree.fromstring(text).iter("joint"):
             limit = joint.find("limit")
             with contextlib.suppress(TypeError, ValueError, AttributeError):
-                told[joint.get("name")] = float(limit.get("velocity"))
+                told[joint.get("name")] = float(limit.get("velocity"))  # pyright: ignore
     for n, joint in enumerate(joints):
         speed = told.get(model.joint(int(joint)).name, 0.0)
         found[n] = speed if 0 < speed < np.inf else np.inf
@@ -508,10 +508,11 @@ def _roles(
             if (number >= len(tree))
             else tree[number]
         )
-    left = sum(
+    apart = [
         data.xpos[bodies[LEFT + part]] - data.xpos[bodies[RIGHT + part]]
         for part in ("UpperLeg", "LowerLeg", "Foot")
-    )
+    ]
+    left = np.sum(apart, axis=0)
     left[2] = 0.0
     if np.linalg.norm(left) < 0.02:
         raise ValueError("its legs are not beside each other in the zero pose")

@@ -115,18 +115,19 @@ class RobotMotion:
         model, tree = self.robot.model, self.robot.tree
         data = mujoco.MjData(model)
         count = len(self.qpos), len(tree)
-        found = tuple(np.zeros((*count, n)) for n in (3, 4, 3, 3))
+        places, turns = np.zeros((*count, 3)), np.zeros((*count, 4))
+        velocities, spins = np.zeros((*count, 3)), np.zeros((*count, 3))
         six = np.zeros(6)
         for frame in range(len(self.qpos)):
             data.qpos[:], data.qvel[:] = self.qpos[frame], self.qvel[frame]
             mujoco.mj_fwdPosition(model, data)
             mujoco.mj_fwdVelocity(model, data)
-            found[0][frame], found[1][frame] = data.xpos[tree], data.xquat[tree]
+            places[frame], turns[frame] = data.xpos[tree], data.xquat[tree]
             for n, body in enumerate(tree):
                 kind = mujoco.mjtObj.mjOBJ_XBODY
                 mujoco.mj_objectVelocity(model, data, kind, int(body), six, 0)
-                found[3][frame, n], found[2][frame, n] = six[:3], six[3:]
-        return found
+                spins[frame, n], velocities[frame, n] = six[:3], six[3:]
+        return places, turns, velocities, spins
 
     def as_skeleton(self) -> tuple[Skeleton, Motion]:
         """Its bodies as joints of a skeleton in our world, and its motion on that."""

@@ -132,9 +132,9 @@ def _in_order(skeleton: Skeleton, found: Mapping[str, int]) -> bool:
     """Whether each limb's joints are below each other."""
     for side in (LEFT, RIGHT):
         for parts in (_ARM[1:], _LEG[:3]):
-            joints = [found.get(side + part) for part in parts]
-            if None in joints:
+            if any(side + part not in found for part in parts):
                 return False
+            joints = [found[side + part] for part in parts]
             chain = anatomy.chain(skeleton.parents, joints[-1])
             if not (joints[0] in chain and joints[1] in chain):
                 return False

@@ -21,6 +21,7 @@ of two bones within reach is met exactly.
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -145,6 +146,7 @@ def _trunk(rest: Rest) -> tuple[list[int], list[int], np.ndarray, np.ndarray]:
     """Joints from hips to chest, and of the neck, and where the two end."""
     trunk = list(rest.anatomy.trunk)
     hips, chest = rest.joint("hips"), rest.joint("chest")
+    assert hips is not None and chest is not None  # of every person
     spine = trunk[trunk.index(hips) : trunk.index(chest) + 1]
     above = trunk[trunk.index(chest) + 1 :]
     head = rest.joint("head")
@@ -205,11 +207,12 @@ _settled = jax.lax.optimization_barrier
 
 # Written out: products of 3 x 3 matrices then compile into the loops around them.
 def _times(a: Array, b: Array) -> Array:
-    return sum(a[..., :, k, None] * b[..., None, k, :] for k in range(3))
+    parts = [a[..., :, k, None] * b[..., None, k, :] for k in range(3)]
+    return functools.reduce(operator.add, parts)
 
 
 def _turned(a: Array, v: np.ndarray | Array) -> Array:
-    return sum(a[..., :, k] * v[k] for k in range(3))
+    return functools.reduce(operator.add, (a[..., :, k] * v[k] for k in range(3)))
 
 
 def _orthonormal(matrices: Array) -> Array:
@@ -338,7 +341,7 @@ class Retarget:
         turned[-1] = jnp.eye(3, dtype=turns.dtype)  # above the hips
         twists = self._twists(turned)
         turned = [twists.get(j, turned[up]) for j, up in enumerate(leader)]
-        hips = turned[self.target.joint("hips")]
+        hips = turned[self.target.joint("hips")]  # pyright: ignore
         turned = _settled(jnp.stack(turned))
         world = _times(turned, jnp.asarray(self.target.turns, turns.dtype))
         parents = np.maximum(self.target.skeleton.parents, 0)
@@ -417,7 +420,7 @@ class Retarget:
                 float(np.mean([one.places[leg.end, 1] for leg in limbs])) - one.sole
             )
         middle = 0.5 * sum(places[leg.upper] for leg, _ in pairs)
-        middle = self._scaled(middle, *heights)
+        middle = self._scaled(jnp.asarray(middle), *heights)
         goals, drops = [], []
         for yours, mine in pairs:
             foot = turned[mine.end]
@@ -458,7 +461,8 @@ class Retarget:
         """The target's hip joint."""
         hips = self.target.joint("hips")
         offset = self.target.places[leg.upper] - self._hip_middle
-        return middle + _turned(turned[hips], offset.astype(np.float32))
+        turn = turned[hips]  # pyright: ignore[reportArgumentType]
+        return middle + _turned(turn, offset.astype(np.float32))
 
     def _aimed(
         self, turned: dict[int, Array], joint: int, child: int, direction: Array

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxmotion.networks import blocks
 from jaxmotion.networks.clip import EPSILON, ClipText
 from jaxmotion.networks.weight_files import Stored, arrays, read_weights
 from jaxmotion.text import files
@@ -140,7 +141,7 @@ def load_clip(folder: str | os.PathLike) -> ClipModel:
     params = _take_weights(weights, stored, network)
     digest = zlib.crc32(vocabulary.read_bytes())
     for leaf in jax.tree.leaves(params):
-        digest = zlib.crc32(np.asarray(leaf), digest)
+        digest = zlib.crc32(np.asarray(leaf).tobytes(), digest)
     return ClipModel(
         network=network, params=params, tokenizer=tokenizer, fingerprint=f"{digest:08x}"
     )
@@ -340,7 +341,7 @@ def tokenize(
 def _forward(
     params: Params, ids: Int[Array, "batch tokens"], *, network: ClipText
 ) -> Float[Array, "batch dimensions"]:
-    return network.apply({"params": params}, ids)
+    return blocks.apply(params, network, ids)
 
 
 def encode(

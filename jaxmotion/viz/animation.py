@@ -5,6 +5,7 @@ import functools
 import io
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -220,7 +221,9 @@ def _ball(center: np.ndarray, radius: float, color: int) -> _Solid:
 def _solid(shot: _Shot, frame: int, *, ghost: bool = False) -> _Solid:
     """All bodies, the ball, and marks of what touches it; or all ghosts."""
     stage, body = shot.stage, shot.stage.body
-    pose = stage.ghost_pose if ghost else (stage.positions, stage.rotations)
+    pose = stage.positions, stage.rotations
+    if ghost and stage.ghost_pose is not None:
+        pose = stage.ghost_pose
     vertices, normals = body.skin(*(values[:, frame] for values in pose))
     colors = body.materials
     if ghost:
@@ -300,7 +303,7 @@ def _draw(shot: _Shot, frame: int) -> Image.Image:
     for key, color in page.keys:
         pen.rectangle(key, fill=color)
     for text, size, place, color in page.texts:
-        halo = dict(stroke_width=2, stroke_fill=_GROUND)
+        halo: dict[str, Any] = dict(stroke_width=2, stroke_fill=_GROUND)
         pen.text(place, text, fill=color, font=_font(size), **halo)
     return picture
 

@@ -1,6 +1,7 @@
 """The camera of an animation: perspective, of one direction, following smoothly."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -84,7 +85,7 @@ def smooth(values: np.ndarray, frames: float) -> np.ndarray:
     """
     reach = max(int(3 * frames), 1)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(frames, 1e-3)) ** 2)
-    mode = {"reflect_type": "odd"} if len(values) > 1 else {}
+    mode: dict[str, Any] = {"reflect_type": "odd"} if len(values) > 1 else {}
     padded = np.pad(values, ((reach, reach), (0, 0)), mode="reflect", **mode)
     columns = [np.convolve(c, weights / weights.sum(), "valid") for c in padded.T]
     return np.stack(columns, axis=-1)

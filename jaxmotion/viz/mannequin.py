@@ -420,6 +420,10 @@ class _Flesh:
         side = unit(side - axis * (side @ axis))
         depth = np.cross(side, axis)
         rows = np.array([[*row, 0.0, 0.0][:5] for row in stations])
+
+        def cap(row: np.ndarray, height: float | None) -> float:
+            return self.s * float(min(row[1:3]) if height is None else height)
+
         self.lofts.append(
             _Loft(
                 start=start,
@@ -431,10 +435,7 @@ class _Flesh:
                 owners=tuple((at * length, joint) for at, joint in owners),
                 colors=tuple((at * length, PALETTE.index(c)) for at, c in colors),
                 blend=blend * self.s,
-                caps=tuple(
-                    self.s * float(min(row[1:3]) if cap is None else cap)
-                    for row, cap in zip(rows[[0, -1]], caps, strict=True)
-                ),
+                caps=(cap(rows[0], caps[0]), cap(rows[-1], caps[1])),
                 floor=floor,
             )
         )
@@ -845,7 +846,7 @@ def _flesh(
         radius = max(radius, thinnest / made.s)
         _add_bone(made, joint, radius, dark if finger else light)
     if not made.lofts:
-        made.ball(places[0], (0.05,) * 3, owner=0, color=IVORY, blend=0.01)
+        made.ball(places[0], (0.05, 0.05, 0.05), owner=0, color=IVORY, blend=0.01)
     return made.lofts
 
 
@@ -862,10 +863,10 @@ def _grid(
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     axes = []
     for axis in range(3):
-        ends = [low[axis] - 2.5 * cell, high[axis] + 2.5 * cell]
+        begin, end = low[axis] - 2.5 * cell, high[axis] + 2.5 * cell
         if axis == 0:
-            ends = [-max(-ends[0], ends[1]), max(-ends[0], ends[1])]
-        fine = np.linspace(*ends, 400)
+            begin, end = -max(-begin, end), max(-begin, end)
+        fine = np.linspace(begin, end, 400)
         rate = np.ones(400)
         for number, place, reach in focus:
             if number == axis:
@@ -1032,10 +1033,10 @@ def describe(
 
 @functools.lru_cache(maxsize=32)
 def _mesh(
-    joints: bytes, parents: tuple[int, ...], found: Anatomy, detail: str
+    packed: bytes, parents: tuple[int, ...], found: Anatomy, detail: str
 ) -> Mannequin:
     """The mannequin of joints at these places, none of which is turned."""
-    places = np.frombuffer(joints, np.float32).reshape(-1, 3).astype(float)
+    places = np.frombuffer(packed, np.float32).reshape(-1, 3).astype(float)
     s = _scale(parents, found, places)
     coarse = _DETAIL[detail]
     reach = float(np.ptp(places, axis=0).max()) if len(places) > 1 else 0.0

@@ -99,7 +99,8 @@ def read_message(text: str | bytes) -> dict[str, Any]:
         raise ValueError("message is no JSON object")
     if "held" not in value:
         return value
-    held, azimuth, target = (value.get(k) for k in ("held", "azimuth", "target"))
+    held, target = value["held"], value.get("target")
+    azimuth = value.get("azimuth", math.nan)
     if not isinstance(held, list) or not all(x in MOVES for x in held):
         raise ValueError(f"held is wrong, expected some of {', '.join(MOVES)}")
     point = [0.0, 0.0] if target is None else target
@@ -306,7 +307,7 @@ class Page:
         dress = self.session.dress
         if dress is not None:
             self._body = engine, dress.packed
-        else:
+        elif skeleton is not None:
             about = {"skeleton": packed.skeleton_json(skeleton)}
             arrays = packed.body_arrays(skeleton, poses)
             self._body = engine, packed.pack(about, arrays)

@@ -120,7 +120,7 @@ def write_dots(
     size = (1.6 + 3.5 * across, 0.5 + down * (0.9 + 0.26 * len(methods)))
     canvas = Figure(figsize=size, dpi=110, layout="constrained")
     # Or the last tick of one axes runs into the first of the next.
-    canvas.get_layout_engine().set(w_pad=0.08)
+    canvas.get_layout_engine().set(w_pad=0.08)  # pyright: ignore
     canvas.suptitle(title, fontsize=11)
     grid = canvas.subplots(down, 2 * across, squeeze=False)
     pairs = grid.reshape(down * across, 2)

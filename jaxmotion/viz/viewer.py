@@ -328,7 +328,7 @@ class Session:
 
     def _end_take(self, engine: Engine | None) -> None:
         frames, self._take = self._take, None
-        if frames:
+        if frames and engine is not None:
             root, rotation = (
                 jnp.asarray(np.stack(x)) for x in zip(*frames, strict=True)
             )
@@ -408,7 +408,9 @@ class Session:
                 due = time.perf_counter()
                 continue
             self.tick()
-            due += 1.0 / self._engine.character.fps
+            engine = self._engine
+            assert engine is not None  # checked above; only this thread changes it
+            due += 1.0 / engine.character.fps
             late = time.perf_counter() - due
             if late > _CATCH_UP:
                 due = time.perf_counter()
@@ -419,6 +421,7 @@ class Session:
         """One tick of all characters, shown and recorded."""
         begin = time.perf_counter()
         engine = self._engine
+        assert engine is not None  # the loop ticks where there is one
         with self._lock:
             settings = self.settings
             inputs = self._inputs.get(self._active, Inputs())
@@ -434,6 +437,7 @@ class Session:
         )
         self._told = settled(self._told, wish, steady=wish == self._wish)
         self._wish = wish
+        assert self._crowd is not None  # made with the engine
         self._crowd, made, more = engine.step(
             self._crowd, self._told, settings, seed=self._seed, n=self._tick
         )
@@ -566,7 +570,8 @@ class Session:
             motion = Motion(
                 root_position=roots, joint_rotation=turns, fps=engine.character.fps
             )
-            self._dresses[name] = self._dress(engine.character, motion)
+            dressed = self._dress(engine.character, motion)  # pyright: ignore
+            self._dresses[name] = dressed
         dress = self._dresses[name]
         joints = engine.character.skeleton.num_joints
         for number in {1, engine.number}:

@@ -38,6 +38,7 @@ class BandaiNamco(base.MotionBuilder):
     the position channels, which every joint has; OFFSET holds the first frame's.
     """
 
+    builder_config: BandaiNamcoConfig  # one of these, as tfds sets it
     BUILDER_CONFIGS = [
         BandaiNamcoConfig(name=name, description=f"Set {name}.") for name in ("1", "2")
     ]

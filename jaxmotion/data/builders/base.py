@@ -66,7 +66,7 @@ class MotionBuilder(tfds.core.GeneratorBasedBuilder, skip_registration=True):
                 dtype=dtype,
                 encoding="bytes" if shape.count(None) > 1 else "none",
             )
-            for name, (shape, dtype) in (_TENSORS | self.MORE_TENSORS).items()
+            for name, (shape, dtype) in {**_TENSORS, **self.MORE_TENSORS}.items()
         }
         # Joint names may contain spaces, but no line ends.
         for name in ("name", "joint_names", *self.LABELS):
@@ -276,7 +276,8 @@ def read_records(builder: MotionBuilder) -> list[dict]:
     Returns:
       Features of each clip, sorted by name.
     """
-    return sorted(builder.as_data_source(split="train"), key=lambda r: r["name"])
+    records = builder.as_data_source(split="train")  # pyright: ignore[reportCallIssue]
+    return sorted(records, key=lambda r: r["name"])
 
 
 def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Clips:

@@ -13,6 +13,7 @@ import dataclasses
 import logging
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import tensorflow_datasets as tfds
@@ -53,6 +54,7 @@ class HumanML3D(tfds.core.GeneratorBasedBuilder, skip_registration=True):
     name = "humanml3d"
     VERSION = tfds.core.Version("1.0.0")
     RELEASE_NOTES = {"1.0.0": "First version."}
+    builder_config: TextConfig  # one of these, as tfds sets it
     BUILDER_CONFIGS = [
         TextConfig(
             name="humanml3d",
@@ -98,7 +100,8 @@ class HumanML3D(tfds.core.GeneratorBasedBuilder, skip_registration=True):
         folder = _find_folder(Path(dl_manager.manual_dir))
         num_features = self.builder_config.num_features
         mean, std = _read_statistics(folder, num_features)
-        self.info.metadata.update(mean=mean.tolist(), std=std.tolist())
+        found = tfds.core.MetadataDict(mean=mean.tolist(), std=std.tolist())
+        self.info.metadata.update(found)  # pyright: ignore[reportOptionalMemberAccess]
         names = _read_lists(folder)
         return {
             split: self._generate_examples(folder, names[split]) for split in SPLITS
@@ -213,10 +216,10 @@ def text_motions_from_source(
 
     Source: the data loader released with T2M.
     """
-    config = builder.builder_config
+    config = cast(TextConfig, builder.builder_config)
     clips, splits = [], []
     for split in SPLITS:
-        records = builder.as_data_source(split=split)
+        records = builder.as_data_source(split=split)  # pyright: ignore[reportCallIssue]
         for record in sorted(records, key=lambda r: r["name"]):
             name = record["name"].decode()
             clips += cut_recording(
@@ -229,13 +232,14 @@ def text_motions_from_source(
             )
             splits += [split] * (len(clips) - len(splits))
     names, features, captions = zip(*clips, strict=True) if clips else ((), (), ())
+    stored: Any = builder.info.metadata or {}
     return text_motions(
         features,
         captions,
         splits,
         names,
-        mean=np.array(builder.info.metadata["mean"], np.float32),
-        std=np.array(builder.info.metadata["std"], np.float32),
+        mean=np.array(stored["mean"], np.float32),
+        std=np.array(stored["std"], np.float32),
         fps=config.fps,
         source=config.source,
     )

@@ -72,6 +72,8 @@ class SoccerX(ball_base.BallBuilder):
             if skeleton is not None:
                 raise ValueError(f"{path}: a second {_SKELETON}, expected one")
             skeleton = read_skeleton(path, data)
+        if skeleton is None:
+            raise FileNotFoundError(f"{folder}: no {_SKELETON}")
         found = False
         for path, data in base.read_files(folder, (".npz",), unique=False):
             if not path.endswith(_SKELETON):

@@ -44,6 +44,7 @@ class Style100Config(tfds.core.BuilderConfig):
 class Style100(base.MotionBuilder):
     """A hundred styles, ten actions each, taken at 30 of 60 frames per second."""
 
+    builder_config: Style100Config  # one of these, as tfds sets it
     BUILDER_CONFIGS = [
         Style100Config(name="original", description="As recorded."),
         Style100Config(

@@ -446,6 +446,8 @@ def own_states(
       States, batch axis first.
     """
     space, joints = model.space, model.skeleton.num_joints
+    if model.starts is None:
+        raise ValueError("the model has no starts")
     chosen = np.random.default_rng(seed).integers(0, len(model.starts), number)
     steps = 0 if memory is None else memory.num_steps
     noise = jax.random.normal(jax.random.key(seed), (number, steps, space.num_features))

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 
 from jaxmotion.motion import features, pose, rotation
 from jaxmotion.motion.features import unpack
+from jaxmotion.networks import blocks
 from jaxmotion.systems.aamdm import network as aamdm_network
 from jaxmotion.typing import Key, Params
 
@@ -188,7 +189,7 @@ def encode(
       [path features in meters, latent].
     """
     given = features.normalize(statistics.group, poses)
-    latent = _nets(config)[0].apply({"params": params["encoder"]}, given)
+    latent = blocks.apply(params["encoder"], _nets(config)[0], given)
     return jnp.concatenate([paths, latent], axis=-1)
 
 
@@ -212,7 +213,7 @@ def decode(
     """
     path = features.normalize(statistics.path, embedded[..., :PATH])
     given = jnp.concatenate([path, embedded[..., PATH:]], axis=-1)
-    found = _nets(config)[1].apply({"params": params["decoder"]}, given)
+    found = blocks.apply(params["decoder"], _nets(config)[1], given)
     return features.denormalize(statistics.pose, found)
 
 

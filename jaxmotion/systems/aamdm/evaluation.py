@@ -166,7 +166,7 @@ def data_frames(
         origin = PlanarFrame(origin=jnp.zeros(2), facing=jnp.array([0.0, 1.0]))
         bone = pose.integrate_root(poses, origin, num_joints=joints, fps=fps)
         root, rot6d = pose.place(poses, bone, num_joints=joints)
-        velocity = jnp.gradient(bone.origin, axis=0) * fps
+        velocity = jnp.asarray(jnp.gradient(bone.origin, axis=0)) * fps
         return Frame(
             root_position=root,
             joint_rotation=rot6d,

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.diffusion import gan, schedule
+from jaxmotion.networks import blocks
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm.model import Config
 from jaxmotion.typing import Key, Params
@@ -30,7 +31,7 @@ def _shaken(key: Key, frame: Array, config: Config) -> Array:
 
 
 def random_noise(
-    key: Key, shape: tuple[int, int], *, largest: float
+    key: Key, shape: tuple[int, ...], *, largest: float
 ) -> Float[Array, "batch features"]:
     """Noise of a different size for each row, uniform up to the largest.
 
@@ -157,7 +158,7 @@ def discriminator_loss(
     """
     previous, t, x_prev, x_t, fake = _pairs(generator, key, windows, config, change)
     net = aamdm_model.discriminator(config)
-    score = lambda x: net.apply({"params": params}, x, x_t, t, previous)  # noqa: E731
+    score = lambda x: blocks.apply(params, net, x, x_t, t, previous)  # noqa: E731
     adversarial = gan.discriminator_loss(score(x_prev), score(fake))
     r1 = gan.r1_penalty(score, x_prev)
     loss = adversarial + 0.5 * config.weight_r1 * r1
@@ -188,7 +189,7 @@ def generator_loss(
     """
     previous, t, _, x_t, fake = _pairs(params, key, windows, config, change)
     net = aamdm_model.discriminator(config)
-    logits = net.apply({"params": discriminator}, fake, x_t, t, previous)
+    logits = blocks.apply(discriminator, net, fake, x_t, t, previous)
     return gan.generator_loss(logits), {}
 
 

@@ -19,7 +19,7 @@ sections 3.2-3.5. Sizes and the schedule are ours, since the paper gives none.
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from jaxmotion.diffusion import chain, guidance
 from jaxmotion.diffusion import schedule as tables
 from jaxmotion.diffusion.schedule import Schedule
-from jaxmotion.networks import mlp
+from jaxmotion.networks import blocks, mlp
 from jaxmotion.typing import Denoiser, Key, Objective, Params
 
 
@@ -223,7 +223,7 @@ def draft(
 
     def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
         latent = jax.random.normal(key, (*x_t.shape[:-1], config.latent), x_t.dtype)
-        found = network(config).apply({"params": params}, x_t, t, previous, latent)
+        found = blocks.apply(params, network(config), x_t, t, previous, latent)
         return to_frame(found, previous, change)
 
     return denoise
@@ -250,7 +250,7 @@ def polish(
 
     def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
         del key  # deterministic
-        found = network(config).apply({"params": params}, x_t, t, previous)
+        found = blocks.apply(params, network(config), x_t, t, previous)
         return to_frame(found, previous, change)
 
     return denoise
@@ -297,7 +297,9 @@ def sampler(
         guided_steps: int | None = None,
         noise: Float[Array, "steps *batch features"] | None = None,
     ) -> Float[Array, "*batch features"]:
-        make = step if noise is None else functools.partial(step, noise=noise)
+        # Only a step that remembers takes noise from outside.
+        given: dict[str, Any] = {} if noise is None else {"noise": noise}
+        make = functools.partial(step, **given)
         guided = config.num_steps if guided_steps is None else guided_steps
         if objective is None:
             guided = 0
@@ -307,7 +309,7 @@ def sampler(
             if start > border:
                 move = make(table, denoise)
                 x = chain.sample_from(move, key_chain, x, start=start, stop=border)
-            if border > stop:
+            if objective is not None and border > stop:
                 denoise = guidance.gradient_guidance(
                     table, denoise, objective, scale=scale
                 )

@@ -8,6 +8,7 @@ full_pose/...                                the same without the embedding
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -362,7 +363,8 @@ def _pose_error(
     """
     poses = [aamdm_space.to_poses(space, x) for x in (found, frames)]
     common = dict(parents=run.skeleton.parents, config=run.embedding)
-    total = sum(aamdm_embedding.pose_errors(*poses, **common))
+    errors = aamdm_embedding.pose_errors(*poses, **common)
+    total = functools.reduce(operator.add, errors)
     if weight_foot:
         feet = run.skeleton.feet
         error = aamdm_embedding.foot_error(*poses, feet=feet, **common)

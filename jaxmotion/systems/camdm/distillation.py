@@ -14,7 +14,7 @@ draws anew what it adds to the prediction, as Song et al. 2023 (alg. 1) do.
 import dataclasses
 import functools
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from jaxmotion.diffusion import distillation, schedule
 from jaxmotion.learning import runs
 from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.networks import blocks
 from jaxmotion.systems.camdm import loss as camdm_loss
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import training as camdm_training
@@ -68,13 +69,13 @@ def loss(
     net = camdm_model.network(config)
 
     def denoiser(params: Params, arguments: tuple[Array, ...]) -> Denoiser:
-        context = net.apply({"params": params}, *arguments, method="encode")
-        return lambda key, x_t, t: net.apply(
-            {"params": params}, context, x_t, t, method="denoise"
+        context = blocks.apply(params, net, *arguments, method="encode")
+        return lambda key, x_t, t: blocks.apply(
+            params, net, context, x_t, t, method="denoise"
         )
 
     def pairs(key: Key, x_0: Array, arguments: tuple[Array, ...]) -> distillation.Pairs:
-        both = dict(
+        both: dict[str, Any] = dict(
             table=schedule.cosine_schedule(config.num_steps),
             student=denoiser(params, arguments),
             teacher=denoiser(teacher, arguments),
@@ -187,7 +188,7 @@ def train(run: runs.Run, teacher: Params, budget: runs.Budget) -> None:
             teacher=teacher,
             skeleton=model.skeleton,
             config=config,
-            steps=model.steps,
+            steps=model.steps,  # pyright: ignore[reportArgumentType]
             target=settings["target"],
         ),
         camdm_training.window_sampler(field=settings["label"], batch=budget.batch),

@@ -227,7 +227,10 @@ def _release_cells(
     """Columns of the released evaluation."""
     values = camdm_release.metrics(reference.skeleton, whole)
     fid = camdm_release.distances(
-        reference.skeleton, whole, reference.evaluator, reference.styles
+        reference.skeleton,
+        whole,
+        reference.evaluator,
+        reference.styles,  # pyright: ignore[reportArgumentType]
     )
     return camdm_release.row(values | {"fid": fid}, group)
 
@@ -395,7 +398,9 @@ def load_evaluator(
     )
     if frozen is not None:
         return style_evaluator.StyleEvaluator(
-            params=frozen, config=evaluator.config, classes=classes
+            params=frozen,
+            config=evaluator.config,  # pyright: ignore
+            classes=classes,
         )
     print(f"training the evaluator of styles for {num_steps} steps", flush=True)
     return style_evaluator.fit(key, run.train, field=run.field, num_steps=num_steps)

@@ -27,6 +27,8 @@ from jaxmotion.systems.camdm.model import (
 )
 from jaxmotion.typing import Key, Params
 
+# pyright: reportCallIssue=false
+
 
 def mean_rotations(
     skeleton: Skeleton, motion: Motion, *, config: Config
@@ -164,7 +166,8 @@ def weighted(
         "acceleration": config.weight_acceleration,
         "foot": config.weight_foot,
     }
-    return sum(weights[name] * value for name, value in terms.items()), terms
+    total = sum(weights[name] * value for name, value in terms.items())
+    return total, terms  # pyright: ignore[reportReturnType]
 
 
 def loss_terms(

@@ -29,7 +29,7 @@ from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.motion import features, rotation, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton
-from jaxmotion.networks import transformer
+from jaxmotion.networks import blocks, transformer
 from jaxmotion.systems.camdm import network as camdm_network
 from jaxmotion.typing import Key, Params
 
@@ -294,7 +294,7 @@ def sampler(
 
     def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
         del key  # deterministic
-        return net.apply({"params": params}, context, x_t, t, method="denoise")
+        return blocks.apply(params, net, context, x_t, t, method="denoise")
 
     def encode(condition: Condition):
         arguments = condition.arguments(config)

@@ -121,7 +121,8 @@ def _stated(path: Path, content: dict[str, Any]) -> dict[str, Any]:
     for field, name, default in zip(found, names, (10, 45, 4, 4), strict=True):
         if found[field] is None:
             found[field] = value.get(name, default)
-        if type(found[field]) is not int or not 1 <= found[field] <= 1000:
+        number: Any = found[field]
+        if type(number) is not int or not 1 <= number <= 1000:
             raise ValueError(
                 f"{path}: states {name} {found[field]!r}, expected 1 to 1000"
             )

@@ -125,9 +125,9 @@ def _features(
         vectors, (length,) * vectors.shape[0], config=config
     )
     sample = emdm_training.row_sampler(params, config, row)
-    scale = emdm_training.guidance_scale(scale, task=config.condition)
+    factor = emdm_training.guidance_scale(scale, task=config.condition)
     many = emdm_training.sample_many(sample, chunk=8)
-    return many(jax.random.key(seed), conditions, scale)[:, :length]
+    return many(jax.random.key(seed), conditions, factor)[:, :length]
 
 
 def make_motions(
@@ -165,7 +165,7 @@ def make_motions(
             raise ValueError(f"{folder} makes motions from {task!r}, not from {name!r}")
     if task in given and not given[task]:
         raise ValueError(f"expected --{task} for {folder}")
-    options = dict(row=row, frames=frames, scale=scale, seed=seed)
+    options: dict[str, Any] = dict(row=row, frames=frames, scale=scale, seed=seed)
     if task == "text":
         run = emdm_text.load_run(folder)
         if run.motions.num_features != 263:
@@ -222,7 +222,7 @@ def exports(
         record = runs.load(folder, system=emdm_training.SYSTEM)
         params, config = emdm_training.load_row(record, row)
     sample = emdm_training.row_sampler(params, config, row)
-    scale = emdm_training.guidance_scale(scale, task=config.condition)
+    factor = emdm_training.guidance_scale(scale, task=config.condition)
     vector = jnp.zeros((1, config.condition_size))
     condition = emdm_model.make_condition(vector, config=config)
     if config.condition == "text":
@@ -246,7 +246,7 @@ def exports(
         }
 
     def made(key: Key, condition: emdm_model.Condition) -> Any:
-        return decode(sample(key, condition, scale=scale))
+        return decode(sample(key, condition, scale=factor))
 
     function = Exported(made, ("key", "condition"), (gives,))
     return {"sample": function}, jax.tree.map(lambda x: x[0], condition), facts

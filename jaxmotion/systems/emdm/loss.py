@@ -14,6 +14,8 @@ Source: Zhou et al. 2024 (EMDM), eq. 5-12; released code.
 """
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Callable
 
 import jax
@@ -23,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxmotion.diffusion import gan, schedule
 from jaxmotion.learning import losses
 from jaxmotion.motion import contact
+from jaxmotion.networks import blocks
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm.model import Config
 from jaxmotion.typing import Key, Params
@@ -127,8 +130,8 @@ def geometric_loss(
         terms["foot"] = losses.foot_slide_loss(
             found[..., feet, :], stands, mask, average=average
         )
-    total = sum(weights[name] * value for name, value in terms.items())
-    return total, terms
+    parts = [weights[name] * value for name, value in terms.items()]
+    return functools.reduce(operator.add, parts), terms
 
 
 def _visible(x: Array, batch: Batch, config: Config) -> Array:
@@ -146,8 +149,9 @@ def _generated(
     t = jax.random.randint(keys["t"], (size,), 1, config.num_steps + 1)
     x_prev, x_t = gan.q_pair(table, keys["pair"], batch.x_0, t)
     keep = jax.random.bernoulli(keys["keep"], 1.0 - config.drop_condition, (size,))
-    prediction = emdm_model.generator(config).apply(
-        {"params": params},
+    prediction = blocks.apply(
+        params,
+        emdm_model.generator(config),
         x_t,
         t,
         batch.vector,
@@ -189,7 +193,7 @@ def discriminator_loss(
     seen = emdm_model.discriminator_condition(batch.vector, config=config)
 
     def score(x: Array) -> Array:
-        return net.apply({"params": params}, x, x_t, t, seen)
+        return blocks.apply(params, net, x, x_t, t, seen)
 
     adversarial = gan.discriminator_loss(
         score(x_prev), score(jax.lax.stop_gradient(fake))
@@ -227,8 +231,8 @@ def generator_loss(
     """
     t, _, x_t, prediction, fake = _generated(params, key, batch, config)
     seen = emdm_model.discriminator_condition(batch.vector, config=config)
-    logits = emdm_model.discriminator(config).apply(
-        {"params": discriminator}, fake, x_t, t, seen
+    logits = blocks.apply(
+        discriminator, emdm_model.discriminator(config), fake, x_t, t, seen
     )
     geometric, terms = geometric_loss(
         prediction, batch, t, config=config, geometry=geometry
@@ -268,8 +272,9 @@ def diffusion_loss(
     noise = jax.random.normal(key_noise, batch.x_0.shape)
     x_t = schedule.q_sample(config.table(), batch.x_0, t, noise)
     keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_condition, (size,))
-    prediction = emdm_model.generator(config).apply(
-        {"params": params},
+    prediction = blocks.apply(
+        params,
+        emdm_model.generator(config),
         x_t,
         t,
         batch.vector,

@@ -311,12 +311,12 @@ def sampler(
     def denoise(key: Key, x_t: Array, t: Array, context) -> Array:
         latent = jax.random.normal(key, (config.latent,)) if config.latent else None
         arguments = context, x_t, t, latent
-        return net.apply({"params": params}, *arguments, method="denoise")
+        return blocks.apply(params, net, *arguments, method="denoise")
 
     def encode(condition: Condition):
         mask = condition.mask | (not config.mask_frames)
         arguments = condition.vector, condition.keep, mask
-        return net.apply({"params": params}, *arguments, method="encode")
+        return blocks.apply(params, net, *arguments, method="encode")
 
     def sample(key: Key, condition: Condition, *, scale=None) -> Array:
         table = config.table()

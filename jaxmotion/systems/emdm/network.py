@@ -13,7 +13,7 @@ size (MDM adds time and text into one token; here they are two).
 Source: Zhou et al. 2024 (EMDM), sec. 3.1, and the released code (no skip connections).
 """
 
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -274,7 +274,9 @@ class SequenceDiscriminator(nn.Module):
             for n in (full, full, full // 2, full // 2, full // 4, full // 16)
         ]
         # Over the channels of one sample only, whatever the batch axes.
-        over_channels = dict(group_size=32, epsilon=1e-5, reduction_axes=(-1,))
+        over_channels: dict[str, Any] = dict(
+            group_size=32, epsilon=1e-5, reduction_axes=(-1,)
+        )
         self.norm_1 = nn.GroupNorm(num_groups=None, **over_channels)
         self.norm_2 = nn.GroupNorm(num_groups=None, **over_channels)
         self.out = nn.Dense(1)

@@ -251,14 +251,15 @@ def make_task(
         weight_velocity=0.0,
         weight_foot=0.0,
     )
-    Data = tuple[TextArrays, Array, Array]
-    data: Data = (
+    data = (
         text_arrays(run.motions, split="train", max_frames=frames),
         jnp.asarray(run.vectors, jnp.float32),
         jnp.asarray(run.index, jnp.int32),
     )
 
-    def batch(key: Key, data: Data, size: int) -> emdm_loss.Batch:
+    def batch(
+        key: Key, data: tuple[TextArrays, Array, Array], size: int
+    ) -> emdm_loss.Batch:
         arrays, vectors, index = data
         x_0, length, caption = sample_text_batch(key, arrays, batch=size)
         return emdm_loss.Batch(

@@ -11,7 +11,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -412,7 +412,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
     steps = 600 if settings.evaluator_steps is None else settings.evaluator_steps
     chosen = (
         published_evaluator(run, settings.matcher, glove=settings.glove)
-        if settings.matcher
+        if settings.matcher and settings.glove
         else train_evaluator(run, frames=frames, num_steps=steps, seed=0)
     )
     arrays = {
@@ -426,7 +426,8 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
     )
     score = {
         padding: make_scorer(run, chosen, padding=padding)
-        for padding in {"zeros", settings.padding}
+        for padding in get_args(text_motion_evaluator.Padding)
+        if padding in ("zeros", settings.padding)
     }
 
     def moments(split: str) -> frechet.Moments:

@@ -70,9 +70,8 @@ def split(
     is_held = np.isin(recordings, held)
     if not is_held.any() or is_held.all():
         raise ValueError("the clips come from one recording of each skill, expected 2")
-    return tuple(
-        take_ball_clips(data, np.flatnonzero(which)) for which in (~is_held, is_held)
-    )
+    train, held_out = np.flatnonzero(~is_held), np.flatnonzero(is_held)
+    return take_ball_clips(data, train), take_ball_clips(data, held_out)
 
 
 def scene_arrays(data: BallClips, length: int, *, stride: int = 1) -> SceneArrays:

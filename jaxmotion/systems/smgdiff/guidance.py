@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.motion import contact
 from jaxmotion.motion.skeleton import joint_positions
+from jaxmotion.networks import blocks
 from jaxmotion.systems.smgdiff.model import Condition, Config, network
 from jaxmotion.systems.smgdiff.scene import Representation, to_scene
 from jaxmotion.typing import Key, Objective, Params
@@ -175,11 +176,11 @@ def sampler(
 
     def sample(key: Key, condition: Condition) -> Array:
         table = schedule.cosine_schedule(config.num_steps)
-        context = net.apply({"params": params}, *condition.arguments(), method="encode")
+        context = blocks.apply(params, net, *condition.arguments(), method="encode")
 
         def denoise(key: Key, x_t: Array, t: Array) -> Array:
             del key  # deterministic
-            return net.apply({"params": params}, context, x_t, t, method="denoise")
+            return blocks.apply(params, net, context, x_t, t, method="denoise")
 
         objective = contact_objective(
             condition.ball, representation=representation, guided=guided

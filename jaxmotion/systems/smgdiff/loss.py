@@ -4,6 +4,7 @@ Source: SMGDiff, section 3.2, eq. 4-9; what it leaves open is as in CAMDM.
 """
 
 import functools
+import operator
 
 import jax
 import jax.numpy as jnp
@@ -138,7 +139,8 @@ def loss(
         "ball": config.weight_ball,
         "ball_acceleration": config.weight_ball_acceleration,
     }
-    return sum(weights[name] * value for name, value in terms.items()), terms
+    parts = [weights[name] * value for name, value in terms.items()]
+    return functools.reduce(operator.add, parts), terms
 
 
 def loss_terms(

@@ -155,7 +155,9 @@ def scorer(evaluator: SkillEvaluator, limits: Thresholds) -> Score:
             evaluator.params, x, config=evaluator.config
         )
         moments = frechet.moments(features)
-        velocity = jnp.gradient(wanted.position, axis=-2) * representation.fps
+        velocity = (
+            jnp.asarray(jnp.gradient(wanted.position, axis=-2)) * representation.fps
+        )
         body = locomotion.locomotion_metrics(
             skeleton,
             scenes.motion,

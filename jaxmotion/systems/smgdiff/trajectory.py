@@ -23,6 +23,7 @@ from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import losses
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.networks import blocks
 from jaxmotion.systems.smgdiff.network import CHANNELS, TrajectoryGenerator
 from jaxmotion.typing import Key, Params
 
@@ -118,8 +119,9 @@ def _pack(path: trajectory.Trajectory, config: Config) -> Array:
 
 
 def _apply(params: Params, x_t: Array, t: Array, wish: Wish, config: Config) -> Array:
-    return network(config).apply(
-        {"params": params},
+    return blocks.apply(
+        params,
+        network(config),
         x_t,
         t,
         _pack(wish.past, config),
