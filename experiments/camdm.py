@@ -69,6 +69,9 @@ class Train:
       token_window: How they are cross-faded.
       attention: "full", or "prefix": computed once per plan.
       noise_levels: Of each window in a step.
+      own_levels: Probability of noise on own predictions at lower levels.
+      seam_half_life: Half-life, frames, of the offset with which plans go on from the
+        past; 0: none.
       frame_kernel: Frames of a last convolution.
       diffusion_steps: Steps T of the diffusion.
       devices: Devices to split each batch over.
@@ -104,6 +107,8 @@ class Train:
     token_window: Literal["hann", "trapezoid"] = "hann"
     attention: cli.Optional[Literal["full", "prefix"]] = None
     noise_levels: cli.Optional[int] = None
+    own_levels: cli.Optional[float] = None
+    seam_half_life: cli.Optional[float] = None
     frame_kernel: cli.Optional[int] = None
     diffusion_steps: int = 8
     devices: int = 1

@@ -131,6 +131,7 @@ def predict_clean(
     apply: Callable[..., Any],
     table: schedule.Schedule,
     levels: int = 1,
+    own: float = 0.0,
 ) -> Float[Array, "levels batch *shape"]:
     """A denoiser's predictions of samples after noise; each condition is encoded once.
 
@@ -142,17 +143,30 @@ def predict_clean(
       table: Schedule.
       levels: Noise levels of each sample: evenly spread over 1..T after a random
         first, so that every one of them is uniform by itself.
+      own: Probability of a sample that the lower half of its levels is noise on the
+        predictions from the upper half, through which no gradient flows. A chain sees
+        its own predictions; a network that has seen only clean samples flattens them
+        a little more at every step.
     """
-    key_t, key_encode, key_denoise = jax.random.split(key, 3)
+    key_t, key_encode, key_denoise, key_own = jax.random.split(key, 4)
     first = jax.random.randint(key_t, x_0.shape[:1], 0, table.num_steps)
     apart = jnp.arange(levels) * table.num_steps // levels
     t = 1 + (first[None] + apart[:, None]) % table.num_steps
     context = apply(*condition, method="encode", rngs={"dropout": key_encode})
 
-    def predict(key: Key, t: Array) -> Array:
+    def predict(key: Key, t: Array, clean: Array) -> Array:
         key_noise, key_drop = jax.random.split(key)
         noise = jax.random.normal(key_noise, x_0.shape)
-        x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
+        x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, clean, t, noise)
         return apply(context, x_t, t, method="denoise", rngs={"dropout": key_drop})
 
-    return jax.vmap(predict)(jax.random.split(key_denoise, levels), t)
+    keys = jax.random.split(key_denoise, levels)
+    clean = jnp.broadcast_to(x_0, (levels, *x_0.shape))
+    if not own or levels < 2:
+        return jax.vmap(predict)(keys, t, clean)
+    t, half = jnp.sort(t, axis=0, descending=True), levels // 2
+    upper = jax.vmap(predict)(keys[:-half], t[:-half], clean[:-half])
+    is_own = jax.random.bernoulli(key_own, own, x_0.shape[:1])
+    is_own = is_own.reshape(-1, *(1 for _ in x_0.shape[1:]))
+    source = jnp.where(is_own, jax.lax.stop_gradient(upper[:half]), x_0)
+    return jnp.concatenate([upper, jax.vmap(predict)(keys[-half:], t[-half:], source)])

@@ -30,6 +30,7 @@ from typing import Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.networks import blocks
@@ -45,11 +46,14 @@ class Context:
       projections: The first layer's queries, keys and values of them.
       steps: Embeddings of steps 0..T, with the time token's position; one table for
         a batch (guidance stacks whole contexts).
+      last: The last past pose, and whether the past is kept; None unless predictions
+        continue it.
     """
 
     tokens: Float[Array, "*batch condition width"]
     projections: blocks.Projections
     steps: Float[Array, "*stack steps width"]
+    last: tuple[Float[Array, "*batch features"], Bool[Array, "*batch"]] | None = None
 
 
 @jax.tree_util.register_dataclass
@@ -60,10 +64,37 @@ class PrefixContext:
     Attributes:
       layers: Keys and values of the condition tokens in each layer.
       steps: As in `Context`.
+      last: As in `Context`.
     """
 
     layers: tuple[blocks.Prefix, ...]
     steps: Float[Array, "*stack steps width"]
+    last: tuple[Float[Array, "*batch features"], Bool[Array, "*batch"]] | None = None
+
+
+def continuing(
+    frames: Float[Array, "*batch future features"],
+    last: Float[Array, "*batch features"],
+    keep_past: Bool[Array, "*batch"],
+    *,
+    half_life: float,
+) -> Float[Array, "*batch future features"]:
+    """Frames moved so that they go on from the last past pose.
+
+    Where the frames would have been one frame earlier is extrapolated from the first
+    two; the last pose's offset to that decays over the frames. A network alone misses a
+    pose that it is given by some 2 cm a joint, which is a jump where plans meet.
+
+    Args:
+      frames: Predicted features.
+      last: Features of the pose before the first frame.
+      keep_past: Frames stay as they are where it is False.
+      half_life: Of the offset, frames.
+    """
+    offset = last - (2.0 * frames[..., 0, :] - frames[..., 1, :])
+    offset = jnp.where(keep_past[..., None], offset, 0.0)
+    fade = 0.5 ** (np.arange(1, frames.shape[-2] + 1) / half_life)
+    return frames + offset[..., None, :] * jnp.asarray(fade, frames.dtype)[:, None]
 
 
 class CamdmTransformer(nn.Module):
@@ -89,6 +120,8 @@ class CamdmTransformer(nn.Module):
         step and the noisy frames.
       frame_kernel: Frames of a convolution over time that is added to the predicted
         frames, and starts as zero (ours; odd, 0 for none).
+      seam_half_life: Half-life, frames, of the offset that makes a prediction go on
+        from the last past pose, as far as it is kept (ours; 0 for no such offset).
     """
 
     features: int
@@ -107,6 +140,7 @@ class CamdmTransformer(nn.Module):
     norm: Literal["post", "pre"] = "post"
     attention: Literal["full", "prefix"] = "full"
     frame_kernel: int = 0
+    seam_half_life: float = 0.0
 
     def setup(self):
         """Makes embeddings and layers."""
@@ -186,14 +220,15 @@ class CamdmTransformer(nn.Module):
         tokens = self._drop(blocks.add_rows(tokens, own), train)
         steps = blocks.add_rows(self.embed_time(self.num_steps), positions[0])
         first = self.layers[0].project(tokens)
+        last = (past[..., -1, :], keep_past) if self.seam_half_life else None
         if self.attention == "full":
-            return Context(tokens=tokens, projections=first, steps=steps)
+            return Context(tokens=tokens, projections=first, steps=steps, last=last)
         layers = [first]
         for before, layer in zip(self.layers[:-1], self.layers[1:], strict=True):
             tokens = before.attend(tokens, layers[-1], train=train)
             layers.append(layer.project(tokens))
         kept = tuple(blocks.Prefix(x.key, x.value) for x in layers)
-        return PrefixContext(layers=kept, steps=steps)
+        return PrefixContext(layers=kept, steps=steps, last=last)
 
     def denoise(
         self,
@@ -244,7 +279,11 @@ class CamdmTransformer(nn.Module):
             margin=self.token_margin,
             window=self.token_window,
         )
-        return frames + self.smooth(frames) if self.frame_kernel else frames
+        if self.frame_kernel:
+            frames = frames + self.smooth(frames)
+        if context.last is not None:
+            frames = continuing(frames, *context.last, half_life=self.seam_half_life)
+        return frames
 
     def _attend_to_all(self, context: Context, ends: Array, train: bool) -> Array:
         """The layers over all tokens; `ends` are those of the step and the frames."""

@@ -86,7 +86,13 @@ def loss(
 
     keys = jax.random.split(key_pairs, x_0.shape[0])
     predictions, targets = jax.vmap(pairs)(keys, x_0, condition.arguments(config))
-    each = camdm_loss.loss_terms(skeleton, predictions, targets, config=config)
+    each = camdm_loss.seam_terms(
+        skeleton,
+        jnp.moveaxis(predictions, 1, 0),
+        jnp.moveaxis(targets, 1, 0),
+        condition,
+        config=config,
+    )
     return camdm_loss.weighted(each, config=config)
 
 

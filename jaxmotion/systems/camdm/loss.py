@@ -7,7 +7,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.learning import losses
@@ -134,9 +134,45 @@ def loss(
         ),
         table=schedule.cosine_schedule(config.num_steps),
         levels=config.noise_levels,
+        own=config.own_levels,
     )
-    each = jax.vmap(lambda x: loss_terms(skeleton, x, x_0, config=config))(predictions)
+    each = seam_terms(skeleton, predictions, x_0, condition, config=config)
     return weighted(each, config=config)
+
+
+# Frames of the past that losses see: an acceleration needs two beside one of its own.
+_OVER_SEAM = 2
+
+
+def seam_terms(
+    skeleton: Skeleton,
+    predictions: Float[Array, "number batch future features"],
+    x_0: Float[Array, "*levels batch future features"],
+    condition: Condition,
+    *,
+    config: Config,
+) -> dict[str, Float[Array, " number"]]:
+    """`loss_terms` of each level; over the seam where predictions go on from the past.
+
+    Args:
+      skeleton: The skeleton.
+      predictions: Predicted features of the future.
+      x_0: True ones.
+      condition: Of the batch.
+      config: The method.
+    """
+    mask = jnp.ones(predictions.shape[1:-1], bool)
+    past = condition.past[:, condition.past.shape[1] :]
+    if config.seam_half_life:
+        past = condition.past[:, -_OVER_SEAM:]
+        kept = jnp.broadcast_to(condition.keep_past[:, None], past.shape[:-1])
+        mask = jnp.concatenate([kept, mask], axis=-1)
+
+    def terms(prediction: Array, target: Array) -> dict[str, Array]:
+        joined = (jnp.concatenate([past, x], axis=-2) for x in (prediction, target))
+        return loss_terms(skeleton, *joined, config=config, mask=mask)
+
+    return jax.vmap(terms)(predictions, jnp.broadcast_to(x_0, predictions.shape))
 
 
 def examples(
@@ -176,6 +212,7 @@ def loss_terms(
     target: Float[Array, "*batch frames features"],
     *,
     config: Config,
+    mask: Bool[Array, "*#batch frames"] | None = None,
 ) -> dict[str, Float[Array, ""]]:
     """The losses: data, velocity, position, position_velocity, acceleration, foot.
 
@@ -187,11 +224,12 @@ def loss_terms(
       prediction: Predicted features.
       target: True features.
       config: The method.
+      mask: Frames that count; None for all.
 
     Returns:
       Each unweighted mean.
     """
-    every = jnp.ones(target.shape[:-1], bool)
+    every = jnp.ones(target.shape[:-1], bool) if mask is None else mask
     predicted, wanted = (
         joint_positions(skeleton, to_motion(x, config=config))
         for x in (prediction, target)
@@ -215,7 +253,8 @@ def loss_terms(
         "position": losses.masked_mse(flat(predicted), flat(wanted), every),
         "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
         "acceleration": losses.velocity_loss(
-            *(losses.displacement(flat(x)) for x in (predicted, wanted)), every[..., 1:]
+            *(losses.displacement(flat(x)) for x in (predicted, wanted)),
+            every[..., 1:] & every[..., :-1],
         ),
         "foot": losses.foot_slide_loss(predicted[..., feet, :], stands, every),
     }

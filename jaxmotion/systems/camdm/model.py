@@ -66,7 +66,13 @@ class Config:
         themselves only, and are computed once per plan (ours).
       frame_kernel: Frames of a convolution over time that corrects the output, and
         starts as zero; odd, ours, 0 for none in the paper.
+      seam_half_life: Half-life, frames, of the offset that makes every prediction go on
+        from the last past pose; ours, 0 in the paper. With it the losses of
+        displacements, accelerations and feet reach over the seam.
       noise_levels: Noise levels of one window in training; ours, 1 in the paper.
+      own_levels: Probability that the lower half of a window's noise levels is noise on
+        predictions from the upper half, as in sampling, instead of noise on the
+        recording; ours, 0 in the paper.
       rotation_layout: 6D as two rows (released code) or two columns.
       heading: Frame of a sample. "random": axes turned by a random yaw (released
         code). "facing": +z is where the character faces in the last past pose (ours:
@@ -107,7 +113,9 @@ class Config:
     norm: Literal["post", "pre"] = "post"
     attention: Literal["full", "prefix"] = "full"
     frame_kernel: int = 0
+    seam_half_life: float = 0.0
     noise_levels: int = 1
+    own_levels: float = 0.0
     rotation_layout: Literal["rows", "columns"] = "rows"
     heading: Literal["random", "facing"] = "random"
     rotation_scale: float = 1.0
