@@ -109,6 +109,8 @@ COLUMNS: dict[str, Column] = {
         Column(id="skate", title="skate", unit="mm"),
         Column(id="toe_sink", title="lowest toe below rest", unit="cm"),
         Column(id="toe_depth", title="mean toe below rest", unit="cm"),
+        Column(id="toe_swing", title="swinging toe", unit="cm", better=""),
+        Column(id="toe_swing_low", title="its 10th percentile", unit="cm", better=""),
         Column(id="acceleration", title="acceleration", unit="m/s²"),
         Column(id="jerk", title="jerk", unit="m/s³"),
         # A ball.

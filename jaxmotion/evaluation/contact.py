@@ -141,3 +141,47 @@ def skating_frame_ratio(
     level = jnp.clip(foot_positions[..., :-1, :, 1] / height, 0.0, 1.0)
     skates = speed * (2.0 - 2.0**level) > min_speed
     return jnp.mean(jnp.any(skates, axis=-1), axis=-1)
+
+
+class Swing(NamedTuple):
+    """How high swinging feet are, by window.
+
+    Attributes:
+      median: Median height over the ground, meters; 0 without a swinging foot.
+      low: 10th percentile of the height.
+      seconds: How long feet swing, summed over feet.
+    """
+
+    median: Float[Array, "*batch"]
+    low: Float[Array, "*batch"]
+    seconds: Float[Array, "*batch"]
+
+
+def swing_height(
+    foot_positions: Float[Array, "*batch frames feet 3"],
+    body_speed: Float[Array, "*batch frames"],
+    fps: Scalar,
+    *,
+    ground: Scalar,
+    least_speed: float = 0.3,
+) -> Swing:
+    """Height of feet that move faster over the ground than the body.
+
+    Args:
+      foot_positions: World positions, meters.
+      body_speed: Speed of the body without its sway, meters per second.
+      fps: Frames per second.
+      ground: Height at which a foot rests, meters.
+      least_speed: A foot of a body that is slower than this, m/s, must be faster than
+        it: those who stand have no swing.
+    """
+    speed = foot_steps(foot_positions) * fps
+    body = jnp.maximum(body_speed[..., 1:, None], least_speed)
+    height = foot_positions[..., 1:, :, 1] - ground
+    swings = speed > body
+    swinging = jnp.where(swings, height, jnp.nan)
+    low, median = (
+        jnp.nan_to_num(jnp.nanpercentile(swinging, part, axis=(-2, -1)))
+        for part in (10.0, 50.0)
+    )
+    return Swing(median=median, low=low, seconds=jnp.sum(swings, axis=(-2, -1)) / fps)

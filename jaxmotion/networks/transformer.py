@@ -94,7 +94,7 @@ def continuing(
     offset = last - (2.0 * frames[..., 0, :] - frames[..., 1, :])
     offset = jnp.where(keep_past[..., None], offset, 0.0)
     fade = 0.5 ** (np.arange(1, frames.shape[-2] + 1) / half_life)
-    return frames + offset[..., None, :] * jnp.asarray(fade, frames.dtype)[:, None]
+    return frames + jnp.einsum("f,...c->...fc", fade.astype(frames.dtype), offset)
 
 
 class CamdmTransformer(nn.Module):

@@ -106,3 +106,26 @@ def test_one_frame_is_refused():
     for measure in (contact.slide_distance, contact.skating_frame_ratio):
         with pytest.raises(ValueError, match="expected at least 2"):
             measure(jnp.zeros((1, 2, 3)), 30.0)
+
+
+def test_a_swinging_foot_is_as_high_as_drawn_frame_by_frame():
+    """One foot swings at three times the body's speed in half of the frames."""
+    generator = np.random.default_rng(0)
+    fps, frames, body = 30.0, 60, 1.2
+    swings = generator.random((2, frames, 2)) < 0.5
+    step = np.where(swings, 3.0 * body, 0.2) / fps
+    height = generator.uniform(0.0, 0.3, step.shape)
+    feet = np.stack([np.zeros(step.shape), height, np.cumsum(step, axis=1)], axis=-1)
+    found = contact.swing_height(
+        jnp.asarray(feet), jnp.full((2, frames), body), fps, ground=0.02
+    )
+    for window in range(2):
+        high = height[window, 1:][swings[window, 1:]] - 0.02
+        np.testing.assert_allclose(found.median[window], np.median(high), atol=1e-6)
+        low = np.percentile(high, 10)
+        np.testing.assert_allclose(found.low[window], low, atol=1e-6)
+        assert found.seconds[window] == pytest.approx(high.size / fps)
+    still = contact.swing_height(
+        jnp.asarray(0.0 * feet), jnp.zeros((2, frames)), fps, ground=0.0
+    )
+    assert not np.any(still.seconds) and not np.any(still.median)

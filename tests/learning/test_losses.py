@@ -212,3 +212,55 @@ def test_each_noise_level_has_its_own_noise_and_dropout():
         levels=4,
     )
     assert np.unique(np.round(keys, 5)).size == keys.size
+
+
+@pytest.mark.parametrize("own", [0.0, 0.3, 1.0])
+def test_lower_levels_are_noise_on_predictions_as_often_as_said(own):
+    """The network predicts 100 at upper levels, and shows its input at lower ones."""
+    table, size = schedule.cosine_schedule(8), 2000
+
+    def apply(*given, method, rngs):
+        if method == "encode":
+            return ()
+        _, x_t, t = given
+        return jnp.where(t[:, None] > 4, 100.0, x_t)
+
+    found = losses.predict_clean(
+        jax.random.key(0),
+        jnp.zeros((size, 1)),
+        (),
+        apply=apply,
+        table=table,
+        levels=4,
+        own=own,
+    )
+    found = np.asarray(found[..., 0])
+    upper = found == 100.0
+    assert np.all(upper.sum(axis=0) == 2)
+    lower = np.where(upper, 0.0, found)
+    assert np.abs(lower[np.abs(lower) < 40]).max() < 6.0  # noise on the sample, 0
+    own_samples = (lower > 40).sum(axis=0)  # noise on 100 sqrt(alpha_bar)
+    assert set(own_samples) <= {0, 2}
+    deviation = np.sqrt(own * (1 - own) / size)
+    assert abs(np.mean(own_samples == 2) - own) <= 4.0 * deviation
+
+
+def test_no_gradient_flows_through_own_predictions():
+    table = schedule.cosine_schedule(8)
+    x_0 = jnp.ones((16, 3))
+
+    def total(params):
+        def apply(*given, method, rngs):
+            if method == "encode":
+                return ()
+            _, x_t, t = given
+            upper, lower = params
+            return jnp.where(t[:, None] > 4, upper, lower) * x_t
+
+        found = losses.predict_clean(
+            jax.random.key(0), x_0, (), apply=apply, table=table, levels=4, own=1.0
+        )
+        return jnp.sum(found[2:])
+
+    upper, lower = jax.grad(total)((jnp.asarray(2.0), jnp.asarray(3.0)))
+    assert upper == 0.0 and lower != 0.0

@@ -31,6 +31,7 @@ from jaxmotion.evaluation import (
     alignment,
     by_frame,
     columns,
+    contact,
     health,
     locomotion,
     table,
@@ -125,16 +126,21 @@ def _window_metrics(
     skeleton: Skeleton, ground: Ground, x: windows.EvalWindows
 ) -> dict[str, Array]:
     positions = joint_positions(skeleton, x.motion)
-    toes = positions[..., jnp.array(skeleton.feet), 1]
+    feet = positions[..., jnp.array(skeleton.feet), :]
+    toes = feet[..., 1]
     reach, fps = _reach(x.motion.fps), x.motion.fps
     speed = alignment.steady_speed(positions[..., 0, ::2], fps, reach=reach)
     metrics = locomotion.locomotion_metrics(
         skeleton, x.motion, x.velocity, x.facing, contact_height=ground.contact
     )
+    swing = contact.swing_height(feet, speed, fps, ground=ground.rest)
     names = ("slide_speed", "slide_seconds", "skate_ratio", "jerk", "orientation_error")
     return {name: metrics[name] for name in names} | {
         "speed": jnp.mean(speed[..., reach:-reach], axis=-1),
         "sink": ground.rest - jnp.min(toes, axis=(-2, -1)),
+        "swing": swing.median,
+        "swing_low": swing.low,
+        "swing_seconds": swing.seconds,
         "depth": jnp.mean(jnp.maximum(ground.rest - toes, 0.0), axis=(-2, -1)),
     }
 
@@ -223,6 +229,8 @@ _OF_WINDOWS = {
     "jerk": ("jerk", None, 1.0),
     "toe_sink": ("sink", None, 100.0),
     "toe_depth": ("depth", None, 100.0),
+    "toe_swing": ("swing", "swing_seconds", 100.0),
+    "toe_swing_low": ("swing_low", "swing_seconds", 100.0),
     "orientation_error": ("orientation_error", None, float(np.rad2deg(1.0))),
 }
 _OF_ROLLOUTS = ("speed_error", "path_error", "path_error_max", "creep")

@@ -350,6 +350,45 @@ def test_the_loss_weighs_its_terms(walker, skeleton, monkeypatch):
     assert len(condition) == 5
 
 
+@pytest.mark.parametrize("keep", [True, False])
+def test_losses_reach_over_the_seam_as_far_as_the_past_is_kept(walker, skeleton, keep):
+    """Displacements and feet are the oracle's, of two past frames and the future."""
+    config = tiny.config(seam_half_life=3.0, contact_speed=1.2)
+    whole = batch_features(skeleton, walker, config)
+    past, target = whole[:, : config.past], whole[:, config.past :]
+    noise = np.random.default_rng(0).normal(0, 0.2, (3, *target.shape))
+    predictions = target[None] + jnp.asarray(noise, jnp.float32)
+    condition = camdm_model.Condition(
+        past=past,
+        trajectory=trajectory.Trajectory(
+            position=jnp.zeros((*target.shape[:-1], 2)),
+            facing=jnp.zeros((*target.shape[:-1], 2)),
+        ),
+        label=jnp.zeros(len(past), jnp.int32),
+        keep_past=jnp.full(len(past), keep),
+    )
+    found = jax.jit(functools.partial(camdm_loss.seam_terms, config=config))(
+        skeleton, predictions, target, condition
+    )
+    joined = [
+        np.concatenate([past[:, -2:], x], axis=1) if keep else np.asarray(x)
+        for x in (*predictions, target)
+    ]
+    for level in range(3):
+        expected = reference.loss_terms(
+            np.asarray(skeleton.offsets, np.float64),
+            skeleton.parents,
+            skeleton.feet,
+            joined[level].astype(np.float64),
+            joined[-1].astype(np.float64),
+            layout=config.rotation_layout,
+            fps=config.fps,
+            speed=config.contact_speed,
+        )
+        for name, value in expected.items():
+            np.testing.assert_allclose(found[name][level], value, rtol=2e-4)
+
+
 def test_dropout_is_on_in_training(walker, skeleton, monkeypatch):
     recorder = Recorder()
     monkeypatch.setattr(camdm_loss, "network", lambda config: recorder)

@@ -36,6 +36,9 @@ KINDS = {
     "prefix, convolution": transformer.CamdmTransformer(
         **(SIZES | {"depth": 1}), attention="prefix", norm="pre", frame_kernel=3
     ),
+    "going on from the past": transformer.CamdmTransformer(
+        **SIZES, attention="prefix", seam_half_life=2.0
+    ),
     "mlp": camdm_network.CamdmMlp(**SIZES),
     "single token": camdm_network.SingleTokenTransformer(**SIZES),
 }
@@ -316,3 +319,28 @@ def test_the_first_step_reads_the_first_position():
     assert rows.shape == (5, 8)
     np.testing.assert_allclose(rows[1:], expected, atol=1e-6)
     np.testing.assert_array_equal(rows[0], rows[1])
+
+
+@pytest.mark.parametrize("attention", ["full", "prefix"])
+def test_plans_go_on_from_the_last_pose_where_the_past_is_kept(attention):
+    """The offset is written number by number, on the same network without it."""
+    plain = transformer.CamdmTransformer(**SIZES, attention=attention)
+    net = plain.clone(seam_half_life=2.0)
+    *given, _ = arguments(2)
+    params = tiny.random_params(plain.init, *given, jnp.ones(2, bool))
+    for keep in (True, False):
+        free, found = (
+            np.asarray(jax.jit(x.apply)(params, *given, jnp.full(2, keep)), np.float64)
+            for x in (plain, net)
+        )
+        past = np.asarray(given[2], np.float64)
+        expected = free.copy()
+        for sample in range(2):
+            for channel in range(12):
+                first, second = free[sample, :2, channel]
+                missed = past[sample, -1, channel] - (2 * first - second)
+                for frame in range(6):
+                    moved = missed * 2 ** (-(frame + 1) / 2.0)
+                    expected[sample, frame, channel] += keep * moved
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+        assert keep != np.allclose(found, free, atol=1e-3)

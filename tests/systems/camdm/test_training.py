@@ -178,7 +178,13 @@ def first(tmp_path):
 
 def test_only_what_has_no_parameters_is_new(first):
     model, params, path = first
-    new = dict(weight_foot=7.0, attention="prefix", noise_levels=2)
+    new = dict(
+        weight_foot=7.0,
+        attention="prefix",
+        noise_levels=2,
+        own_levels=0.5,
+        seam_half_life=15.0,
+    )
     config = dataclasses.replace(model.config, rotation_mean=(1.0,), **new)
     wanted = dataclasses.replace(model, config=config, source="mine")
     found, loaded = camdm_training.continued(wanted, path)
