@@ -48,6 +48,11 @@ class Train:
       depth: Its layers; None for the preset's.
       token_margin: Frames that its neighboring output tokens share; None for the
         preset's.
+      attention: "full", or "prefix": computed once per plan; None for the preset's.
+      noise_levels: Of each window in an update; None for the preset's.
+      own_levels: Probability of noise on own predictions at lower levels.
+      seam_half_life: Half-life, frames, of the offset with which plans go on from the
+        past; 0: none.
       held_out: Part of the recordings kept for evaluation.
       steps: Updates of a motion model.
       draft_steps: Updates before these in which displacements hardly count.
@@ -65,6 +70,10 @@ class Train:
     width: int | None = None
     depth: int | None = None
     token_margin: int | None = None
+    attention: Literal["full", "prefix"] | None = None
+    noise_levels: int | None = None
+    own_levels: float | None = None
+    seam_half_life: float | None = None
     held_out: float = 0.1
     steps: int = 3000
     draft_steps: int = 3500

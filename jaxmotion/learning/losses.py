@@ -23,6 +23,10 @@ from jaxmotion.typing import Key
 
 Average = Literal["frames", "samples"]
 
+# Past frames that losses see where predictions go on from the past: an acceleration
+# needs two beside one of its own.
+OVER_SEAM = 2
+
 
 def masked_mse(
     prediction: Float[Array, "*batch frames features"],

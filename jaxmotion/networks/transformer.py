@@ -78,6 +78,7 @@ def continuing(
     keep_past: Bool[Array, "*batch"],
     *,
     half_life: float,
+    moved: int,
 ) -> Float[Array, "*batch future features"]:
     """Frames moved so that they go on from the last past pose.
 
@@ -90,9 +91,11 @@ def continuing(
       last: Features of the pose before the first frame.
       keep_past: Frames stay as they are where it is False.
       half_life: Of the offset, frames.
+      moved: Leading channels that are moved.
     """
     offset = last - (2.0 * frames[..., 0, :] - frames[..., 1, :])
-    offset = jnp.where(keep_past[..., None], offset, 0.0)
+    some = np.arange(offset.shape[-1]) < moved
+    offset = jnp.where(keep_past[..., None] & some, offset, 0.0)
     fade = 0.5 ** (np.arange(1, frames.shape[-2] + 1) / half_life)
     return frames + jnp.einsum("f,...c->...fc", fade.astype(frames.dtype), offset)
 
@@ -122,6 +125,7 @@ class CamdmTransformer(nn.Module):
         frames, and starts as zero (ours; odd, 0 for none).
       seam_half_life: Half-life, frames, of the offset that makes a prediction go on
         from the last past pose, as far as it is kept (ours; 0 for no such offset).
+      seam_features: Leading channels that it moves; 0 for all.
     """
 
     features: int
@@ -141,6 +145,7 @@ class CamdmTransformer(nn.Module):
     attention: Literal["full", "prefix"] = "full"
     frame_kernel: int = 0
     seam_half_life: float = 0.0
+    seam_features: int = 0
 
     def setup(self):
         """Makes embeddings and layers."""
@@ -281,9 +286,12 @@ class CamdmTransformer(nn.Module):
         )
         if self.frame_kernel:
             frames = frames + self.smooth(frames)
-        if context.last is not None:
-            frames = continuing(frames, *context.last, half_life=self.seam_half_life)
-        return frames
+        if context.last is None:
+            return frames
+        moved = self.seam_features or self.features
+        return continuing(
+            frames, *context.last, half_life=self.seam_half_life, moved=moved
+        )
 
     def _attend_to_all(self, context: Context, ends: Array, train: bool) -> Array:
         """The layers over all tokens; `ends` are those of the step and the frames."""

@@ -140,10 +140,6 @@ def loss(
     return weighted(each, config=config)
 
 
-# Frames of the past that losses see: an acceleration needs two beside one of its own.
-_OVER_SEAM = 2
-
-
 def seam_terms(
     skeleton: Skeleton,
     predictions: Float[Array, "number batch future features"],
@@ -164,7 +160,7 @@ def seam_terms(
     mask = jnp.ones(predictions.shape[1:-1], bool)
     past = condition.past[:, condition.past.shape[1] :]
     if config.seam_half_life:
-        past = condition.past[:, -_OVER_SEAM:]
+        past = condition.past[:, -losses.OVER_SEAM :]
         kept = jnp.broadcast_to(condition.keep_past[:, None], past.shape[:-1])
         mask = jnp.concatenate([kept, mask], axis=-1)
 

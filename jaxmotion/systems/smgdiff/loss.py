@@ -125,10 +125,17 @@ def loss(
         ),
         table=schedule.cosine_schedule(config.num_steps),
         levels=config.noise_levels,
+        own=config.own_levels,
     )
-    each = jax.vmap(lambda x: loss_terms(x, x_0, representation=representation))(
-        predictions
-    )
+    seen = losses.OVER_SEAM if config.seam_half_life else 0
+    past = condition.past[:, config.past - seen :]
+
+    def joined(x: Array) -> Array:
+        return jnp.concatenate([past, x], axis=-2)
+
+    each = jax.vmap(
+        lambda x: loss_terms(joined(x), joined(x_0), representation=representation)
+    )(predictions)
     terms = jax.tree.map(jnp.mean, each)
     weights = {
         "data": config.weight_data,

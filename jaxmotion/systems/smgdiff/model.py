@@ -56,7 +56,12 @@ class Config:
         themselves only, and are computed once per plan (ours).
       frame_kernel: Frames of a convolution over time that corrects the output, and
         starts as zero; odd, ours, 0 for none in the paper.
+      seam_half_life: Half-life, frames, of the offset that makes every prediction of
+        root and rotations go on from the last past pose; ours, 0 in the paper. With it
+        the losses of displacements and feet reach over the seam.
+      seam_features: Channels of root and rotations, which come first; 0 without.
       noise_levels: Noise levels of one window in training; ours, 1 in the paper.
+      own_levels: As in `camdm.Config`; ours, 0 in the paper.
       weight_data: Weight of the mean squared error of features.
       weight_velocity: Weight of the displacements of features.
       weight_position: Weight of the joint positions.
@@ -85,7 +90,10 @@ class Config:
     norm: Literal["post", "pre"] = "post"
     attention: Literal["full", "prefix"] = "full"
     frame_kernel: int = 0
+    seam_half_life: float = 0.0
+    seam_features: int = 0
     noise_levels: int = 1
+    own_levels: float = 0.0
     weight_data: float = 1.0
     weight_velocity: float = 1.0
     weight_position: float = 1.0

@@ -60,6 +60,9 @@ def make_model(
     config = smgdiff_model.Config(
         num_features=names.size, num_labels=len(labels), fps=clips.fps, **sizes
     )
+    if config.seam_half_life:
+        stops = {name: stop for name, _, stop in names.fields}
+        config = dataclasses.replace(config, seam_features=stops["rotations"])
     arrays = smgdiff_data.scene_arrays(data, config.window)
     return Model(
         config=config,

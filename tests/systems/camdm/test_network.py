@@ -322,10 +322,11 @@ def test_the_first_step_reads_the_first_position():
 
 
 @pytest.mark.parametrize("attention", ["full", "prefix"])
-def test_plans_go_on_from_the_last_pose_where_the_past_is_kept(attention):
+@pytest.mark.parametrize("moved", [0, 7])
+def test_plans_go_on_from_the_last_pose_where_the_past_is_kept(attention, moved):
     """The offset is written number by number, on the same network without it."""
     plain = transformer.CamdmTransformer(**SIZES, attention=attention)
-    net = plain.clone(seam_half_life=2.0)
+    net = plain.clone(seam_half_life=2.0, seam_features=moved)
     *given, _ = arguments(2)
     params = tiny.random_params(plain.init, *given, jnp.ones(2, bool))
     for keep in (True, False):
@@ -336,7 +337,7 @@ def test_plans_go_on_from_the_last_pose_where_the_past_is_kept(attention):
         past = np.asarray(given[2], np.float64)
         expected = free.copy()
         for sample in range(2):
-            for channel in range(12):
+            for channel in range(moved or 12):
                 first, second = free[sample, :2, channel]
                 missed = past[sample, -1, channel] - (2 * first - second)
                 for frame in range(6):
