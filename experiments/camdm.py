@@ -73,6 +73,7 @@ class Train:
       seam_half_life: Half-life, frames, of the offset with which plans go on from the
         past; 0: none.
       frame_kernel: Frames of a last convolution.
+      weight_foot: Of feet that slide while they stand; None for the preset's.
       diffusion_steps: Steps T of the diffusion.
       devices: Devices to split each batch over.
       distributed: One of several processes: "auto", or address, number, index.
@@ -110,6 +111,7 @@ class Train:
     own_levels: cli.Optional[float] = None
     seam_half_life: cli.Optional[float] = None
     frame_kernel: cli.Optional[int] = None
+    weight_foot: cli.Optional[float] = None
     diffusion_steps: int = 8
     devices: int = 1
     distributed: cli.Distributed = ()
