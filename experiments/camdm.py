@@ -432,11 +432,14 @@ class Export:
       out: File to write; parameters are stored as float16.
       starts: Poses per style that the model itself stands in, stored with it, so that
         characters start without any recording; None for none.
+      visit: Steps of the schedule that its plans visit unless told otherwise; none: the
+        run's own.
     """
 
     run: Path = Path("runs/camdm")
     out: Path = Path("camdm.npz")
     starts: int | None = None
+    visit: tuple[int, ...] = ()
 
 
 def export(args: Export) -> None:
@@ -446,6 +449,7 @@ def export(args: Export) -> None:
         run = camdm_training.load_run(args.run)
         starts = camdm_evaluation.own_starts(run, number=args.starts)
         model = dataclasses.replace(model, starts=starts)
+    model = camdm_model.with_steps(model, args.visit)
     checkpoint.export_params(args.out, params, camdm_model.to_json(model))
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
 

@@ -48,8 +48,8 @@ class Tuning:
     Attributes:
       method: `(num_steps, scale) -> method`, and `locks=` where `lockable`: whether
         planted feet are locked. Scale and locks may be traced: others compile nothing.
-      num_steps: Numbers of diffusion steps that a plan may take; the last is the one
-        that the network was trained for.
+      num_steps: Numbers of diffusion steps that a plan may take, increasing.
+      own_steps: The one of them that the character itself takes.
       scale: Scale of the system's guidance that the character has.
       scales: The least and the largest that make sense.
       patience: Ticks that a plan may come late, for it is longer than what is played
@@ -59,6 +59,7 @@ class Tuning:
 
     method: Callable[..., Method]
     num_steps: tuple[int, ...]
+    own_steps: int
     scale: float
     scales: tuple[float, float]
     patience: int

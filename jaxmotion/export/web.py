@@ -46,7 +46,7 @@ def check() -> None:
 
 
 def step_choices(character: Any, wanted: tuple[int, ...]) -> tuple[int, ...]:
-    """Numbers of diffusion steps to offer, the model's own last.
+    """Numbers of diffusion steps to offer: those wanted, and the model's own.
 
     Raises:
       ValueError: if one of those wanted is none that the model offers.
@@ -57,7 +57,7 @@ def step_choices(character: Any, wanted: tuple[int, ...]) -> tuple[int, ...]:
             raise ValueError(
                 f"--steps has {steps}, expected some of {', '.join(map(str, offered))}"
             )
-    return tuple(sorted({*wanted, offered[-1]}))
+    return tuple(sorted({*wanted, character.tuning.own_steps}))
 
 
 def functions(character: Any, steps: int) -> dict[str, Exported]:
@@ -144,6 +144,7 @@ def write_character(
         "graphs": graphs,
         "runs": runs,
         "steps": list(runs),
+        "num_steps": character.tuning.own_steps,
         "scale": character.tuning.scale,
         "scales": list(character.tuning.scales),
         "lockable": character.tuning.lockable,

@@ -536,7 +536,7 @@ class Session:
                 self.settings = dataclasses.replace(
                     self.settings,
                     label=0,
-                    num_steps=1 if tuning is None else tuning.num_steps[-1],
+                    num_steps=1 if tuning is None else tuning.own_steps,
                     scale=1.0 if tuning is None else tuning.scale,
                     foot_lock=self._foot_locks.get(name, True),
                 )

@@ -140,7 +140,7 @@ def angles(a, b):
 
 def plays_as_jax_does(packages, folder, character, *, locks):
     """Whether ten seconds are the same with the same noise; prints by how much."""
-    steps = character.tuning.num_steps[-1]
+    steps = character.tuning.own_steps
     commands = course(character.fps, character.labels)
     noise = np.random.default_rng(0).standard_normal(4_000_000, np.float32)
     noise.tofile(folder / "noise.f32")

@@ -104,6 +104,7 @@ def strider(ball=False, cost=0.0, labels=LABELS):
     tuning = Tuning(
         method=lambda num_steps, scale: method,
         num_steps=tuple(range(1, 9)),
+        own_steps=8,
         scale=0.7,
         scales=(0.0, 2.0),
         patience=30,

@@ -569,6 +569,7 @@ def load_character(
         tuning=Tuning(
             method=lambda num_steps, scale: dataclasses.replace(method, scale=scale),
             num_steps=(model.config.num_steps,),
+            own_steps=model.config.num_steps,
             scale=method.scale,
             scales=(0.0, 4 * method.scale),
             patience=0,

@@ -494,22 +494,25 @@ class Method:
         )
 
 
-def _tuning(method: Method) -> Tuning:
+def _tuning(method: Method, *, all_steps: bool) -> Tuning:
     control = Control() if method.control is None else method.control
-    visited = method.steps or tuple(range(1, method.config.num_steps + 1))
-    total = len(visited)
+    every = tuple(range(1, method.config.num_steps + 1))
+    own = method.steps or every
+    offered = every if all_steps else own
 
     def tuned(num_steps: int, scale: Any) -> Method:
-        some = tuple(visited[i - 1] for i in spread_steps(total, num_steps))
+        places = spread_steps(len(offered), num_steps)
+        some = tuple(offered[i - 1] for i in places)
         return dataclasses.replace(
             method,
             control=dataclasses.replace(control, guidance_scale=scale),
-            steps=method.steps if num_steps == total else some,
+            steps=method.steps if num_steps == len(own) else some,
         )
 
     return Tuning(
         method=tuned,
-        num_steps=tuple(range(1, total + 1)),
+        num_steps=tuple(range(1, len(offered) + 1)),
+        own_steps=len(own),
         scale=control.guidance_scale,
         scales=(0.0, 2.0),
         patience=method.config.future - control.apply,
@@ -522,7 +525,7 @@ def character(
     *,
     control: Control | None = None,
     step: chain.StepFactory = chain.ancestral_step,
-    steps: tuple[int, ...] | None = None,
+    steps: int | tuple[int, ...] | None = None,
 ) -> Character:
     """A model as a character to be steered.
 
@@ -533,13 +536,16 @@ def character(
         poses of its own, else for the paper's.
       step: Makes the chain's step, such as `chain.dpm_solver_step`. Another
         `functools.partial` is another program: make one once.
-      steps: Steps of the schedule to visit, increasing up to T; None for the model's.
+      steps: Steps of the schedule to visit, increasing up to T, or how many of them,
+        evenly spread; None for the model's.
 
     Raises:
       ValueError: if the steps are none of its schedule.
     """
     if control is None and model.starts is not None:
         control = OWN_STARTS
+    if type(steps) is int:
+        steps = spread_steps(model.config.num_steps, steps)
     if steps is not None:
         steps = camdm_model.check_steps(steps, config=model.config)
 
@@ -558,7 +564,7 @@ def character(
         source=model.source,
         params=(params, model.skeleton),
         method=method,
-        tuning=_tuning(method),
+        tuning=_tuning(method, all_steps=model.all_steps),
         starts=lambda labels, seed: own_states(model, labels, seed=seed),
         clip_starts=clip_starts,
     )
@@ -569,7 +575,7 @@ def load_character(
     *,
     control: Control | None = None,
     step: chain.StepFactory = chain.ancestral_step,
-    steps: tuple[int, ...] | None = None,
+    steps: int | tuple[int, ...] | None = None,
 ) -> Character:
     """The character of a run folder or an exported file; see `character`.
 

@@ -146,7 +146,7 @@ def prepare(
     parts = {"train": taught.train, "held_out": taught.held_out}
 
     def content() -> runs.Content:
-        model = dataclasses.replace(taught.model, steps=steps)
+        model = dataclasses.replace(taught.model, steps=steps, all_steps=False)
         return runs.Content(
             model=camdm_model.to_json(model),
             source=model.source,

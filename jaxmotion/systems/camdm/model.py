@@ -330,8 +330,8 @@ def sampler(
 
 def check_steps(steps: Any, *, config: Config) -> tuple[int, ...]:
     """Steps for a plan to visit; raises `ValueError` unless they increase up to T."""
-    whole = isinstance(steps, list | tuple) and all(type(x) is int for x in steps)
     total = config.num_steps
+    whole = isinstance(steps, list | tuple) and all(type(x) is int for x in steps)
     if (
         not whole
         or [*steps] != sorted({*steps})
@@ -360,6 +360,8 @@ class Model:
         made itself.
       steps: Steps of the schedule that a plan visits, increasing, the last T; None for
         all. A student was distilled for its few.
+      all_steps: Whether the network learned all steps of its schedule, so that plans
+        may visit others than `steps`; a student learned its own alone.
     """
 
     config: Config
@@ -368,6 +370,7 @@ class Model:
     source: str
     starts: Motion | None = None
     steps: tuple[int, ...] | None = None
+    all_steps: bool = True
 
 
 def with_steps(model: Model, steps: tuple[int, ...]) -> Model:
@@ -399,6 +402,7 @@ def to_json(model: Model) -> dict[str, Any]:
     }
     if model.steps is not None:
         value["steps"] = list(model.steps)
+        value["all_steps"] = model.all_steps
     if model.starts is not None:
         value["starts"] = model_json.arrays_to_json(
             {
@@ -464,7 +468,12 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         steps = None if steps is None else check_steps(steps, config=config)
     except ValueError as error:
         raise ValueError(f"{where}: field 'steps': {error}") from None
-    return dataclasses.replace(model, starts=starts, steps=steps)
+    all_steps = value.get("all_steps", steps is None)
+    if not isinstance(all_steps, bool):
+        raise ValueError(
+            f"{where}: field 'all_steps' is {all_steps!r:.60}, expected true or false"
+        )
+    return dataclasses.replace(model, starts=starts, steps=steps, all_steps=all_steps)
 
 
 def _shapes(model: Model, where: Path) -> Params:

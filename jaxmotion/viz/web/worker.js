@@ -77,7 +77,7 @@ async function choose(name, wish = {}, runtime = null) {
   const label = Number(wish.label) || 0, steps = Number(wish.num_steps);
   const given = {
     label: about.labels[label] ? label : 0,
-    num_steps: about.steps.includes(steps) ? steps : about.steps[about.steps.length - 1],
+    num_steps: about.steps.includes(steps) ? steps : about.num_steps,
     scale: about.scale, foot_lock: "foot_lock" in wish ? wish.foot_lock : true,
   };
   model = next;

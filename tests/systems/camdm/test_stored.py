@@ -12,6 +12,7 @@ import optax
 import pytest
 
 from jaxmotion.learning import checkpoint, runs, training
+from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
 
@@ -188,6 +189,28 @@ def test_an_exported_file(tmp_path, model, params):
     found, found_params = camdm_model.load(path)
     assert found.labels == model.labels
     jax.tree.map(np.testing.assert_array_equal, found_params, params)
+
+
+def test_a_file_may_visit_few_steps_and_offer_all(tmp_path, model, params):
+    total = model.config.num_steps
+    few = camdm_model.with_steps(model, (1, total))
+    path = tmp_path / "model.npz"
+    checkpoint.export_params(path, params, camdm_model.to_json(few))
+    own = camdm_controller.load_character(path, control=camdm_controller.Control())
+    tuning, scale = own.tuning, own.tuning.scale
+    assert tuning.num_steps == tuple(range(1, total + 1)) and tuning.own_steps == 2
+    assert own.method.steps == tuning.method(2, scale).steps == (1, total)
+    assert tuning.method(1, scale).steps == (total,)
+    assert tuning.method(total, scale).steps == tuple(range(1, total + 1))
+    every = camdm_controller.load_character(path, steps=total)
+    assert every.method.steps == tuple(range(1, total + 1))
+    assert every.tuning.own_steps == total
+    for wrong in (0, total + 1, True, 1.5):
+        with pytest.raises(ValueError, match=f"{wrong}.*, expected"):
+            camdm_controller.load_character(path, steps=wrong)
+    value = camdm_model.to_json(few) | {"all_steps": 1}
+    with pytest.raises(ValueError, match="here: field 'all_steps' is 1, expected true"):
+        camdm_model.from_json(value, where="here")
 
 
 def test_parameters_of_another_size_are_refused(tmp_path, model, params):
