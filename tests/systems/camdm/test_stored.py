@@ -205,7 +205,7 @@ def test_a_file_may_visit_few_steps_and_offer_all(tmp_path, model, params):
     every = camdm_controller.load_character(path, steps=total)
     assert every.method.steps == tuple(range(1, total + 1))
     assert every.tuning.own_steps == total
-    for wrong in (0, total + 1, True, 1.5):
+    for wrong in (0, total + 1, True):
         with pytest.raises(ValueError, match=f"{wrong}.*, expected"):
             camdm_controller.load_character(path, steps=wrong)
     value = camdm_model.to_json(few) | {"all_steps": 1}

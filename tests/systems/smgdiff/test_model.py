@@ -281,6 +281,54 @@ def test_a_shifted_person_costs_its_shift(scenes, representation):
     assert float(terms["velocity"]) == pytest.approx(0.0, abs=1e-9)
 
 
+def test_losses_reach_over_the_seam(scenes, representation, config, monkeypatch):
+    """Beside the last two past frames, a prediction of zeros is as wrong as it is."""
+
+    class Zeros:
+        def apply(self, variables, *args, method, train, rngs):
+            return () if method == "encode" else jnp.zeros_like(args[1])
+
+    monkeypatch.setattr(smgdiff_loss, "network", lambda config: Zeros())
+    config = dataclasses.replace(config, seam_half_life=3.0)
+    labels = jnp.array([0, 1, 0])
+    _, found = smgdiff_loss.loss(
+        {},
+        jax.random.key(0),
+        (scenes, labels),
+        representation=representation,
+        config=config,
+    )
+    frame = jax.vmap(
+        lambda scene: smgdiff_scene.plan_frame(
+            representation.skeleton, jax.tree.map(lambda x: x[:4], scene.motion)
+        )
+    )(scenes)
+    seen = jax.vmap(smgdiff_scene.to_frame)(scenes, frame)
+    x = smgdiff_scene.to_features(seen, representation)[:, 2:]
+    expected = smgdiff_loss.loss_terms(
+        x.at[:, 2:].set(0.0), x, representation=representation
+    )
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-3, err_msg=name)
+
+
+def test_only_the_pose_goes_on_from_the_past(condition, config, params):
+    plain = smgdiff_model.network(config)
+    seamed = dataclasses.replace(config, seam_half_life=3.0, seam_features=33)
+    x_t = jax.random.normal(jax.random.key(0), (12, config.num_features))
+    free, found = (
+        jax.jit(net.apply)(
+            {"params": params}, x_t, jnp.int32(2), *condition.arguments()
+        )
+        for net in (plain, smgdiff_model.network(seamed))
+    )
+    np.testing.assert_array_equal(found[:, 33:], free[:, 33:])
+    before = 2 * free[0, :33] - free[1, :33]
+    moved = (found - free)[:, :33] / (condition.past[-1, :33] - before)[None]
+    fade = 0.5 ** (np.arange(1, 13) / 3.0)
+    np.testing.assert_allclose(moved, np.repeat(fade[:, None], 33, 1), atol=2e-3)
+
+
 @pytest.mark.slow
 def test_training_lowers_the_loss(scenes, representation, config, params):
     data = (scenes, jnp.array([0, 1, 0]))
