@@ -110,6 +110,10 @@ STILL = 0.02
 # off a figure eight, not 5.
 OWN_STARTS = Control(follow=1.0, bias_position=3.0, bias_facing=3.0)
 
+# Seconds. Plans that go on from the last pose differ from it in velocity alone, which
+# may be taken up sooner: a long seam moves planted feet.
+VELOCITY_SEAM = 0.1
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -544,6 +548,8 @@ def character(
     """
     if control is None and model.starts is not None:
         control = OWN_STARTS
+        if model.config.seam_half_life:
+            control = dataclasses.replace(control, seam=VELOCITY_SEAM)
     if type(steps) is int:
         steps = spread_steps(model.config.num_steps, steps)
     if steps is not None:
