@@ -94,10 +94,11 @@ def continuing(
       moved: Leading channels that are moved.
     """
     offset = last - (2.0 * frames[..., 0, :] - frames[..., 1, :])
-    some = np.arange(offset.shape[-1]) < moved
-    offset = jnp.where(keep_past[..., None] & some, offset, 0.0)
-    fade = 0.5 ** (np.arange(1, frames.shape[-2] + 1) / half_life)
-    return frames + jnp.einsum("f,...c->...fc", fade.astype(frames.dtype), offset)
+    offset = jnp.where(keep_past[..., None], offset, 0.0)
+    *_, number, channels = frames.shape
+    fade = 0.5 ** (np.arange(1, number + 1) / half_life)
+    fades = np.outer(fade, np.arange(channels) < moved).astype(frames.dtype)
+    return frames + jnp.einsum("fc,...c->...fc", fades, offset)
 
 
 class CamdmTransformer(nn.Module):

@@ -341,7 +341,7 @@ def test_plans_go_on_from_the_last_pose_where_the_past_is_kept(attention, moved)
                 first, second = free[sample, :2, channel]
                 missed = past[sample, -1, channel] - (2 * first - second)
                 for frame in range(6):
-                    moved = missed * 2 ** (-(frame + 1) / 2.0)
-                    expected[sample, frame, channel] += keep * moved
+                    offset = missed * 2 ** (-(frame + 1) / 2.0)
+                    expected[sample, frame, channel] += keep * offset
         np.testing.assert_allclose(found, expected, atol=1e-5)
         assert keep != np.allclose(found, free, atol=1e-3)
