@@ -376,9 +376,9 @@ class Retarget:
         goal = size * jnp.einsum("ij,j->i", way, places[yours[-1]] - places[yours[0]])
         bones = np.diff(at, axis=0).astype(np.float32)
         goal = goal - _turned(hips, bones[0])
-        now = sum(
-            _turned(turned[j], b) for j, b in zip(mine[1:-1], bones[1:], strict=True)
-        )
+        now = jnp.zeros(3)
+        for joint, bone in zip(mine[1:-1], bones[1:], strict=True):
+            now = now + _turned(turned[joint], bone)
         swing = _swing(_unit(now), _unit(goal))
         return turned | {j: _settled(_times(swing, turned[j])) for j in mine[1:-1]}
 

@@ -57,8 +57,8 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
   encoded once; `train --balance 0.5`: windows of rare speeds and turns are drawn more
   often. The shipped `locomotion` is trained so.
 * `seam_half_life=15`: predictions go on from the last past pose, which the network
-  alone misses by 2 cm a joint, and losses reach over the seam; `own_levels=0.5`: half of
-  the windows are noised, at lower levels, on the network's own predictions, as in
+  alone misses by 2 cm a joint, and losses reach over the seam; `own_levels=0.5`: half
+  of the windows are noised, at lower levels, on the network's own predictions, as in
   sampling.
   `locomotion` was trained so last, and plans as well in 2 calls as in 8.
 * `frame_kernel`: a convolution over frames after the tokens; `weight_acceleration`:
