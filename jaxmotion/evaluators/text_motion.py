@@ -214,8 +214,8 @@ def matcher_loss(
         raise ValueError(f"a batch of {count}, expected at least 2 to mismatch pairs")
     key_drop, key_shift = jax.random.split(key)
     text, motion = blocks.apply(
-        config.network,
         params,
+        config.network,
         *(batch.features, batch.frames, batch.vectors, batch.tags, batch.words),
         train=True,
         rngs={"dropout": key_drop},
