@@ -151,7 +151,12 @@ def predict_clean(
         predictions from the upper half, through which no gradient flows. A chain sees
         its own predictions; a network that has seen only clean samples flattens them
         a little more at every step.
+
+    Raises:
+      ValueError: if predictions should be noised, and there is one level alone.
     """
+    if own and levels < 2:
+        raise ValueError(f"own levels of {own:g} need two noise levels, found {levels}")
     key_t, key_encode, key_denoise, key_own = jax.random.split(key, 4)
     first = jax.random.randint(key_t, x_0.shape[:1], 0, table.num_steps)
     apart = jnp.arange(levels) * table.num_steps // levels
@@ -166,7 +171,7 @@ def predict_clean(
 
     keys = jax.random.split(key_denoise, levels)
     clean = jnp.broadcast_to(x_0, (levels, *x_0.shape))
-    if not own or levels < 2:
+    if not own:
         return jax.vmap(predict)(keys, t, clean)
     t, half = jnp.sort(t, axis=0, descending=True), levels // 2
     upper = jax.vmap(predict)(keys[:-half], t[:-half], clean[:-half])

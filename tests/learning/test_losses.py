@@ -264,3 +264,15 @@ def test_no_gradient_flows_through_own_predictions():
 
     upper, lower = jax.grad(total)((jnp.asarray(2.0), jnp.asarray(3.0)))
     assert upper == 0.0 and lower != 0.0
+
+
+def test_one_level_alone_has_no_predictions_to_noise():
+    with pytest.raises(ValueError, match="own levels of 0.5 need two .*, found 1"):
+        losses.predict_clean(
+            jax.random.key(0),
+            jnp.zeros((2, 1)),
+            (),
+            apply=lambda *given, **options: (),
+            table=schedule.cosine_schedule(4),
+            own=0.5,
+        )

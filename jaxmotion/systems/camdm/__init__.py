@@ -59,8 +59,8 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
 * `seam_half_life=15`: predictions go on from the last past pose, which the network
   alone misses by 2 cm a joint, and losses reach over the seam; `own_levels=0.5`: half
   of the windows are noised, at lower levels, on the network's own predictions, as in
-  sampling.
-  `locomotion` was trained so last, and plans as well in 2 calls as in 8.
+  sampling. `locomotion` was trained so last; it plans in 2 calls as well as in 8 when
+  it goes straight on, and more roughly in curves.
 * `frame_kernel`: a convolution over frames after the tokens; `weight_acceleration`:
   second differences of positions (in `--preset planted`).
 * `Control(follow=...)`: the wanted path returns to the commanded one.

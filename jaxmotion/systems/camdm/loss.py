@@ -157,12 +157,11 @@ def seam_terms(
       condition: Of the batch.
       config: The method.
     """
-    mask = jnp.ones(predictions.shape[1:-1], bool)
-    past = condition.past[:, condition.past.shape[1] :]
-    if config.seam_half_life:
-        past = condition.past[:, -losses.OVER_SEAM :]
-        kept = jnp.broadcast_to(condition.keep_past[:, None], past.shape[:-1])
-        mask = jnp.concatenate([kept, mask], axis=-1)
+    seen = losses.OVER_SEAM if config.seam_half_life else 0
+    past = condition.past[:, config.past - seen :]
+    kept = jnp.broadcast_to(condition.keep_past[:, None], past.shape[:-1])
+    future = jnp.ones(predictions.shape[1:-1], bool)
+    mask = jnp.concatenate([kept, future], axis=-1)
 
     def terms(prediction: Array, target: Array) -> dict[str, Array]:
         joined = (jnp.concatenate([past, x], axis=-2) for x in (prediction, target))

@@ -195,7 +195,15 @@ def network(config: Config) -> Network:
 
     Returns:
       A module with methods `encode`, `denoise` and their composition.
+
+    Raises:
+      ValueError: if its predictions should go on from the past, and it cannot.
     """
+    if config.seam_half_life and config.network != "transformer":
+        raise ValueError(
+            f"seam_half_life is {config.seam_half_life:g}, expected 0 with the network "
+            f"{config.network!r}"
+        )
     kind = {
         "transformer": transformer.CamdmTransformer,
         "mlp": camdm_network.CamdmMlp,
@@ -306,7 +314,7 @@ def sampler(
 
     def encode(condition: Condition):
         arguments = condition.arguments(config)
-        return net.apply({"params": params}, *arguments, method="encode")
+        return blocks.apply(params, net, *arguments, method="encode")
 
     def sample(key: Key, condition: Condition, *, scale=None) -> Array:
         noise_table = schedule.cosine_schedule(config.num_steps)

@@ -52,6 +52,12 @@ def many(count, seed=0):
 # Sizes
 
 
+def test_only_the_transformer_goes_on_from_the_past():
+    config = tiny.config(network="mlp", seam_half_life=3.0)
+    with pytest.raises(ValueError, match="seam_half_life is 3, expected 0 .*'mlp'"):
+        camdm_model.network(config)
+
+
 def test_the_papers_network():
     config = camdm_model.Config(num_joints=25, num_labels=100)
     shapes = jax.eval_shape(
