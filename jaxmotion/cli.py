@@ -117,9 +117,6 @@ def check(args: Arguments) -> Arguments:
     Args:
       args: Dataclass of a command line; None stands for a default.
 
-    Returns:
-      The same.
-
     Raises:
       ValueError: names the option, its value and what is expected.
     """
@@ -141,7 +138,6 @@ def given(kind: type, args: Any) -> dict[str, Any]:
 
     Args:
       kind: A dataclass of the library.
-      args: Dataclass of a command line.
 
     Returns:
       Values by name, for `kind(**...)`.
@@ -233,9 +229,6 @@ def announce(what: str, seconds: int) -> None:
 
 def start(main: Callable[[], None]) -> None:
     """Runs a script.
-
-    Args:
-      main: The script.
 
     Raises:
       SystemExit: with one line and status 1 after bad input, a training that diverged,

@@ -126,7 +126,6 @@ def commands(
       course: One of `control.courses.COURSES`; or a list of segments (seconds,
         direction of travel and facing in degrees from +z toward +x, m/s, and, if it
         changes, the label), which begin again at their end.
-      model: Says the rate and the labels.
       number: Characters; None for one per label or speed that is given, or one.
       seconds: Length; None for 10 s, or for a list's own length.
       speed: Meters per second, for all or one per character; a list of segments has
@@ -190,10 +189,7 @@ def rollout(
     """Frames of steered characters: one program, compiled once per shape.
 
     Args:
-      model: From `load`.
       key: Consumed. Character c draws from `fold_in(key, c)`, however many there are.
-      states: From `model.start`.
-      commands: From `commands`.
       chunk: Characters to run at a time, at most; None for what suits the processor.
       mesh: Devices to split the characters over; None for one.
 
@@ -223,7 +219,6 @@ def sample(
     """Whole motions: one program, compiled once per shape.
 
     Args:
-      model: From `load`.
       key: Consumed. Motion i draws from `fold_in(key, i)`, however many there are.
       labels: Name or index of an action for all motions, or one for each; None for the
         first.
@@ -381,7 +376,6 @@ def retarget(
     a clip: `target_motion = retarget(model.skeleton, "hero.glb")(frames.motion)`.
 
     Args:
-      source: Such as `model.skeleton`.
       target: A skeleton, or a rig's file; see `read_skeleton`.
       roles: Joints of some of the target's roles, by the names of
         `retarget.roles.ROLES`, or a JSON file of them; None for what its names and
@@ -513,7 +507,6 @@ def show(
     """What a notebook cell displays: play, pause, turn and zoom, also without a kernel.
 
     Args:
-      skeleton: The skeleton.
       frames: Frames of one character, such as `frames[0]`, or of many, which are set
         apart where they would start within each other.
       title: Above the picture.

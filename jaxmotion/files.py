@@ -110,7 +110,6 @@ def read_object(path: str | os.PathLike, *, what: str) -> dict[str, Any]:
     """JSON object of a file.
 
     Args:
-      path: The file.
       what: What it is, or who writes it, for messages.
 
     Raises:
@@ -152,7 +151,6 @@ def read_members(
     """Names and contents of members of a zip, sorted by name.
 
     Args:
-      path: The zip.
       wanted: Which members, by their names.
 
     Raises:
@@ -237,15 +235,9 @@ def read_versioned(
     """Arrays of a file that states its format and version, each of the expected kind.
 
     Args:
-      path: The file.
       wanted: For each field the kind of its numbers ("f" float, "i" integer, "U" text)
         and how many axes it has.
       what: What the file holds, for messages.
-      format_name: Expected value of its field "format".
-      version: Expected value of its field "version".
-
-    Returns:
-      All its arrays.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -278,7 +270,6 @@ def check_fields(
 
     Args:
       path: The file, for messages.
-      fields: Its arrays.
       wanted: For each field the kind of its numbers and how many axes it has.
 
     Raises:

@@ -41,7 +41,6 @@ def write_rollout(
 
     Args:
       folder: Where to; made if missing.
-      skeleton: The skeleton.
       motion: Frames of one character, world.
       desired_velocity: What was commanded, meters per second; its integral is drawn as
         the commanded path. None if nothing was.
@@ -91,7 +90,6 @@ def write_table(
 
     Args:
       folder: Where to; made if missing.
-      rows: The table.
       report: What belongs beside it: arguments, versions, hardware, bounds.
       notes: Lines below the table.
     """
@@ -115,8 +113,6 @@ def write_sweep(
 
     Args:
       folder: Where to; it must exist.
-      rows: The table.
-      points: Its models.
       report: What belongs beside it: its "title", which the plot has too, and "notes",
         which stand below the Markdown table too.
       quality: Column of the plot.
@@ -278,9 +274,6 @@ def arguments_json(arguments: Any) -> dict[str, Any]:
 
     Args:
       arguments: A dataclass of plain values and paths.
-
-    Returns:
-      A JSON object.
     """
     return {
         name: str(value) if isinstance(value, Path) else value

@@ -118,13 +118,10 @@ def course_commands(
 
     Args:
       name: One of `COURSES`.
-      seconds: Length.
-      fps: Ticks per second.
       speed: Meters per second.
-      label: Style or skill.
 
     Returns:
-      Commands [ticks, ...], for a character that starts facing +z.
+      [ticks, ...], for a character that starts facing +z.
 
     Raises:
       ValueError: if there is no such course (names those there are), the length is
@@ -153,15 +150,7 @@ def course_batch(
 ) -> Command:
     """One course for each character, with its own label and at its own speed.
 
-    Args:
-      name: One of `COURSES`.
-      labels: Style or skill of each character.
-      speeds: Meters per second, one per character.
-      seconds: Length.
-      fps: Ticks per second.
-
-    Returns:
-      Commands [characters, ticks, ...].
+    Speeds are in meters per second. Commands are [characters, ticks, ...].
 
     Raises:
       ValueError: as `course_commands`.
@@ -184,16 +173,10 @@ def segment_commands(
     seconds: float,
     fps: float,
 ) -> Command:
-    """Commands of segments, one per tick; they begin again at their end.
+    """Commands of segments, one per tick [ticks, ...]; they begin again at their end.
 
-    Args:
-      segments: Seconds, direction of travel and facing in degrees from +z toward +x,
-        speed in m/s, label.
-      seconds: Length of the result.
-      fps: Ticks per second.
-
-    Returns:
-      Commands [ticks, ...].
+    A segment is seconds, direction of travel and facing in degrees from +z toward +x,
+    speed in m/s, and label.
     """
     table = np.array(segments)
     ticks = round(seconds * fps)

@@ -183,14 +183,8 @@ def step_lock(
 ) -> LockState:
     """Where the toes are to be displayed: parts 1 and 2 of the module's text.
 
-    Args:
-      state: After the last frame.
-      toes: Animated toes of this frame, world.
-      fps: Frames per second.
-      lock: Settings.
-
-    Returns:
-      The state of this frame; `shown` is where its toes belong.
+    From the state after the last frame and the animated toes of this one (world) comes
+    the state of this frame; its `shown` is where the toes belong.
     """
     dt = 1.0 / fps
     velocity = jnp.where(state.started, (toes - state.animated) * fps, 0.0)
@@ -289,16 +283,14 @@ def solve_leg(
 ) -> Float[Array, "3 3 3"]:
     """World rotations of hip, knee and ankle that bring the toe to a place.
 
+    They stay as they are where the toe is in its place.
+
     Args:
       positions: Hip, knee, ankle and toe as animated, world.
       rotations: Their world rotations.
       toe: Where the toe belongs, world.
       bend: Axis that a straight leg bends about: the knee moves along the cross product
         of it and the leg's direction.
-      lock: Settings.
-
-    Returns:
-      The rotations; those given where the toe is in its place.
     """
     hip, knee, ankle, animated = positions
     goal = ankle + toe - animated
@@ -351,15 +343,13 @@ def place_toes(
 ) -> Float[Array, "joints 6"]:
     """Rotations of a pose whose toes are moved to other places: part 4.
 
+    Only hips, knees and ankles differ.
+
     Args:
-      skeleton: The skeleton; its feet are the toes.
+      skeleton: Its feet are the toes.
       root_position: World, meters; stays.
       joint_rotation: The pose as animated.
       toes: Where they belong, world; no lower than a standing toe is taken.
-      lock: Settings.
-
-    Returns:
-      Rotations; only hips, knees and ankles differ.
     """
     positions, rotations = global_transforms(skeleton, root_position, joint_rotation)
     return _place(skeleton, positions, rotations, joint_rotation, toes, lock=lock)
@@ -407,18 +397,10 @@ def lock_frame(
     fps: float,
     lock: FootLock,
 ) -> tuple[LockState, Float[Array, "3"], Float[Array, "joints 6"]]:
-    """The next frame with its feet locked.
-
-    Args:
-      skeleton: The skeleton; its feet are the toes.
-      state: From `init_lock` or the frame before.
-      root_position: World, meters.
-      joint_rotation: The pose as animated.
-      fps: Frames per second.
-      lock: Settings.
+    """The next frame with its feet, the skeleton's toes, locked.
 
     Returns:
-      The state, and the root's position and the rotations to display.
+      The state, and the root's position (world, meters) and the rotations to display.
     """
     state = _move_body(state, fps=fps, lock=lock)
     root_position = root_position.at[::2].add(state.body)
@@ -451,7 +433,7 @@ def toe_offsets(
     stand: float = 1e4,
     smooth: float = 10.0,
 ) -> Float[Array, "frames feet 2"]:
-    """Least changes of the toes' paths after which planted toes stand.
+    """Least changes of the toes' paths (x, z), meters, after which planted toes stand.
 
     With toes p and offsets o it minimizes, over all frames at once,
 
@@ -464,11 +446,6 @@ def toe_offsets(
     Args:
       toes: World, meters.
       planted: Whether a toe should not move from a frame to the next.
-      stand: Weight of standing still.
-      smooth: Weight of the acceleration that is added.
-
-    Returns:
-      What to add to (x, z) of each toe, meters.
     """
     path = toes[..., ::2]
     weight = stand * planted[..., None].astype(path.dtype)
@@ -608,14 +585,9 @@ def _tuning(inner: Tuning, fps: float, lock: FootLock) -> Tuning:
 
 
 def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
-    """A character that is displayed with locked feet.
+    """A character that is displayed with locked feet; its states are `LockedState`s.
 
-    Args:
-      character: Character of any system; its skeleton has legs.
-      lock: Settings; None for the defaults.
-
-    Returns:
-      The character; its states are `LockedState`s.
+    Its skeleton needs legs; lock None: the default settings.
 
     Raises:
       ValueError: if the skeleton names no feet, or a foot has no leg above it.
@@ -660,9 +632,7 @@ def clean_sampler(
 ) -> sampling.Sampler:
     """A sampler whose motions stand on their planted feet; see `clean_motion`.
 
-    Args:
-      sampler: Sampler of any system; its skeleton has legs.
-      lock: Settings; None for the defaults.
+    Its skeleton needs legs; lock None: the default settings.
 
     Raises:
       ValueError: if the skeleton names no feet, or a foot has no leg above it.

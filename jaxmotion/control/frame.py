@@ -21,7 +21,6 @@ class Frame:
       desired_facing: What was asked for, unit.
       planned: Whether this tick made a new plan.
       extra: What only one system displays, by name; see its `controller` module.
-      fps: Frames per second.
     """
 
     root_position: Float[Array, "*batch 3"]

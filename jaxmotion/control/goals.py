@@ -120,16 +120,9 @@ def _along(path: Path, way: Array) -> tuple[Array, Array, Array]:
 def pursue(
     path: Path, walker: Walker, way: Float[Array, ""]
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
-    """Velocity along a path.
+    """Velocity along a path, and how far along it the walker now is.
 
-    Args:
-      path: The path.
-      walker: Who walks it.
-      way: How far along it he was, meters: he never goes back, so that a path may
-        cross itself.
-
-    Returns:
-      The velocity, and the new way.
+    He has come `way` meters and never goes back, so that a path may cross itself.
     """
     ways = way + jnp.linspace(0.0, REACH, 41)
     points, _, length = _along(path, ways)
@@ -156,16 +149,7 @@ def _seconds_to(distance: Array, speed: Array) -> Array:
 def arrive(
     place: Place, walker: Walker, seconds: Float[Array, ""]
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """Velocity and facing of who is to be at a place at a time.
-
-    Args:
-      place: Where and when.
-      walker: Who.
-      seconds: Now.
-
-    Returns:
-      The velocity, and the direction to face.
-    """
+    """Velocity and facing of who is to be at a place at a time; it is `seconds` now."""
     gap = place.position - walker.position - LAG * walker.velocity
     distance, left = _length(gap), place.seconds - seconds
     slow, fast = jnp.float32(SLOWEST), jnp.float32(FASTEST)
@@ -229,12 +213,8 @@ def avoid(
 
     Args:
       wanted: Velocities, m/s.
-      walkers: All of them.
       circles: Center (x, z) and radius of what stands around, meters.
       radius: Of a walker, meters.
-
-    Returns:
-      The velocities.
 
     Source: van den Berg et al. 2008, sections IV and V.
     """
@@ -325,14 +305,11 @@ def goal_rollouts(
     """Frames of characters who go after goals, as one compiled program.
 
     Args:
-      character: What moves them.
       key: Consumed; character c draws from `fold_in(key, c)`.
       states: From `character.start`: at the origin, facing +z.
       goal: One kind of goal, arrays with the characters' axis first.
-      seconds: Length.
       places: Where each starts, (x, z) meters, instead of the origin.
       labels: Style of each; None for the first.
-      avoiding: Whether they keep clear of each other.
       circles: Center (x, z) and radius of what they keep clear of, meters.
 
     Returns:

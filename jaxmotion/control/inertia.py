@@ -51,9 +51,6 @@ def quintic(
       duration: Seconds until the offset and its first three derivatives are zero;
         less where it would overshoot. Zero or less: the offset is zero.
 
-    Returns:
-      Offset at t.
-
     Source: Bollo 2018, as in the released code of CAMDM; in factored form.
     """
     # Where -5 x / v is positive, i.e. x and v have opposite signs.
@@ -88,15 +85,11 @@ def decay(
     """Offset vectors at many times, the same in every coordinate system.
 
     Args:
-      x: Offsets at time zero.
-      v: Their velocities, units per second.
+      v: Velocities of the offsets x, units per second.
       t: Seconds since, not negative.
-      duration: Duration of the quintic, seconds.
+      duration: Of the quintic, seconds.
       half_life: If given, seconds: the offset decays as a critically damped spring,
         which never quite ends, and `duration` is not used.
-
-    Returns:
-      Offsets at each time.
 
     Source: Bollo 2018; the spring: orangeduck's Motion-Matching, spring.h.
     """
@@ -147,9 +140,6 @@ def inertialize(
       chunk: The frames that follow, of the same skeleton.
       duration: Seconds until the chunk is displayed as it is.
       half_life: If given, seconds: fades as a critically damped spring does instead.
-
-    Returns:
-      The frames to display.
 
     Raises:
       ValueError: if either has fewer than two frames, or their fps differ.

@@ -73,17 +73,7 @@ def exports(controller: Controller) -> dict[str, Exported]:
 def tick(
     controller: Controller, key: Key, state: State, command: Commands
 ) -> tuple[State, Frame]:
-    """One tick of one character: plan if needed, then display a frame.
-
-    Args:
-      controller: Its three functions.
-      key: Consumed.
-      state: The character's state.
-      command: What the user wants now.
-
-    Returns:
-      The next state and the displayed frame.
-    """
+    """One tick of one character: plan if needed, then display a frame."""
     branches = [lambda k, s, c: s, *controller.plans]
     need = controller.plan_level(state, command)
     state = jax.lax.switch(need, branches, key, state, command)
@@ -102,11 +92,7 @@ def batch_tick(
 ) -> tuple[State, Frame]:
     """One tick of many characters: the most expensive plan that any of them needs.
 
-    Args:
-      controller: Its three functions.
-      keys: One a character; consumed.
-      states: Batch axis first.
-      commands: What the user wants of each now.
+    Keys, one per character, are consumed; states have the batch axis first.
     """
     need = jax.vmap(controller.plan_level)(states, commands)
     states = _plan(controller, keys, states, commands, need)
@@ -156,14 +142,8 @@ def crowd_tick(
     its budget of plans.
 
     Args:
-      controller: Its three functions.
       key: Consumed; character c draws from `fold_in(key, c)`.
-      crowd: The characters.
-      commands: What the user wants of each now.
       at_most: Plans in a tick, in 1..characters; static.
-
-    Returns:
-      The characters after the tick, and a frame of each.
     """
     need = jax.vmap(controller.plan_level)(crowd.states, commands)
     waited = jnp.where(need > 0, crowd.waited + 1, 0)
@@ -193,8 +173,6 @@ def rollout(
     """Displays one frame a tick for many characters; jit it as a whole.
 
     Args:
-      controller: Its three functions.
-      key: Consumed.
       states: States of the characters, batch axis first.
       commands: Commands [characters, ticks, ...].
       first: Number c of the first character: a part of a batch draws what it draws in

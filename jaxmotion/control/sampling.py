@@ -28,9 +28,7 @@ class Sampler:
     """What a system hands over to be sampled.
 
     Attributes:
-      skeleton: The skeleton.
       labels: Names of the actions; none where motions have no label.
-      fps: Frames per second.
       frames: Frames of a motion.
       source: The data that it was trained on, and their license.
       license: License of the weights; None where nobody gave one.
@@ -55,16 +53,10 @@ class Sampler:
 def sample_motions(
     model: Sampler, key: Key, labels: Int[np.ndarray, " motions"], *, chunk: int
 ) -> Motion:
-    """Motions from the ground's origin that begin facing +z, as one compiled program.
+    """Motions [motions, frames, ...] from the origin, facing +z; one compiled program.
 
-    Args:
-      model: What makes them.
-      key: Consumed. Motion i draws from `fold_in(key, i)`, however many there are.
-      labels: Index of each motion's label.
-      chunk: Motions to make at a time, at most.
-
-    Returns:
-      Motions [motions, frames, ...].
+    Motion i draws from `fold_in(key, i)`, however many there are; at most `chunk` of
+    them are made at a time.
 
     Raises:
       ValueError: if a label is none of the model's.

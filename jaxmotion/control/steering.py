@@ -71,9 +71,7 @@ class Character:
     """What a system hands over to be steered.
 
     Attributes:
-      skeleton: The skeleton.
       labels: Names of the styles or skills; none where commands have no label.
-      fps: Ticks per second.
       source: The data that it was trained on, and their license.
       license: License of the weights; None where nobody gave one.
       params: All arrays that `method` needs, not only a network's.
@@ -111,17 +109,13 @@ class Character:
         clips: Any = None,
         seed: int = 0,
     ) -> Any:
-        """States of characters at the origin that face +z.
+        """States of characters at the origin that face +z, batch axis first.
 
         Args:
           number: Characters; None for one per label that is given, or one.
           labels: Name or index for all characters, or a sequence with one for each;
             None for the first label.
           clips: Start in poses of these clips instead of the model's own.
-          seed: Seeds the choice of poses.
-
-        Returns:
-          States, batch axis first.
 
         Raises:
           ValueError: if a label is unknown, the numbers do not agree, or the system
@@ -151,16 +145,13 @@ def steered(model: Any, *, what: str = "this model") -> Character:
 def label_indices(
     names: tuple[str, ...], labels: Any = None, number: int | None = None
 ) -> np.ndarray:
-    """Index of each character's label.
+    """Index of each character's label; zeros where the model has no labels.
 
     Args:
       names: Those that the model has; none where commands have no label.
       labels: Name or index for all, or a sequence with one for each; None for the
         first.
       number: Characters; None for as many as there are labels.
-
-    Returns:
-      Indices [number]; zeros where the model has no labels.
 
     Raises:
       ValueError: if a label is unknown or the numbers do not agree.
@@ -215,20 +206,14 @@ def steered_rollouts(
     chunk: int | None = None,
     mesh: Mesh | None = None,
 ) -> Frame:
-    """Frames of steered characters, as one compiled program.
+    """Frames [characters, ticks, ...] of steered characters; one compiled program.
 
     Args:
-      character: What moves them.
-      key: Consumed.
-      states: From `character.start`.
-      commands: Commands [characters, ticks, ...], as from `courses.course_batch`.
+      commands: [characters, ticks, ...], as from `courses.course_batch`.
       first: Number of the first character; see `rollout.rollout`.
       chunk: Characters to run at a time, at most (the largest number that divides
         theirs); see `rollout.rollout`.
       mesh: Devices to split the characters over; see `rollout.rollout`.
-
-    Returns:
-      Frames [characters, ticks, ...].
 
     Raises:
       ValueError: if states and commands are of different numbers of characters, the
@@ -265,21 +250,11 @@ def calmest(
     seconds: float = 12.0,
     seed: int = 0,
 ) -> tuple[Any, Frame]:
-    """Characters that were told to stand, of which those that move least in the end.
+    """Those of many standing characters that move least in the end.
 
-    What a shipped model starts from, so that no recorded frame is in its file.
-
-    Args:
-      character: What moves them.
-      states: From which they begin.
-      labels: Label of each.
-      number: Characters to keep.
-      past: Frames at the end that count.
-      seconds: How long they stand.
-      seed: Seeds the noise.
-
-    Returns:
-      Their last states, and their last frames [number, past, ...].
+    They are to stand still for `seconds`. A shipped model starts so, with no recorded
+    frame in its file. Of the `number` that are kept come the last states, and the last
+    frames [number, past, ...].
 
     Raises:
       ValueError: if fewer characters begin.
@@ -312,14 +287,7 @@ def chosen_starts(
 ) -> Any:
     """A start of its label for each character, drawn with equal chances.
 
-    Args:
-      starts: Arrays [labels, starts, ...], of as many starts of each label.
-      labels: Label of each character.
-      names: Those that the model has.
-      seed: Seeds the choice.
-
-    Returns:
-      Arrays [characters, ...].
+    Starts are [labels, starts, ...], of as many starts of each label.
 
     Raises:
       ValueError: if a label is none of the model's.
@@ -458,10 +426,7 @@ def _go(angle: float, speed: float, facing: tuple[float, float] | None = None) -
 def settled(told: Wish, wish: Wish, *, steady: bool) -> Wish:
     """What to tell the character: every change of it costs a plan, so small ones wait.
 
-    Args:
-      told: What it was told last.
-      wish: What is wanted now.
-      steady: Whether that is what was wanted a tick ago: then it is told as it is.
+    A steady wish, which was the same a tick ago, is passed on as it is.
     """
     stops = bool(told.speed) != bool(wish.speed)
     turned = float(np.dot(told.facing, wish.facing)) < math.cos(HEADING_STEP)

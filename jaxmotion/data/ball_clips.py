@@ -58,15 +58,11 @@ def ball_clips(
     """Puts a ball beside clips.
 
     Args:
-      clips: The person.
       position: World position of the ball's center in every frame, meters; its shape,
         [frames, 3], is checked here, since it may come from a file.
       touch: Which of the joints touch the ball in every frame, [frames, touching].
       joints: Joints that may touch the ball.
       radius: Radius of the ball, meters.
-
-    Returns:
-      The clips with the ball.
 
     Raises:
       ValueError: if the frames differ in number, a position is not finite, a joint does
@@ -107,7 +103,6 @@ def save_ball_clips(path: str | os.PathLike, data: BallClips) -> None:
 
     Args:
       path: File to write, conventionally .npz.
-      data: The clips.
 
     Raises:
       OSError: if the file cannot be written.
@@ -123,12 +118,6 @@ def save_ball_clips(path: str | os.PathLike, data: BallClips) -> None:
 
 def load_ball_clips(path: str | os.PathLike) -> BallClips:
     """Reads what `save_ball_clips` wrote; checks every field.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The clips with the ball, on the default device.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -154,13 +143,6 @@ def load_ball_clips(path: str | os.PathLike) -> BallClips:
 def take_ball_clips(data: BallClips, indices: Sequence[int] | np.ndarray) -> BallClips:
     """The clips of those numbers, in that order.
 
-    Args:
-      data: The clips.
-      indices: Numbers of clips.
-
-    Returns:
-      Those clips alone.
-
     Raises:
       ValueError: if there is no such clip, or none is asked for.
     """
@@ -179,12 +161,8 @@ def cut_scene(data: BallClips, start: Int[Array, ""], length: int) -> Scene:
     """The frames from `start`.
 
     Args:
-      data: The clips.
       start: First frame, counted over all clips.
       length: Frames.
-
-    Returns:
-      The window.
     """
     take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, length)  # noqa: E731
     return Scene(

@@ -43,9 +43,6 @@ def bvh_transforms(
 ]:
     """Parent-local positions and rotations of all joints in all frames.
 
-    Args:
-      bvh: A parsed file.
-
     Returns:
       Positions in the file's units (position channels replace OFFSET), and rotation
       matrices, both float64.
@@ -83,11 +80,7 @@ def without_joints(bvh: Bvh, names: Collection[str]) -> Bvh:
     """The file's content without some joints and everything below them.
 
     Args:
-      bvh: A parsed file.
       names: Joints to drop, such as those of the fingers; never the root.
-
-    Returns:
-      The rest.
 
     Raises:
       BvhError: for an unknown joint name, or the root's.
@@ -263,7 +256,6 @@ def bvh_from_motion(
     """A motion as BVH content: six channels on the root, ZYX rotations elsewhere.
 
     Args:
-      skeleton: The bones.
       motion: Frames of that skeleton, without batch axes.
       scale: Units of the file per meter; 100 for centimeters.
       name: Name for messages.

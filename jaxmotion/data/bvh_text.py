@@ -191,7 +191,6 @@ class Bvh:
     """What a BVH file says, in the file's own units and joint order.
 
     Attributes:
-      names: One name a joint.
       parents: Parent of each joint; -1 for the root, else smaller than the joint.
       offsets: OFFSET of each joint, in its parent's frame.
       channels: For each joint its channels in file order, such as "Zrotation".
@@ -407,7 +406,6 @@ def format_bvh(bvh: Bvh, *, decimals: int = 6) -> str:
     otherwise are permuted with them.
 
     Args:
-      bvh: What to write.
       decimals: Digits after the point of a channel value.
 
     Returns:
@@ -429,8 +427,6 @@ def write_bvh(path: str | os.PathLike, bvh: Bvh, *, decimals: int = 6) -> None:
     """Writes a BVH file, whole or not at all.
 
     Args:
-      path: File to write.
-      bvh: What to write.
       decimals: Digits after the point of a channel value.
 
     Raises:

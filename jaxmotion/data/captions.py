@@ -274,11 +274,7 @@ def captions_for(
     """Some captions of a clip, drawn without repetition from all.
 
     Args:
-      content: The clip's content.
-      style: The clip's style.
-      seed: Seed of the data set.
       index: Number of the clip, so that clips with the same labels differ.
-      count: Captions to draw.
       templates: Templates to use, of `TEMPLATES`.
 
     Returns:

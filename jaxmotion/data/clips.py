@@ -26,10 +26,7 @@ class Clips:
       joint_rotation: Parent-local rotations, two columns each.
       offsets: First frame of each clip, and the number of frames at the end.
       labels: One integer a clip for each label field ("style", "content", ...).
-      skeleton: The bones all clips share.
-      fps: Frames per second of all clips.
       label_names: For each label field, the name of each integer.
-      clip_names: One name a clip.
       source: Where the data came from and its license, for tables and cards.
     """
 
@@ -58,9 +55,6 @@ class Clips:
 
         Args:
           field: For example "style".
-
-        Returns:
-          The name of each integer.
 
         Raises:
           ValueError: if the clips have no such field; names those they have.
@@ -148,9 +142,6 @@ def clips_from_motions(
       source: Where the data came from and its license.
       tolerance: Largest difference between the offsets of two skeletons, meters.
 
-    Returns:
-      The clips.
-
     Raises:
       ValueError: if there is no clip, the numbers of clips, names and labels differ,
         two skeletons or rates differ (names both clips), a value is not finite, or a
@@ -211,13 +202,6 @@ def _join(arrays: Sequence[Array]) -> Array:
 def clip_motion(clips: Clips, index: int) -> Motion:
     """One clip as a motion.
 
-    Args:
-      clips: The clips.
-      index: Number of the clip.
-
-    Returns:
-      Its frames.
-
     Raises:
       ValueError: if there is no such clip.
     """
@@ -233,13 +217,6 @@ def clip_motion(clips: Clips, index: int) -> Motion:
 
 def take_clips(clips: Clips, indices: Sequence[int] | np.ndarray) -> Clips:
     """The clips of those numbers, in that order; label names are kept.
-
-    Args:
-      clips: The clips.
-      indices: Numbers of clips.
-
-    Returns:
-      Those clips alone.
 
     Raises:
       ValueError: if there is no such clip, or none is asked for.
@@ -273,11 +250,9 @@ def stretches(
     """Stretches of frames, each as one clip with the labels of the clip it is from.
 
     Args:
-      clips: The clips.
       owners: Number of each stretch's clip.
       firsts: Its first frame, counted over all clips.
       lengths: Its frames.
-      names: Its name.
 
     Returns:
       The stretches in that order.

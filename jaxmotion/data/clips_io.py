@@ -36,14 +36,7 @@ def _text(values: tuple[str, ...]) -> np.ndarray:
 
 
 def to_fields(clips: Clips) -> dict[str, np.ndarray]:
-    """Clips as named arrays.
-
-    Args:
-      clips: The clips.
-
-    Returns:
-      The arrays that a file of clips holds.
-    """
+    """Clips as named arrays."""
     fields = {
         "format": np.array(_FORMAT),
         "version": np.array(_VERSION),
@@ -70,7 +63,6 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
 
     Args:
       path: File to write, conventionally .npz; its folder is made if need be.
-      clips: The clips.
 
     Raises:
       OSError: if the file cannot be written.
@@ -83,12 +75,6 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
 
 def read_fields(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """All arrays of a file of clips, each of the expected kind and number of axes.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The arrays.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -210,9 +196,6 @@ def check_rate(path: str, fps: np.ndarray | float) -> None:
 def load_clips(path: str | os.PathLike) -> Clips:
     """Reads what `save_clips` wrote; checks every field.
 
-    Args:
-      path: The file.
-
     Returns:
       The clips, on the default device.
 
@@ -229,7 +212,6 @@ def from_fields(path: str, fields: dict[str, np.ndarray]) -> Clips:
 
     Args:
       path: The file, for messages.
-      fields: Its arrays.
 
     Returns:
       The clips, on the default device.

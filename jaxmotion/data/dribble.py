@@ -130,11 +130,7 @@ def possible_touches(body: Body, settings: Dribble) -> Touches:
     """Frames in which a foot could touch a ball, and where that would be.
 
     Args:
-      body: The clip.
       settings: What counts as a touch.
-
-    Returns:
-      The touches.
     """
     speed = np.linalg.norm(body.velocity, axis=-1)
     direction = body.velocity / np.maximum(speed, 1e-9)[..., None]
@@ -169,14 +165,9 @@ def is_free(
     """Whether a ball on the ground is clear of the legs and within reach of the root.
 
     Args:
-      body: The clip.
       place: Place of the ball's center on the ground plane, meters.
-      frames: Frames of the clip.
       near: Whether a touch is so near in time that a leg may come nearer.
       settings: What is clear and what is near.
-
-    Returns:
-      Whether it is, frame by frame.
     """
     height = np.full(place.shape[:-1], body.ground + settings.radius)
     ball = np.stack([place[..., 0], height, place[..., 1]], axis=-1)
@@ -230,11 +221,8 @@ def next_touches(
     """Touches to which the ball can be sent by one touch.
 
     Args:
-      body: The clip.
-      touches: All of the clip.
       now: The touch that sends it.
       arrive: Velocity with which the ball came to it, meters per second.
-      settings: What a ball may do.
 
     Returns:
       Those touches, and the velocity with which the ball comes to each.
@@ -275,11 +263,7 @@ def find_chain(
     """Touches one after the other, as many as chance finds.
 
     Args:
-      body: The clip.
-      touches: All of the clip.
-      first: The touch to begin with.
       tried: Touches from which no way led on; those that are tried are added.
-      settings: What a ball may do.
       generator: Draws the order in which ways are tried.
 
     Returns:
@@ -341,9 +325,7 @@ def find_segments(
     """Stretches of a clip beside which a ball can be dribbled; they do not overlap.
 
     Args:
-      body: The clip.
       settings: What a ball may do, and how long a stretch is.
-      generator: Draws everything.
 
     Returns:
       The segments in their order, perhaps none.
@@ -372,10 +354,7 @@ def dribble_clips(
     nothing.
 
     Args:
-      clips: Locomotion.
       skill: Label of all stretches in a new field "skill".
-      settings: What a ball may do.
-      seed: Seeds the choice among possible touches.
 
     Returns:
       The stretches, each from the ball's rest (or its first touch) to its last touch,
@@ -462,7 +441,6 @@ def resting_clips(
     through wherever it might lie are left out.
 
     Args:
-      clips: Any motion.
       skill: Label of all clips in a new field "skill".
       distance: Least and largest distance of the ball from where the root comes
         nearest to it on the ground plane, meters. (2.5, 5) is a ball off which the
@@ -538,9 +516,6 @@ def concatenate_ball_clips(parts: Sequence[BallClips]) -> BallClips:
     Args:
       parts: Sets with the same skeleton, label fields and rate, joints and ball; the
         names of labels, skills among them, are merged.
-
-    Returns:
-      One set.
 
     Raises:
       ValueError: if there is no part, or they differ in any of that.

@@ -229,7 +229,6 @@ def plan_footsteps(
     Args:
       path: [F, 2] ground position (x, z) of the body, meters.
       yaw: [F] its facing, radians.
-      fps: Frames per second.
       cadence: Steps per second at no speed.
       cadence_slope: More steps per second for each meter per second.
       double_support: Part of a step in which both feet stand.
@@ -238,11 +237,7 @@ def plan_footsteps(
       toe_height: Height of a standing toe joint, meters.
       lift: Height of a swinging toe, meters.
       toe_out: Outward turn of each foot, radians.
-      generator: Draws the small variations.
       jitter: Standard deviation of the landing points, meters.
-
-    Returns:
-      The feet in every frame.
     """
     velocity = np.gradient(path, axis=0) * fps
     speed = np.linalg.norm(velocity, axis=-1)

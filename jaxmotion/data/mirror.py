@@ -157,9 +157,6 @@ def mirror_plan(
       motion: Reference frames, as varied as possible, without batch axes.
       tolerance: Largest asymmetry of a bone's offset, meters.
 
-    Returns:
-      The plan.
-
     Raises:
       ValueError: if a name's partner is missing, two partners have parents that are
         none, or the bones are not symmetric; names the joint.
@@ -204,13 +201,9 @@ def mirror(
     Mirroring twice gives the motion back, to the bit.
 
     Args:
-      skeleton: The bones.
       motion: Frames of that skeleton, with any batch axes.
       pairs: As for `mirror_plan`; not used if a plan is given.
       plan: What `mirror_plan` returned; by default that of the skeleton alone.
-
-    Returns:
-      The mirrored motion, for the same skeleton.
 
     Raises:
       ValueError: as `mirror_plan`, or if the motion has another number of joints.
@@ -239,7 +232,6 @@ def mirror_clips(clips: Clips, *, plan: MirrorPlan | None = None) -> Clips:
     """Mirror images of all clips; left and right are swapped in the labels too.
 
     Args:
-      clips: The clips.
       plan: By default worked out from the skeleton and all frames.
 
     Returns:

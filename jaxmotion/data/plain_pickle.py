@@ -57,11 +57,7 @@ def read_plain_pickle(data: bytes, *, name: str) -> Any:
     dictionaries of them. Text of Python 2 is taken as Latin-1.
 
     Args:
-      data: Content of the file.
       name: Path of the file, for messages.
-
-    Returns:
-      The value.
 
     Raises:
       ValueError: if the file is damaged, or names anything beyond NumPy arrays; it is

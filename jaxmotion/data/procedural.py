@@ -48,7 +48,6 @@ def follow_commands(
     Args:
       commands: One a frame; the body starts at the origin, at rest, facing as the
         first command.
-      fps: Frames per second.
       half_life: Half-life of the springs, seconds.
 
     Returns:
@@ -101,8 +100,6 @@ def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> 
         ignored.
       gait: The manner. Speeds above its max_speed look rushed; far above, legs are too
         short for the steps.
-      fps: Frames per second.
-      seed: Seeds the small variations between steps.
 
     Returns:
       The motion, and which toes stand.
@@ -149,9 +146,6 @@ def random_commands(
     rest strafe sideways or walk backwards.
 
     Args:
-      generator: Draws everything.
-      frames: Length.
-      fps: Frames per second.
       max_speed: Meters per second; sideways and backwards half of it.
 
     Returns:
@@ -195,8 +189,6 @@ def make_clips(
       seed: Seeds everything; the same seed gives the same clips.
       minutes: Minutes of all clips together, rounded up to whole clips of each gait.
       gaits: Manners by name; None for all of `GAITS`.
-      fps: Frames per second.
-      clip_seconds: Length of each clip.
 
     Returns:
       The clips, with labels "style".

@@ -56,9 +56,6 @@ def resample(motion: Motion, fps: float) -> Motion:
       motion: Frames, with any batch axes.
       fps: Frames per second that are wanted.
 
-    Returns:
-      The motion at that rate.
-
     Raises:
       ValueError: if the rate is not positive and finite, the motion has no frames, or
         the rate is more than 16 times or less than 1/16 of the motion's (a mistake).
@@ -120,7 +117,6 @@ def resample_clips(clips: Clips, fps: float) -> Clips:
     """All clips at another rate, as `resample` makes each, in one compiled call.
 
     Args:
-      clips: The clips.
       fps: Frames per second, at most 16 times and at least 1/16 of theirs.
 
     Returns:

@@ -105,7 +105,6 @@ class Body:
       velocity: Velocity of the toes, on the ground plane.
       standing: Which of them stand.
       legs: Both ends of the bones from toe to ankle and from ankle to knee.
-      fps: Frames per second.
     """
 
     ground: float
@@ -123,9 +122,6 @@ def bodies(clips: Clips, *, thickness: float) -> list[Body]:
     Args:
       clips: At least two frames a clip.
       thickness: How high the joint of a standing toe is above the ground, meters.
-
-    Returns:
-      One body a clip.
 
     Raises:
       ValueError: if a clip has one frame, or the skeleton no feet.

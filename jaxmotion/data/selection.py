@@ -26,7 +26,6 @@ def select(clips: Clips, field: str, names: Sequence[str]) -> Clips:
     """Clips whose label is one of those; label indices stay as they were.
 
     Args:
-      clips: The clips.
       field: Label field, such as "content".
       names: Labels to keep.
 
@@ -51,10 +50,6 @@ def relabel(clips: Clips, field: str) -> Clips:
 
     After `select`, a network needs as many label embeddings as labels that occur.
 
-    Args:
-      clips: The clips.
-      field: Label field.
-
     Returns:
       The same clips with labels 0..number of labels that occur - 1, in the old order.
 
@@ -75,8 +70,6 @@ def merge_labels(clips: Clips, field: str, merge: Mapping[str, str]) -> Clips:
     """Gives clips of some labels another one, for sets that name one thing twice.
 
     Args:
-      clips: The clips.
-      field: Label field.
       merge: Label to take away, and the label its clips get.
 
     Returns:
@@ -99,8 +92,6 @@ def frequent_labels(clips: Clips, field: str, *, least: int) -> tuple[str, ...]:
     """Labels that at least so many clips have.
 
     Args:
-      clips: The clips.
-      field: Label field.
       least: Clips.
 
     Returns:
@@ -123,7 +114,6 @@ def split_clips(
     in the training part and, where n > 1, at least one is held out.
 
     Args:
-      clips: The clips.
       fraction: Part of each label's clips to hold out, in (0, 1).
       seed: Seed of the shuffle; the same seed splits the same clips alike.
       field: Label field by which to stratify.
@@ -153,7 +143,6 @@ def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
     """Splits clips by their names.
 
     Args:
-      clips: The clips.
       held_out: Names of the clips to hold out.
 
     Returns:
@@ -179,7 +168,6 @@ def cut(clips: Clips, spans: Sequence[tuple[int, int, int]]) -> Clips:
     """Stretches of clips, each as one clip with its labels.
 
     Args:
-      clips: The clips.
       spans: Clip, first frame within it and number of frames of each stretch.
 
     Returns:

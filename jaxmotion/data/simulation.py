@@ -29,7 +29,6 @@ def upsample(motion: Motion, fps: float) -> Motion:
     """The motion at a higher rate, by cubic splines through its frames.
 
     Args:
-      motion: One clip.
       fps: Frames per second that are wanted.
 
     Returns:
@@ -75,9 +74,6 @@ def upsample(motion: Motion, fps: float) -> Motion:
 def chest_joint(skeleton: Skeleton) -> int:
     """Finds the joint under which the simulation bone runs.
 
-    Args:
-      skeleton: The bones.
-
     Returns:
       Index of Spine2, Chest2, Chest or Spine1, the first of these that exists, in any
       case and after a prefix like "mixamorig:".
@@ -103,9 +99,6 @@ def _window(seconds: float, fps: float) -> int:
 def least_frames(fps: float) -> int:
     """Frames that a clip needs to have a simulation bone.
 
-    Args:
-      fps: Frames per second.
-
     Returns:
       The longest window of the filters.
     """
@@ -116,7 +109,6 @@ def simulation_bone(skeleton: Skeleton, motion: Motion) -> Trajectory:
     """The smooth path on the ground that carries a clip.
 
     Args:
-      skeleton: The bones.
       motion: One clip, world.
 
     Returns:

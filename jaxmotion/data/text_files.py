@@ -69,7 +69,6 @@ def parse_captions(text: str, *, path: str) -> list[Caption]:
     """Captions of a file.
 
     Args:
-      text: Content of the file.
       path: Its path, for messages.
 
     Returns:
@@ -124,11 +123,7 @@ def cut_recording(
     captions that cut it.
 
     Args:
-      name: Name of the recording.
-      features: Its frames.
-      captions: Its captions.
       cut_fps: Frames per second by which times become frames.
-      min_frames: Fewest frames of a clip.
       max_frames: Most frames of a clip.
 
     Returns:

@@ -58,8 +58,6 @@ class TextMotions:
       tokens: For each sentence its words as "word/POS word/POS".
       caption_clip: The clip of each caption, ascending.
       split: Number of each clip's split.
-      clip_names: One name a clip.
-      fps: Frames per second.
       split_names: Name of each split.
       source: Where the data came from and its license.
     """
@@ -90,9 +88,6 @@ class TextMotions:
     def clips_of(self, split: str) -> Int[np.ndarray, "_"]:
         """Numbers of the clips of a split.
 
-        Args:
-          split: Its name.
-
         Returns:
           Ascending; empty if it has none.
 
@@ -116,9 +111,6 @@ def check_statistics(
     """Raises unless both have one usable number for each feature.
 
     Args:
-      mean: Mean of each feature.
-      std: Standard deviation of each feature.
-      num_features: Numbers in a feature vector.
       names: What to call them in messages, such as their files.
 
     Raises:
@@ -142,12 +134,6 @@ def grouped_statistics(
     features: Sequence[Float[np.ndarray, "_ features"]],
 ) -> tuple[Float[np.ndarray, "features"], Float[np.ndarray, "features"]]:
     """Mean of each feature, and standard deviations averaged within groups.
-
-    Args:
-      features: Clips.
-
-    Returns:
-      Mean and standard deviation.
 
     Raises:
       ValueError: if a group never changes, or the vectors are of neither set's size.
@@ -245,8 +231,6 @@ def text_motions(
       splits: "train", "val" or "test" for each clip.
       names: One name a clip.
       mean: Mean of each feature; without it and std, those of the training clips.
-      std: Standard deviation of each feature.
-      fps: Frames per second.
       source: Where the data came from and its license.
 
     Returns:
@@ -288,7 +272,6 @@ def save_text_motions(path: str | os.PathLike, motions: TextMotions) -> None:
 
     Args:
       path: File to write, conventionally .npz; its folder is made if need be.
-      motions: The clips.
 
     Raises:
       OSError: if the file cannot be written.
@@ -359,9 +342,6 @@ def _check_ranges(
 
 def load_text_motions(path: str | os.PathLike) -> TextMotions:
     """Reads what `save_text_motions` wrote; checks every field.
-
-    Args:
-      path: The file.
 
     Returns:
       The clips, on the host.
@@ -449,7 +429,6 @@ def text_arrays(
     """Puts the clips of a split on the default device, z-scored.
 
     Args:
-      motions: Clips with captions.
       split: "train", "val" or "test".
       max_frames: Frames of a sample; 196 in the published experiments.
       unit_length: Lengths of samples are multiples of it, frames.
@@ -508,11 +487,6 @@ def sample_text_batch(
 
     The length is that of the clip, at most max_frames, rounded down to units; one time
     in three it is a unit shorter still, unless that would leave nothing.
-
-    Args:
-      key: Consumed.
-      arrays: Clips of one split.
-      batch: Samples to draw.
 
     Returns:
       Z-scored features, zero after their end; lengths in frames; and captions as

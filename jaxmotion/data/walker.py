@@ -162,8 +162,6 @@ def solve_pose(
       path: [F, 2] ground position of the body, meters.
       yaw: [F] its facing, radians.
       steps: Where the feet are.
-      gait: The manner.
-      fps: Frames per second.
 
     Returns:
       [F, 3] meters, and [F, 22, 3, 3] parent-local rotation matrices.

@@ -66,13 +66,9 @@ def window_index(
     """Lists all windows of a length that lie within one clip.
 
     Args:
-      clips: The clips.
       length: Frames per window.
       stride: Frames between the starts of windows of one clip.
       short: What to do with clips shorter than a window.
-
-    Returns:
-      The index.
 
     Raises:
       ValueError: if a clip is shorter than a window and short is "error" (names the
@@ -112,7 +108,6 @@ def balance(
     walking: a model that has seen few stops slides into them.
 
     Args:
-      clips: The clips.
       index: Where windows may start.
       last: Frame that the future begins after.
       power: 0 leaves the index as it is; 1 gives all classes the same share.
@@ -157,9 +152,6 @@ def motion_kinds(
       now: Speed at the beginning, meters per second.
       end: Speed at the end.
       turned: Angle by which the facing turns between, radians.
-
-    Returns:
-      Numbers of classes.
     """
     speeds, turns = len(SPEED_BORDERS) + 1, len(TURN_BORDERS) + 1
     kinds = np.digitize(now, SPEED_BORDERS) * speeds + np.digitize(end, SPEED_BORDERS)
@@ -173,7 +165,6 @@ def repeat_rare(
     """Windows in which rare classes stand more often, each n^-power for n windows.
 
     Args:
-      kinds: The class of each window.
       power: 0 draws all windows alike; 1 gives all classes the same share.
 
     Returns:
@@ -195,12 +186,8 @@ def cut(clips: Clips, start: Int[Array, ""], length: int) -> Motion:
     """The frames from `start`.
 
     Args:
-      clips: The clips.
       start: First frame, counted over all clips.
       length: Frames.
-
-    Returns:
-      The window.
     """
     take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, length)  # noqa: E731
     return Motion(
@@ -216,10 +203,7 @@ def sample_windows(
     """Draws windows, uniformly over all starts.
 
     Args:
-      key: Consumed.
-      clips: The clips.
       index: Where windows may start.
-      batch: Windows to draw.
 
     Returns:
       Windows [batch, length, ...] and the clip of each.
@@ -284,8 +268,6 @@ def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
     """Raises unless rollouts are long enough to be measured; for use before the work.
 
     Args:
-      ticks: Length of the rollouts.
-      fps: Ticks per second.
       skip: Ticks to leave out at the start.
 
     Raises:
@@ -306,7 +288,6 @@ def rollout_windows(
 
     Args:
       frames: A `control.frame.Frame` [characters, ticks, ...].
-      labels: Style of each character.
       skip: Ticks to leave out at the start, where the data's own pose still shows.
 
     Returns:

@@ -54,7 +54,6 @@ def respaced(make: StepFactory, steps: tuple[int, ...] | None) -> StepFactory:
     """A factory of steps that visit only some steps of the schedule it is given.
 
     Args:
-      make: The factory.
       steps: Steps to visit, as for `schedule.respace`; None for all.
 
     Returns:
@@ -168,13 +167,9 @@ def ancestral_step(
     denoiser this is the sampler of denoising-diffusion GANs.
 
     Args:
-      schedule: Table of T steps.
       denoise: Predicts x_0 from x_t.
       noise: Normal noise of steps 1..T, for who does not want it drawn anew from the
         key; None draws it.
-
-    Returns:
-      The step.
 
     Source: Ho et al. 2020, eq. 6-7, with the smaller of its two variances; the released
     code of CAMDM.
@@ -204,13 +199,9 @@ def ddim_step(
     prediction itself.
 
     Args:
-      schedule: Table of T steps.
       denoise: Predicts x_0 from x_t.
       eta: Share of the posterior's standard deviation that is drawn as noise, in
         [0, 1].
-
-    Returns:
-      The step.
 
     Raises:
       ValueError: if eta is a Python number out of range.
@@ -307,12 +298,8 @@ def sample(
 
     Args:
       step: Maps (key, x_t, t) to x_{t-1}.
-      key: Consumed.
       shape: Shape of the sample; static.
       num_steps: T of the step's schedule; static.
-
-    Returns:
-      Clean sample.
 
     Raises:
       ValueError: if num_steps is negative or no integer.

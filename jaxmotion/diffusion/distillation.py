@@ -48,10 +48,7 @@ def chain_pairs(
     """The student's predictions at some steps, and where the teacher's chain ends.
 
     Args:
-      key: Consumed.
       x_0: Clean sample, which noise is added to.
-      table: Schedule of T steps.
-      student: Who learns.
       teacher: Who is learned from; called once per step of each chain.
       steps: Steps in 1..T that the student is taught at; static.
 
@@ -87,10 +84,7 @@ def consistency_pairs(
     At t = 1 the target is the teacher's prediction.
 
     Args:
-      key: Consumed.
       x_0: Clean sample, which noise is added to.
-      table: Schedule of T steps.
-      student: Who learns.
       teacher: Who is learned from; called once per pair.
       number: Pairs; each is of a step uniform in 1..T, and they are spread evenly.
 

@@ -36,9 +36,6 @@ def q_pair(
     The noise of the second step is independent of that of the first.
 
     Args:
-      schedule: Table of T steps.
-      key: Consumed.
-      x_0: Clean sample.
       t: Step of the noisier of the two, in 1..T.
 
     Returns:
@@ -61,10 +58,7 @@ def posterior_sample(
     """Draws x_{t-1} given x_t and (a prediction of) x_0.
 
     Args:
-      schedule: Table of T steps.
-      key: Consumed.
       x_0: Clean sample, or a generator's prediction.
-      x_t: Sample at step t.
       t: Step in 1..T.
 
     Returns:
@@ -80,10 +74,6 @@ def discriminator_loss(
 ) -> Float[Array, ""]:
     """Non-saturating loss of the discriminator.
 
-    Args:
-      real_logits: Its logits of pairs from the data.
-      fake_logits: Its logits of generated pairs.
-
     Returns:
       Mean softplus(-real) plus mean softplus(fake); 2 ln 2 where it is undecided.
     """
@@ -94,9 +84,6 @@ def discriminator_loss(
 @jax.jit
 def generator_loss(fake_logits: Float[Array, "*batch"]) -> Float[Array, ""]:
     """Non-saturating loss of the generator.
-
-    Args:
-      fake_logits: The discriminator's logits of generated pairs.
 
     Returns:
       Mean softplus(-fake).

@@ -30,9 +30,6 @@ def classifier_free(
       null_cond: Condition that stands for "none", of the same structure and shapes.
       scale: Guidance scale; may be traced.
 
-    Returns:
-      The guided denoiser.
-
     Raises:
       ValueError: if the two conditions differ in structure, shape or dtype.
 
@@ -86,13 +83,9 @@ def gradient_guidance(
     where a change of the input would have moved it.
 
     Args:
-      schedule: Table of T steps.
       denoise: Predicts x_0; differentiable in x_t.
       objective: Scalar of the prediction.
       scale: Step size; 0 leaves the prediction as it is; may be traced.
-
-    Returns:
-      The guided denoiser.
 
     Source: Li et al. 2024 (AAMDM), eq. 13; Rempe et al. 2023 (TRACE).
     """
@@ -135,16 +128,12 @@ def dsg_step(
     of length sqrt(n) `last_sigma`.
 
     Args:
-      schedule: Table of T steps.
       denoise: Predicts x_0; differentiable in x_t.
       objective: Scalar of the prediction, whose gradient is finite.
       rate: 0 keeps the drawn direction, 1 takes the descent's; may be traced.
       last_sigma: sigma of the step from t = 1; None for that of t = 2, as the released
         code's clipped variance has it. It is a fifth of the data's deviation at T = 8,
         all of it along one direction: smaller values disturb less.
-
-    Returns:
-      The step.
 
     Source: Yang et al. 2024 (DSG), eq. 13-15 of SMGDiff, and DSG's released code.
     """

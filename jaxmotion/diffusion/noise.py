@@ -42,7 +42,6 @@ def draw_noise(function: Callable[..., Any], key: Key, *args: Any) -> Tape:
 
     Args:
       function: Takes a key first.
-      key: Consumed.
       *args: Its other arguments; only their shapes matter, and may stand for them.
 
     Returns:

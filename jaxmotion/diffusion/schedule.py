@@ -75,9 +75,6 @@ def cosine_schedule(
       offset: Keeps the first steps from vanishing; at least 0.
       max_beta: Upper bound of beta, in (0, 1).
 
-    Returns:
-      A schedule of T steps.
-
     Raises:
       ValueError: if an argument is out of range.
 
@@ -124,9 +121,6 @@ def linear_schedule(
       scaled: Multiplies both bounds by 1000 / T, so that few steps add as much noise
         as 1000 would; needs T >= 1000 * beta_max.
 
-    Returns:
-      A schedule of T steps.
-
     Raises:
       ValueError: if an argument is out of range, or a scaled bound exceeds 1; names
         the smallest usable number of steps.
@@ -172,9 +166,6 @@ def vp_schedule(
       beta_max: Noise rate at time 1, at least beta_min.
       t_min: Time of the clean sample, in [0, 1).
 
-    Returns:
-      A schedule of T steps.
-
     Raises:
       ValueError: if an argument is out of range.
 
@@ -203,9 +194,6 @@ def schedule_from_betas(beta: Float[Array, " steps"]) -> Schedule:
 
     Args:
       beta: Variance added at steps 1..T, in (0, 1); the last may be 1.
-
-    Returns:
-      A schedule of T steps.
 
     Raises:
       ValueError: if beta is empty, not one-dimensional, or has a value out of range;
@@ -236,7 +224,6 @@ def respace(schedule: Schedule, steps: tuple[int, ...]) -> Schedule:
     told the old step, as `chain.respaced` does.
 
     Args:
-      schedule: Table of T steps.
       steps: Steps to keep, in 1..T, strictly increasing, at least one; static.
 
     Returns:
@@ -309,14 +296,10 @@ def q_sample(
     At t = 0 it is x_0 itself.
 
     Args:
-      schedule: Table of T steps.
       x_0: Clean sample, in normalized units.
       t: Step in 0..T, a scalar or one for each index of x_0's leading axes. Steps out
         of range clamp, they do not raise.
       noise: Standard normal noise.
-
-    Returns:
-      The sample at step t.
 
     Raises:
       ValueError: at trace time, if shapes do not fit.
@@ -338,14 +321,9 @@ def q_step(
     """One noising step x_{t-1} -> x_t.
 
     Args:
-      schedule: Table of T steps.
-      x_prev: Sample at step t - 1.
       t: Step in 1..T, a scalar or one for each index of x_prev's leading axes. Steps
         out of range clamp, they do not raise.
       noise: Standard normal noise.
-
-    Returns:
-      The sample at step t.
 
     Raises:
       ValueError: at trace time, if shapes do not fit.
@@ -386,9 +364,7 @@ def posterior(
     At t = 1 the variance is exactly zero and the mean is x_0.
 
     Args:
-      schedule: Table of T steps.
       x_0: Clean sample (or its prediction), in normalized units.
-      x_t: Sample at step t.
       t: Step in 1..T, a scalar or one for each index of x_0's leading axes. Steps out
         of range clamp, they do not raise.
 
@@ -422,14 +398,9 @@ def noise_from_x0(
     """Noise that takes x_0 to x_t.
 
     Args:
-      schedule: Table of T steps.
       x_0: Clean sample, in normalized units.
-      x_t: Sample at step t.
       t: Step in 1..T (at 0 there is no noise to find), a scalar or one for each index
         of x_0's leading axes. Steps out of range clamp, they do not raise.
-
-    Returns:
-      The noise.
 
     Raises:
       ValueError: at trace time, if shapes do not fit.
@@ -456,12 +427,8 @@ def x0_from_noise(
     Args:
       schedule: Table of T steps; alpha_bar_t must not be 0.
       noise: The noise (or its prediction).
-      x_t: Sample at step t.
       t: Step in 0..T, a scalar or one for each index of x_t's leading axes. Steps out
         of range clamp, they do not raise.
-
-    Returns:
-      The clean sample.
 
     Raises:
       ValueError: at trace time, if shapes do not fit.

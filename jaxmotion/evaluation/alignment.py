@@ -61,7 +61,6 @@ def trajectory_error(
       wanted_velocity: Velocity (x, z) that the user asked for in each frame, meters a
         second; the last is not used.
       position: Root position (x, z) in each frame, meters.
-      fps: Frames per second.
       min_speed: Meters per second.
 
     Returns:
@@ -116,7 +115,6 @@ def commanded_path(
     Args:
       velocity: Wanted velocity at the end of each frame (after the springs, in systems
         that have them), meters per second.
-      fps: Frames per second.
 
     Returns:
       Positions, meters: the trapezoidal integral, which is within a millimeter of the
@@ -162,7 +160,6 @@ def steady_speed(
 
     Args:
       position: Root position (x, z) in each frame, meters.
-      fps: Frames per second.
       reach: The speed is that from so many frames before to so many after; less at
         both ends of the path.
 
@@ -224,7 +221,6 @@ def reaction(
       reached: Whether a frame does what the command says.
       begins: First frame of each command.
       ends: First frame that it no longer holds in.
-      fps: Frames per second.
     """
     reached = np.asarray(reached)
     lead, number = reached.shape[:-1], len(begins)

@@ -57,7 +57,6 @@ def touch_events(
 
     Args:
       ball: Positions, meters.
-      fps: Frames per second.
       threshold: Meters per second squared, exclusive. The paper's 2 is a second
         difference of 2.2 mm at 30 fps, which noise in a recording exceeds.
 
@@ -92,7 +91,6 @@ def foot_ball_distance(
     Args:
       ball: Positions, meters.
       joints: World positions of the joints that may touch it (feet, or hands), meters.
-      fps: Frames per second.
       threshold: Acceleration of an event, meters per second squared, exclusive.
 
     Returns:
@@ -126,7 +124,6 @@ def touch_count(
     Args:
       ball: Positions, meters.
       joints: World positions of the joints that may touch it, meters.
-      fps: Frames per second.
       threshold: Acceleration of an event, meters per second squared, exclusive.
       max_distance: From a joint to the ball's center, meters, inclusive: the ball's
         radius, half a foot, and a margin.
@@ -165,7 +162,6 @@ def untouched_acceleration(
     Args:
       ball: Positions, meters.
       joints: World positions of the joints that may touch it, meters.
-      fps: Frames per second.
       max_distance: From a joint to the ball's center, meters, inclusive.
 
     Returns:

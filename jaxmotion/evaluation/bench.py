@@ -183,7 +183,6 @@ def resolve(amounts: Amounts, name: str, changes: Sequence[str] = ()) -> Budget:
     """The numbers of a budget, some of them changed.
 
     Args:
-      amounts: Amounts of the system.
       name: "quick" or "full".
       changes: "number=value", for numbers of the budget.
 
@@ -325,7 +324,6 @@ def time_cells(times: np.ndarray, *, seed: int) -> Row:
 
     Args:
       times: Milliseconds.
-      seed: Seeds the resamples.
 
     Returns:
       Two columns.

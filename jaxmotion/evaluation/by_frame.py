@@ -43,7 +43,6 @@ def place_sums(
     Args:
       values: One a frame.
       place: Place of each frame, in 0..num_places-1; others are left out.
-      num_places: Length of the result.
       weights: Weights of the values; None for equal ones.
     """
     at = jax.nn.one_hot(place, num_places)
@@ -105,8 +104,6 @@ def by_frame(
       positions: World, meters.
       feet: Joints whose sliding counts.
       place: Place of each frame, in 0..num_places-1; others are left out.
-      fps: Frames per second.
-      num_places: Length of the result.
       contact_height: A foot joint below this height should not move, meters.
 
     Returns:

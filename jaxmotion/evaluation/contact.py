@@ -53,7 +53,6 @@ def slide_distance(
 
     Args:
       foot_positions: World positions of the toes, meters, ground at y = 0.
-      fps: Frames per second.
       max_height: Meters, exclusive ("below, e.g., 1 cm" in the paper).
 
     Returns:
@@ -89,7 +88,6 @@ def skate_ratio(
 
     Args:
       foot_positions: World positions of feet or toes, meters, ground at y = 0.
-      fps: Frames per second.
       max_height: Meters, exclusive.
       min_speed: Meters per second, exclusive. The source's 2.5 cm a frame at 20 fps.
 
@@ -124,7 +122,6 @@ def skating_frame_ratio(
 
     Args:
       foot_positions: World positions of feet or toes, meters, ground at y = 0.
-      fps: Frames per second.
       height: H, meters.
       min_speed: Meters per second, exclusive; ours, since the source sums the measure.
 
@@ -170,7 +167,6 @@ def swing_height(
     Args:
       foot_positions: World positions, meters.
       body_speed: Speed of the body without its sway, meters per second.
-      fps: Frames per second.
       ground: Height at which a foot rests, meters.
       least_speed: A foot of a body that is slower than this, m/s, must be faster than
         it: those who stand have no swing.

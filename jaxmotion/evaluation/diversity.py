@@ -30,7 +30,6 @@ def diversity(
     meet itself.
 
     Args:
-      key: Consumed.
       features: One row a sample, of all conditions together.
       num_pairs: Pairs to draw (the source: 200 or 300).
 
@@ -54,7 +53,6 @@ def multimodality(
     """Mean distance of random pairs of samples of the same condition.
 
     Args:
-      key: Consumed.
       features: Features of several samples of each condition.
       num_pairs: Pairs to draw for each condition (the source: 10 or 20).
 
@@ -84,10 +82,8 @@ def joint_distance(
     `diversity` it has the unit of a length and does not grow with frames or joints.
 
     Args:
-      key: Consumed.
       positions: Joint positions, meters, in the frame they are to be compared in:
         world for the whole rollout, root-local for the pose alone.
-      num_pairs: Pairs to draw.
 
     Returns:
       Meters.

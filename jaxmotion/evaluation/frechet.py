@@ -39,9 +39,6 @@ def moments(features: Float[Array, "samples features"]) -> Moments:
     Args:
       features: One row a sample.
 
-    Returns:
-      The moments.
-
     Raises:
       ValueError: if there are fewer than two samples.
 
@@ -101,10 +98,6 @@ def frechet_distance(a: Moments, b: Moments) -> Float[Array, ""]:
     where covariances are nearly singular, below 1e-6 elsewhere; 64-bit inputs need
     `jax.enable_x64`.
 
-    Args:
-      a: Moments of one set.
-      b: Moments of the other.
-
     Returns:
       Distance, in squared units of the features, not negative.
 
@@ -134,9 +127,6 @@ def frechet_distance_of_rows(
 
     Args:
       a: Rows from `count_a` on are padding.
-      count_a: Rows of it that count.
-      b: The other set.
-      count_b: Rows of it that count.
 
     Returns:
       Distance, in squared units of the features, not negative; NaN where fewer than

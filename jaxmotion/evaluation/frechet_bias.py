@@ -45,7 +45,6 @@ def subset_sizes(count: int, *, number: int = 15, least: int) -> tuple[int, ...]
     """Sizes evenly spaced from the least to all samples, as in the source.
 
     Args:
-      count: Samples there are.
       number: Sizes; 15 in the source.
       least: The smallest. At least the number of features (the source: 5,000 for
         2,048): below it (1) has further terms, and the line misses them.
@@ -82,7 +81,6 @@ def frechet_bias(
     not extrapolated away.
 
     Args:
-      key: Consumed.
       features: Features of all samples of a model, one row each.
       reference: Moments of what they are compared with, of as many samples as there
         are.

@@ -27,7 +27,6 @@ def diverged_frames(
 
     Args:
       positions: World positions of the joints, meters; joint 0 is the root.
-      fps: Frames per second.
       min_root: Lowest root height, meters.
       max_root: Highest root height, meters.
       max_speed: Largest speed of any joint, meters per second.
@@ -59,7 +58,6 @@ def has_diverged(
 
     Args:
       positions: World positions of the joints, meters; joint 0 is the root.
-      fps: Frames per second.
       min_root: Lowest root height, meters.
       max_root: Highest root height, meters.
       max_speed: Largest speed of any joint, meters per second.
@@ -93,7 +91,6 @@ def frozen_frames(
     Args:
       positions: World positions of the joints, meters; joint 0 is the root.
       wanted_velocity: Velocity (x, z) asked for in each frame, meters per second.
-      fps: Frames per second.
       seconds: Length of a window.
       min_speed: Meters per second.
       commanded: Meters per second.
@@ -137,7 +134,6 @@ def is_frozen(
     Args:
       positions: World positions of the joints, meters; joint 0 is the root.
       wanted_velocity: Velocity (x, z) asked for in each frame, meters per second.
-      fps: Frames per second.
       seconds: Length of a window of `frozen_frames`.
       min_speed: Meters per second.
       commanded: Meters per second.

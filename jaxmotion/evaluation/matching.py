@@ -43,7 +43,6 @@ def r_precision(
       text: Embeddings of sentences.
       motion: Embeddings of their motions.
       top: The largest k, at most pool.
-      pool: Motions to choose from.
 
     Returns:
       Fractions for k = 1..top, in 0..1; NaN if an embedding is.

@@ -17,8 +17,6 @@ def mode_scores(
     """Scores of sequences whose every step should be uniform over the modes.
 
     Args:
-      points: Rollouts.
-      centers: Centers of the modes.
       sigma: Standard deviation of a mode in each axis.
       share: A mode counts as covered at a step if at least this share of that step's
         points is within 3 sigma of its center.

@@ -28,7 +28,6 @@ def acceleration(
 
     Args:
       positions: World positions of the joints, meters.
-      fps: Frames per second.
 
     Returns:
       Meters per second squared.
@@ -52,7 +51,6 @@ def jerk(
 
     Args:
       positions: World positions of the joints, meters.
-      fps: Frames per second.
 
     Returns:
       Meters per second cubed.

@@ -98,9 +98,7 @@ def bootstrap_interval(
     Args:
       samples: Independent ones, [samples].
       statistic: Function of them, with an argument `axis`.
-      seed: Seeds what is drawn.
       level: Part of the resampled values that the interval holds, in (0, 1).
-      num_resamples: How often to draw.
 
     Raises:
       ValueError: if there are fewer than two samples.

@@ -88,7 +88,6 @@ def time_in_turn(
       rounds: Timed rounds.
       warmup: Rounds before, fewer where they take a quarter of the limit.
       limit_s: Stop after so many seconds, but not before the least number of rounds.
-      least: That number.
 
     Returns:
       For each name an array [rounds, 2]: milliseconds of wall clock, and of processor

@@ -27,10 +27,6 @@ class Config:
     """Size of the evaluator.
 
     Attributes:
-      num_classes: Classes.
-      num_joints: Joints of the skeleton.
-      num_features: Width of the feature layer.
-      hidden: Width of the recurrent states.
       state_scale: Standard deviation of the states before the first frame.
     """
 
@@ -54,10 +50,6 @@ def _initial_state(key: Key, batch: int, config: Config) -> Array:
 def init(key: Key, config: Config) -> Params:
     """Initial parameters.
 
-    Args:
-      key: Consumed.
-      config: Its size.
-
     Returns:
       Parameters of `ActionClassifier`.
     """
@@ -76,11 +68,9 @@ def classify(
     """Features and logits of motions.
 
     Args:
-      params: The evaluator's parameters.
       key: Consumed by the states before the first frame; the same key, batch size and
         motions give the same features.
       x: Joint positions, meters, of motions that start at the origin facing +z.
-      config: Its size.
 
     Returns:
       Features (for Fréchet distance and diversity), and logits.
@@ -99,10 +89,8 @@ def loss(
     """Cross entropy of a batch.
 
     Args:
-      params: The evaluator's parameters.
       key: Consumed by the states before the first frame.
       batch: Joint positions as above, and the classes of the motions.
-      config: Its size.
 
     Returns:
       The loss, and the accuracy.
@@ -125,10 +113,7 @@ def train(
     """Trains an evaluator as one compiled program.
 
     Args:
-      key: Consumed.
       x: Joint positions, meters, of motions that start at the origin facing +z.
-      labels: Their classes.
-      config: Its size.
       num_steps: Updates.
       batch: Motions an update, drawn with replacement.
       learning_rate: Rate of Adam, with cosine decay to a tenth.

@@ -55,7 +55,6 @@ class Evaluator:
       field: Label field of the clips that the classes are from.
       labels: Names of the classes, in their order.
       joints: Names of the skeleton's joints, in their order.
-      fps: Frames per second.
       frames: Frames of what it looks at.
       source: Data that it was trained on, and their license.
       clips: Fingerprint of the training clips.
@@ -122,14 +121,7 @@ def released_style(path: Path) -> Evaluator:
 
 
 def to_json(evaluator: Evaluator) -> dict[str, Any]:
-    """All of an evaluator but its parameters, with their fingerprint.
-
-    Args:
-      evaluator: The evaluator.
-
-    Returns:
-      A JSON object.
-    """
+    """All of an evaluator but its parameters, with their fingerprint."""
     value = {
         name: getattr(evaluator, name) for name in _FIELDS if name != "fingerprint"
     }
@@ -146,10 +138,6 @@ def to_json(evaluator: Evaluator) -> dict[str, Any]:
 def save(path: Path, evaluator: Evaluator) -> None:
     """Writes an evaluator as one npz file, whole or not at all.
 
-    Args:
-      path: File to write.
-      evaluator: The evaluator.
-
     Raises:
       OSError: if the file cannot be written.
     """
@@ -161,12 +149,6 @@ def save(path: Path, evaluator: Evaluator) -> None:
 
 def load(path: Path) -> Evaluator:
     """Reads what `save` wrote; checks every field.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The evaluator.
 
     Raises:
       ValueError: if it is missing, damaged, foreign or of another version; names the
@@ -226,10 +208,6 @@ def params_for(
 
     Args:
       evaluator: The evaluator; None if one is to be trained.
-      kind: That the run needs.
-      labels: Classes of the run.
-      joints: Joint names of the run's skeleton.
-      fps: Frames per second of the run.
       frames: Frames that are scored at a time.
 
     Returns:
@@ -255,7 +233,6 @@ def clips_fingerprint(data: Clips | BallClips, field: str) -> str:
     """Fingerprint of clips, of their labels, and of the ball if there is one.
 
     Args:
-      data: The clips.
       field: Label field that counts; others do not.
 
     Returns:
@@ -280,13 +257,9 @@ def describe(
     """Who scored a table, for what stands beside it.
 
     Args:
-      params: Parameters of the evaluator.
       evaluator: The frozen evaluator that they are of; None if they were trained for
         this table.
       reference: Fingerprint of the clips that Fréchet distances refer to.
-
-    Returns:
-      A JSON object.
     """
     found = {"fingerprint": fingerprint(params), "reference_clips": reference}
     if evaluator is None:
@@ -304,9 +277,6 @@ def note(description: dict[str, Any]) -> str:
 
     Args:
       description: From `describe`; at least a fingerprint and an origin.
-
-    Returns:
-      The line.
     """
     line = f"Evaluator {description['fingerprint']} ({description['origin']})"
     if "reference_clips" in description:

@@ -20,11 +20,7 @@ from jaxmotion.networks.convolution import convolve
 
 
 class InferenceBatchNorm(nn.Module):
-    """Batch norm whose statistics are parameters, as training left them.
-
-    Attributes:
-      channels: Channels, the last axis.
-    """
+    """Batch norm whose statistics are parameters, as training left them."""
 
     channels: int
 
@@ -49,7 +45,6 @@ class ResidualConvolution(nn.Module):
     """Convolution of width 3, norm and leaky ReLU, added to a 1 x 1 convolution.
 
     Attributes:
-      channels: Output channels.
       frozen: Batch norm in inference mode in place of group norm.
     """
 
@@ -69,9 +64,6 @@ class ResidualConvolution(nn.Module):
     ) -> Float[Array, "batch frames channels"]:
         """Applies it along time.
 
-        Args:
-          x: Frames.
-
         Returns:
           As many frames.
         """
@@ -82,8 +74,6 @@ class WindowClassifier(nn.Module):
     """Windows of poses to features and class logits.
 
     Attributes:
-      num_classes: Classes.
-      num_features: Width of the feature layer.
       dropout: Rate after the convolutions.
       frozen: Batch norms in inference mode in place of layer and group norms.
     """
@@ -136,13 +126,7 @@ class StyleClassifier(WindowClassifier):
 
 
 class ActionClassifier(nn.Module):
-    """Motions to features and class logits.
-
-    Attributes:
-      num_classes: Classes.
-      num_features: Width of the feature layer.
-      hidden: Width of both states.
-    """
+    """Motions to features and class logits."""
 
     num_classes: int
     num_features: int = 30
@@ -186,7 +170,6 @@ class MovementEncoder(nn.Module):
     """Two convolutions of width 4 and stride 2, and a linear layer.
 
     Attributes:
-      width: Channels of each layer.
       dropout: Rate after each convolution.
     """
 
@@ -229,7 +212,6 @@ class SequenceEncoder(nn.Module):
 
     Attributes:
       width: Channels of the GRU, one direction.
-      embedding: Channels of the result.
     """
 
     width: int
@@ -253,9 +235,6 @@ class SequenceEncoder(nn.Module):
         Args:
           x: Sequences; rows at and after a sequence's length are not read.
           length: In 1..rows.
-
-        Returns:
-          Embeddings.
         """
         x = self.input(x)
         states = []
@@ -274,7 +253,6 @@ class TextEncoder(nn.Module):
 
     Attributes:
       width: Channels of the GRU, one direction.
-      embedding: Channels of the result.
     """
 
     width: int = 512
@@ -290,12 +268,8 @@ class TextEncoder(nn.Module):
         """Embeds sentences of different lengths.
 
         Args:
-          vectors: Word vectors.
           tags: One-hot parts of speech.
           words: Words of each sentence, with its marks of start and end; in 1..slots.
-
-        Returns:
-          Embeddings.
         """
         tagged = nn.Dense(vectors.shape[-1], kernel_init=_XAVIER, name="tags")(tags)
         encoder = SequenceEncoder(self.width, self.embedding, name="sequence")
@@ -306,10 +280,8 @@ class Matcher(nn.Module):
     """Both towers: motions and sentences to embeddings that can be compared.
 
     Attributes:
-      movement_width: Channels of a movement.
       motion_width: Channels of the motions' GRU, one direction.
       text_width: Channels of the sentences' GRU, one direction.
-      embedding: Channels of an embedding.
       dropout: Rate in the movement encoder.
     """
 
@@ -345,9 +317,6 @@ class Matcher(nn.Module):
           train: Whether to drop; needs rngs={"dropout": key}.
           padding: What is seen beyond the whole movements: "zeros", or "kept", what is
             there.
-
-        Returns:
-          Embeddings.
         """
         units = frames // UNIT
         if padding == "zeros":
@@ -367,9 +336,6 @@ class Matcher(nn.Module):
           vectors: As `TextEncoder`.
           tags: As `TextEncoder`.
           words: As `TextEncoder`.
-
-        Returns:
-          Embeddings.
         """
         return self.text(vectors, tags, words)
 

@@ -30,8 +30,6 @@ class Config:
     """Size of the evaluator.
 
     Attributes:
-      num_classes: Classes.
-      num_joints: Joints of the skeleton.
       frames: Frames of a window, at 30 fps.
     """
 
@@ -108,7 +106,6 @@ def released_input(
     shoulders face +x.
 
     Args:
-      skeleton: The skeleton.
       motion: Frames of it, at 30 per second.
 
     Returns:
@@ -136,10 +133,6 @@ def window_input(
     So neither where a character walks nor how fast or where it faces is visible, but
     what its limbs do.
 
-    Args:
-      skeleton: The skeleton.
-      motion: Frames of it.
-
     Returns:
       Meters; three channels a joint, the root's height in place of its zeros.
     """
@@ -159,7 +152,6 @@ def cross_entropy(
 
     Args:
       logits: One row a sample.
-      labels: Its class.
 
     Returns:
       The loss in nats, and the accuracy.
@@ -173,10 +165,6 @@ def cross_entropy(
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters.
-
-    Args:
-      key: Consumed.
-      config: Its size.
 
     Returns:
       Parameters of `WindowClassifier`.
@@ -195,10 +183,8 @@ def loss(
     """Cross entropy of a batch.
 
     Args:
-      params: The evaluator's parameters.
       key: Consumed by dropout.
       batch: Windows of `window_input`, and their classes.
-      config: Its size.
 
     Returns:
       The loss, and the accuracy.
@@ -219,9 +205,7 @@ def classify(
     """Features and logits of windows.
 
     Args:
-      params: The evaluator's parameters.
       x: Windows of `window_input`.
-      config: Its size.
 
     Returns:
       Features (for Fréchet distances), and logits.
@@ -242,10 +226,7 @@ def train(
     """Trains an evaluator as one compiled program.
 
     Args:
-      key: Consumed.
       x: Windows of `window_input`.
-      labels: Their classes.
-      config: Its size.
       num_steps: Updates.
       batch: Windows per update, drawn with replacement.
       learning_rate: Rate of Adam, with cosine decay to a tenth.
@@ -280,10 +261,8 @@ def train_classifier(
     """Trains any classifier of motions as one compiled program.
 
     Args:
-      key: Consumed.
       init: Initial parameters from a key.
       loss: Loss of a batch of samples and classes.
-      data: Samples, and their classes.
       num_steps: Updates.
       batch: Samples per update, drawn with replacement.
       learning_rate: Rate of Adam, with cosine decay to a tenth.
@@ -319,11 +298,7 @@ def in_batches(function: Callable[[Any], Any], x: Any, *, size: int = 256) -> An
 
     Args:
       function: Array or pytree with a first axis to the like.
-      x: Its argument.
       size: Rows at a time.
-
-    Returns:
-      The results, put together.
     """
     number = jax.tree.leaves(x)[0].shape[0]
     parts = [
@@ -338,8 +313,6 @@ class StyleEvaluator:
     """A style evaluator and its size.
 
     Attributes:
-      params: Its parameters.
-      config: Its size.
       classes: Its class of each label; none if they are the same.
     """
 
@@ -354,14 +327,8 @@ def fit(
     """Trains the style evaluator on windows with a stride of 10 frames.
 
     Args:
-      key: Consumed.
-      clips: Training clips.
       field: Label field that is the style.
       num_steps: Updates.
-      batch: Windows per update.
-
-    Returns:
-      The evaluator.
     """
     found = eval_windows(clips, stride=10, field=field)
     config = Config(
@@ -383,8 +350,6 @@ def features_and_hits(
     """Features of windows, and whether each one's style is recognized.
 
     Args:
-      skeleton: The skeleton.
-      found: Windows.
       evaluator: From `fit`.
 
     Returns:

@@ -70,10 +70,8 @@ class MatcherConfig:
     Attributes:
       num_features: Channels of a frame, without the 4 contact labels: 259 for
         HumanML3D, 247 for KIT-ML.
-      movement_width: Channels of a movement.
       motion_width: Channels of the motions' GRU, one direction.
       text_width: Channels of the sentences' GRU, one direction.
-      embedding: Channels of an embedding.
       dropout: Rate in the movement encoder.
     """
 
@@ -116,10 +114,6 @@ class Pairs:
 def init_matcher(key: Key, config: MatcherConfig) -> Params:
     """Initial parameters.
 
-    Args:
-      key: Consumed.
-      config: Its size.
-
     Returns:
       Parameters of `Matcher`.
     """
@@ -146,11 +140,9 @@ def embed_motion(
     """Embeds motions.
 
     Args:
-      params: The evaluator's parameters.
       features: As in `Pairs`; all padded to the length used in training.
       frames: Frames of each motion, at least 4; those beyond a multiple of 4 do not
         count.
-      config: Its size.
       padding: What is seen beyond a motion's frames: "zeros", or "kept", what is there.
 
     Returns:
@@ -173,14 +165,9 @@ def embed_text(
     """Embeds sentences.
 
     Args:
-      params: The evaluator's parameters.
       vectors: As `encode_tokens` gives them.
       tags: As `encode_tokens` gives them.
       words: As `encode_tokens` gives them.
-      config: Its size.
-
-    Returns:
-      Embeddings.
     """
     return blocks.apply(
         params, config.network, vectors, tags, words, method="embed_text"
@@ -196,13 +183,8 @@ def matcher_loss(
     the batch. If it has the same sentence, the pair is pushed apart all the same.
 
     Args:
-      params: The evaluator's parameters.
       key: Consumed by dropout and the shift.
       batch: At least two pairs.
-      config: Its size.
-
-    Returns:
-      The loss, and its two terms.
 
     Raises:
       ValueError: if there is one pair only.
@@ -241,10 +223,7 @@ def train_matcher(
     """Trains an evaluator as one compiled program.
 
     Args:
-      key: Consumed.
       sample_batch: `(key, data) -> Pairs`, traced.
-      data: What it draws from: arrays on the device.
-      config: Its size.
       num_steps: Updates.
       optimizer: None for the source's: Adam at 1e-4, gradients clipped to 0.5 (here
         of all parts together, there of each encoder).
@@ -275,9 +254,6 @@ def word_vectors(words: Sequence[str]) -> Float[np.ndarray, "words 300"]:
     They tell words apart and nothing more: "run" is as far from "jog" as from "table".
     The numbers are a hash of the word (SHAKE-256), so they are the same everywhere,
     which NumPy does not promise of its generators.
-
-    Args:
-      words: Any words.
 
     Returns:
       One row a word, of norm 6, as GloVe's are within a factor of two.

@@ -30,8 +30,6 @@ class Port:
     """An array that goes into a graph or comes out of it; for one character.
 
     Attributes:
-      name: Its name in the file.
-      shape: Its shape.
       dtype: Such as "float32".
       text: What it is and its unit, as the docstrings of its dataclasses say.
     """
@@ -51,10 +49,7 @@ class Graph:
     """A function of arrays, for one character.
 
     Attributes:
-      name: Its name.
       run: `(*inputs) -> outputs`, arrays in the order of the ports.
-      inputs: What goes in.
-      outputs: What comes out.
     """
 
     name: str
@@ -67,7 +62,6 @@ def make(name: str, exported: Exported, arguments: dict[str, Any]) -> Graph:
     """The graph of a function.
 
     Args:
-      name: Its name.
       exported: The function. Where it takes a "key", the graph takes "noise".
       arguments: Values of its other arguments by name, of one character; only shapes
         matter.

@@ -74,7 +74,6 @@ def open_session(model: bytes, *, threads: int = 0) -> Any:
     """An `onnxruntime.InferenceSession` of a file's content.
 
     Args:
-      model: The content.
       threads: Threads of one operation; 0 leaves their number to onnxruntime. They do
         not wait for more work between calls, as that takes cores from other work.
     """

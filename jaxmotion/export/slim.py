@@ -63,7 +63,6 @@ def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:
     """A model's content with fewer nodes, and its large constants elsewhere.
 
     Args:
-      model: Content of an ONNX file.
       weights: Takes the large constants.
       half: Round all large constants to 16-bit floats, not only those that are such.
     """

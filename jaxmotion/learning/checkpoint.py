@@ -50,8 +50,6 @@ def save(
 
     Args:
       folder: The run's checkpoint folder; made if missing.
-      step: Number of the step.
-      state: A pytree of arrays.
       config: What rebuilds the model; must be JSON.
       keep: Newest steps to keep.
 
@@ -82,14 +80,7 @@ def save(
 
 
 def latest_step(folder: str | Path) -> int | None:
-    """Newest whole step of a folder, or None.
-
-    Args:
-      folder: The run's checkpoint folder.
-
-    Returns:
-      Its number.
-    """
+    """Newest whole step of a folder, or None."""
     if not Path(folder).is_dir():
         return None
     with _manager(Path(folder)) as manager:
@@ -175,7 +166,6 @@ def restore(folder: str | Path, like: Any, step: int | None = None) -> Any:
     """State of a step.
 
     Args:
-      folder: The run's checkpoint folder.
       like: A state of the same structure and shapes (arrays or ShapeDtypeStructs).
       step: Which; None for the newest.
 
@@ -231,15 +221,11 @@ def restore_part(
     """Some fields of a saved state, such as the averaged parameters alone.
 
     Args:
-      folder: The run's checkpoint folder.
       like: Field names to nested dicts of arrays (or ShapeDtypeStructs), of the same
         structure and shapes.
       step: Which; None for the newest.
       within: Field of the state whose fields they are, such as "generator"; None for
         the state itself.
-
-    Returns:
-      Those fields.
 
     Raises:
       CheckpointError: if there is none, it is corrupt, or of another model; names the
@@ -302,7 +288,6 @@ def export_params(
     """Writes parameters and config as one small npz file, whole or not at all.
 
     Args:
-      path: File to write.
       params: Nested dict of arrays.
       config: What rebuilds the model; must be JSON.
       dtype: Stored type; float16 halves the size at three decimal digits.

@@ -33,9 +33,6 @@ def fingerprint(tree: Any) -> str:
     The same for any order of the dicts' entries, and for device and host arrays; other
     if one bit of one number, a shape, a type or a name differs.
 
-    Args:
-      tree: Pytree of arrays.
-
     Returns:
       The first 12 hexadecimal digits of the SHA-256 of names, types, shapes and bytes.
     """

@@ -248,11 +248,7 @@ def train(
         at a time where a chunk takes longer than about a second.
       state: New, or restored from `<folder>/checkpoints`; donated.
       key: The same for all parts of a run.
-      data: Arrays on the device.
       loop: How long, and what to write.
-
-    Returns:
-      The last state.
 
     Raises:
       TrainingDiverged: if a loss is not finite; nothing of that chunk is saved.

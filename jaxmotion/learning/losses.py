@@ -38,8 +38,6 @@ def masked_mse(
     """Mean squared error over the frames that count.
 
     Args:
-      prediction: Any features.
-      target: The same features.
       mask: Frames that count. Without any, a batch gives 0; so does a sample, which
         still counts as one (the released code divides by zero).
       average: See the module.
@@ -60,9 +58,6 @@ def masked_mse(
 def displacement(x: Float[Array, "*batch frames n"]) -> Array:
     """Difference of neighboring frames.
 
-    Args:
-      x: Frames.
-
     Returns:
       One frame less, per frame.
     """
@@ -79,8 +74,6 @@ def velocity_loss(
     """Mean squared error of displacements; both frames of a pair must count.
 
     Args:
-      prediction: Any features.
-      target: The same features.
       mask: Frames that count.
       average: See the module.
 
@@ -140,11 +133,8 @@ def predict_clean(
     """A denoiser's predictions of samples after noise; each condition is encoded once.
 
     Args:
-      key: Consumed.
-      x_0: Clean samples.
       condition: What the network's method `encode` takes, batch axis first.
       apply: The network with its parameters: `(*arguments, method=, rngs=)`.
-      table: Schedule.
       levels: Noise levels of each sample: evenly spread over 1..T after a random
         first, so that every one of them is uniform by itself.
       own: Probability of a sample that the lower half of its levels is noise on the

@@ -25,7 +25,6 @@ def decode(
     """Fields of a JSON object, each made into what it stands for.
 
     Args:
-      value: The JSON object.
       where: Its file, for messages.
       parts: What makes each field; other fields are left out.
 
@@ -135,9 +134,6 @@ def config_from_json(kind: type, value: Any) -> Any:
         lists and such dataclasses.
       value: What `dataclasses.asdict` gave, read back.
 
-    Returns:
-      The configuration.
-
     Raises:
       ValueError: names the field that is missing, unknown, of another kind or out of
         range.
@@ -231,7 +227,6 @@ def arrays_from_json(
     """Inverse of `arrays_to_json` for poses to start from.
 
     Args:
-      value: The JSON object.
       lead: Leading axes of all arrays; the next axis is the number of poses, one or
         more, the same for all.
       shapes: The axes after that, by name.

@@ -69,7 +69,6 @@ class Run:
     """A run folder.
 
     Attributes:
-      folder: Where it is.
       system: Whose run it is.
       model: JSON of what rebuilds the model.
       settings: JSON of how model and data were made.
@@ -123,16 +122,11 @@ def begin(
     several processes the first one writes; all of them must see the folder.
 
     Args:
-      folder: Where.
-      system: Whose run it is.
       data: Files that its data are made from. Files that are gone are taken to be those
         of that name; those that are there may have moved.
       settings: JSON of how model and data are made.
       make: Reads the files and makes the content; not called for a folder that is
         there.
-
-    Returns:
-      The run.
 
     Raises:
       OSError: if a file cannot be read or written.
@@ -266,7 +260,6 @@ def load(folder: Path, *, system: str | None = None) -> Run:
     """Loads a run folder and checks that its data are those it was made with.
 
     Args:
-      folder: Where it is.
       system: Whose run it must be; None for any system's.
 
     Raises:
@@ -406,9 +399,6 @@ def stage_config(run: Run, stage: str, kind: type, **more: Any) -> Any:
     """The configuration that a stage was trained with.
 
     Args:
-      run: The run.
-      stage: Name of the stage.
-      kind: Its dataclass.
       **more: Fields that stages of that kind do not decide.
 
     Raises:
@@ -432,9 +422,6 @@ def store(run: Run, stage: str, state: Any, *, model: dict[str, Any]) -> None:
     """Writes what is made without training as a stage: its checkpoint of step 0.
 
     Args:
-      run: The run.
-      stage: Name of the stage.
-      state: A pytree of arrays.
       model: JSON of what rebuilds its structure.
 
     Raises:
@@ -484,20 +471,11 @@ def fit(
     """Trains a stage, from its newest checkpoint if there is one.
 
     Args:
-      run: The run.
-      stage: Name of the stage, which is its folder in the run.
-      state: A new one.
-      update: Update of the state by a batch.
       sample_batch: `(key, data) -> batch`.
-      data: Arrays.
-      budget: How long.
       model: JSON of what rebuilds the stage's networks.
       settings: JSON of how the stage is trained besides the budget.
       key: Key of batches and noise; None for one of the budget's seed.
       show: Names on the progress bar.
-
-    Returns:
-      The last state.
 
     Raises:
       CheckpointError: if the folder holds another stage.
@@ -552,17 +530,9 @@ def minimize(
     """Trains a stage of one network by a loss, with the budget's optimizer.
 
     Args:
-      params: Initial parameters.
-      run: The run.
-      stage: Name of the stage.
       loss: `(params, key, batch) -> (loss, info)`.
       sample_batch: `(key, data) -> batch`.
-      data: Arrays.
-      budget: How long.
       **more: As `fit` takes them.
-
-    Returns:
-      The last state.
     """
     optimizer = make_optimizer(budget)
     return fit(
@@ -587,8 +557,6 @@ def load_params(
     """Averaged parameters of a stage.
 
     Args:
-      run: The run.
-      stage: Name of the stage.
       init: Makes parameters of the same shapes; never run.
       adversarial: Whether the stage trained a generator against a discriminator.
 
@@ -610,12 +578,8 @@ def restore_evaluator(
     """Parameters of an evaluator that must have been trained as told.
 
     Args:
-      folder: Folder of its checkpoint.
       value: JSON of how it must have been trained.
       init: Makes parameters of the same shapes; never run.
-
-    Returns:
-      The parameters.
 
     Raises:
       CheckpointError: if there is none.

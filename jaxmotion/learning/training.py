@@ -31,10 +31,7 @@ class TrainState:
     """All that a run needs to go on.
 
     Attributes:
-      step: Updates made.
-      params: Parameters.
       ema_params: Their exponential moving average: what evaluation uses.
-      opt_state: The optimizer's state.
     """
 
     step: Int[Array, ""]
@@ -108,9 +105,6 @@ def make_optimizer(
       final_fraction: Rate at the end of the decay as a fraction of the peak.
       max_norm: Clip the gradient to this global norm; None to leave it.
       **own: What that optimizer alone has, such as adamw's weight_decay.
-
-    Returns:
-      The optimizer.
     """
     rate: optax.ScalarOrSchedule = learning_rate
     if num_steps is not None:
@@ -129,7 +123,6 @@ def init_train_state(params: Params, optimizer: Optimizer) -> TrainState:
     """State before the first step.
 
     Args:
-      params: Initial parameters.
       optimizer: As given to `make_update`.
 
     Returns:
@@ -153,7 +146,6 @@ def make_update(
 
     Args:
       loss: `(params, key, batch) -> (loss, info)`.
-      optimizer: An optax transformation.
       ema_decay: Decay of the average a step, in [0, 1).
 
     Returns:
@@ -246,9 +238,6 @@ def replicate(tree: Any, mesh: Mesh | None) -> Any:
     Args:
       tree: Arrays; in a run of several processes each has the same values.
       mesh: The mesh, or None to leave the tree as it is.
-
-    Returns:
-      The tree on the mesh.
     """
     if mesh is None:
         return tree

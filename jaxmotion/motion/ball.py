@@ -40,7 +40,6 @@ class Scene:
     """A person and a ball over some frames.
 
     Attributes:
-      motion: The person.
       ball: Position of the ball's center in the same frame, meters.
       touch: Which joints touch the ball; 0 or 1, or a model's guess between.
     """
@@ -80,7 +79,6 @@ def ball_velocities(
 
     Args:
       ball: Positions, meters.
-      fps: Frames per second.
 
     Returns:
       Meters per second; the first frame's is that of the second.
@@ -101,7 +99,6 @@ def ball_accelerations(
 
     Args:
       ball: Positions, meters.
-      fps: Frames per second.
 
     Returns:
       Meters per second squared; zero in the first and the last frame, which have no
@@ -189,7 +186,6 @@ def decode_ball(
       features: Features of the ball, perhaps from a network.
       root: Positions of the root, meters.
       start: Where the ball was in the frame before the first, meters.
-      fps: Frames per second.
 
     Returns:
       Positions of the ball, meters.

@@ -24,14 +24,10 @@ def foot_contacts(
 
     Args:
       foot_positions: World positions, meters, y up.
-      fps: Frames per second.
       max_speed: Meters per second, in space (not only on the ground). CAMDM's foot loss
         has 0.01 m a frame at 30 fps, which is 0.3.
       max_height: Meters above the ground; infinite, that is no test of height, as in
         CAMDM's foot loss.
-
-    Returns:
-      Whether each foot stands.
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -55,7 +51,6 @@ def ball_contact_gate(
 
     Args:
       ball: Positions of the ball's center, meters.
-      fps: Frames per second.
       threshold: Least acceleration, meters per second squared. The paper's 2 is 2.2 mm
         of second difference at 30 fps, which a model's jitter exceeds; a ball that
         flies falls with 9.8.

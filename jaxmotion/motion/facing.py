@@ -34,9 +34,6 @@ _SHOULDERS = (
 def plain_names(skeleton: Skeleton) -> list[str]:
     """Joint names in lower case, without separators and rig prefix.
 
-    Args:
-      skeleton: The bones.
-
     Returns:
       One name a joint: "spine2" of "mixamorig:Spine_2".
     """
@@ -49,9 +46,6 @@ def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
     Knows LeftUpLeg/RightUpLeg (Mixamo, LaFAN1), UpperLeg_L/UpperLeg_R (Bandai Namco),
     LeftHip/RightHip (100STYLE, SMPL) and L_Hip/R_Hip (BallPlay-M), in any case and
     after a prefix like "mixamorig:".
-
-    Args:
-      skeleton: The bones.
 
     Returns:
       Indices of the left and the right hip joint.
@@ -105,7 +99,6 @@ def hip_facing(
     """Facing of poses from their hips.
 
     Args:
-      skeleton: The bones.
       joint_rotation: Parent-local rotations, two columns each; the root's is global.
       hips: Left and right hip joint; found by name if not given.
 
@@ -130,7 +123,6 @@ def body_facing(
     """Facing of poses from hips and shoulders alike, as CAMDM's evaluation has it.
 
     Args:
-      skeleton: The bones.
       positions: World positions of its joints.
 
     Returns:

@@ -55,9 +55,6 @@ def feature_layout(**sizes: int) -> FeatureLayout:
     Args:
       **sizes: For each field, in order, how many numbers it has.
 
-    Returns:
-      The layout.
-
     Raises:
       ValueError: if a size is not positive.
 
@@ -76,11 +73,7 @@ def pack(
     """Joins named parts into feature vectors.
 
     Args:
-      layout: Names, order and sizes.
       parts: One array for each field, of its size along the last axis.
-
-    Returns:
-      Feature vectors.
 
     Raises:
       ValueError: if names or sizes are not those of the layout.
@@ -104,13 +97,6 @@ def unpack(
 ) -> dict[str, Float[Array, "*batch _"]]:
     """Inverse of `pack`.
 
-    Args:
-      layout: Names, order and sizes.
-      features: Feature vectors.
-
-    Returns:
-      One array for each field.
-
     Raises:
       ValueError: if the vectors are not of the layout's size.
 
@@ -132,7 +118,6 @@ class Normalizer:
     """An affine map to zero mean and unit deviation.
 
     Attributes:
-      mean: Mean of each feature.
       std: Standard deviation of each feature, never below the floor it was fitted with.
     """
 
@@ -150,9 +135,6 @@ def fit_normalizer(
       features: Feature vectors of the training data.
       floor: Least deviation, in the features' units, so that constant channels stay
         finite (they map to zero).
-
-    Returns:
-      The normalizer.
 
     Source: own.
     """
@@ -176,9 +158,6 @@ def normalize(
     Args:
       normalizer: Fitted on the training data.
       x: Features in their own units.
-
-    Returns:
-      Normalized features.
 
     Source: own.
     """
@@ -237,9 +216,6 @@ def to_frame(motion: Motion, frame: PlanarFrame) -> Motion:
       motion: Frames in the world.
       frame: One for the whole motion.
 
-    Returns:
-      The motion in that frame.
-
     Source: own.
     """
     zero = jnp.zeros_like(frame.origin)
@@ -250,7 +226,6 @@ def to_first_pose(skeleton: Skeleton, motion: Motion) -> Motion:
     """Moves motions so that they start at the ground's origin facing +z.
 
     Args:
-      skeleton: The skeleton.
       motion: In the world.
 
     Returns:
@@ -332,7 +307,6 @@ def motion_from_features(
     Args:
       features: (J + 1) * 6 numbers a frame, as a network predicts them; the last three
         are ignored.
-      fps: Frames per second.
       rotation_layout: As in `motion_features`.
 
     Returns:

@@ -45,9 +45,6 @@ def turn(
       vector: Ground vectors (x, z).
       yaw: Angle in radians; positive turns +z toward +x.
 
-    Returns:
-      Vectors of the same length.
-
     Source: own.
     """
     x, z = vector[..., 0], vector[..., 1]
@@ -83,9 +80,6 @@ def into_frame(
     Args:
       vector: World vectors (x, z).
       facing: Unit vectors, world.
-
-    Returns:
-      Vectors in the frame's axes.
 
     Source: own.
     """

@@ -54,9 +54,6 @@ def minimal_swing(
     Args:
       start: Unit vectors.
       end: Unit vectors; opposite ones turn about some axis at right angles.
-
-    Returns:
-      Rotation matrices.
     """
     axis = jnp.eye(3, dtype=start.dtype)[jnp.argmin(jnp.abs(start), axis=-1)]
     start, half_turn = jnp.broadcast_arrays(start, jnp.cross(start, axis), end)[:2]
@@ -110,7 +107,6 @@ def canonical_joints(
 
     Args:
       joints: World positions, y up.
-      layout: The joints.
 
     Returns:
       Positions; a second call changes nothing.
@@ -165,7 +161,6 @@ def features_from_joints(
     Args:
       joints: World positions, y up, at the frame rate of the data set; need not be
         canonical.
-      layout: The joints.
 
     Returns:
       One vector a frame but for the last one, not normalized.
@@ -228,7 +223,6 @@ def joints_from_features(
 
     Args:
       features: Vectors, not normalized.
-      layout: The joints.
 
     Returns:
       Positions; the root of the first frame is above the origin and faces +z.

@@ -185,7 +185,6 @@ def motion_from_joints(
 
     Args:
       positions: World positions of HumanML3D's joints, meters, y up.
-      fps: Frames per second.
 
     Returns:
       A skeleton with the joints `SMPL_JOINTS`, and the motion.

@@ -18,9 +18,6 @@ SECONDS = (1 / 3, 2 / 3, 1.0)
 def path_offsets(fps: float) -> tuple[int, ...]:
     """How many frames ahead the path is looked at.
 
-    Args:
-      fps: Frames per second.
-
     Returns:
       Three numbers of frames; 20, 40, 60 at 60 frames per second.
 
@@ -34,7 +31,6 @@ def query(path: Trajectory, frame: PlanarFrame) -> Float[Array, "*batch 12"]:
 
     Args:
       path: The three points, world.
-      frame: Where the character is now.
 
     Returns:
       Three positions (x, z), meters, then three facings (x, z), in the axes of the
@@ -54,7 +50,6 @@ def path_features(bone: Trajectory, *, fps: float) -> Float[Array, "frames 12"]:
 
     Args:
       bone: Simulation bone of one clip, world.
-      fps: Frames per second.
 
     Returns:
       One row a frame, as `query`.

@@ -38,9 +38,6 @@ _CONTACT_FILTER = 6  # frames of the median at 60 frames per second
 def pose_layout(num_joints: int) -> FeatureLayout:
     """Fields of a pose vector.
 
-    Args:
-      num_joints: J.
-
     Returns:
       The layout, 15 J + 8 features.
 
@@ -110,7 +107,6 @@ def pose_vectors(
     Args:
       skeleton: The bones; it has two feet, the left one first.
       motion: One clip, world.
-      bone: Its simulation bone.
 
     Returns:
       15 J + 8 features a frame; velocities are central differences, extrapolated at
@@ -189,7 +185,6 @@ def advance_frame(
       frame: Where it is, world.
       velocity: In its own axes, meters per second; the vertical part is not used.
       angular_velocity: In its own axes, radians per second; the vertical part counts.
-      fps: Frames per second.
 
     Returns:
       Where it is one frame later.
@@ -216,8 +211,6 @@ def point_velocities(
       poses: Pose vectors, frame after frame.
       points: Points in the axes of each frame's simulation bone, meters, such as joints
         of `character_transforms`.
-      num_joints: J.
-      fps: Frames per second.
 
     Returns:
       Velocity from each frame to the next in the axes of the former's bone, meters per
@@ -245,11 +238,6 @@ def place(
 
     Translations of other joints than the first are not used: a `Motion` has the bones
     of its skeleton.
-
-    Args:
-      poses: Pose vectors.
-      frame: The simulation bone of each.
-      num_joints: J.
 
     Returns:
       Root positions, meters, and parent-local rotations, two columns each: the fields
@@ -280,10 +268,7 @@ def integrate_root(
     A pose's velocity is what leads to it: that of the first pose has no effect.
 
     Args:
-      poses: Pose vectors, one a frame.
       frame: The simulation bone of the first frame.
-      num_joints: J.
-      fps: Frames per second.
 
     Returns:
       The simulation bone of every frame, world.

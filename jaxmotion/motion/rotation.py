@@ -126,9 +126,6 @@ def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3
     Args:
       rot6d: Two columns, not necessarily orthonormal.
 
-    Returns:
-      Rotation matrices.
-
     Source: Zhou et al. 2019, eq. 15.
     """
     return jnp.moveaxis(
@@ -139,9 +136,6 @@ def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3
 @jax.jit
 def rot6d_from_matrix(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 6"]:
     """First two columns of a rotation matrix.
-
-    Args:
-      matrix: Rotation matrices.
 
     Returns:
       `[c1, c2]`, six numbers.
@@ -176,9 +170,6 @@ def matrix_from_quaternion(
 
     Args:
       quaternion: wxyz of any non-zero length; zero gives the identity.
-
-    Returns:
-      Rotation matrices.
     """
     identity = jnp.array([1.0, 0.0, 0.0, 0.0], quaternion.dtype)
     w, x, y, z = jnp.moveaxis(safe_normalize(quaternion, identity), -1, 0)
@@ -198,9 +189,6 @@ def quaternion_from_matrix(
 
     Of the four algebraically equal forms the best conditioned one is taken, so the
     result and its gradient are finite everywhere, half turns included.
-
-    Args:
-      matrix: Rotation matrices.
 
     Returns:
       Unit quaternions, wxyz.
@@ -244,9 +232,6 @@ def matrix_from_facing(facing: Float[Array, "*batch 2"]) -> Float[Array, "*batch
 
     Args:
       facing: Direction (x, z), unit length.
-
-    Returns:
-      Rotation matrices.
     """
     x, z = facing[..., 0], facing[..., 1]
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)

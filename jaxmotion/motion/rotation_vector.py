@@ -15,9 +15,6 @@ _TINY = 1e-12
 def from_matrix(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
     """Rotation vector of a rotation matrix.
 
-    Args:
-      matrix: Rotation matrices.
-
     Returns:
       Rotation vectors, at most pi long.
 
@@ -38,9 +35,6 @@ def to_matrix(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 
     Args:
       vector: Rotation vectors of any length.
-
-    Returns:
-      Rotation matrices.
 
     Source: own.
     """

@@ -33,7 +33,6 @@ class Skeleton:
     Attributes:
       offsets: Joint position in its parent's frame, meters. The root's is unused.
       parents: Parent of each joint; -1 for the root, else smaller than the joint.
-      names: One name a joint.
       feet: Joints whose contact with the ground counts (toes, left before right).
     """
 
@@ -49,12 +48,6 @@ class Skeleton:
 
     def index(self, name: str) -> int:
         """Index of the joint of that name.
-
-        Args:
-          name: Joint name.
-
-        Returns:
-          The index.
 
         Raises:
           ValueError: if the skeleton has no such joint; names those it has.
@@ -74,7 +67,6 @@ class Motion:
     Attributes:
       root_position: World position of the root joint, meters, y up.
       joint_rotation: Parent-local rotations as two columns; the root's is global.
-      fps: Frames per second.
     """
 
     root_position: Float[Array, "*batch frames 3"]
@@ -91,9 +83,6 @@ class Motion:
 
 def check_parents(parents: tuple[int, ...]) -> None:
     """Raises unless every parent precedes its joint and only joint 0 is a root.
-
-    Args:
-      parents: Parent of each joint.
 
     Raises:
       ValueError: names the first joint that breaks the rule.
@@ -212,7 +201,6 @@ def global_transforms(
     Differentiable in reverse mode only: its gradient is written out.
 
     Args:
-      skeleton: The bones.
       root_position: World position of the root, meters.
       joint_rotation: Parent-local rotations, two columns each.
 
@@ -248,7 +236,6 @@ def forward_kinematics(
     """World positions of all joints.
 
     Args:
-      skeleton: The bones.
       root_position: World position of the root, meters.
       joint_rotation: Parent-local rotations, two columns each.
 
@@ -268,10 +255,6 @@ def joint_positions(
 ) -> Float[Array, "*batch frames joints 3"]:
     """World positions of all joints in all frames of a motion.
 
-    Args:
-      skeleton: The bones.
-      motion: Frames of that skeleton.
-
     Returns:
       Positions, meters.
 
@@ -287,9 +270,7 @@ def from_root(
     """World vector from the root to a joint: kinematics of its own chain only.
 
     Args:
-      skeleton: The bones.
       joint_rotation: Parent-local rotations, two columns each; the root's is global.
-      joint: Where to.
 
     Returns:
       Meters; zeros for the root.
@@ -315,7 +296,6 @@ def joint_velocities(
 
     Args:
       positions: World positions, meters.
-      fps: Frames per second.
 
     Returns:
       Forward differences, meters per second.

@@ -43,7 +43,6 @@ def spring(
     Args:
       x: Value now, in any unit.
       v: Its velocity, units per second.
-      goal: Where it comes to rest.
       half_life: Seconds; below 1e-5 counts as 1e-5 (at once).
       dt: Seconds to move on, not negative. An array gives many times at once.
 

@@ -79,7 +79,6 @@ def root_trajectory(
     """Path of the root and the facing of the hips in every frame.
 
     Args:
-      skeleton: The bones.
       motion: Frames of that skeleton, world.
       hips: Left and right hip joint; found by name if not given.
 
@@ -116,9 +115,7 @@ def desired_trajectory(
     Args:
       frame: Where the character is and faces, world.
       velocity: Its velocity, meters per second, world.
-      command: Wanted velocity and facing.
       num_frames: Length of the path; frame i is (i + 1) / fps seconds ahead.
-      fps: Frames per second.
       half_life: Half-life of both springs, seconds.
       acceleration: Meters per second squared, world; zero if not given.
       turn_rate: Turn rate of the facing, radians per second; zero if not given.
@@ -242,9 +239,6 @@ def to_local(trajectory: Trajectory, frame: PlanarFrame) -> Trajectory:
       trajectory: World path.
       frame: Frame, one for the whole path.
 
-    Returns:
-      The path in that frame.
-
     Source: own.
     """
     moved = trajectory.position - frame.origin[..., None, :]
@@ -287,12 +281,8 @@ def smooth_course(key: Key, course: Trajectory, *, last: int) -> Trajectory:
     1/4); the facings are smoothed with sigma 5 or 10.
 
     Args:
-      key: Consumed.
       course: Path of one window.
       last: Frame in which the smoothed path stays where it was.
-
-    Returns:
-      The path.
 
     Source: released code of CAMDM. Differs: facings are smoothed within the window,
     there within the whole clip.
@@ -313,11 +303,7 @@ def smooth(
     """Filters along time with a matrix of weights.
 
     Args:
-      x: Frames.
       matrix: Row f holds the weights of frame f.
-
-    Returns:
-      Filtered frames.
     """
     return jax.numpy.einsum("fg,...gn->...fn", matrix, x)
 
@@ -329,7 +315,6 @@ def integrate_path(
 
     Args:
       velocity: Meters per second, one a frame.
-      fps: Frames per second.
 
     Returns:
       Positions after each frame, meters.

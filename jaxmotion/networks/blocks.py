@@ -33,9 +33,7 @@ def apply(params: Params, module: Any, *args: Any, **options: Any) -> Any:
     """What a module makes of its parameters and arguments.
 
     Args:
-      params: Its parameters.
       module: Flax module without collections but these; or what has its `apply`.
-      *args: Of its method.
       **options: Of its method; Flax's own `method` and `rngs`.
     """
     return module.apply({"params": params}, *args, **options)
@@ -64,7 +62,6 @@ def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
     """Table of sinusoidal position codes: sine on even channels, cosine on odd.
 
     Args:
-      num: Number of positions.
       width: Channels; even.
 
     Returns:
@@ -89,11 +86,7 @@ def add_rows(
     """Adds the same rows (positions) to the tokens of every sample.
 
     Args:
-      x: Tokens.
       rows: One row for each token, or one for all.
-
-    Returns:
-      Their sum.
     """
     return x + jnp.broadcast_to(rows, x.shape)
 
@@ -131,10 +124,8 @@ def unfold_weights(
     weights of a frame sum to 1.
 
     Args:
-      tokens: Number of tokens.
       n: Own frames of a token.
       margin: Frames beyond them on either side.
-      window: Shape of the cross-fade.
 
     Returns:
       One row per frame, one column per prediction (token by token).
@@ -171,7 +162,6 @@ def unfold_frames(
       x: Outputs, n + 2 margin frames of features in each token.
       n: Own frames of a token.
       margin: Frames beyond them on either side.
-      window: Shape of the cross-fade.
 
     Returns:
       n frames per token.
@@ -191,12 +181,6 @@ def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     Written with erf. `jax.nn.gelu` takes erfc, which keeps relative accuracy where the
     result is nearly zero and takes three times as long on a CPU; the two differ by
     less than 1e-6.
-
-    Args:
-      x: Any values.
-
-    Returns:
-      As many values.
 
     Source: Hendrycks & Gimpel 2016; PyTorch's formula.
     """
@@ -229,11 +213,7 @@ def row_of(
 
 
 class TimeEmbedding(nn.Module):
-    """Sinusoid of the step, then Linear, SiLU, Linear.
-
-    Attributes:
-      width: Channels.
-    """
+    """Sinusoid of the step, then Linear, SiLU, Linear."""
 
     width: int
 
@@ -248,9 +228,6 @@ class TimeEmbedding(nn.Module):
         Step t reads row t - 1 of the sinusoid, as the released weights of CAMDM do
         (their least noisy step is 0); row 0 (clean data) repeats row 1.
 
-        Args:
-          num_steps: T.
-
         Returns:
           One row a step.
         """
@@ -264,10 +241,6 @@ class LabelEmbedding(nn.Module):
 
     Labels out of range are refused, or in a compiled program take the nearest row
     (`known_labels`).
-
-    Attributes:
-      num_labels: Rows.
-      width: Channels.
     """
 
     num_labels: int
@@ -287,9 +260,7 @@ class EncoderLayer(nn.Module):
     """Transformer encoder layer.
 
     Attributes:
-      width: Channels of a token.
       heads: Attention heads; divides width.
-      hidden: Channels of the feed-forward layer.
       dropout: Rate on attention weights, and on the three branch outputs.
       norm: "post", or "pre"; see the module's docstring.
       activation: Of the feed-forward layer.
@@ -323,11 +294,7 @@ class EncoderLayer(nn.Module):
         """Queries, keys and values of tokens.
 
         Args:
-          x: Tokens.
           last: Make queries of only the last so many tokens; None for all.
-
-        Returns:
-          The projections.
         """
         if self.norm == "pre":
             x = self.norm_1(x)
@@ -351,13 +318,9 @@ class EncoderLayer(nn.Module):
         Args:
           x: Tokens of the queries.
           projections: Queries of those tokens, keys and values of all tokens.
-          train: Whether to drop.
           mask: Tokens of `projections` that may be attended to; None for all.
           prefix: More tokens to attend to. They stay apart, so that `vmap` shares one
             prefix among many `x` without a copy.
-
-        Returns:
-          Tokens of the next layer.
         """
         query, key, value = projections
         drop = lambda y: self.drop(y, deterministic=not train)  # noqa: E731
@@ -397,14 +360,9 @@ class EncoderLayer(nn.Module):
         """The whole layer.
 
         Args:
-          x: Tokens.
-          train: Whether to drop.
           last: Return only the last so many tokens; None for all.
           mask: Tokens that may be attended to; None for all.
           prefix: As for `attend`.
-
-        Returns:
-          Tokens of the next layer.
         """
         projections = self.project(x, last=last)
         return self.attend(

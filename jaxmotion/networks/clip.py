@@ -27,12 +27,6 @@ EPSILON = 1e-5
 def quick_gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """CLIP's stand-in for GELU: x sigmoid(1.702 x).
 
-    Args:
-      x: Any values.
-
-    Returns:
-      As many values.
-
     Source: Hendrycks & Gimpel 2016, section 2.
     """
     return x * jax.nn.sigmoid(1.702 * x)
@@ -42,9 +36,7 @@ class ClipLayer(nn.Module):
     """Pre-norm transformer layer with a causal mask.
 
     Attributes:
-      width: Channels of a token.
       heads: Attention heads; divides width.
-      hidden: Channels of the feed-forward layer.
     """
 
     width: int
@@ -65,14 +57,7 @@ class ClipLayer(nn.Module):
     def __call__(
         self, x: Float[Array, "batch tokens width"]
     ) -> Float[Array, "batch tokens width"]:
-        """Applies it.
-
-        Args:
-          x: Tokens.
-
-        Returns:
-          As many tokens.
-        """
+        """Applies it."""
         normed = self.norm_1(x)
         heads = (*x.shape[:-1], self.heads, self.width // self.heads)
         mixed = jax.nn.dot_product_attention(
@@ -91,11 +76,7 @@ class ClipText(nn.Module):
     Attributes:
       vocabulary: Tokens known.
       context: Most tokens of a text, with those of start and end.
-      width: Channels of a token.
-      depth: Layers.
       heads: Attention heads; divides width.
-      hidden: Channels of the feed-forward layers.
-      dimensions: Components of the vector.
       end_of_text: Id of the token whose row is read.
     """
 

@@ -29,14 +29,12 @@ def convolve(
 
     Args:
       frames: Batch, time, channels: the order of `nn.Conv`.
-      kernel: Weights.
       window_strides: Frames between results.
       padding: "SAME", "VALID", or zeros before and after.
       lhs_dilation: 1: nothing else is here.
       rhs_dilation: 1.
       dimension_numbers: Those of `nn.Conv`, whatever they say.
       feature_group_count: 1.
-      precision: Precision of the product.
 
     Returns:
       Sums over the width of the kernel.

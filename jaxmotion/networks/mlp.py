@@ -29,10 +29,7 @@ class ConditionedMlp(nn.Module):
     """Maps a noisy vector, its step and a condition to a vector.
 
     Attributes:
-      features: Channels of the result.
-      num_steps: T.
       width: Channels of a hidden layer; a multiple of 16.
-      depth: Hidden layers.
       time_width: Channels of the step's embedding; even.
       groups: Groups of the norms.
     """
@@ -55,7 +52,6 @@ class ConditionedMlp(nn.Module):
         """The network.
 
         Args:
-          x_t: Noisy vector.
           t: Step in 1..T, one for all or one a sample.
           condition: What the result depends on besides.
           latent: Noise of a generator; None for none.
@@ -78,9 +74,6 @@ class PairDiscriminator(nn.Module):
     """Logit that (x_{t-1}, x_t) is a pair of the data, given a condition.
 
     Attributes:
-      num_steps: T.
-      width: Channels of a hidden layer.
-      depth: Hidden layers.
       time_width: Channels of the step's embedding; even.
     """
 
@@ -100,13 +93,8 @@ class PairDiscriminator(nn.Module):
         """The network.
 
         Args:
-          x_prev: Sample at step t - 1.
-          x_t: Sample at step t.
           t: Step in 1..T.
           condition: What the pair depends on.
-
-        Returns:
-          The logit.
         """
         step = _step_embedding(self.time_width, self.num_steps, t, x_t.shape[:-1])
         h = jnp.concatenate([x_prev, x_t, condition, step], axis=-1)

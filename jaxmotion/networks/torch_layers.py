@@ -25,7 +25,6 @@ class Layers:
 
         Args:
           path: The file, for messages.
-          weights: Its arrays.
           what: What they should be of, for messages.
         """
         self.path, self.weights, self.what = path, weights, what
@@ -72,7 +71,6 @@ class Layers:
         """The parameters on the device.
 
         Args:
-          params: Made of what was taken.
           ignore: How names may begin that nobody took.
 
         Raises:

@@ -87,7 +87,6 @@ def continuing(
     pose that it is given by some 2 cm a joint, which is a jump where plans meet.
 
     Args:
-      frames: Predicted features.
       last: Features of the pose before the first frame.
       keep_past: Frames stay as they are where it is False.
       half_life: Of the offset, frames.
@@ -105,15 +104,6 @@ class CamdmTransformer(nn.Module):
     """The denoiser.
 
     Attributes:
-      features: Channels of a pose.
-      past: Past frames.
-      future: Frames to predict.
-      num_labels: Styles.
-      num_steps: T.
-      width: Channels of a token.
-      depth: Encoder layers.
-      heads: Attention heads.
-      hidden: Channels of the feed-forward layers.
       dropout: Rate, after the positions and in every layer.
       frames_per_token: Frames of one token; 1 in the paper.
       token_margin: Frames beyond its own, on either side, that a token predicts and
@@ -199,16 +189,10 @@ class CamdmTransformer(nn.Module):
         """What does not depend on the noisy sample.
 
         Args:
-          past: Features of the last displayed poses.
           path: Ground positions (x, z) of the future, meters from the last pose.
           facing: 6D rotations of the future facings.
-          label: Style.
           keep_past: Where False the past is zeroed (its token is then the bias),
             which is the null condition of classifier-free guidance.
-          train: Whether to drop.
-
-        Returns:
-          The context of `denoise`.
         """
         n = self.frames_per_token
         kept = jnp.where(keep_past[..., None, None], past, 0.0)
@@ -247,13 +231,7 @@ class CamdmTransformer(nn.Module):
         """Prediction of the clean sample.
 
         Args:
-          context: From `encode`.
-          x_t: Noisy features.
           t: Step in 1..T, one for all or one a sample.
-          train: Whether to drop.
-
-        Returns:
-          Predicted features x_0.
         """
         batch, outputs = x_t.shape[:-2], self.num_outputs
         step = jnp.broadcast_to(blocks.row_of(context.steps, t), (*batch, self.width))
@@ -331,17 +309,11 @@ class CamdmTransformer(nn.Module):
         """`encode`, then `denoise`; arguments as there.
 
         Args:
-          x_t: Noisy features.
           t: Step in 1..T.
-          past: Features of the last displayed poses.
           path: Ground positions of the future, meters.
           facing: 6D rotations of the future facings.
-          label: Style.
           keep_past: False for the null condition.
           train: Whether to drop; needs rngs={"dropout": key}.
-
-        Returns:
-          Predicted features x_0.
         """
         context = self.encode(past, path, facing, label, keep_past, train=train)
         return self.denoise(context, x_t, t, train=train)

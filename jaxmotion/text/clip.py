@@ -86,8 +86,6 @@ class ClipModel:
     """A text tower with its tokenizer.
 
     Attributes:
-      network: The module.
-      params: Its parameters, float32.
       tokenizer: Tokenizer of the package `tokenizers`.
       fingerprint: Eight hexadecimal digits that change with weights and tokenizer.
     """
@@ -105,9 +103,6 @@ def load_clip(folder: str | os.PathLike) -> ClipModel:
       folder: With model.safetensors, config.json and tokenizer.json, or with one .pt
         file of OpenAI's and tokenizer.json. Sizes that the config does not name are
         those of ViT-B/32, as on the hub.
-
-    Returns:
-      The model.
 
     Raises:
       FileNotFoundError: if a file is missing; names all that are.
@@ -297,7 +292,6 @@ def tokenize(
 
     Args:
       model: Its tokenizer and context are used.
-      texts: Some sentences.
       max_tokens: Cut longer texts to so many tokens, those of start and end included;
         22 in EMDM and MDM (HumanML3D). None: a text beyond the context is an error.
 
@@ -350,8 +344,6 @@ def encode(
     """Vectors of texts, not normalized: what EMDM and MDM take as condition.
 
     Args:
-      model: The text tower.
-      texts: Some sentences.
       max_tokens: See `tokenize`, also for what is raised.
 
     Returns:

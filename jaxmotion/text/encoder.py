@@ -31,7 +31,6 @@ class TextEncoder:
 
     Attributes:
       name: For tables of results, and to tell caches apart: other vectors, other name.
-      dimensions: Components of a vector.
       embed: The function itself; `encode` checks what goes in and comes out.
     """
 
@@ -67,12 +66,6 @@ class TextEncoder:
 def plain_texts(texts: Sequence[str]) -> list[str]:
     """Texts with single spaces between words.
 
-    Args:
-      texts: Some sentences.
-
-    Returns:
-      As many texts.
-
     Raises:
       ValueError: if it is one string, or a text is empty; gives the text's index.
     """
@@ -86,14 +79,7 @@ def plain_texts(texts: Sequence[str]) -> list[str]:
 
 
 def hashed_encoder(*, dimensions: int) -> TextEncoder:
-    """Hashed n-grams; see `jaxmotion.text.hashing`.
-
-    Args:
-      dimensions: Components of a vector.
-
-    Returns:
-      The encoder.
-    """
+    """Hashed n-grams; see `jaxmotion.text.hashing`."""
     return TextEncoder(
         name=f"hashed n-grams {dimensions}",
         dimensions=dimensions,
@@ -102,11 +88,7 @@ def hashed_encoder(*, dimensions: int) -> TextEncoder:
 
 
 def wordllama_encoder() -> TextEncoder:
-    """WordLlama; see `jaxmotion.text.wordllama`, also for what is raised.
-
-    Returns:
-      The encoder.
-    """
+    """WordLlama; see `jaxmotion.text.wordllama`, also for what is raised."""
     model = wordllama.load_wordllama()
     dimensions = model.embedding.shape[1]
     return TextEncoder(
@@ -146,9 +128,6 @@ def make_encoder(name: str, *, max_tokens: int | None = None) -> TextEncoder:
       name: "wordllama", "hashed" (256 components), or a folder with CLIP's files.
       max_tokens: See `clip_encoder`; the others read any text whole.
 
-    Returns:
-      The encoder.
-
     Raises:
       ModuleNotFoundError: if a package is missing; says how to install it.
       ValueError: if it is none of the three; see also `clip.load_clip`.
@@ -186,7 +165,6 @@ def encode_unique(
     """Encodes every text once, and none that the cache has.
 
     Args:
-      encoder: The encoder.
       texts: Some sentences, with repetitions.
       cache: An npz file, made or extended with what was missing; one for each encoder.
 

@@ -9,12 +9,6 @@ from typing import Any
 def require(package: str) -> ModuleType:
     """Imports a package that only texts need.
 
-    Args:
-      package: Its name.
-
-    Returns:
-      The module.
-
     Raises:
       ModuleNotFoundError: if it is not installed; says how to install it.
     """
@@ -29,9 +23,6 @@ def require(package: str) -> ModuleType:
 def missing(package: str) -> ModuleNotFoundError:
     """The error of a package that is not installed.
 
-    Args:
-      package: Its name.
-
     Returns:
       The error, to be raised.
     """
@@ -44,9 +35,6 @@ def missing(package: str) -> ModuleNotFoundError:
 
 def read_tokenizer(path: str | os.PathLike) -> Any:
     """Reads a tokenizer.json; it neither pads nor cuts.
-
-    Args:
-      path: The file.
 
     Returns:
       A `tokenizers.Tokenizer`. Its `encode_batch` may be called by several threads.

@@ -28,9 +28,6 @@ _EDGE = ""
 def features(text: str) -> Iterator[tuple[str, float]]:
     """Features of a sentence with their weights; one that occurs twice comes twice.
 
-    Args:
-      text: A sentence.
-
     Returns:
       An iterator: words and pairs weigh 1; the groups of letters of a word have a
       Euclidean length of 1 together, so that long words do not drown the rest.
@@ -60,7 +57,6 @@ def encode(
     """Hashed n-grams of texts.
 
     Args:
-      texts: Some sentences.
       dimensions: D, at least 1.
 
     Returns:

@@ -42,9 +42,6 @@ class WordLlama:
 def load_wordllama() -> WordLlama:
     """Reads the two files from where the package is installed; needs no network.
 
-    Returns:
-      The model.
-
     Raises:
       FileNotFoundError: if the installed package does not carry them.
       ModuleNotFoundError: if `wordllama`, `tokenizers` or `safetensors` is missing.
@@ -71,7 +68,6 @@ def encode(
     """Means of token embeddings, not normalized (their length is about 4).
 
     Args:
-      model: Embeddings and tokenizer.
       texts: Some sentences, none of them empty. Case matters.
 
     Returns:

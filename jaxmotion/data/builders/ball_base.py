@@ -44,8 +44,6 @@ def ball_example(
 
     Args:
       name: Unique name of the clip.
-      skeleton: Its bones.
-      motion: Its frames.
       labels: One word for each label field.
       ball: World position of the ball's center in every frame, meters, y up.
       touch: Which of the joints touch the ball in every frame.
@@ -71,7 +69,6 @@ def ball_clips_from_source(
     """All clips of a prepared builder, with their ball.
 
     Args:
-      builder: A prepared builder.
       tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Returns:

@@ -124,9 +124,6 @@ class Ballplay(ball_base.BallBuilder):
 def read_skill(label: str) -> str:
     """The skill that a clip's label names.
 
-    Args:
-      label: As published.
-
     Returns:
       The label, or "other" for those of the authors' experiments.
     """
@@ -138,7 +135,6 @@ def read_fields(path: str, data: bytes) -> dict[str, np.ndarray]:
 
     Args:
       path: The file's path, for messages.
-      data: Its content.
 
     Returns:
       The arrays; numbers are float64.

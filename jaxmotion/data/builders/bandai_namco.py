@@ -121,9 +121,6 @@ def read_labels(path: str, data: bytes, names: dict[str, list[str]]) -> dict[str
       data: Its content, such as {"content": 7, "style": 0}.
       names: The published label lists.
 
-    Returns:
-      The words.
-
     Raises:
       ValueError: if the JSON is malformed, an id is unknown, or the name disagrees.
     """

@@ -104,10 +104,6 @@ def motion_from_matrices(
     Args:
       root_position: World position of the root, meters, y up.
       local: Parent-local rotations; the root's is global.
-      fps: Frames per second.
-
-    Returns:
-      The motion.
     """
     columns = np.concatenate([local[..., 0], local[..., 1]], axis=-1)
     return Motion(
@@ -124,8 +120,6 @@ def example(
 
     Args:
       name: Unique name of the clip.
-      skeleton: Its bones.
-      motion: Its frames.
       labels: One word for each label field.
 
     Returns:
@@ -222,9 +216,6 @@ def prepare(
       manual_dir: Folder with the published files.
       overwrite: Read them again although the builder's folder is there.
 
-    Returns:
-      The builder.
-
     Raises:
       FileNotFoundError: if the folder or its files are missing.
       OSError: if the builder's folder cannot be written, as on a full disk.
@@ -270,9 +261,6 @@ def _word(value) -> str:
 def read_records(builder: MotionBuilder) -> list[dict]:
     """All examples of a prepared builder.
 
-    Args:
-      builder: A prepared builder.
-
     Returns:
       Features of each clip, sorted by name.
     """
@@ -284,7 +272,6 @@ def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Cli
     """All clips of a prepared builder.
 
     Args:
-      builder: A prepared builder.
       tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Returns:
@@ -302,8 +289,6 @@ def clips_from_records(
     """Clips of what `read_records` read.
 
     Args:
-      builder: The builder.
-      records: Features of each clip.
       tolerance: Largest difference between the offsets of two skeletons, meters.
 
     Returns:

@@ -21,9 +21,6 @@ def world_rotations(
     Args:
       local: Parent-local rotations; the root's is global.
       parents: Parent of each joint, smaller than the joint.
-
-    Returns:
-      Rotation matrices.
     """
     world = np.array(local)
     for joint, parent in enumerate(parents[1:], start=1):

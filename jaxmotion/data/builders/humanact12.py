@@ -88,7 +88,6 @@ def read_clips(
 
     Args:
       path: The file's path, for messages.
-      data: Its content.
 
     Returns:
       For each clip rotation vectors [frames, 72], positions [frames, 24, 3] in meters,

@@ -37,7 +37,6 @@ class TextConfig(tfds.core.BuilderConfig):
 
     Attributes:
       num_features: Numbers in a feature vector.
-      fps: Frames per second.
       min_frames: Fewest frames of a clip.
       source: Name of the set and its license.
     """

@@ -112,7 +112,6 @@ def read_skeleton(path: str, data: bytes) -> Skeleton:
 
     Args:
       path: The file's path, for messages.
-      data: Its content.
 
     Returns:
       The skeleton. Its feet are ankles and feet, left before right; row 0 of its
@@ -159,8 +158,6 @@ def read_sequence(path: str, data: bytes, skeleton: Skeleton) -> tuple[str, dict
 
     Args:
       path: The file's path.
-      data: Its content.
-      skeleton: The bones.
 
     Returns:
       Key and features, as a builder's generator yields them.

@@ -128,15 +128,7 @@ def init_state(
 ) -> CharacterState:
     """A character at the origin that faces +z, in a real pose.
 
-    Args:
-      space: The space.
-      vector: Its pose vector.
-      path: Its path features.
-      noise: Normal noise that its first tick remembers; None if none is.
-      num_joints: Joints of the skeleton.
-
-    Returns:
-      The state.
+    Its first tick remembers the normal `noise`; None if none is remembered.
     """
     parts = unpack(pose.pose_layout(num_joints), vector)
     return CharacterState(
@@ -151,19 +143,11 @@ def init_state(
 def wanted_path(
     state: CharacterState, command: Command, *, fps: float, half_life: float
 ) -> Float[Array, " 12"]:
-    """Path features that a command asks for.
+    """Path features that a command asks for, in the axes of the character's bone.
 
     They begin with the character's own velocity, but never faster than told: a wish
-    that does would ask him who is too fast to go on so.
-
-    Args:
-      state: The character.
-      command: What the user wants now.
-      fps: Frames per second.
-      half_life: Half-life of the springs, seconds.
-
-    Returns:
-      Path features in the axes of the character's bone.
+    that does would ask him who is too fast to go on so. The springs' half-life is in
+    seconds.
 
     Source: Holden et al. 2020, released code (controller), but for this.
     """
@@ -196,11 +180,8 @@ def wanted_path(
 def path_objective(goal: Float[Array, " 12"]) -> Objective:
     """Half the squared distance of a frame's path features to those wanted.
 
-    Args:
-      goal: Path features as the first 12 channels of a frame.
-
-    Returns:
-      J of eq. 13, a function of frames; each feature in its deviation over the data.
+    J of eq. 13, a function of frames; each feature, of the first 12 channels, in its
+    deviation over the data.
     """
 
     def objective(frame: Float[Array, " channels"], /) -> Float[Array, ""]:
@@ -216,17 +197,14 @@ def guided(
     guided_steps: int | None = None,
     memory: Memory | None = None,
 ) -> Stepper:
-    """AAMDM as a stepper: steered by the gradient of the objective.
+    """AAMDM as a stepper steered by the objective's gradient, unless the goal is None.
 
     Args:
       sample: From `aamdm_model.sampler`.
       scale: Strength of the guidance, epsilon of eq. 13.
       guided_steps: How many at the chain's end are guided; None for all (paper).
-      memory: How the noise of its posteriors is remembered; None draws it anew in
-        every frame (paper).
-
-    Returns:
-      The stepper; unguided where the goal is None.
+      memory: How the noise of its posteriors is remembered; None draws it anew in every
+        frame (paper).
     """
 
     def step(key: Key, previous: Array, goal: Array | None, **noise: Array) -> Array:
@@ -248,18 +226,9 @@ def advance(
     fps: float,
     wanted: Float[Array, " 12"] | None,
 ) -> tuple[CharacterState, Frame]:
-    """Decodes the character's frame, moves its bone on, and shows it.
+    """Decodes the character's frame, moves its old bone on, and shows it.
 
-    Args:
-      space: The space.
-      state: The character, with the new frame and the old bone.
-      command: What the user wants now.
-      num_joints: Joints of the skeleton.
-      fps: Frames per second.
-      wanted: Path features that were asked for; None for those that the frame has.
-
-    Returns:
-      The state after the tick, and what it shows.
+    Path features were `wanted`; None for those that the frame has.
     """
     vector = aamdm_space.to_poses(space, state.frame)
     parts = unpack(pose.pose_layout(num_joints), vector)
@@ -302,15 +271,9 @@ def controller(
 
     Args:
       step: Makes the next frame.
-      space: The space.
-      num_joints: Joints of the skeleton.
-      fps: Frames per second.
       steered: Whether commands matter; if not, none of the steering is compiled in.
       bounded: Whether frames are kept within the bounds of the data; ours.
-      half_life: Half-life of the springs that turn a command into a path, seconds.
-
-    Returns:
-      A controller that makes a frame in every tick.
+      half_life: Of the springs that turn a command into a path, seconds.
     """
 
     def wanted(state: CharacterState, command: Command) -> Array:
@@ -365,9 +328,6 @@ class Method:
     """What makes a controller of `(networks' parameters, space)`; hashable.
 
     Attributes:
-      config: The networks and the chain.
-      num_joints: Joints of the skeleton.
-      fps: Frames per second.
       scale: Strength of the guidance.
       guided_steps: How many at the chain's end are guided; None for all.
       memory: How the noise of the posteriors is remembered.
@@ -411,19 +371,7 @@ def start_states(
     seed: int,
     memory: Memory | None = None,
 ) -> CharacterState:
-    """Characters in poses of the data, each at the origin and facing +z.
-
-    Args:
-      data: Where the poses come from, such as held-out frames.
-      space: The space.
-      number: Characters.
-      num_joints: Joints of the skeleton.
-      seed: Seeds the choice of poses, and the noise that is remembered.
-      memory: How noise is remembered, if it is.
-
-    Returns:
-      States, batch axis first.
-    """
+    """Characters in poses of the data, each at the origin and facing +z."""
     chosen = np.random.default_rng(seed).integers(0, data.num_frames, number)
     init = functools.partial(init_state, space, num_joints=num_joints)
     steps = 0 if memory is None else memory.num_steps
@@ -434,17 +382,7 @@ def start_states(
 def own_states(
     model: aamdm_stored.Model, number: int, *, seed: int, memory: Memory | None = None
 ) -> CharacterState:
-    """Characters in frames that the model made itself, at the origin and facing +z.
-
-    Args:
-      model: A model with starts.
-      number: Characters.
-      seed: Seeds the choice of frames, and the noise that is remembered.
-      memory: How noise is remembered, if it is.
-
-    Returns:
-      States, batch axis first.
-    """
+    """Characters in a model's own frames, at the origin and facing +z."""
     space, joints = model.space, model.skeleton.num_joints
     if model.starts is None:
         raise ValueError("the model has no starts")
@@ -493,18 +431,10 @@ def load_run(
 def own_starts(
     path: Path, *, number: int, noise_half_life: float = 0.0, seed: int = 0
 ) -> Float[Array, "number channels"]:
-    """Frames in which the characters of a run stand: a start without a recorded one.
+    """Frames in which a run's characters stand (`Model.starts`), none of them recorded.
 
-    Characters stand for twelve seconds; of sixteen the calmest are taken.
-
-    Args:
-      path: The run folder.
-      number: Starts, 1 to 16.
-      noise_half_life: As `load_character` takes it.
-      seed: Seeds the held-out poses that they begin with, and the noise.
-
-    Returns:
-      `Model.starts`.
+    They stand for twelve seconds; of sixteen the calmest `number` are taken. The
+    noise's half-life is as in `load_character`.
     """
     character = load_character(path, noise_half_life=noise_half_life)
     labels = np.zeros(16, int)
@@ -531,7 +461,6 @@ def load_character(
     Commands have no labels.
 
     Args:
-      path: Where it is.
       step: Makes the chain's step; the default is the paper's.
       noise_half_life: Seconds in which the noise of the posteriors is forgotten; 0 to
         draw it anew in every frame (paper). None for what the model was exported with,

@@ -22,10 +22,7 @@ class PoseData:
     """Frames of clips, concatenated.
 
     Attributes:
-      poses: Pose vectors.
-      paths: Path features.
       offsets: First frame of each clip, and the number of frames at the end.
-      fps: Frames per second.
     """
 
     poses: Float[Array, "frames features"]
@@ -40,15 +37,9 @@ class PoseData:
 
 
 def starts(data: PoseData, length: int, *, stride: int = 1) -> Int[Array, " windows"]:
-    """First frames of all windows that lie within one clip.
+    """First frames of all windows of `length` frames that lie within one clip.
 
-    Args:
-      data: The frames.
-      length: Frames per window.
-      stride: Frames between the starts of windows of one clip.
-
-    Returns:
-      The starts.
+    Within a clip they are `stride` frames apart.
 
     Raises:
       ValueError: if no clip is long enough.
@@ -69,12 +60,8 @@ def balanced_starts(
 
     A window's class is what the path features of its first frame say: the speeds over
     the first third of a second and over the last of the second ahead, and the turn of
-    the facing.
-
-    Args:
-      data: The frames.
-      length: Frames per window.
-      power: As of `windows.repeat_rare`; 0 lists each once, as `starts`.
+    the facing. The power is that of `windows.repeat_rare`; 0 lists each once, as
+    `starts`.
 
     Raises:
       ValueError: if no clip is long enough.
@@ -91,15 +78,7 @@ def balanced_starts(
 
 
 def take(data: PoseData, spans: list[tuple[int, int]]) -> PoseData:
-    """Parts of the frames, each a clip of its own.
-
-    Args:
-      data: The frames.
-      spans: First frame and the frame after the last of each part.
-
-    Returns:
-      Those parts.
-    """
+    """Parts of the frames, each a clip of its own; a span's end is exclusive."""
     frames = np.concatenate([np.arange(a, b) for a, b in spans])
     lengths = [b - a for a, b in spans]
     return PoseData(
@@ -114,12 +93,8 @@ def split_ends(data: PoseData, fraction: float) -> tuple[PoseData, PoseData]:
     """Holds out the end of every clip.
 
     Args:
-      data: The frames.
       fraction: Part of each clip to hold out, in (0, 1); the second before it is in
         neither part.
-
-    Returns:
-      The training part and the held-out part.
 
     Raises:
       ValueError: if the fraction is out of range, or a part would be empty.
@@ -140,14 +115,9 @@ def split_ends(data: PoseData, fraction: float) -> tuple[PoseData, PoseData]:
 
 
 def pose_data(clips: Clips, *, fps: float = 60.0) -> tuple[PoseData, tuple[str, ...]]:
-    """Resamples clips and describes their frames.
+    """Frames of clips at another rate, and the names of the clips that were used.
 
-    Args:
-      clips: The clips; those too short for a simulation bone are left out.
-      fps: Frames per second that are wanted.
-
-    Returns:
-      The frames, and the names of the clips that were used.
+    Clips too short for a simulation bone are left out.
 
     Raises:
       ValueError: if the skeleton lacks a joint, the rate cannot be reached, or all

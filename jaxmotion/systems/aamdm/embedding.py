@@ -60,11 +60,8 @@ class Config:
     """Sizes of the autoencoder.
 
     Attributes:
-      num_joints: Joints of the skeleton.
-      fps: Frames per second.
       latent: Channels of z (paper: 52, so that xz has 64).
       width: Channels of a hidden layer (ours; the paper gives none).
-      weights: Weights of the loss.
     """
 
     num_joints: int
@@ -111,14 +108,6 @@ def fit_statistics(
 ) -> Statistics:
     """Statistics of training frames; constant channels get a floor of 1e-4.
 
-    Args:
-      poses: Pose vectors.
-      paths: Path features.
-      config: Sizes.
-
-    Returns:
-      The statistics.
-
     Source: Holden et al. 2020, released code: train_decompressor, database.
     """
     own = features.fit_normalizer(poses)
@@ -150,15 +139,7 @@ def _nets(
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
-    """Initial parameters.
-
-    Args:
-      key: Consumed.
-      config: Sizes.
-
-    Returns:
-      {"encoder", "decoder"}.
-    """
+    """Initial parameters, {"encoder", "decoder"}."""
     key_e, key_d = jax.random.split(key)
     encoder, decoder = _nets(config)
     pose_like = jnp.zeros(config.num_features)
@@ -176,17 +157,9 @@ def encode(
     *,
     config: Config,
 ) -> Float[Array, "*batch embedded"]:
-    """Embeds poses; path features stay in meters, for those who steer.
+    """Embeds poses as [path features, latent].
 
-    Args:
-      params: The autoencoder's.
-      statistics: Statistics of the training frames.
-      poses: Pose vectors.
-      paths: Path features.
-      config: Sizes.
-
-    Returns:
-      [path features in meters, latent].
+    Path features stay in meters, for those who steer.
     """
     given = features.normalize(statistics.group, poses)
     latent = blocks.apply(params["encoder"], _nets(config)[0], given)
@@ -200,17 +173,7 @@ def decode(
     *,
     config: Config,
 ) -> Float[Array, "*batch features"]:
-    """Pose vectors of embedded vectors.
-
-    Args:
-      params: The autoencoder's.
-      statistics: Statistics of the training frames.
-      embedded: As `encode` returns them.
-      config: Sizes.
-
-    Returns:
-      Pose vectors in their own units.
-    """
+    """Pose vectors, in their own units, of what `encode` returns."""
     path = features.normalize(statistics.path, embedded[..., :PATH])
     given = jnp.concatenate([path, embedded[..., PATH:]], axis=-1)
     found = blocks.apply(params["decoder"], _nets(config)[1], given)
@@ -229,12 +192,7 @@ def _transforms(
 def character_positions(
     poses: Float[Array, "*batch features"], parents: tuple[int, ...]
 ) -> Float[Array, "*batch joints 3"]:
-    """Joints that pose vectors mean, in the axes of the simulation bone, meters.
-
-    Args:
-      poses: Pose vectors.
-      parents: Parent of each joint.
-    """
+    """Joints that pose vectors mean, in the axes of the simulation bone, meters."""
     return _transforms(unpack(pose.pose_layout(len(parents)), poses), parents)[0]
 
 
@@ -253,16 +211,9 @@ def pose_errors(
     parents: tuple[int, ...],
     config: Config,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """How far pose vectors are from others: weighted L1 means.
+    """How far pose vectors are from others, and their changes per second.
 
-    Args:
-      found: Pose vectors, frame after frame.
-      poses: Those that they should be.
-      parents: Parent of each joint.
-      config: Sizes and weights.
-
-    Returns:
-      The error of values, and of their changes per second.
+    Weighted L1 means over frames in a row.
 
     Source: Li et al. 2024 (AAMDM), eq. 1 and 2.
     """
@@ -289,18 +240,9 @@ def foot_error(
     """How much faster or slower toes go over the ground than recorded slow ones.
 
     Errors of joints are in the character's axes, where a planted foot moves as fast as
-    the bone: this one is in the world, where it stands.
-
-    Args:
-      found: Pose vectors, frame after frame.
-      poses: Those that they should be.
-      parents: Parent of each joint.
-      feet: The toes.
-      config: Sizes.
-
-    Returns:
-      Mean error of a coordinate of the toes' velocities, meters per second; toes that
-      are recorded at `SLOW` or more count as without error.
+    the bone: this one is in the world, where it stands. It is the mean error of a
+    coordinate of the toes' velocities, meters per second, over frames in a row; toes
+    that are recorded at `SLOW` or more count as without error.
 
     Source: own.
     """
@@ -326,14 +268,6 @@ def loss(
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """The autoencoder's loss on pairs of neighboring frames; L1 means throughout.
-
-    Args:
-      params: The autoencoder's.
-      key: Not used; losses have one.
-      batch: Pose vectors and path features.
-      statistics: Statistics of the training frames.
-      parents: Parent of each joint.
-      config: Sizes and weights.
 
     Returns:
       The weighted sum, and "value", "change" and "latent", its weighted parts.

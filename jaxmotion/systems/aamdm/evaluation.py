@@ -68,17 +68,9 @@ def start_states(
 def commands(
     run: Run, number: int, ticks: int, *, course: str, speed: float
 ) -> Command:
-    """The same commands for every character.
+    """Commands [characters, ticks, ...], the same for every one of `number` characters.
 
-    Args:
-      run: The run.
-      number: Characters.
-      ticks: Length.
-      course: One of `courses.COURSES`.
-      speed: Meters per second.
-
-    Returns:
-      Commands [characters, ticks, ...].
+    The course is one of `courses.COURSES`, the speed in meters per second.
 
     Raises:
       ValueError: if there is no such course.
@@ -101,9 +93,6 @@ def roller(
     """Rollouts as one jitted function.
 
     Args:
-      run: The run.
-      space: The space.
-      step: Makes the next frame.
       steered: Whether commands matter.
       bounded: Whether frames are kept within the bounds of the data.
 
@@ -123,15 +112,7 @@ def roller(
 
 @jax.jit
 def positions_of(skeleton: Skeleton, frames: Frame) -> jax.Array:
-    """World positions of the joints in rollouts.
-
-    Args:
-      skeleton: The skeleton.
-      frames: Displayed frames.
-
-    Returns:
-      Positions [characters, ticks, joints, 3], meters.
-    """
+    """World positions [characters, ticks, joints, 3] of rollouts, meters."""
     return forward_kinematics(skeleton, frames.root_position, frames.joint_rotation)
 
 
@@ -140,15 +121,7 @@ def data_frames(
 ) -> Frame:
     """Windows of real frames as if they were rollouts.
 
-    Args:
-      run: The run.
-      data: Where they come from.
-      number: Windows.
-      ticks: Frames per window.
-      seed: Seeds their choice.
-
-    Returns:
-      Frames; what they wanted is their own path and velocity.
+    They wanted their own path and velocity.
 
     Raises:
       ValueError: if no clip is that long.
@@ -191,15 +164,8 @@ def frames_per_second(
 ) -> float:
     """Frames per second of one character, generated one after the other.
 
-    Args:
-      run: The run.
-      space: The space.
-      step: Makes the next frame.
-      ticks: Frames of a timed rollout.
-      repeats: Timed rollouts; the median counts.
-
-    Returns:
-      Frames per second, decoding and placing included, compilation not.
+    Decoding and placing are included, compilation is not; the median of `repeats`
+    rollouts of `ticks` frames.
     """
     states = start_states(run, space, step, 1, seed=0)
     given = commands(run, 1, ticks, course="forward", speed=1.0)
@@ -236,15 +202,7 @@ class Reference:
 
 
 def make_reference(skeleton: Skeleton, data: PoseData) -> Reference:
-    """The reference of training frames.
-
-    Args:
-      skeleton: The skeleton.
-      data: Training frames.
-
-    Returns:
-      The reference; every fifth frame counts.
-    """
+    """The reference of every fifth training frame."""
     parents = skeleton.parents
     found = jax.jit(lambda x: character_positions(x, parents))(data.poses[::STRIDE])
     toes = np.asarray(found[:, jnp.array(skeleton.feet), 1])
@@ -280,20 +238,16 @@ def free_row(
     fps: float,
     groups: int = 4,
 ) -> Row:
-    """Columns that need no commands.
+    """Columns that need no commands, of frames [characters, ticks, ...].
 
     Args:
-      key: Consumed; of the pairs for diversity.
-      skeleton: The skeleton.
-      reference: What to compare with.
-      frames: Rollouts [characters, ticks, ...].
-      fps: Frames per second.
+      key: Of the pairs for diversity.
       groups: Groups of rollouts for the intervals of DIV and FID; divides their number.
 
     Returns:
       div and fid over groups; ffr_mann, ffr_gmd, speed, acceleration and jerk over
-      rollouts; diverged, the number of rollouts with numbers that no body shows. If
-      a position is not finite there is no other column.
+      rollouts; diverged, the number of rollouts with numbers that no body shows. If a
+      position is not finite there is no other column.
 
     Raises:
       ValueError: if the groups do not divide the rollouts.
@@ -351,15 +305,10 @@ def _realized(frames: Frame, fps: float) -> tuple[Array, Array]:
 def control_row(frames: Frame, *, fps: float) -> Row:
     """Columns of how well commands were followed.
 
-    Args:
-      frames: Steered rollouts.
-      fps: Frames per second.
-
-    Returns:
-      te_promised: mean absolute difference of the 12 path features of the frame and
-      those wanted, meters and components of unit vectors together, as the paper's |x|;
-      te_realized: the same of where the character went; trajectory_error: angle
-      between the commanded and the actual velocity.
+    te_promised: mean absolute difference of the 12 path features of the frame and those
+    wanted, meters and components of unit vectors together, as the paper's |x|;
+    te_realized: the same of where the character went; trajectory_error: angle between
+    the commanded and the actual velocity.
     """
     promised = jnp.abs(frames.extra["path"] - frames.extra["wanted_path"]).mean(
         axis=(1, 2)
@@ -383,19 +332,12 @@ def long_health(
     *,
     fps: float,
 ) -> dict[str, int]:
-    """How many long rollouts diverged or froze.
+    """How many of all long "rollouts" "diverged" or were "frozen".
 
-    Args:
-      positions: World positions.
-      desired_velocity: What was commanded; None for free rollouts, of which those are
-        frozen whose limbs move at less than 0.05 m/s on average through 30 s. Under
-        control, 2 s of that while 0.3 m/s are wanted are enough.
-      reference: Heights of the body.
-      fps: Frames per second.
-
-    Returns:
-      Counts "diverged" (root below 0.1 m or above 2.5 times its median height, a joint
-      faster than 20 m/s, or no number), "frozen" and "rollouts".
+    Diverged: root below 0.1 m or above 2.5 times its median height, a joint faster than
+    20 m/s, or no number. Frozen, without a desired velocity: limbs move at less than
+    0.05 m/s on average through 30 s; under control, 2 s of that while 0.3 m/s are
+    wanted are enough. Positions are in the world.
     """
     height = reference.root_height
     diverged = health.has_diverged(
@@ -427,16 +369,10 @@ def score_stepper(
     """Row of free rollouts, with columns of steered ones whose names end in "_uc".
 
     Args:
-      run: The run.
-      space: The space.
-      step: Makes the next frame.
-      reference: What frames are compared with.
       rollouts: Characters, free and steered.
-      ticks: Length of a rollout after its first second, where the data's own pose
-        still shows.
-      course: Commands of the steered rollouts.
+      ticks: Length of a rollout after its first second, where the data's own pose still
+        shows.
       speed: Meters per second that are commanded.
-      seed: Seeds poses, noise and pairs.
       groups: As in `free_row`.
 
     Returns:

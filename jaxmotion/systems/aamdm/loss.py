@@ -33,16 +33,7 @@ def _shaken(key: Key, frame: Array, config: Config) -> Array:
 def random_noise(
     key: Key, shape: tuple[int, ...], *, largest: float
 ) -> Float[Array, "batch features"]:
-    """Noise of a different size for each row, uniform up to the largest.
-
-    Args:
-      key: Consumed.
-      shape: Rows and channels.
-      largest: Largest deviation.
-
-    Returns:
-      The noise.
-    """
+    """Noise of a size per row, uniform up to the largest deviation."""
     key_size, key_noise = jax.random.split(key)
     size = largest * jax.random.uniform(key_size, (shape[0], 1))
     return size * jax.random.normal(key_noise, shape)
@@ -72,13 +63,9 @@ def polisher_loss(
 
     The first frame is given. Each further frame is noised to a step of its own and
     predicted from it and from the prediction of the frame before; the gradient runs
-    through the whole window.
+    through the whole window, of `config.window` + 1 frames.
 
     Args:
-      params: The diffusion model's.
-      key: Consumed.
-      windows: Frames of the data, `config.window` + 1 each.
-      config: The method.
       change: Deviation of each channel's changes; where they are predicted only. Errors
         are then measured in it.
       pose_error: Error of the poses that windows of frames mean, from those that others
@@ -143,18 +130,10 @@ def discriminator_loss(
     config: Config,
     change: Scale = None,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The discriminator's loss on windows, with its R1 penalty.
+    """The discriminator's loss on windows, with its R1 penalty: "adversarial" and "r1".
 
-    Args:
-      params: The discriminator's.
-      generator: The generator's.
-      key: Consumed.
-      windows: Frames of the data, `config.gan_window` each, at least three.
-      config: The method.
-      change: Deviation of each channel's changes; where they are predicted only.
-
-    Returns:
-      The loss, and "adversarial" and "r1".
+    Windows have `config.gan_window` frames, at least three; `change` is the deviation
+    of each channel's changes, where they are predicted only.
     """
     previous, t, x_prev, x_t, fake = _pairs(generator, key, windows, config, change)
     net = aamdm_model.discriminator(config)
@@ -174,18 +153,10 @@ def generator_loss(
     config: Config,
     change: Scale = None,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The generator's loss on windows.
+    """The generator's loss on windows, which has no further terms.
 
-    Args:
-      params: The generator's.
-      discriminator: The discriminator's.
-      key: Consumed.
-      windows: Frames of the data, `config.gan_window` each, at least three.
-      config: The method.
-      change: Deviation of each channel's changes; where they are predicted only.
-
-    Returns:
-      The loss, and nothing more.
+    Windows have `config.gan_window` frames, at least three; `change` is the deviation
+    of each channel's changes, where they are predicted only.
     """
     previous, t, _, x_t, fake = _pairs(params, key, windows, config, change)
     net = aamdm_model.discriminator(config)

@@ -40,7 +40,6 @@ class Config:
     rest is ours.
 
     Attributes:
-      features: Channels of a frame.
       drafts: Steps of the generator, the first of the chain (paper: 3).
       polishes: Steps of the diffusion model, the last of the chain (paper: 2).
       schedule: "cosine", or "vp" (which keeps less of the sample at each step).
@@ -48,8 +47,6 @@ class Config:
         previous one in deviations of changes (ours), in which the polisher's errors are
         then measured, too.
       latent: Channels of the generator's latent.
-      width: Channels of a hidden layer.
-      depth: Hidden layers.
       window: Frames that the diffusion model predicts in a row in training (paper).
       gan_window: Frames of the windows of the GAN, at least three (paper: 10).
       levels: Steps that each network learns: "all", or its "own" (ours), those that
@@ -110,14 +107,7 @@ class Config:
 
 
 def network(config: Config) -> mlp.ConditionedMlp:
-    """Module of the generator and of the diffusion model (which has no latent).
-
-    Args:
-      config: Its sizes.
-
-    Returns:
-      The module.
-    """
+    """Module of the generator and of the diffusion model (which has no latent)."""
     return mlp.ConditionedMlp(
         features=config.features,
         num_steps=config.num_steps,
@@ -127,14 +117,7 @@ def network(config: Config) -> mlp.ConditionedMlp:
 
 
 def discriminator(config: Config) -> mlp.PairDiscriminator:
-    """Module of the discriminator.
-
-    Args:
-      config: Its sizes.
-
-    Returns:
-      The module.
-    """
+    """Module of the discriminator."""
     return mlp.PairDiscriminator(
         num_steps=config.num_steps, width=config.width, depth=config.depth
     )
@@ -142,15 +125,7 @@ def discriminator(config: Config) -> mlp.PairDiscriminator:
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
-    """Initial parameters of the three networks.
-
-    Args:
-      key: Consumed.
-      config: Their sizes.
-
-    Returns:
-      {"polisher", "generator", "discriminator"}.
-    """
+    """Initial parameters of "polisher", "generator" and "discriminator"."""
     key_p, key_g, key_d = jax.random.split(key, 3)
     x = jnp.zeros(config.features)
     z = jnp.zeros(config.latent)
@@ -170,14 +145,7 @@ def to_frame(
 ) -> Float[Array, "*batch features"]:
     """The frame that a network's prediction means.
 
-    Args:
-      found: What the network predicts.
-      previous: The frame before.
-      change: Deviation of each channel's changes, which it predicts; None where it
-        predicts the frame.
-
-    Returns:
-      The frame.
+    It predicts changes in their deviation `change`; None where it predicts the frame.
     """
     if change is None:
         return found
@@ -185,11 +153,7 @@ def to_frame(
 
 
 def check_change(config: Config, change: Array | None) -> None:
-    """Raises unless the scale of changes is there exactly if it is needed.
-
-    Args:
-      config: The method.
-      change: Deviation of each channel's changes, or None.
+    """Raises unless the deviation of changes is there exactly if it is needed.
 
     Raises:
       ValueError: if it is missing, or given for nothing.
@@ -211,14 +175,7 @@ def draft(
 ) -> Denoiser:
     """The generator as a denoiser; its latent comes from its key.
 
-    Args:
-      params: The generator's.
-      previous: The previous frame.
-      config: The method.
-      change: As in `to_frame`.
-
-    Returns:
-      The denoiser.
+    `change` is as in `to_frame`.
     """
 
     def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
@@ -236,17 +193,7 @@ def polish(
     config: Config,
     change: Float[Array, " features"] | None = None,
 ) -> Denoiser:
-    """The diffusion model as a denoiser.
-
-    Args:
-      params: Its parameters.
-      previous: The previous frame.
-      config: The method.
-      change: As in `to_frame`.
-
-    Returns:
-      The denoiser.
-    """
+    """The diffusion model as a denoiser; `change` is as in `to_frame`."""
 
     def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
         del key  # deterministic
@@ -271,7 +218,6 @@ def sampler(
     Args:
       params: Parameters of the generator and the polisher; the discriminator's are not
         used, and one that takes no steps may be missing.
-      config: The method.
       change: Deviation of each channel's changes; where they are predicted only.
       step: Makes the chain's step from the schedule and a denoiser; the default is the
         paper's. One that looks back forgets where the polisher takes over.

@@ -10,13 +10,7 @@ from jaxtyping import Array, Float
 
 
 class PoseEncoder(nn.Module):
-    """Maps a normalized pose vector to a latent vector.
-
-    Attributes:
-      latent: Channels of the result.
-      width: Channels of a hidden layer.
-      depth: Linear layers.
-    """
+    """Maps a normalized pose vector to a latent vector."""
 
     latent: int
     width: int = 512
@@ -24,27 +18,13 @@ class PoseEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, pose: Float[Array, "*batch n"]) -> Float[Array, "*batch latent"]:
-        """The network.
-
-        Args:
-          pose: Normalized pose vectors.
-
-        Returns:
-          Latent vectors.
-        """
         for _ in range(self.depth - 1):
             pose = nn.elu(nn.Dense(self.width)(pose))
         return nn.Dense(self.latent)(pose)
 
 
 class PoseDecoder(nn.Module):
-    """Maps an embedded vector to a normalized pose vector.
-
-    Attributes:
-      features: Channels of the result.
-      width: Channels of a hidden layer.
-      depth: Linear layers.
-    """
+    """Maps an embedded vector to a normalized pose vector."""
 
     features: int
     width: int = 512
@@ -52,14 +32,7 @@ class PoseDecoder(nn.Module):
 
     @nn.compact
     def __call__(self, embedded: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
-        """The network.
-
-        Args:
-          embedded: Embedded vectors.
-
-        Returns:
-          Normalized pose vectors.
-        """
+        """The network."""
         for _ in range(self.depth - 1):
             embedded = nn.relu(nn.Dense(self.width)(embedded))
         return nn.Dense(self.features)(embedded)

@@ -28,13 +28,7 @@ _TAIL = 0.005
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Autoencoder:
-    """A trained autoencoder.
-
-    Attributes:
-      params: Its parameters.
-      statistics: Statistics of its training frames.
-      config: Its sizes.
-    """
+    """A trained autoencoder."""
 
     params: Params
     statistics: aamdm_embedding.Statistics
@@ -90,16 +84,9 @@ def fit_space(
     *,
     autoencoder: Autoencoder | None,
 ) -> Space:
-    """The space of training frames.
+    """The space of training frames; without an autoencoder that of full poses.
 
-    Args:
-      poses: Pose vectors of all clips.
-      paths: Path features.
-      neighbors: Frames that are followed by another of the same clip.
-      autoencoder: Autoencoder of an embedded space; None for full poses.
-
-    Returns:
-      The space.
+    Neighbors are frames that are followed by another of the same clip.
     """
     raw = _raw(autoencoder, poses, paths)
     normalizer = features.fit_normalizer(raw, floor=_LEAST)
@@ -125,13 +112,6 @@ def keep_within(
     A network that has drifted to where no data are may go ever farther; held at the
     bounds it comes back.
 
-    Args:
-      space: The space.
-      frames: Frames.
-
-    Returns:
-      Frames.
-
     Source: ours.
     """
     return jnp.clip(frames, _like(space.low, frames), _like(space.high, frames))
@@ -146,31 +126,14 @@ def to_frames(
     poses: Float[Array, "*batch features"],
     paths: Float[Array, "*batch 12"],
 ) -> Float[Array, "*batch channels"]:
-    """Frames of poses.
-
-    Args:
-      space: The space.
-      poses: Pose vectors.
-      paths: Path features.
-
-    Returns:
-      Frames, of unit variance over the training data.
-    """
+    """Frames, of unit variance over the training data, of poses and path features."""
     return features.normalize(space.normalizer, _raw(space.autoencoder, poses, paths))
 
 
 def to_poses(
     space: Space, frames: Float[Array, "*batch channels"]
 ) -> Float[Array, "*batch features"]:
-    """Pose vectors of frames.
-
-    Args:
-      space: The space.
-      frames: Frames.
-
-    Returns:
-      Pose vectors in their own units.
-    """
+    """Pose vectors of frames, in their own units."""
     raw = features.denormalize(space.normalizer, frames)
     if space.autoencoder is None:
         return raw[..., PATH:]
@@ -181,26 +144,11 @@ def to_poses(
 def to_paths(
     space: Space, frames: Float[Array, "*batch channels"]
 ) -> Float[Array, "*batch 12"]:
-    """Path features of frames.
-
-    Args:
-      space: The space.
-      frames: Frames.
-
-    Returns:
-      Path features: meters, and directions.
-    """
+    """Path features of frames: meters, and directions."""
     return features.denormalize(path_normalizer(space), frames[..., :PATH])
 
 
 def path_normalizer(space: Space) -> features.Normalizer:
-    """How path features are scaled in frames.
-
-    Args:
-      space: The space.
-
-    Returns:
-      Of the first 12 channels.
-    """
+    """How path features, the first 12 channels, are scaled in frames."""
     own = space.normalizer
     return features.Normalizer(mean=own.mean[:PATH], std=own.std[:PATH])

@@ -31,10 +31,6 @@ class Model:
     """Everything but the parameters of the chain's networks.
 
     Attributes:
-      config: The chain.
-      skeleton: The skeleton.
-      space: The embedded space.
-      source: The data, and their license.
       noise_half_life: Seconds in which the noise of the posteriors is forgotten; 0
         where it is drawn anew in every frame.
       starts: Frames of the space that characters start in; None in a run folder.

@@ -44,10 +44,7 @@ def frame_windows(
     """Windows of frames for training.
 
     Args:
-      frames: One a frame of the data.
-      data: The data.
       length: Frames per window.
-      batch: Windows per batch.
       balance: How much more often rare speeds and turns are drawn; see
         `data.balanced_starts`.
 
@@ -73,8 +70,6 @@ class Run:
     """A run folder and its data.
 
     Attributes:
-      record: What the folder is.
-      skeleton: The skeleton.
       embedding: Sizes of the autoencoder.
       train: Training frames.
       held_out: Frames that no network saw.
@@ -111,14 +106,10 @@ def prepare(
     """Makes the frames of a run folder, or loads those it has.
 
     Args:
-      folder: The run folder.
-      data: Clips.
       field: Label field by which clips are chosen.
       labels: Their labels; none: all clips.
-      fps: Frames per second.
       held_out: Part of each clip, at its end, to hold out.
-      mirrored: Whether mirrored clips are added.
-      balance: As of `frame_windows`, for all stages.
+      balance: As in `frame_windows`, for all stages.
 
     Raises:
       OSError: if the clips cannot be read.
@@ -283,9 +274,7 @@ def _space(run: Run, autoencoder: Autoencoder | None) -> Space:
 def make_space(run: Run, autoencoder: Autoencoder | None) -> Space:
     """Makes a space of the run and stores it; one that is there is loaded.
 
-    Args:
-      run: The run.
-      autoencoder: For the embedded space; None for full poses.
+    The autoencoder is that of the embedded space; None for full poses.
     """
     name: SpaceName = "full_pose" if autoencoder is None else "embedded"
     if checkpoint.latest_step(run.record.checkpoints(name)) is not None:
@@ -375,18 +364,7 @@ def _pose_error(
 def train_polisher(
     run: Run, name: SpaceName, space: Space, config: aamdm_model.Config, budget: Budget
 ) -> Params:
-    """Stage 2.
-
-    Args:
-      run: The run.
-      name: Name of the space.
-      space: The space.
-      config: The method.
-      budget: How long.
-
-    Returns:
-      Averaged parameters.
-    """
+    """Stage 2: trains the diffusion model, and returns its averaged parameters."""
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     change = scale_of_changes(space, config)
     error = functools.partial(_pose_error, run, space, config.weight_foot)
@@ -417,17 +395,9 @@ def train_polisher(
 def train_generator(
     run: Run, name: SpaceName, space: Space, config: aamdm_model.Config, budget: Budget
 ) -> Params:
-    """Stage 3.
+    """Stage 3: trains the generator, and returns its averaged parameters.
 
-    Args:
-      run: The run.
-      name: Name of the space.
-      space: The space.
-      config: The method.
-      budget: How long; both players have its optimizer.
-
-    Returns:
-      The generator's averaged parameters.
+    Both players have the budget's optimizer.
     """
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     change = scale_of_changes(space, config)
@@ -471,19 +441,11 @@ def load_networks(
     polishes: int,
     predict: Literal["frame", "change"] = "change",
 ) -> tuple[Params, aamdm_model.Config]:
-    """The networks of a trained chain.
+    """Parameters of a trained chain's stages that take steps, and their configuration.
 
     Args:
-      run: The run.
-      name: Name of the space.
-      space: The space.
-      drafts: Steps of the generator.
       polishes: Steps of the diffusion model.
       predict: What the networks predict.
-
-    Returns:
-      Parameters of those stages that take steps, and the configuration that they were
-      trained with.
 
     Raises:
       CheckpointError: if a stage that it needs is missing, or of another kind.

@@ -148,15 +148,9 @@ class CharacterState:
 def init_state(
     skeleton: Skeleton, past: Motion, *, config: camdm_model.Config
 ) -> CharacterState:
-    """State of a character that has shown `past` and has no plan yet.
+    """State of a character that has shown `past` (world) and has no plan yet.
 
-    Args:
-      skeleton: The skeleton.
-      past: At least `config.past` displayed poses of one character, world.
-      config: The method.
-
-    Returns:
-      The state; the springs start at the mean velocity of the poses.
+    The springs start at the mean velocity of the poses.
 
     Raises:
       ValueError: if there are fewer poses.
@@ -212,16 +206,7 @@ def is_new_style(
 def plan_level(
     state: CharacterState, command: trajectory.Command, *, control: Control
 ) -> Int[Array, ""]:
-    """Which plan a tick needs.
-
-    Args:
-      state: The character's state.
-      command: What the user wants now.
-      control: Constants.
-
-    Returns:
-      0 for none, 1 for a plan, 2 for a guided one.
-    """
+    """Which plan a tick needs: 0 for none, 1 for a plan, 2 for a guided one."""
     need = (state.command.label < 0) | (state.cursor >= control.apply)
     if control.replan_on_change:
         need = need | _changed(state, command)
@@ -235,15 +220,9 @@ def plan_level(
 def plan_frame(
     skeleton: Skeleton, past: Motion, *, config: camdm_model.Config
 ) -> trajectory.PlanarFrame:
-    """Frame of the next plan: at the last displayed pose.
+    """Frame of the next plan: at the last displayed pose (world).
 
-    Args:
-      skeleton: The skeleton.
-      past: Displayed poses, world.
-      config: Says whether the frame turns with the character.
-
-    Returns:
-      The frame. With heading "random" its axes are the world's, as in the release.
+    With heading "random" its axes are the world's, as in the release.
     """
     last = jax.tree.map(lambda x: x[-1:], past)
     here = trajectory.root_trajectory(skeleton, last)
@@ -261,15 +240,7 @@ def wanted_trajectory(
 ) -> trajectory.Trajectory:
     """Steps 1a to 1c: the user's path, blended with the model's own.
 
-    Args:
-      skeleton: The skeleton.
-      state: The character's state.
-      command: What the user wants.
-      config: The method.
-      control: Constants.
-
-    Returns:
-      The path of the next `config.future` frames, world.
+    It has the next `config.future` frames, world.
     """
     here = trajectory.PlanarFrame(
         origin=state.past.root_position[-1, ::2], facing=state.facing
@@ -318,21 +289,10 @@ def replan(
     control: Control,
     guided: bool,
 ) -> CharacterState:
-    """Step 1: a new plan.
+    """Step 1: a new plan, none of it displayed yet.
 
-    Args:
-      sample: From `camdm.sampler`.
-      key: Consumed.
-      skeleton: The skeleton.
-      state: The character's state.
-      command: What the user wants now.
-      config: The method.
-      control: Constants.
-      guided: Sample with guidance; a character that needs none gets the scale that
-        changes nothing (it may stand beside a guided one in a batch).
-
-    Returns:
-      The state with the plan, none of it displayed yet.
+    With `guided`, a character that needs no guidance gets the scale that changes
+    nothing (it may stand beside a guided one in a batch).
     """
     frame = plan_frame(skeleton, state.past, config=config)
     wanted = wanted_trajectory(skeleton, state, command, config=config, control=control)
@@ -371,17 +331,7 @@ def advance(
     config: camdm_model.Config,
     control: Control,
 ) -> tuple[CharacterState, Frame]:
-    """Step 2: displays the next pose, and moves the springs on.
-
-    Args:
-      state: The character's state.
-      command: What the user wants now.
-      config: The method.
-      control: Constants.
-
-    Returns:
-      The next state, and what is displayed.
-    """
+    """Step 2: displays the next pose, and moves the springs on."""
     pose = jax.tree.map(
         lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
     )
@@ -434,17 +384,12 @@ def controller(
 ) -> Controller:
     """The run-time of one character, for `rollout.tick` and `rollout.rollout`.
 
+    Its second planner is the guided one.
+
     Args:
-      params: The network's parameters.
-      skeleton: The skeleton.
-      config: The method.
-      control: Constants; None for the defaults.
       table: Schedule; None for the cosine one of `config.num_steps`.
       step: Makes the chain's step; the default is the paper's.
       steps: Steps of the schedule to visit, increasing; None for all.
-
-    Returns:
-      A controller whose frames are `Frame`s. Its second planner is the guided one.
 
     Raises:
       ValueError: if `control.apply` is not in 1..`config.future`.
@@ -534,7 +479,6 @@ def character(
     """A model as a character to be steered.
 
     Args:
-      params: The network's parameters.
       model: The model. Without poses of its own (`starts`) it starts from clips alone.
       control: Constants of the run-time; None for `OWN_STARTS` where the model has
         poses of its own, else for the paper's.
@@ -612,19 +556,10 @@ def load_character(
 def start_states(
     clips: Clips, model: camdm_model.Model, labels: np.ndarray, *, field: str, seed: int
 ) -> CharacterState:
-    """States of characters that start with real poses of their style.
+    """States of characters that start with real poses of their style, batch axis first.
 
-    Each is moved so that it stands at the origin and faces +z.
-
-    Args:
-      clips: Where the poses come from.
-      model: The model.
-      labels: Style of each character.
-      field: Label field that is the style.
-      seed: Seeds the choice of poses.
-
-    Returns:
-      States, batch axis first.
+    Each is moved so that it stands at the origin and faces +z. The label field `field`
+    is the style.
 
     Raises:
       ValueError: if a label is none of the model's, or a style has no clip that is long
@@ -650,14 +585,6 @@ def own_states(
 ) -> CharacterState:
     """States of characters that start with the model's own poses of their style.
 
-    Args:
-      model: A model with `starts`.
-      labels: Style of each character.
-      seed: Seeds the choice of poses.
-
-    Returns:
-      States, batch axis first.
-
     Raises:
       ValueError: if the model has no poses of its own, or no such style.
     """
@@ -670,11 +597,8 @@ def own_states(
 def mean_pose(model: camdm_model.Model) -> Motion:
     """A character that stands at the origin in the mean pose of its data, facing +z.
 
-    Args:
-      model: One with a mean pose (`Config.rotation_mean`) of samples that face +z.
-
-    Returns:
-      As many equal frames as a plan wants to see; the lowest joint is on the ground.
+    As many equal frames as a plan wants to see; the lowest joint is on the ground. The
+    model has a mean pose (`Config.rotation_mean`) of samples that face +z.
     """
     config = model.config
     zeros = jnp.zeros((config.past, config.num_features))

@@ -47,20 +47,15 @@ def loss(
     steps: tuple[int, ...],
     target: Target = "chain",
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The loss of a student on a batch of windows; nothing is dropped in the networks.
+    """The weighted sum of a student's losses, and its terms by name, unweighted.
+
+    Nothing is dropped in the networks.
 
     Args:
-      params: The student's parameters.
-      key: Consumed.
       batch: Windows of `config.window` frames, and their styles.
-      teacher: The teacher's parameters.
-      skeleton: The skeleton.
       config: The method, the same for both.
       steps: Steps of the schedule that the student's plans visit.
       target: "chain", or "consistency" with as many random steps per window.
-
-    Returns:
-      The weighted sum, and its terms by name, unweighted.
     """
     key_example, key_pairs = jax.random.split(key)
     condition, x_0 = camdm_loss.examples(
@@ -107,21 +102,16 @@ def prepare(
     mirrored: bool,
     balance: float,
 ) -> tuple[runs.Run, Params]:
-    """Makes the run folder of a student, or loads the one that is there.
+    """Makes a student's run folder, or loads it, and the teacher's averaged parameters.
 
     Args:
-      folder: Run folder of the student.
       source: Run folder of the teacher; or a shipped model or an exported file.
       data: Clips; None for those that the teacher's run was trained on.
       held_out_clips: Clips of `data` that a shipped or exported teacher never saw.
       steps: Steps of the schedule that the student's plans visit.
-      target: What it is compared with.
       mirrored: Whether it learns from mirrored copies of the clips as well.
       balance: How much more often rare changes of speed and direction are drawn; see
         `windows.balance`.
-
-    Returns:
-      The run, and the teacher's averaged parameters.
 
     Raises:
       OSError: if a file cannot be read.
@@ -171,12 +161,7 @@ def prepare(
 
 
 def train(run: runs.Run, teacher: Params, budget: runs.Budget) -> None:
-    """Trains a student, from its newest checkpoint if there is one.
-
-    Args:
-      run: From `prepare`.
-      teacher: The teacher's parameters, which the student begins with.
-      budget: How long.
+    """Trains a student from its newest checkpoint, or from the teacher's parameters.
 
     Raises:
       ValueError: if no clip is as long as a window, or the checkpoint has other

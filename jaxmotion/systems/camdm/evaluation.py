@@ -49,17 +49,9 @@ SKIP = 60
 def course_of_run(
     run: Run, course: str, labels: np.ndarray, *, seconds: float, speed: float | None
 ) -> tuple[np.ndarray, trajectory.Command]:
-    """Speed and commands of each character.
+    """Speeds [characters] and commands [characters, ticks, ...] of a `courses.COURSES`.
 
-    Args:
-      run: The run.
-      course: One of `courses.COURSES`.
-      labels: Style of each character.
-      seconds: Length.
-      speed: Meters per second; None for each style's own median speed.
-
-    Returns:
-      Speeds [characters], and commands [characters, ticks, ...].
+    The speed is in meters per second; None for each style's own median speed.
 
     Raises:
       ValueError: if there is no such course.
@@ -84,13 +76,9 @@ def steer_one(
     """Steers one character from a pose of the training clips.
 
     Args:
-      run: The run.
-      style: Its style.
       course: One of `courses.COURSES`.
-      seconds: Length.
       to_style: Its style from half time on; None for the same.
       speed: Meters per second; None for the first style's own median speed.
-      seed: Seeds the start pose and the noise.
 
     Returns:
       The motion, and the velocity asked for in each frame, meters per second.
@@ -118,18 +106,10 @@ def steer_one(
 
 
 def own_starts(run: Run, *, number: int, seed: int = 0) -> Motion:
-    """Poses that the model itself stands in: a start without any recorded frame.
+    """Poses that the model itself stands in (`Model.starts`), none of them recorded.
 
-    Characters of each style stand still for twelve seconds; of sixteen the calmest are
-    taken.
-
-    Args:
-      run: The run.
-      number: Starts per style, 1 to 16.
-      seed: Seeds the recorded poses that the rollouts begin with, and the noise.
-
-    Returns:
-      `Model.starts`.
+    Characters of each style stand still for twelve seconds; of sixteen the calmest
+    `number` are taken.
 
     Raises:
       ValueError: if a style has no clip to begin with.
@@ -264,12 +244,7 @@ def score_run(
     """Steers the characters of a trial from held-out poses, and measures them.
 
     Args:
-      run: The run.
-      reference: The reference.
-      trial: Who is steered, and how.
       count: Windows of each Fréchet distance.
-      chunk: Characters to run at a time, at most.
-      seed: Seeds noise and subsets.
       replicated: As in `made_row`.
 
     Returns:
@@ -311,14 +286,11 @@ def evaluate_run(
     """Steers characters in every style, and measures them beside held-out clips.
 
     Args:
-      run: The run.
       course: One of `courses.COURSES`.
       rollouts: Characters, spread evenly over the styles; at least one a style.
-      seconds: Length of each rollout.
       speed: Meters per second; None for each style's own median speed.
       chunk: Characters to run at a time, at most.
       evaluator_steps: Updates of the evaluator of styles, if it is trained here.
-      seed: Seeds poses, noise, evaluator and subsets.
       evaluator: A frozen evaluator of styles; None to train one.
 
     Returns:
@@ -368,13 +340,8 @@ def load_evaluator(
     """The frozen evaluator if there is one, else one trained on the run's clips.
 
     Args:
-      key: Consumed.
-      run: The run.
       evaluator: A frozen evaluator of styles; None to train one.
       num_steps: Updates of a training.
-
-    Returns:
-      The evaluator.
 
     Raises:
       ValueError: if the evaluator does not fit the run; names the field.
@@ -432,14 +399,9 @@ def train_style(
     """CAMDM's evaluator, of windows of 60 frames.
 
     Args:
-      train: Training clips.
       held_out: Clips for its accuracy.
       field: Label field that it recognizes.
       num_steps: Updates.
-      seed: Seeds parameters and batches.
-
-    Returns:
-      The evaluator.
 
     Raises:
       ValueError: if a part has no clip as long as a window, or there is no such field.

@@ -33,15 +33,9 @@ from jaxmotion.typing import Key, Params
 def mean_rotations(
     skeleton: Skeleton, motion: Motion, *, config: Config
 ) -> tuple[float, ...]:
-    """Mean of the rotations' features over frames, each seen from its own facing.
+    """Mean of the rotations' features over frames (world), each from its own facing.
 
-    Args:
-      skeleton: The skeleton.
-      motion: Frames of it, world.
-      config: Says how rotations are laid out.
-
-    Returns:
-      `Config.rotation_mean`.
+    It is what `Config.rotation_mean` expects.
     """
 
     def local(pose: Motion) -> Array:
@@ -64,17 +58,7 @@ def example(
     *,
     config: Config,
 ) -> tuple[Condition, Float[Array, "future features"]]:
-    """One training example from one window of motion.
-
-    Args:
-      key: Consumed.
-      skeleton: The skeleton.
-      window: Past and future frames, in the world.
-      label: Style.
-      config: The method.
-
-    Returns:
-      The condition, and the features of the future.
+    """The condition and the future's features, of one window of motion (world).
 
     Source: released code of CAMDM.
     """
@@ -109,17 +93,9 @@ def loss(
     skeleton: Skeleton,
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The training loss of a batch of windows.
+    """The weighted sum of a batch's losses, and its terms by name, unweighted.
 
-    Args:
-      params: The network's parameters.
-      key: Consumed.
-      batch: Windows of `config.window` frames, and their styles.
-      skeleton: The skeleton.
-      config: The method.
-
-    Returns:
-      The weighted sum, and its terms by name, unweighted.
+    The batch has windows of `config.window` frames, and their styles.
 
     Source: Chen et al. 2024 (CAMDM), eq. 2-4, and the released code's fifth term.
     """
@@ -148,15 +124,7 @@ def seam_terms(
     *,
     config: Config,
 ) -> dict[str, Float[Array, " number"]]:
-    """`loss_terms` of each level; over the seam where predictions go on from the past.
-
-    Args:
-      skeleton: The skeleton.
-      predictions: Predicted features of the future.
-      x_0: True ones.
-      condition: Of the batch.
-      config: The method.
-    """
+    """`loss_terms` of each level, over the seam if predictions go on from the past."""
     seen = losses.OVER_SEAM if config.seam_half_life else 0
     past = condition.past[:, config.past - seen :]
     kept = jnp.broadcast_to(condition.keep_past[:, None], past.shape[:-1])
@@ -209,20 +177,11 @@ def loss_terms(
     config: Config,
     mask: Bool[Array, "*#batch frames"] | None = None,
 ) -> dict[str, Float[Array, ""]]:
-    """The losses: data, velocity, position, position_velocity, acceleration, foot.
+    """Unweighted: data, velocity, position, position_velocity, acceleration, foot.
 
     Positions and foot displacements are in the world, with the predicted root. A foot
     stands where the target's is slower than `config.contact_speed`, at any height.
-
-    Args:
-      skeleton: The skeleton.
-      prediction: Predicted features.
-      target: True features.
-      config: The method.
-      mask: Frames that count; None for all.
-
-    Returns:
-      Each unweighted mean.
+    Without a mask all frames count.
     """
     every = jnp.ones(target.shape[:-1], bool) if mask is None else mask
     predicted, wanted = (

@@ -43,18 +43,12 @@ class Config:
     """Architecture and method; the defaults are the paper's.
 
     Attributes:
-      num_joints: Joints of the skeleton.
-      num_labels: Styles.
       past: Past poses of the condition, frames.
       future: Poses of a sample, frames.
-      fps: Frames per second.
       num_steps: T of the cosine schedule (paper 8, released weights 4).
       network: "transformer", or the ablation's "mlp" or "single_token".
       width: Channels of a token (released code; the paper does not say).
       depth: Layers (released code 4; the ablation's MLP 8).
-      heads: Attention heads.
-      hidden: Channels of the feed-forward layers.
-      dropout: Rate.
       frames_per_token: Frames of one token; ours, 1 in the paper.
       token_margin: Frames beyond its own, on either side, that an output token predicts
         and shares with its neighbors; ours, 0 in the paper.
@@ -158,14 +152,7 @@ class Condition:
     keep_past: Bool[Array, "*batch"]
 
     def arguments(self, config: Config) -> tuple[Array, ...]:
-        """The network's arguments after x_t and t.
-
-        Args:
-          config: Says how facings are laid out.
-
-        Returns:
-          past, path, facing (6D), label, keep_past.
-        """
+        """Past, path, facing (6D), label and keep_past, which follow x_t and t."""
         facing = rotation.rot6d_from_matrix(
             rotation.matrix_from_facing(self.trajectory.facing)
         )
@@ -188,13 +175,7 @@ Network = (
 
 
 def network(config: Config) -> Network:
-    """The denoiser's Flax module.
-
-    Args:
-      config: Its sizes.
-
-    Returns:
-      A module with methods `encode`, `denoise` and their composition.
+    """The denoiser's Flax module, with `encode`, `denoise` and their composition.
 
     Raises:
       ValueError: if its predictions should go on from the past, and it cannot.
@@ -216,15 +197,7 @@ def network(config: Config) -> Network:
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
-    """Initial parameters.
-
-    Args:
-      key: Consumed.
-      config: The architecture.
-
-    Returns:
-      Parameters of `network(config)`.
-    """
+    """Initial parameters."""
     past = jnp.zeros((config.past, config.num_features))
     x_t = jnp.zeros((config.future, config.num_features))
     path, facing = jnp.zeros((config.future, 2)), jnp.zeros((config.future, 6))
@@ -238,12 +211,7 @@ def to_features(
 ) -> Float[Array, "*batch frames features"]:
     """Features of a motion in the frame of a plan.
 
-    Args:
-      motion: In that frame.
-      config: The layout and scale of rotations.
-
-    Returns:
-      One 6D rotation a joint, and the root's (x, y, z, 0, 0, 0).
+    One 6D rotation per joint, and the root's (x, y, z, 0, 0, 0).
     """
     poses = features.motion_features(motion, rotation_layout=config.rotation_layout)
     rotations, root = poses[..., :-6], poses[..., -6:]
@@ -259,14 +227,9 @@ def _mean(config: Config, rotations: Array) -> Array:
 def to_motion(
     poses: Float[Array, "*batch frames features"], *, config: Config
 ) -> Motion:
-    """Inverse of `to_features`; rotations are made orthonormal.
+    """Inverse of `to_features`, in the frame of the plan.
 
-    Args:
-      poses: Features, perhaps from a network.
-      config: The layout and scale of rotations.
-
-    Returns:
-      The motion, in the frame of the plan.
+    Rotations are made orthonormal, so features may come from a network.
     """
     rotations, root = poses[..., :-6], poses[..., -6:]
     plain = rotations / config.rotation_scale + _mean(config, rotations)
@@ -294,8 +257,6 @@ def sampler(
     which the compiler lays out once: fastest at batch 1, one program a model.
 
     Args:
-      params: The network's parameters.
-      config: The method.
       table: Schedule; None for the cosine one of `config.num_steps`.
       step: Makes the chain's step from the schedule and the denoiser; the default is
         the paper's.
@@ -359,8 +320,6 @@ class Model:
     """Everything but the parameters.
 
     Attributes:
-      config: The method.
-      skeleton: The skeleton that it was trained on.
       labels: Names of the styles.
       source: The data, and its license.
       starts: Poses to start from, [labels, number, past, ...], at the origin facing +z;
@@ -393,14 +352,7 @@ def with_steps(model: Model, steps: tuple[int, ...]) -> Model:
 
 
 def to_json(model: Model) -> dict[str, Any]:
-    """JSON of a model.
-
-    Args:
-      model: The model.
-
-    Returns:
-      A JSON object.
-    """
+    """JSON of a model."""
     value = {
         "system": SYSTEM,
         "config": dataclasses.asdict(model.config),
@@ -437,14 +389,7 @@ def _starts_from_json(value: Any, config: Config, where: str) -> Motion | None:
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
-    """Inverse of `to_json`.
-
-    Args:
-      value: The JSON object.
-      where: The file, for error messages.
-
-    Returns:
-      The model.
+    """Inverse of `to_json`; `where` is the file, for messages.
 
     Raises:
       ValueError: names the file and the field that is missing or wrong.
@@ -493,12 +438,7 @@ def _shapes(model: Model, where: Path) -> Params:
 
 
 def check_clips(model: Model, clips: Clips, field: str) -> None:
-    """Raises unless clips are of the model's skeleton, styles and rate.
-
-    Args:
-      model: The model.
-      clips: The clips.
-      field: Label field that is the style.
+    """Raises unless clips have the model's skeleton, rate and (in `field`) styles.
 
     Raises:
       ValueError: names what differs.

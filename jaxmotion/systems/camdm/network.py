@@ -25,7 +25,6 @@ class FlatContext:
     """What one condition contributes to all steps.
 
     Attributes:
-      condition: One vector.
       steps: Embeddings of steps 0..T, one table for a batch.
     """
 
@@ -41,14 +40,7 @@ def flatten_condition(
 ) -> Float[Array, "*batch channels"]:
     """All frame streams of a condition as one vector; a dropped past is zero.
 
-    Args:
-      past: Features of the last poses.
-      path: Ground positions of the future, meters.
-      facing: 6D rotations of the future facings.
-      keep_past: False zeroes the past.
-
-    Returns:
-      Their concatenation.
+    Path is in meters, facings are 6D rotations.
     """
     kept = jnp.where(keep_past[..., None, None], past, 0.0)
     flat = [x.reshape(*x.shape[:-2], -1) for x in (kept, path, facing)]
@@ -88,16 +80,7 @@ class _OneVectorCondition(nn.Module):
     ) -> FlatContext:
         """What does not depend on the noisy sample; arguments as the full network's.
 
-        Args:
-          past: Features of the last poses.
-          path: Ground positions of the future, meters.
-          facing: 6D rotations of the future facings.
-          label: Style.
-          keep_past: False zeroes the past.
-          train: Unused here; the context has no dropout.
-
-        Returns:
-          The context of `denoise`.
+        The context has no dropout.
         """
         del train
         flat = flatten_condition(past, path, facing, keep_past)
@@ -119,21 +102,7 @@ class _OneVectorCondition(nn.Module):
         *,
         train: bool = False,
     ) -> Float[Array, "*batch future features"]:
-        """`encode`, then `denoise`; arguments as there.
-
-        Args:
-          x_t: Noisy features.
-          t: Step in 1..T.
-          past: Features of the last poses.
-          path: Ground positions of the future, meters.
-          facing: 6D rotations of the future facings.
-          label: Style.
-          keep_past: False zeroes the past.
-          train: Whether to drop.
-
-        Returns:
-          Predicted features x_0.
-        """
+        """`encode`, then `denoise`; arguments as there."""
         context = self.encode(past, path, facing, label, keep_past)
         return self.denoise(context, x_t, t, train=train)
 
@@ -159,17 +128,7 @@ class SingleTokenTransformer(_OneVectorCondition):
         *,
         train: bool = False,
     ) -> Float[Array, "*batch future features"]:
-        """Prediction of the clean sample.
-
-        Args:
-          context: From `encode`.
-          x_t: Noisy features.
-          t: Step in 1..T.
-          train: Whether to drop.
-
-        Returns:
-          Predicted features x_0.
-        """
+        """The clean sample, predicted from step t in 1..T."""
         step = jnp.broadcast_to(
             blocks.row_of(context.steps, t), context.condition.shape
         )
@@ -203,17 +162,7 @@ class CamdmMlp(_OneVectorCondition):
         *,
         train: bool = False,
     ) -> Float[Array, "*batch future features"]:
-        """Prediction of the clean sample.
-
-        Args:
-          context: From `encode`.
-          x_t: Noisy features.
-          t: Step in 1..T.
-          train: Whether to drop.
-
-        Returns:
-          Predicted features x_0.
-        """
+        """The clean sample, predicted from step t in 1..T."""
         batch = x_t.shape[:-2]
         step = jnp.broadcast_to(
             blocks.row_of(context.steps, t), context.condition.shape

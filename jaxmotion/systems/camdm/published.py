@@ -42,9 +42,6 @@ def load(
       labels: Names of the styles; None for those of "100style_conditions.json" beside
         the file.
 
-    Returns:
-      The model and its parameters.
-
     Raises:
       FileNotFoundError: if there is no such file, or no names of styles.
       ValueError: if a file is damaged or foreign, arrays are missing, unknown or of

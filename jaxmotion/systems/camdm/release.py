@@ -115,17 +115,15 @@ def clip_metrics(
     frames: Count | None = None,
     command: trajectory.Command | None = None,
 ) -> dict[str, Float[Array, ""]]:
-    """All of one clip, which `jax.vmap` maps over padded ones.
+    """Slide and coherence of one clip, which `jax.vmap` maps over padded ones.
+
+    With a command trajectory, and orientation if the skeleton has shoulders (found by
+    name); radians.
 
     Args:
-      skeleton: Its shoulders are found by name.
       motion: [frames, ...], world, meters.
       frames: That are the clip's own; None for all.
-      command: Told in each frame, unsmoothed; None for clips that nobody steered.
-
-    Returns:
-      slide and coherence, and with a command trajectory, and orientation if the
-      skeleton has shoulders; radians.
+      command: Given in each frame, unsmoothed; None for clips that nobody steered.
     """
     positions = joint_positions(skeleton, motion)
     root, toes = positions[:, 0], positions[:, jnp.array(toe_joints(skeleton))]
@@ -170,14 +168,7 @@ def frechet_distances(
     """Fréchet distance of each clip to its style, divided by the features' number.
 
     A clip has few windows, which makes its distance large: compare clips of one length.
-
-    Args:
-      clips: Features of windows, by clip.
-      styles: The same of the reference, by style.
-      label: Style of each clip.
-
-    Returns:
-      Squared units of the features; NaN where either has fewer than two windows.
+    Squared units of the features; NaN where either has fewer than two windows.
     """
 
     def of_one(x: tuple[Groups, Array]) -> Array:
@@ -289,15 +280,12 @@ def distances(
 def row(
     values: dict[str, np.ndarray], group: np.ndarray | None = None
 ) -> dict[str, table.Cell]:
-    """Columns of the table, with intervals over recordings or groups of them.
+    """Columns, with intervals over recordings or groups of them; angles in degrees.
 
     Args:
-      values: From `metrics`, and "fid" from `distances`; those that are not numbers
-        are left out, as the scripts do.
+      values: From `metrics`, and "fid" from `distances`; those that are not numbers are
+        left out, as the scripts do.
       group: Group of each recording, such as its replication; None for each on its own.
-
-    Returns:
-      Columns; angles in degrees.
     """
     found = {}
     for name, (column, scale) in COLUMNS.items():

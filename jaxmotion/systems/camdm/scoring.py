@@ -35,16 +35,8 @@ def frechet_cell(
 ) -> table.Cell:
     """Fréchet distance to the reference, of random subsets of equal size.
 
-    Args:
-      feature: Features of the windows of a row.
-      reference: Features of the reference windows.
-      count: Windows of each subset, the same for all rows.
-      seed: Seeds the subsets.
-      repeats: Subsets.
-
-    Returns:
-      Mean, and interval over the subsets (not over clips); no interval where a subset
-      is all there is.
+    The interval is over the `repeats` subsets of `count` windows (the same for all
+    rows), not over clips; there is none where a subset is all there is.
     """
     if count == len(feature):
         repeats = 1
@@ -61,17 +53,10 @@ def frechet_cell(
 def unbiased_cells(
     feature: np.ndarray, reference: np.ndarray, *, seed: int, sizes: int = 5
 ) -> Row:
-    """Fréchet distance to the reference, extrapolated to infinitely many windows.
+    """The distance extrapolated to infinitely many windows, "fid_unbiased".
 
-    Args:
-      feature: Features of all windows of a row.
-      reference: Features of the reference windows.
-      seed: Seeds the subsets.
-      sizes: Sizes of the subsets, from as many windows as there are features to all.
-
-    Returns:
-      "fid_unbiased", without an interval; nothing if there are too few windows for
-      the extrapolation to hold.
+    It has no interval; nothing if there are too few windows for the extrapolation to
+    hold. There are `sizes` subsets, from as many windows as there are features to all.
 
     Source: `frechet_bias`.
     """
@@ -96,32 +81,18 @@ def frechet_cells(
     seed: int,
     repeats: int = 5,
 ) -> Row:
-    """Both distances to the reference.
+    """The cell "fid", and "fid_unbiased" if there are enough windows.
 
-    Args:
-      feature: Features of the windows of a row.
-      reference: Features of the reference windows.
-      count: Windows of the subsets of `frechet_cell`.
-      seed: Seeds all subsets.
-      repeats: Subsets of `frechet_cell`.
-
-    Returns:
-      "fid", and "fid_unbiased" if there are enough windows.
+    There are `repeats` subsets of `count` windows.
     """
     fid = frechet_cell(feature, reference, count=count, seed=seed, repeats=repeats)
     return {"fid": fid} | unbiased_cells(feature, reference, seed=seed)
 
 
 def random_half(clips: np.ndarray, labels: np.ndarray, seed: int) -> np.ndarray:
-    """Which windows are of a random half of each style's clips.
+    """True for the windows of a random half of each style's clips.
 
-    Args:
-      clips: Clip of each window.
-      labels: Style of each window.
-      seed: Seeds the choice.
-
-    Returns:
-      True for the windows of that half.
+    Clips and labels are those of each window.
 
     Raises:
       ValueError: if there is one clip only.
@@ -167,14 +138,11 @@ def metric_row(
 ) -> Row:
     """All columns but the Fréchet distances, with intervals over clips or rollouts.
 
+    Angles are in degrees.
+
     Args:
-      skeleton: The skeleton.
-      found: Windows.
       hits: From `style.features_and_hits`; None to leave style accuracy out.
       height: Below it a foot joint should not move, meters.
-
-    Returns:
-      Columns; angles in degrees.
     """
     run = functools.partial(_metrics, skeleton, jnp.float32(height))
     values = in_batches(run, found)
@@ -197,17 +165,10 @@ def rollout_health(
     fps: float,
     height: float,
 ) -> dict[str, int]:
-    """How many rollouts diverged or froze; bounds as in `evaluation.health`.
+    """Numbers of rollouts, diverged and frozen; bounds as in `evaluation.health`.
 
-    Args:
-      skeleton: The skeleton.
-      frames: Displayed frames [characters, ticks, ...].
-      fps: Frames per second.
-      height: Root height of the standing character, meters; half of it and 1.5
-        times of it are the bounds.
-
-    Returns:
-      Counts by name, and the number of rollouts.
+    Frames are [characters, ticks, ...]; `height` is that of the standing character's
+    root, meters: half of it and 1.5 times of it are the bounds.
     """
 
     @jax.jit
@@ -229,18 +190,10 @@ def rollout_health(
 def repeat_diversity(
     skeleton: Skeleton, found: windows.EvalWindows, *, repeats: int
 ) -> table.Cell:
-    """Intra-style variance over characters of one style under one control.
+    """Variance (square meters) over characters of one style under one control.
 
-    Windows of the same time are compared in the frame of the root.
-
-    Args:
-      skeleton: The skeleton.
-      found: Windows of rollouts in which every `repeats` neighboring characters
-        share style and commands.
-      repeats: Characters a style.
-
-    Returns:
-      Square meters, with an interval over styles.
+    Windows of the same time are compared in the frame of the root. Every `repeats`
+    neighboring characters share style and commands; the interval is over styles.
     """
     local = in_batches(
         jax.jit(functools.partial(style_evaluator.window_input, skeleton)),
@@ -253,15 +206,10 @@ def repeat_diversity(
 
 
 def contact_height(skeleton: Skeleton, real: windows.EvalWindows) -> float:
-    """Height below which toes should not move.
+    """Height below which toes should not move, meters.
 
-    Args:
-      skeleton: The skeleton.
-      real: Windows of real clips.
-
-    Returns:
-      Where toes rest (their first percentile), and one centimeter more, as the paper's
-      "below, e.g., 1 cm"; meters.
+    One centimeter above where toes rest (their first percentile), as the paper's
+    "below, e.g., 1 cm".
     """
     feet = jnp.array(skeleton.feet)
     toes = in_batches(
@@ -275,10 +223,7 @@ class Reference:
     """What rollouts are measured with, and what recorded motion looks like to it.
 
     Attributes:
-      skeleton: The skeleton.
-      evaluator: Evaluator of styles.
       real: Windows of held-out clips, one after the other.
-      real_features: Theirs.
       hits: Whether the evaluator recognizes their styles.
       features: Features of windows of training clips, with a short stride.
       own: Which of these are of a random half of the clips.
@@ -299,11 +244,7 @@ class Reference:
     styles: camdm_release.Groups | None = None
 
     def count(self, made: int) -> int:
-        """Windows of each Fréchet distance, the same for all rows.
-
-        Args:
-          made: Windows of rollouts.
-        """
+        """Windows of each Fréchet distance, the same for all rows."""
         own = int(self.own.sum())
         return min(len(self.real_features), made, own, len(self.own) - own)
 
@@ -337,11 +278,7 @@ def real_rows(
 ) -> tuple[Row, Row]:
     """Rows of held-out clips, and of half of the training clips beside the others.
 
-    Args:
-      reference: The reference.
-      count: Windows of each Fréchet distance.
-      seed: Seeds the subsets.
-      repeats: Subsets of each Fréchet distance.
+    Their Fréchet distances are of `repeats` subsets of `count` windows.
     """
     distances = functools.partial(
         frechet_cells, count=count, seed=seed, repeats=repeats
@@ -365,11 +302,8 @@ def made_row(
     """Row of rollouts in which `repeats` neighbors share style and commands.
 
     Args:
-      reference: The reference.
-      made: Windows of the rollouts.
       repeats: Such neighbors; with one there is no column of diversity.
       count: Windows of each Fréchet distance.
-      seed: Seeds the subsets.
       replicated: Intervals run over replications, of which every neighbor belongs to
         another, instead of over rollouts and random subsets.
     """

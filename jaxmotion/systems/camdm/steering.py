@@ -92,13 +92,7 @@ def changes(commands: Command) -> list[Change]:
 def since_changes(
     new: Sequence[Change], ticks: int, fps: float
 ) -> Int[np.ndarray, "kinds ticks"]:
-    """Steps of 0.2 s since the last change, if it was of that kind of `KINDS`, else -1.
-
-    Args:
-      new: Changes.
-      ticks: Number of all commands.
-      fps: Ticks per second.
-    """
+    """Steps of 0.2 s since the last change, if it was of that of `KINDS`, else -1."""
     since, step = np.full((len(KINDS), ticks), -1), round(_STEP_SECONDS * fps)
     for kind, begin, end in new:
         since[KINDS.index(kind), begin:end] = np.arange(end - begin) // step
@@ -158,14 +152,7 @@ def _measure(
 ) -> dict[str, Any]:
     """All that is kept of some rollouts of one course.
 
-    Args:
-      skeleton: The skeleton.
-      ground: Heights.
-      frames: What the characters display.
-      facing: What they are told.
-      since: From `since_changes`.
-      skip: Ticks to leave out at the start.
-      places: Frames of a plan to play.
+    The first `skip` ticks are left out; `places` frames of a plan are played.
     """
     fps, reach = frames.fps, _reach(frames.fps)
     number, ticks = frames.root_position.shape[:2]
@@ -259,11 +246,7 @@ def _reaction_cells(
 ) -> Row:
     """Times until new commands are obeyed: cells over characters.
 
-    Args:
-      values: "speed" and "facing_error" [characters, ticks].
-      told: New commands.
-      commands: All of them [ticks, ...].
-      fps: Ticks per second.
+    Values are "speed" and "facing_error" [characters, ticks].
     """
     least = round(_LEAST_SECONDS * fps)
     wanted = np.linalg.norm(np.asarray(commands.velocity), axis=-1)
@@ -332,7 +315,6 @@ class _Real:
     """Windows of real clips with a label, and where the ground is by the first clips.
 
     Attributes:
-      ground: Heights.
       values: Metrics of the windows and their clips, by name of the clips.
     """
 
@@ -423,11 +405,9 @@ def steering_table(
     """Steers characters straight on and along courses, and measures them.
 
     Args:
-      character: What moves them.
       held_out: Clips that it never saw: rows of real motion, poses to start from, and
         where the ground is.
       train: Clips that it was trained on: rows of real motion.
-      field: Their label field.
       label: Label of all characters and of the real windows.
       speeds: What characters are told that go straight on, m/s; 0 to stand.
       names: Courses that they follow besides.
@@ -439,7 +419,6 @@ def steering_table(
       foot_lock: Settings of the lock for second rows; None for none.
       chunk: Characters to run at a time, at most (the largest number that divides
         theirs).
-      seed: Seeds start poses and noise.
 
     Raises:
       ValueError: if rollouts are too short to measure, there is no such label or

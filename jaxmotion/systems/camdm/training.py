@@ -86,15 +86,12 @@ FITTING["planted"] = FITTING["small"]
 
 
 def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
-    """A model for clips.
+    """A model for clips; where rotations are scaled, with the mean of their rotations.
 
     Args:
-      clips: The clips; their skeleton, rate, styles and source become the model's.
+      clips: Their skeleton, rate, styles and source become the model's.
       field: Label field that is the style.
       **sizes: Fields of `camdm.Config`, but for those that the clips decide.
-
-    Returns:
-      The model; where rotations are scaled, with the mean of the clips' rotations.
 
     Raises:
       ValueError: if the clips have no such field.
@@ -123,16 +120,9 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
 
 
 def continued(model: Model, path: Path) -> tuple[Model, Params]:
-    """Another run's network and averaged parameters, to be trained as this model.
+    """A run's or exported model's averaged parameters, to be trained as this model.
 
     Weights of the losses, attention and noise levels are this model's.
-
-    Args:
-      model: The model to train.
-      path: Run folder or exported model to start from.
-
-    Returns:
-      The other model with the weights replaced, and its parameters.
 
     Raises:
       ValueError: if skeleton, styles or sizes differ; names which.
@@ -164,11 +154,7 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
 def window_sampler(
     *, field: str, batch: int
 ) -> Callable[[Key, tuple[Clips, windows.WindowIndex]], tuple[skeleton.Motion, Array]]:
-    """Random windows and their styles, as `camdm_loss.loss` takes them.
-
-    Args:
-      field: Label field that is the style.
-      batch: Windows a draw.
+    """Random windows and their styles (`field`), as `camdm_loss.loss` takes them.
 
     Returns:
       `(key, (clips, index)) -> (motion, label)`.
@@ -193,7 +179,6 @@ class Run:
     """What a run left behind.
 
     Attributes:
-      model: The model.
       params: Its averaged parameters.
       train: Clips that it was trained on, without mirrored ones.
       held_out: Clips that it never saw.
@@ -219,16 +204,12 @@ def split_data(
     """Training and held-out clips; the same for every run with these arguments.
 
     Args:
-      data: File of clips.
       contents: Keep only clips of these contents; none, or clips without such a
         field: keep all.
       label: Label field that is the style.
       held_out: Part of each style's clips to hold out, in (0, 1).
       labels: Keep only clips of these styles, and forget the others; none: keep all.
       held_out_clips: Hold out these clips, by name, instead of a part.
-
-    Returns:
-      Both parts.
 
     Raises:
       OSError: if the file cannot be read.
@@ -295,18 +276,11 @@ def prepare(
     """Makes model and clips of a run folder, or loads those it has.
 
     Args:
-      folder: The run folder.
       data: Clips; which of them, the next five arguments say as for `split_data`.
-      label: Label field that is the style.
-      contents: Contents of the clips.
-      labels: Styles of the clips.
-      held_out: Part of each style's clips to hold out.
-      held_out_clips: Clips to hold out.
       mirrored: Whether it is trained on mirrored copies of the clips as well.
-      make: The model for the training clips.
       balance: How much more often rare changes of speed and direction are drawn; see
         `windows.balance`.
-      settings: JSON of what it makes them from.
+      settings: JSON of what `make` makes the model from.
 
     Raises:
       OSError: if the clips cannot be read.
@@ -381,11 +355,8 @@ def training_windows(
 def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> None:
     """Trains the model of a run, from its newest checkpoint if there is one.
 
-    Args:
-      run: The run folder.
-      budget: How long.
-      init: Run folder or exported model whose parameters a new training starts with;
-        None for random ones.
+    A new training starts with the parameters of `init`, a run folder or exported model;
+    None for random ones.
 
     Raises:
       ValueError: if no clip is as long as a window, or the checkpoint has other
@@ -420,14 +391,10 @@ def load_run(
     """Loads a run folder.
 
     Args:
-      folder: Where it is.
       data: Other clips, to choose and split as those that it was trained on; None for
         these.
       contents: Keep only clips of these contents, of those that the run used; none:
         keep all.
-
-    Returns:
-      Model, parameters and clips.
 
     Raises:
       OSError: if the clips cannot be read.

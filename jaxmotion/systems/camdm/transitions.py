@@ -75,12 +75,10 @@ def make_changes(
     """Every ordered pair of styles, in each replication.
 
     Args:
-      run: The run.
       course: One of `courses.COURSES`.
       before: Seconds in the first style, at least half a window.
       limit: Seconds after the command in which the change must have come.
       replications: Sets of all pairs, each with start poses of its own.
-      seed: Seeds the start poses.
 
     Returns:
       The changes; their rollouts last so long that the last window is whole.
@@ -127,13 +125,9 @@ def make_changes(
 
 
 def without(changes: Changes) -> Changes:
-    """The same characters, who keep their first style: what finds a change is wrong.
+    """The same characters, who keep label and speed, evaluated for the same new styles.
 
-    Args:
-      changes: The changes.
-
-    Returns:
-      Changes whose commands keep label and speed, evaluated for the same new styles.
+    What finds a change there is wrong.
     """
     first = changes.commands.label[:, :1]
     label = jnp.broadcast_to(first, changes.commands.label.shape)
@@ -150,13 +144,6 @@ def find_changes(
     fps: float,
 ) -> tuple[Bool[np.ndarray, "characters windows"], np.ndarray]:
     """Whether each window about or after the command shows the new style.
-
-    Args:
-      skeleton: The skeleton.
-      frames: Displayed frames [characters, ticks, ...].
-      changes: That they were made for.
-      evaluator: Evaluator of styles.
-      fps: Ticks per second.
 
     Returns:
       Decisions, and the windows' centers in seconds after the command, from 0 on.
@@ -185,17 +172,10 @@ def transition_row(
 ) -> dict[str, table.Cell]:
     """Success, duration and quality of motion, over replications.
 
-    Args:
-      run: The run.
-      frames: Frames of all characters.
-      changes: That they were made for.
-      evaluator: Evaluator of styles.
-      height: Below it a foot joint should not move, meters.
-
-    Returns:
-      Success in per cent; duration in seconds and frames, failures counted as the
-      limit; of the four seconds after the command what `metric_row` measures; and of
-      the whole rollout slide and coherence of CAMDM's release.
+    Success in per cent; duration in seconds and frames, failures counted as the limit;
+    of the four seconds after the command what `metric_row` measures; and of the whole
+    rollout slide and coherence of CAMDM's release. Below `height`, meters, a foot joint
+    should not move.
     """
     skeleton, fps = run.model.skeleton, run.model.config.fps
     found, centers = find_changes(skeleton, frames, changes, evaluator, fps=fps)
@@ -237,17 +217,11 @@ def evaluate_transitions(
     """One row for each run-time, and one of characters who keep their style.
 
     Args:
-      run: The run.
-      changes: What characters are told.
       controls: Constants of the run-time, by row; the last row's serve for those who
         keep their style.
-      evaluator: Evaluator of styles.
       chunk: Characters to run at a time, at most.
       seed: Seeds the noise, the same for all rows.
       report: Called with each row's name when it is measured.
-
-    Returns:
-      The table.
     """
     real = windows.eval_windows(
         run.held_out, stride=windows.EVAL_WINDOW, field=run.field
@@ -273,15 +247,7 @@ def evaluate_transitions(
 
 
 def clip_accuracy(run: Run, evaluator: StyleEvaluator) -> table.Cell:
-    """How often the evaluator is right on held-out clips: a bound on success.
-
-    Args:
-      run: The run.
-      evaluator: Evaluator of styles.
-
-    Returns:
-      Per cent, over clips.
-    """
+    """Per cent of held-out clips that the evaluator recognizes: a bound on success."""
     real = windows.eval_windows(run.held_out, stride=STRIDE, field=run.field)
     _, hits = style_evaluator.features_and_hits(run.model.skeleton, real, evaluator)
     return table.cell(

@@ -48,14 +48,7 @@ _RECOGNIZED = 12288
 
 
 def evaluator_config(run: ActionRun) -> action_evaluator.Config:
-    """Size of a run's evaluator.
-
-    Args:
-      run: The run.
-
-    Returns:
-      The size.
-    """
+    """Size of a run's evaluator."""
     return action_evaluator.Config(
         num_classes=len(run.actions), num_joints=run.clips.skeleton.num_joints
     )
@@ -64,16 +57,7 @@ def evaluator_config(run: ActionRun) -> action_evaluator.Config:
 def fit_evaluator(
     train: ActionArrays, *, num_steps: int, seed: int
 ) -> tuple[action_evaluator.Config, Params]:
-    """Trains an evaluator on motions with actions drawn uniformly.
-
-    Args:
-      train: Training clips.
-      num_steps: Updates.
-      seed: Seeds parameters, batches and motions.
-
-    Returns:
-      Its size, and its parameters.
-    """
+    """Trains an evaluator on motions with actions drawn uniformly."""
     config = action_evaluator.Config(
         num_classes=train.counts.shape[0], num_joints=train.clips.skeleton.num_joints
     )
@@ -95,14 +79,7 @@ def load_evaluator(
 ) -> Params:
     """The run's evaluator, trained on its training clips if it is not there yet.
 
-    Args:
-      run: The run.
-      num_steps: Updates.
-      seed: Seeds parameters and batches.
-      evaluator: A frozen evaluator to use in its place; None for none.
-
-    Returns:
-      Its parameters.
+    A frozen evaluator, if given, takes its place.
 
     Raises:
       ValueError: if the folder's was trained otherwise, or the evaluator does not fit
@@ -147,30 +124,13 @@ def _flat(positions: Array) -> Array:
 def real_positions(
     key: Key, actions: Int[Array, " batch"], part: ActionArrays
 ) -> Float[Array, "batch frames joints 3"]:
-    """Joint positions of recorded motions.
-
-    Args:
-      key: Consumed.
-      actions: Wanted actions.
-      part: Training or held-out clips.
-
-    Returns:
-      Positions, meters.
-    """
+    """Joint positions, meters, of recorded motions."""
     motions = emdm_data.sample_motions(key, part, actions)
     return joint_positions(part.clips.skeleton, motions)
 
 
 def moments(params: Params, run: ActionRun) -> Callable[[Key, Array], frechet.Moments]:
-    """Moments of the evaluator's features of a set of motions.
-
-    Args:
-      params: The evaluator's.
-      run: The run.
-
-    Returns:
-      `(key, positions) -> moments`, jitted.
-    """
+    """Moments of the evaluator's features, `(key, positions) -> moments`, jitted."""
     config = evaluator_config(run)
 
     @jax.jit
@@ -189,8 +149,6 @@ def scorer(
     """Scores of a set of motions, as one compiled program.
 
     Args:
-      params: The evaluator's.
-      run: The run.
       reference: Moments of the real features.
       ground: Height of the lowest joint of a person who stands, meters.
 
@@ -235,12 +193,6 @@ def ground_height(run: ActionRun) -> float:
     """Height of the lowest joint of a person who stands in the run's clips, meters.
 
     The median over frames of the height of the lowest joint.
-
-    Args:
-      run: The run.
-
-    Returns:
-      The height.
     """
     motion = Motion(
         root_position=run.clips.root_position,
@@ -375,17 +327,9 @@ def train_action(
     num_steps: int,
     seed: int,
 ) -> Evaluator:
-    """EMDM's evaluator, of motions with actions drawn uniformly.
+    """EMDM's evaluator, of motions with actions (`field`) drawn uniformly.
 
-    Args:
-      train: Training clips.
-      held_out: Clips for its accuracy.
-      field: Label field that is the action.
-      num_steps: Updates.
-      seed: Seeds parameters, batches and motions.
-
-    Returns:
-      The evaluator.
+    The held-out clips give its accuracy.
     """
     clips = train.clips
     config, params = fit_evaluator(train, num_steps=num_steps, seed=seed)

@@ -34,13 +34,7 @@ MERGE = ("bye=wave-right-hand", "byebye=wave-both-hands", "dash=run")
 
 
 def merges(pairs: tuple[str, ...]) -> dict[str, str]:
-    """Labels that name the same action as others.
-
-    Args:
-      pairs: "old=new".
-
-    Returns:
-      The new label of each old one.
+    """The new label of each old one, from pairs "old=new".
 
     Raises:
       ValueError: if a pair is not of that form.
@@ -60,7 +54,6 @@ class ActionArrays:
     """Clips by action, on the device.
 
     Attributes:
-      clips: The clips.
       members: Clips of each action, filled up with -1.
       counts: Clips of each action.
       frames: Frames of a sample.
@@ -80,17 +73,13 @@ def prepare_clips(
     least: int,
     fps: float,
 ) -> tuple[Clips, tuple[str, ...]]:
-    """Clips of all files at one rate, with the labels that are frequent enough.
+    """Clips of all files at one rate, and the labels that were too rare.
 
     Args:
       paths: Files of clips of one skeleton.
       field: Label field that is the action.
       merge: Labels that are the same action as others, and those others.
       least: Fewest clips of an action.
-      fps: Frames per second.
-
-    Returns:
-      The clips, and the labels that were left out.
 
     Raises:
       OSError: if a file cannot be read.
@@ -112,15 +101,9 @@ def prepare_clips(
 
 
 def action_arrays(clips: Clips, *, field: str, frames: int) -> ActionArrays:
-    """Puts clips on the device, listed by action.
+    """Puts clips on the device, listed by action (`field`).
 
-    Args:
-      clips: The clips; every label has some.
-      field: Label field that is the action.
-      frames: Frames of a sample.
-
-    Returns:
-      The arrays.
+    A sample has `frames` frames.
 
     Raises:
       ValueError: if an action has no clip; names it.
@@ -145,16 +128,7 @@ def action_arrays(clips: Clips, *, field: str, frames: int) -> ActionArrays:
 def sample_motions(
     key: Key, arrays: ActionArrays, action: Int[Array, " batch"]
 ) -> skeleton.Motion:
-    """Draws a motion of each action, from the ground's origin and facing +z.
-
-    Args:
-      key: Consumed.
-      arrays: The clips.
-      action: Wanted actions.
-
-    Returns:
-      The motions.
-    """
+    """Draws a motion of each action, from the ground's origin and facing +z."""
     key_clip, key_start = jax.random.split(key)
     clips, frames = arrays.clips, arrays.frames
     place = jax.random.randint(key_clip, action.shape, 0, arrays.counts[action])
@@ -181,7 +155,6 @@ class ActionRun:
     """A run folder and its data.
 
     Attributes:
-      record: What the folder is.
       clips: All clips, at the run's rate, those that are held out last.
       train: Training clips on the device.
       held_out: Clips that no network saw.
@@ -221,16 +194,10 @@ def prepare(
     """Makes the clips of a run folder, or loads those it has.
 
     Args:
-      folder: The run folder.
       data: As `prepare_clips` takes them; so are field, merge, least and fps.
       task: "action", or "none" for motions from nothing.
-      field: Label field that is the action.
-      merge: Labels that are the same action as others, and those others.
-      least: Fewest clips of an action.
-      fps: Frames per second.
       frames: Frames of a sample.
       held_out: Part of each action's clips to hold out.
-      mirrored: Whether mirrored training clips are added.
 
     Raises:
       OSError: if a file cannot be read.
@@ -309,15 +276,9 @@ def _decode(record: runs.Run) -> ActionRun:
 def make_task(
     run: ActionRun, base: emdm_model.Config, *, conditional: bool
 ) -> emdm_training.Task:
-    """What models of a run are trained on.
+    """What models of a run are trained on: motions from actions, or from nothing.
 
-    Args:
-      run: The run.
-      base: Sizes and weights; features, frames and condition are set here.
-      conditional: Motions from actions; else from nothing.
-
-    Returns:
-      The task.
+    Features, frames and condition of `base` are set here.
     """
     number = len(run.actions) if conditional else 0
     representation = run.representation
@@ -366,8 +327,8 @@ def clip_features(
         rate of the features.
 
     Returns:
-      One array a clip, of one frame less than the clip; and the largest error of joints
-      to features to joints, meters.
+      One array per clip, of one frame less than the clip; and the largest error of
+      joints to features to joints, meters.
 
     Raises:
       ValueError: if the skeleton is unknown.
@@ -426,8 +387,6 @@ def from_labels(
       unseen: Pairs "content/style".
       held_out: Part of the other clips in "test".
       least: Shortest clip, frames at the new rate.
-      fps: Frames per second of the features.
-      seed: Seeds captions and the split.
 
     Returns:
       The text motions, and the largest error of joints to features to joints, meters.

@@ -66,16 +66,11 @@ def evaluate_run(
     rows: tuple[str, ...] = (),
     long_replications: int = 2,
 ) -> tuple[Rows, dict[str, by_frame.ByFrame], RowScorer]:
-    """Scores every row of a run folder.
+    """The table of a run's rows, jerk and slide by place in a token, and what scored.
 
     Args:
-      folder: The run folder.
-      settings: How.
       rows: Which rows and samplers; none: all that were trained.
       long_replications: Replications of rows with 500 network calls and more.
-
-    Returns:
-      The table, jerk and slide by place in a token, and what scored.
 
     Raises:
       ValueError: if nothing was trained, or a row was not.
@@ -140,19 +135,13 @@ def make_motions(
     scale: float | None = None,
     seed: int = 0,
 ) -> tuple[dict[str, tuple[Skeleton, Motion]], str]:
-    """One motion for each action or sentence; one in all where a run has neither.
+    """Skeleton and motion by action or sentence, and the data's source.
+
+    One motion in all where a run has neither.
 
     Args:
-      folder: The run folder.
-      actions: Actions, for a run of actions.
-      texts: Sentences, for a run of texts.
-      row: Which model.
       frames: Length; None for the model's longest.
       scale: Guidance; None for the paper's.
-      seed: Seeds the noise.
-
-    Returns:
-      Skeleton and motion by action or sentence, and the data's source.
 
     Raises:
       ValueError: if an action is unknown, a text is empty or too long, the length is

@@ -51,14 +51,8 @@ def _raw(motion: Motion) -> Array:
 def fit(skeleton: Skeleton, motions: Motion, *, floor: float = 0.01) -> Representation:
     """Mean and deviation of features: of each root channel, one for all rotations.
 
-    Args:
-      skeleton: The skeleton.
-      motions: Motions of the training data, batch first, from
-        `features.to_first_pose`.
-      floor: Least deviation, meters or entries of rotation matrices.
-
-    Returns:
-      The representation.
+    Motions, batch first, are from `features.to_first_pose`; the least deviation `floor`
+    is in meters or entries of rotation matrices.
     """
     raw = _raw(motions)
     found = features.fit_normalizer(raw, floor=0.0)
@@ -76,27 +70,16 @@ def fit(skeleton: Skeleton, motions: Motion, *, floor: float = 0.01) -> Represen
 def to_features(
     motion: Motion, representation: Representation
 ) -> Float[Array, "*batch frames features"]:
-    """Features of motions that `features.to_first_pose` has moved.
-
-    Args:
-      motion: The motions.
-
-    Returns:
-      Features in the network's units.
-    """
+    """Features (network's units) of motions moved by `features.to_first_pose`."""
     return features.normalize(representation.normalizer, _raw(motion))
 
 
 def to_motion(
     x: Float[Array, "*batch frames features"], representation: Representation
 ) -> Motion:
-    """Inverse of `to_features`; rotations are made orthonormal.
+    """Inverse of `to_features`, in meters.
 
-    Args:
-      x: Features, perhaps from a network.
-
-    Returns:
-      The motions, in meters.
+    Rotations are made orthonormal, so features may come from a network.
     """
     raw = features.denormalize(representation.normalizer, x)
     step = raw[..., -6:-3]
@@ -108,12 +91,9 @@ def to_motion(
 def geometry(representation: Representation, *, relative: bool) -> Geometry:
     """What the geometric losses need of a representation.
 
-    Args:
-      relative: Joint positions relative to the root, as released; else in the world.
-
-    Returns:
-      Joint positions by forward kinematics; toes and their parents as feet; frame
-      differences of rotations only, as released.
+    Joint positions by forward kinematics, relative to the root as released, or else in
+    the world; toes and their parents as feet; frame differences of rotations only, as
+    released.
     """
     skeleton = representation.skeleton
     feet = [j for foot in skeleton.feet for j in (skeleton.parents[foot], foot)]

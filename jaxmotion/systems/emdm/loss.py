@@ -81,10 +81,8 @@ def geometric_loss(
     """Weighted errors of features, joint positions, frame differences and feet.
 
     Args:
-      prediction: Predicted x_0.
-      batch: The motions.
+      prediction: Of x_0.
       t: Steps of the noise that it is predicted from.
-      config: The weights.
       geometry: None if the three last weights are 0.
 
     Returns:
@@ -175,19 +173,7 @@ def discriminator_loss(
     config: Config,
     penalized: Bool[Array, ""],
 ) -> tuple[Float[Array, ""], Info]:
-    """The discriminator's loss, with its R1 penalty when it is due.
-
-    Args:
-      params: The discriminator's.
-      generator: The generator's.
-      key: Consumed.
-      batch: The motions.
-      config: The method.
-      penalized: Whether this update has the penalty.
-
-    Returns:
-      The loss, and "adversarial" and "r1" (0 in updates without).
-    """
+    """The discriminator's loss: "adversarial", and "r1" in the updates that have it."""
     t, x_prev, x_t, _, fake = _generated(generator, key, batch, config)
     net = emdm_model.discriminator(config)
     seen = emdm_model.discriminator_condition(batch.vector, config=config)
@@ -216,18 +202,9 @@ def generator_loss(
     config: Config,
     geometry: Geometry | None,
 ) -> tuple[Float[Array, ""], Info]:
-    """The generator's loss.
+    """The generator's loss, "adversarial" (weighted) and the geometric terms.
 
-    Args:
-      params: The generator's.
-      discriminator: The discriminator's.
-      key: Consumed.
-      batch: The motions.
-      config: The method.
-      geometry: None if the weights of positions, velocities and feet are 0.
-
-    Returns:
-      The loss, "adversarial" (weighted) and the geometric terms.
+    Geometry is None if the weights of positions, velocities and feet are 0.
     """
     t, _, x_t, prediction, fake = _generated(params, key, batch, config)
     seen = emdm_model.discriminator_condition(batch.vector, config=config)
@@ -251,15 +228,7 @@ def diffusion_loss(
 ) -> tuple[Float[Array, ""], Info]:
     """MDM's loss: the geometric one alone, of a denoiser with or without latent.
 
-    Args:
-      params: The generator's.
-      key: Consumed.
-      batch: The motions.
-      config: The method.
-      geometry: None if the weights of positions, velocities and feet are 0.
-
-    Returns:
-      The loss, and its terms.
+    Geometry is None if the weights of positions, velocities and feet are 0.
 
     Source: Tevet et al. 2023 (MDM), eq. 2-6.
     """

@@ -47,9 +47,6 @@ class Config:
       latent: Channels of z; 0 for a deterministic denoiser, that is a diffusion model.
       width: Channels of a token of the generator.
       depth: Its encoder layers.
-      heads: Its attention heads.
-      hidden: Channels of its feed-forward layers.
-      dropout: Rate.
       frames_per_token: Frames of one token; ours, 1 in the paper.
       token_margin: Frames beyond its own, on either side, that an output token predicts
         and shares with its neighbors; ours, 0 in the paper.
@@ -138,11 +135,7 @@ class Config:
         return bool(self.latent and self.weight_adversarial)
 
     def table(self) -> Schedule:
-        """The schedule.
-
-        Returns:
-          Table of T steps.
-        """
+        """The schedule."""
         make = {"vp": schedule.vp_schedule, "cosine": schedule.cosine_schedule}
         return make[self.schedule](self.num_steps)
 
@@ -182,15 +175,7 @@ def make_condition(
     *,
     config: Config,
 ) -> Condition:
-    """Conditions of motions of given lengths.
-
-    Args:
-      vector: One-hot actions or text vectors.
-      lengths: Frames of each motion; None for all of the model's.
-      config: The method.
-
-    Returns:
-      The conditions.
+    """Conditions of motions of given lengths, frames; None for the model's longest.
 
     Raises:
       ValueError: if a vector or a length does not fit the model; names both.
@@ -212,28 +197,14 @@ def make_condition(
 
 
 def generator(config: Config) -> emdm_network.SequenceGenerator:
-    """The generator's Flax module.
-
-    Args:
-      config: Its sizes.
-
-    Returns:
-      The module.
-    """
+    """The generator's Flax module."""
     kind = emdm_network.SequenceGenerator
     names = {field.name for field in dataclasses.fields(kind)} - {"parent", "name"}
     return kind(**{k: v for k, v in dataclasses.asdict(config).items() if k in names})
 
 
 def discriminator(config: Config) -> emdm_network.SequenceDiscriminator:
-    """The discriminator's Flax module.
-
-    Args:
-      config: Its sizes.
-
-    Returns:
-      The module.
-    """
+    """The discriminator's Flax module."""
     return emdm_network.SequenceDiscriminator(
         num_steps=config.num_steps, width=config.discriminator_width
     )
@@ -242,29 +213,13 @@ def discriminator(config: Config) -> emdm_network.SequenceDiscriminator:
 def discriminator_condition(
     vector: Float[Array, "*batch condition"], *, config: Config
 ) -> Float[Array, "*batch seen"]:
-    """What of the condition the discriminator sees: never dropped, or nothing.
-
-    Args:
-      vector: One-hot actions or text vectors.
-      config: Whether the discriminator is conditional.
-
-    Returns:
-      The vectors, or vectors of width 0.
-    """
+    """What of the condition the discriminator sees: all, or nothing (width 0)."""
     return vector if config.discriminator_condition else vector[..., :0]
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> dict[str, Params]:
-    """Initial parameters of both networks.
-
-    Args:
-      key: Consumed.
-      config: The method.
-
-    Returns:
-      Under "generator" and, if there is a latent, "discriminator".
-    """
+    """Initial parameters: "generator" and, if there is a latent, "discriminator"."""
     key_generator, key_discriminator = jax.random.split(key)
     x = jnp.zeros((1, config.frames, config.features))
     vector = jnp.zeros((1, config.condition_size))
@@ -296,7 +251,6 @@ def sampler(
 
     Args:
       params: The generator's.
-      config: The method.
       step: Makes the chain's step from the schedule and the denoiser; the default is
         that of EMDM and DDPM.
       steps: Steps of the schedule to visit, increasing; None for all.

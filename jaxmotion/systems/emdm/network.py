@@ -32,12 +32,7 @@ class GeneratorContext(NamedTuple):
 
 
 class LatentMlp(nn.Module):
-    """Linear layers, each with leaky ReLU, from a latent to a token.
-
-    Attributes:
-      width: Channels of the token.
-      depth: Layers.
-    """
+    """Linear layers, each with leaky ReLU, from a latent to a token."""
 
     width: int
     depth: int = 5
@@ -47,14 +42,7 @@ class LatentMlp(nn.Module):
         self.layers = [nn.Dense(self.width) for _ in range(self.depth)]
 
     def __call__(self, latent: Float[Array, "*batch latent"]) -> Float[Array, "..."]:
-        """The token.
-
-        Args:
-          latent: Draws of N(0, 1).
-
-        Returns:
-          One token each.
-        """
+        """The token of a latent drawn from N(0, 1)."""
         for layer in self.layers:
             latent = nn.leaky_relu(layer(latent), 0.2)
         return latent
@@ -64,15 +52,8 @@ class SequenceGenerator(nn.Module):
     """Predicts a whole clean motion from a noisy one, its step, a condition, a latent.
 
     Attributes:
-      features: Channels of a frame.
-      frames: Frames of a motion.
-      num_steps: T.
       condition: "action" (one-hot), "text" (a vector) or "none".
       latent: Channels of z; 0 for a deterministic denoiser.
-      width: Channels of a token.
-      depth: Encoder layers.
-      heads: Attention heads.
-      hidden: Channels of the feed-forward layers.
       dropout: Rate, after the positions and in every layer.
       frames_per_token: Frames of one token; 1 in the paper. Divides `frames`.
       token_margin: Frames beyond its own, on either side, that a token predicts and
@@ -140,9 +121,6 @@ class SequenceGenerator(nn.Module):
           keep: Where False the condition is zeroed before its linear layer, which is
             the null condition of classifier-free guidance.
           mask: Frames that count; tokens without any are not attended to.
-
-        Returns:
-          The context of `denoise`.
         """
         token = None
         if self.condition != "none":
@@ -163,17 +141,10 @@ class SequenceGenerator(nn.Module):
         *,
         train: bool = False,
     ) -> Float[Array, "*batch frames features"]:
-        """Prediction of the clean motion.
+        """The clean motion, predicted from step t in 1..T, one for all or per sample.
 
-        Args:
-          context: From `encode`.
-          x_t: Noisy features.
-          t: Step in 1..T, one for all or one a sample.
-          latent: Draws of N(0, 1); None for a deterministic denoiser.
-          train: Whether to drop; needs rngs={"dropout": key}.
-
-        Returns:
-          Predicted features x_0.
+        The latent is drawn from N(0, 1), None for a deterministic denoiser. Training,
+        with dropout, needs rngs={"dropout": key}.
         """
         batch = x_t.shape[:-2]
         own = [jnp.broadcast_to(blocks.row_of(context.steps, t), (*batch, self.width))]
@@ -212,36 +183,16 @@ class SequenceGenerator(nn.Module):
         *,
         train: bool = False,
     ) -> Float[Array, "*batch frames features"]:
-        """`encode`, then `denoise`; arguments as there.
-
-        Args:
-          x_t: Noisy features.
-          t: Step in 1..T.
-          condition: One-hot action or text vector.
-          keep: False for the null condition.
-          mask: Frames that count.
-          latent: Draws of N(0, 1), or None.
-          train: Whether to drop.
-
-        Returns:
-          Predicted features x_0.
-        """
+        """`encode`, then `denoise`; arguments as there."""
         context = self.encode(condition, keep, mask)
         return self.denoise(context, x_t, t, latent, train=train)
 
 
 def step_codes(num_steps: int, width: int) -> Float[Array, "steps {width}"]:
-    """Sinusoids of all steps, to be indexed by t: sines first, then cosines.
+    """Sinusoids of all steps 0..T, to be indexed by t: sines first, then cosines.
 
     Step t reads the code of t - 1, as the released code counts from 0; row 0 repeats
-    row 1.
-
-    Args:
-      num_steps: T.
-      width: Channels; even.
-
-    Returns:
-      One row a step 0..T.
+    row 1. The width is even.
     """
     half = width // 2
     rate = np.exp(-np.log(10000.0) * np.arange(half) / (half - 1))
@@ -253,11 +204,9 @@ class SequenceDiscriminator(nn.Module):
     """Logit that (x_{t-1}, x_t) is a pair of the data, given a condition.
 
     Attributes:
-      num_steps: T.
       width: Channels of the first two layers; the others have its half, half, quarter
         and sixteenth. A multiple of 64: norms have groups of 32 channels, as
         published. (Few channels a group would leave little to tell motions by.)
-      time_width: Channels of the step's embedding.
     """
 
     num_steps: int = 10
@@ -288,17 +237,7 @@ class SequenceDiscriminator(nn.Module):
         t: Int[Array, "*batch"],
         condition: Float[Array, "*batch condition"],
     ) -> Float[Array, "*batch"]:
-        """The network.
-
-        Args:
-          x_prev: Sample at step t - 1.
-          x_t: Sample at step t.
-          t: Step in 1..T.
-          condition: One-hot action or text vector; of width 0 for none.
-
-        Returns:
-          The logit.
-        """
+        """The logit of a pair at step t in 1..T; the condition has width 0 for none."""
         flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
         codes = step_codes(self.num_steps, self.time_width)[t]
         step = self.time_out(nn.leaky_relu(self.time_hidden(codes), 0.2))

@@ -33,17 +33,14 @@ _IGNORED = (
 def load(
     path: str | os.PathLike, *, frames: int, num_steps: int = 10, heads: int = 32
 ) -> tuple[emdm_model.Config, dict[str, Params]]:
-    """Reads released weights; runs no code of the file.
+    """Configuration and parameters, "generator" and perhaps "discriminator".
+
+    Reads released weights; runs no code of the file.
 
     Args:
-      path: The checkpoint.
       frames: Longest motion: 60 (HumanAct12), 196 (HumanML3D, KIT-ML).
       num_steps: T; a checkpoint does not say.
       heads: Attention heads of the generator; a checkpoint does not say.
-
-    Returns:
-      The configuration, and parameters under "generator" and, if the file has them,
-      "discriminator".
 
     Raises:
       FileNotFoundError: if there is no such file.

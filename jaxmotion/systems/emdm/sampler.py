@@ -26,8 +26,6 @@ class Model:
     """Everything but the generator's parameters.
 
     Attributes:
-      config: The method.
-      representation: What features mean.
       labels: Names of the actions.
       source: The data, and their license.
     """
@@ -68,11 +66,7 @@ def _representation(value: Any) -> Representation:
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
-    """Inverse of `to_json`.
-
-    Args:
-      value: The JSON object.
-      where: The file, for error messages.
+    """Inverse of `to_json`; `where` is the file, for messages.
 
     Raises:
       ValueError: names the file and the field that is missing or wrong.
@@ -110,9 +104,7 @@ def _check(model: Model, where: str) -> None:
 def load(path: Path, *, row: str = "emdm") -> tuple[Model, Params]:
     """Model and averaged parameters of a run folder or an exported file.
 
-    Args:
-      path: Run folder of `experiments/emdm.py train`, or file of its `export`.
-      row: Which model of a run folder.
+    The row says which model of a folder that `experiments/emdm.py train` made.
 
     Raises:
       CheckpointError: if the row was not trained, or the file is damaged.

@@ -43,7 +43,6 @@ class TextRun:
     """A run folder and its data.
 
     Attributes:
-      record: What the folder is.
       motions: Clips with captions.
       encoder: Encoder of sentences.
       vectors: Vectors of the captions' distinct sentences, as the networks take them.
@@ -90,9 +89,6 @@ def make_encoder(name: str, form: TextForm) -> text_encoder.TextEncoder:
 def check_words(texts: Sequence[str]) -> None:
     """Raises if a text is too long.
 
-    Args:
-      texts: Sentences.
-
     Raises:
       ValueError: names the text's number and length.
     """
@@ -121,9 +117,7 @@ def prepare(
     """Makes the text motions of a run folder, or loads those it has.
 
     Args:
-      folder: The run folder.
       data: One file of text motions, or files of labeled clips.
-      encoder: Encoder of sentences.
       form: How much of a text it reads, and how its vectors are scaled.
       unseen: Pairs "content/style" of labeled clips to keep for evaluation.
       least: Frames of the shortest labeled clip that gets a caption.
@@ -212,14 +206,7 @@ def _decode(record: runs.Run) -> TextRun:
 
 
 def encode(run: TextRun, texts: Sequence[str]) -> Float[Array, "texts channels"]:
-    """Vectors of new sentences as the networks of a run know them.
-
-    Args:
-      run: The run.
-      texts: Sentences.
-
-    Returns:
-      One row each.
+    """Vectors of new sentences, one row each, as the networks of a run know them.
 
     Raises:
       ValueError: if a text is empty or too long; names its number.
@@ -233,13 +220,7 @@ def make_task(
 ) -> emdm_training.Task:
     """What models of a run are trained on: features only, no joints (as in the paper).
 
-    Args:
-      run: The run.
-      base: Sizes and weights; features, frames and condition are set here.
-      frames: Longest motion.
-
-    Returns:
-      The task.
+    Features, frames (the longest motion) and condition of `base` are set here.
     """
     base = dataclasses.replace(
         base,
@@ -280,14 +261,9 @@ def make_task(
 def joints(
     run: TextRun, x: Float[Array, "*batch frames features"]
 ) -> Float[Array, "*batch frames joints 3"]:
-    """Joint positions of features in the network's units.
+    """Joint positions of z-scored features.
 
-    Args:
-      run: The run.
-      x: Z-scored features.
-
-    Returns:
-      Positions, meters (as published: KIT-ML's unit is its own).
+    Meters (as published: KIT-ML's unit is its own).
     """
     like = lambda v: jnp.asarray(v).reshape((1,) * (x.ndim - 1) + (-1,))  # noqa: E731
     raw = x * like(run.motions.std) + like(run.motions.mean)

@@ -62,8 +62,6 @@ class Evaluator:
     """A text-motion evaluator and how it reads features.
 
     Attributes:
-      params: Its parameters.
-      config: Its size.
       mean: Mean of the features as it was trained on them.
       std: Their standard deviation.
       name: What it is, for tables.
@@ -115,15 +113,6 @@ def train_evaluator(
     run: TextRun, *, frames: int, num_steps: int, seed: int
 ) -> Evaluator:
     """The run's evaluator, trained on its training clips if it is not there yet.
-
-    Args:
-      run: The run.
-      frames: Longest motion.
-      num_steps: Updates.
-      seed: Seeds parameters and batches.
-
-    Returns:
-      The evaluator.
 
     Raises:
       ValueError: if the folder's was trained otherwise; names the field.
@@ -185,14 +174,10 @@ def _pairs(key: Key, data: Any) -> text_motion_evaluator.Pairs:
 
 
 def load_glove(folder: Path) -> dict[str, np.ndarray]:
-    """Reads the word vectors that published weights were trained with.
+    """Word vectors of published weights, by word, for `matching.encode_tokens`.
 
-    Args:
-      folder: Has our_vab_data.npy [words, 300], our_vab_words.pkl (the words) and
-        our_vab_idx.pkl (row of each); nothing in the pickles is run.
-
-    Returns:
-      Vectors by word, for `matching.encode_tokens`.
+    The folder has our_vab_data.npy [words, 300], our_vab_words.pkl (the words) and
+    our_vab_idx.pkl (row of each); nothing in the pickles is run.
 
     Raises:
       ValueError: if a file is missing, damaged or does not fit the others; names it.
@@ -312,19 +297,13 @@ def embed(
     *,
     padding: text_motion_evaluator.Padding = "zeros",
 ) -> Float[Array, "batch embedding"]:
-    """Embeds motions, normalized anew as the evaluator expects.
+    """Embeds motions, normalized anew as the evaluator expects; one row each.
 
     Args:
-      run: The run.
-      evaluator: The evaluator.
       x: Z-scored features of the run.
-      frames: Frames of each motion.
-      padding: What the evaluator sees beyond a motion's end: "zeros", as beyond that
-        of real motions, or "kept", what is there, as the release does with generated
+      padding: What the evaluator sees beyond a motion's end: "zeros", as beyond that of
+        real motions, or "kept", what is there, as the release does with generated
         motions.
-
-    Returns:
-      One row each.
     """
     # At once, and not by way of the raw features, which would lose digits.
     wide = lambda v: np.asarray(v, np.float64)  # noqa: E731
@@ -344,11 +323,6 @@ def make_scorer(
     padding: text_motion_evaluator.Padding = "zeros",
 ) -> Callable[[Key, Array, Array, Array, frechet.Moments], dict[str, Array]]:
     """Scores of a set of motions, as one compiled program.
-
-    Args:
-      run: The run.
-      evaluator: The evaluator.
-      padding: As in `embed`.
 
     Returns:
       `score(key, x, frames, caption, reference) -> scores`: z-scored features, frames

@@ -47,9 +47,6 @@ SAMPLERS: dict[str, tuple[str, int]] = {"ddim_10": ("ddpm_1000", 10)}
 def check_rows(names: tuple[str, ...]) -> None:
     """Raises unless all are rows or samplers.
 
-    Args:
-      names: Names.
-
     Raises:
       ValueError: names the first unknown one and those there are.
     """
@@ -62,14 +59,7 @@ def check_rows(names: tuple[str, ...]) -> None:
 
 
 def row_config(base: Config, row: str) -> Config:
-    """Configuration of a row.
-
-    Args:
-      base: Configuration of the row "emdm".
-      row: Its name, or a sampler's.
-
-    Returns:
-      The configuration.
+    """Configuration of a row or of a sampler's, from that of the row "emdm".
 
     Raises:
       ValueError: if there is no such row.
@@ -81,13 +71,6 @@ def row_config(base: Config, row: str) -> Config:
 
 def ddim_steps(num_steps: int, count: int) -> tuple[int, ...]:
     """Steps that "ddimN" of guided-diffusion visits: 1, 1 + T/N, ..., never T itself.
-
-    Args:
-      num_steps: T.
-      count: N, which divides T.
-
-    Returns:
-      The steps, increasing.
 
     Raises:
       ValueError: if N does not divide T.
@@ -125,9 +108,7 @@ class Task:
     """What models are trained on, the same for all rows.
 
     Attributes:
-      run: The run folder.
       base: Configuration of the row "emdm".
-      data: Arrays on the device.
       batch: `(key, data, size) -> Batch`.
       geometry: For the losses of joints; None if there are none.
     """
@@ -150,7 +131,6 @@ def gan_update(
 
     Args:
       optimizers: The generator's and the discriminator's.
-      config: The method.
       geometry: See `emdm_loss.generator_loss`.
       ema: Decay of the generator's average.
 
@@ -189,11 +169,8 @@ def train_row(
 ) -> None:
     """Trains a row, from its newest checkpoint if there is one.
 
-    Args:
-      task: Data and configuration.
-      row: Its name.
-      generator: How long, and the generator's optimizer.
-      discriminator: The discriminator's optimizer; its steps are the generator's.
+    Of the discriminator's budget only the optimizer counts: its steps are the
+    generator's.
 
     Raises:
       ValueError: if the row has a checkpoint of other sizes or data.
@@ -242,12 +219,8 @@ def train_row(
 def import_row(task: Task, weights: Path, *, heads: int, num_steps: int) -> Config:
     """Puts the authors' weights into a run folder, as its row "emdm".
 
-    Args:
-      task: Its data; only what it is conditioned on and how it looks counts.
-      weights: These and the next two: see `emdm_published.load`.
-
-    Returns:
-      The configuration.
+    Of the task's data only what it is conditioned on and how it looks counts; for the
+    other arguments see `emdm_published.load`.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -271,11 +244,7 @@ def import_row(task: Task, weights: Path, *, heads: int, num_steps: int) -> Conf
 
 
 def load_row(run: runs.Run, row: str) -> tuple[Params, Config]:
-    """Averaged parameters of a row's generator, and its configuration.
-
-    Args:
-      run: The run folder.
-      row: Its name, or a sampler's.
+    """Averaged parameters of a row's (or sampler's) generator, and its configuration.
 
     Raises:
       CheckpointError: if the row was not trained here.
@@ -293,16 +262,7 @@ def load_row(run: runs.Run, row: str) -> tuple[Params, Config]:
 
 
 def row_sampler(params: Params, config: Config, row: str) -> emdm_model.Sample:
-    """The way a row samples.
-
-    Args:
-      params: Its generator's.
-      config: Its configuration.
-      row: Its name, or a sampler's.
-
-    Returns:
-      `sample(key, condition, *, scale=None)`.
-    """
+    """The way a row samples, `sample(key, condition, *, scale=None)`."""
     if row not in SAMPLERS:
         return emdm_model.sampler(params, config=config)
     steps = ddim_steps(config.num_steps, SAMPLERS[row][1])
@@ -314,14 +274,9 @@ GUIDANCE = {"action": 1.0, "text": 2.5, "none": 1.0}
 
 
 def guidance_scale(scale: float | None, *, task: TaskName) -> Array | None:
-    """Scale of classifier-free guidance as samplers take it.
+    """Scale of classifier-free guidance as samplers take it, by default the paper's.
 
-    Args:
-      scale: What was asked for; None for the paper's of the task.
-      task: What motions are made from.
-
-    Returns:
-      The scale; None for 1, which needs no second call of the network.
+    None for 1, which needs no second call of the network.
     """
     scale = GUIDANCE[task] if scale is None else scale
     return None if scale == 1.0 else jnp.float32(scale)
@@ -331,10 +286,6 @@ def sample_many(
     sample: emdm_model.Sample, *, chunk: int
 ) -> Callable[[Key, emdm_model.Condition, Array | None], Array]:
     """Samples of many conditions, in chunks that fit the cache, as one program.
-
-    Args:
-      sample: Sampler of one condition.
-      chunk: Conditions at a time.
 
     Returns:
       `run(key, conditions, scale) -> [conditions, frames, features]`, jitted; the

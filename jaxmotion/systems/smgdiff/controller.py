@@ -104,15 +104,9 @@ class PlayerState:
 
 
 def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerState:
-    """State of a player that has shown `past` and has no plan yet.
+    """State of a player that has shown `past` (world) and has no plan yet.
 
-    Args:
-      skeleton: The skeleton.
-      past: At least `config.past` displayed frames, world.
-      config: The method.
-
-    Returns:
-      The state; until the first plan it would go on with its mean velocity.
+    Until its first plan it would go on with its mean velocity.
 
     Raises:
       ValueError: if there are fewer frames.
@@ -143,16 +137,7 @@ def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerStat
 def plan_level(
     state: PlayerState, command: trajectory.Command, *, control: Control
 ) -> Int[Array, ""]:
-    """Whether a tick needs a plan.
-
-    Args:
-      state: The player's state.
-      command: What the user wants now.
-      control: Constants.
-
-    Returns:
-      0 for none, 1 for a plan.
-    """
+    """Whether a tick needs a plan: 0 for no, 1 for yes."""
     old = state.command
     changed = jnp.any(jnp.abs(old.velocity - command.velocity) > 1e-3)
     changed = changed | (old.label != command.label)
@@ -171,17 +156,7 @@ def wanted_trajectory(
 ) -> trajectory.Trajectory:
     """Steps 1a and 1b: the generated path, blended with the plan's own.
 
-    Args:
-      generate: From `smgdiff_trajectory`.
-      key: Consumed.
-      skeleton: The skeleton.
-      state: The player's state.
-      command: What the user wants.
-      config: The method.
-      control: Constants.
-
-    Returns:
-      The path of the next `config.future` frames, in the frame of the plan.
+    It has the next `config.future` frames, in the frame of the plan.
     """
     frame = smgdiff_scene.plan_frame(skeleton, state.past.motion)
     past = trajectory.root_trajectory(skeleton, state.past.motion)
@@ -218,21 +193,7 @@ def replan(
     config: Config,
     control: Control,
 ) -> PlayerState:
-    """Step 1: a new plan.
-
-    Args:
-      generate: From `smgdiff_trajectory`.
-      sample: From `smgdiff_guidance.sampler`.
-      key: Consumed.
-      state: The player's state.
-      command: What the user wants now.
-      representation: What features mean.
-      config: The method.
-      control: Constants.
-
-    Returns:
-      The state with the plan, none of it displayed yet.
-    """
+    """Step 1: a new plan, none of it displayed yet."""
     key_path, key_motion = jax.random.split(key)
     skeleton = representation.skeleton
     wanted = wanted_trajectory(
@@ -259,16 +220,8 @@ def join(
 ) -> Scene:
     """Step 1d: a chunk that starts where body and ball are displayed.
 
-    The ball keeps its velocity, too, unless a joint is near enough to push it.
-
-    Args:
-      past: Displayed frames, two at least.
-      chunk: The frames that follow.
-      representation: Says what may touch the ball, and its radius.
-      control: Durations of the seams.
-
-    Returns:
-      The chunk, its differences from what is displayed faded out.
+    Its differences from `past`, of at least two displayed frames, are faded out. The
+    ball keeps its velocity, too, unless a joint is near enough to push it.
     """
     fps = chunk.motion.fps
     shown = jax.tree.map(lambda x: x[-2:], past.motion)
@@ -290,15 +243,7 @@ def join(
 def advance(
     state: PlayerState, command: trajectory.Command
 ) -> tuple[PlayerState, Frame]:
-    """Step 2: displays the next frame.
-
-    Args:
-      state: The player's state.
-      command: What the user wants now.
-
-    Returns:
-      The next state, and what is displayed.
-    """
+    """Step 2: displays the next frame."""
     now = jax.tree.map(
         lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
     )
@@ -340,12 +285,6 @@ def controller(
     Args:
       generate: Paths: `smgdiff_trajectory.sampler`, or `straight`.
       sample: Plans: `smgdiff_guidance.sampler`.
-      representation: What features mean.
-      config: The method.
-      control: Constants; None for the defaults.
-
-    Returns:
-      A controller whose frames are `Frame`s.
 
     Raises:
       ValueError: if `control.apply` is not in 1..`config.future`.
@@ -436,18 +375,9 @@ def _tuning(method: Method) -> Tuning:
 def start_states(
     data: BallClips, model: Model, labels: np.ndarray, *, seed: int
 ) -> PlayerState:
-    """States of players that start with real frames of their skill.
+    """States of players that start with real frames of their skill, batch axis first.
 
     Each is moved so that it stands at the origin and faces +z.
-
-    Args:
-      data: Clips with a ball.
-      model: The model.
-      labels: Skill of each player.
-      seed: Seeds the choice of frames.
-
-    Returns:
-      States, batch axis first.
 
     Raises:
       ValueError: if a label is none of the model's, or a skill has no clip that is
@@ -479,14 +409,6 @@ def start_states(
 def own_states(model: Model, labels: np.ndarray, *, seed: int) -> PlayerState:
     """States of players that start with the model's own frames of their skill.
 
-    Args:
-      model: A model with `starts`.
-      labels: Skill of each player.
-      seed: Seeds the choice of frames.
-
-    Returns:
-      States, batch axis first.
-
     Raises:
       ValueError: if the model has no frames of its own, or no such skill.
     """
@@ -513,17 +435,10 @@ def load_run(path: Path) -> tuple[smgdiff_training.Run, Model, dict[str, Params]
 
 
 def own_starts(path: Path, *, number: int, seed: int = 0) -> Scene:
-    """Frames in which the players of a run stand: a start without a recorded frame.
+    """Frames in which a run's players stand (`Model.starts`), none of them recorded.
 
-    Players of each skill stand for twelve seconds; of sixteen the calmest are taken.
-
-    Args:
-      path: The run folder.
-      number: Starts per skill, 1 to 16.
-      seed: Seeds the recorded frames that they begin with, and the noise.
-
-    Returns:
-      `Model.starts`.
+    Players of each skill stand for twelve seconds; of sixteen the calmest `number` are
+    taken.
     """
     run, model, _ = load_run(path)
     character, skeleton = load_character(path), model.representation.skeleton

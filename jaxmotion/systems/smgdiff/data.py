@@ -21,12 +21,7 @@ FIELD = "skill"
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class SceneArrays:
-    """Clips with a ball, and where windows of them may start.
-
-    Attributes:
-      data: The clips.
-      index: The windows.
-    """
+    """Clips with a ball, and where windows of them may start."""
 
     data: BallClips
     index: windows.WindowIndex
@@ -48,10 +43,6 @@ def split(
       data: The clips; what stands before "@" or "#" in a name is its recording, of
         which a mirror image is one, too.
       fraction: Part of the recordings to hold out, in (0, 1).
-      seed: Seeds the choice.
-
-    Returns:
-      Both parts.
 
     Raises:
       ValueError: if the fraction is out of range, or a part would be empty.
@@ -75,15 +66,9 @@ def split(
 
 
 def scene_arrays(data: BallClips, length: int, *, stride: int = 1) -> SceneArrays:
-    """Lists the windows of clips; clips that are too short are left out.
+    """Lists windows of `length` frames; clips that are too short are left out.
 
-    Args:
-      data: The clips.
-      length: Frames of a window.
-      stride: Frames between the starts of windows of one clip.
-
-    Returns:
-      The clips with their windows.
+    Within a clip their starts are `stride` frames apart.
 
     Raises:
       ValueError: if no clip is long enough.
@@ -95,16 +80,7 @@ def scene_arrays(data: BallClips, length: int, *, stride: int = 1) -> SceneArray
 def sample_scenes(
     key: Key, arrays: SceneArrays, *, batch: int
 ) -> tuple[Scene, Int[Array, "{batch}"]]:
-    """Draws windows, uniformly over all starts.
-
-    Args:
-      key: Consumed.
-      arrays: The clips.
-      batch: Windows to draw.
-
-    Returns:
-      Windows, world, and their skills.
-    """
+    """Draws windows (world) and their skills, uniformly over all starts."""
     index = arrays.index
     chosen = jax.random.randint(key, (batch,), 0, index.starts.shape[0])
     return all_scenes(arrays, chosen)
@@ -114,15 +90,7 @@ def sample_scenes(
 def all_scenes(
     arrays: SceneArrays, chosen: Int[Array, " windows"]
 ) -> tuple[Scene, Int[Array, " windows"]]:
-    """Windows by number.
-
-    Args:
-      arrays: The clips.
-      chosen: Numbers of windows.
-
-    Returns:
-      Windows, world, and their skills.
-    """
+    """The chosen windows (world) and their skills."""
     index, data = arrays.index, arrays.data
     cut = jax.vmap(lambda start: cut_scene(data, start, index.length))
     labels = data.clips.labels[FIELD][index.clips[chosen]]
@@ -135,12 +103,8 @@ def fit_representation(
     """Fits the features' mean and deviation to windows spread over the clips.
 
     Args:
-      arrays: Training clips and windows of past and future frames.
-      past: Frames before the plan.
+      past: Frames of a window before the plan.
       windows_used: Windows to look at, at most.
-
-    Returns:
-      The representation.
     """
     number = arrays.index.starts.shape[0]
     chosen = np.unique(np.linspace(0, number - 1, windows_used).astype(int))
@@ -161,12 +125,8 @@ def fit_representation(
 
 
 def skill_speeds(data: BallClips) -> Float[np.ndarray, " skills"]:
-    """Median speed of the root in each skill: the speed to command it at.
+    """Median speed of the root in each skill, to command it at.
 
-    Args:
-      data: The clips.
-
-    Returns:
-      Meters per second; 0 for a skill without clips.
+    Meters per second; 0 for a skill without clips.
     """
     return np.asarray(label_speeds(data.clips, field=FIELD))

@@ -45,11 +45,6 @@ def plan_many(
 ) -> Callable[[Key, Condition], Scene]:
     """Plans for many conditions, as one compiled program.
 
-    Args:
-      plan: From `smgdiff_guidance.sampler`.
-      model: Says what features mean.
-      chunk: Plans at a time.
-
     Returns:
       `run(key, conditions) -> scenes` in the frames of the plans; condition i draws
       from `fold_in(key, i)`.
@@ -113,17 +108,9 @@ def make_setting(
     """Trains the evaluator and draws the windows.
 
     Args:
-      train: Training clips.
-      held_out: Held-out clips.
-      model: The model.
       number: Windows of either part, at most.
       replications: Sets of half of the held-out windows.
-      evaluator_steps: Updates of the evaluator.
-      seed: Seeds everything random.
       evaluator: A frozen evaluator; None to train one.
-
-    Returns:
-      The setting.
 
     Raises:
       ValueError: if clips are too short or few, or the evaluator does not fit.
@@ -159,13 +146,9 @@ def make_setting(
 def score_scenes(
     setting: Setting, scenes_of: Callable[[int, Array], Scene]
 ) -> list[dict[str, Float[Array, ""]]]:
-    """Scores of each replication.
+    """Scores of each replication's held-out windows, a dictionary each.
 
-    Args:
-      scenes_of: `(replication, windows) -> scenes` of those held-out windows.
-
-    Returns:
-      One dictionary a replication.
+    `scenes_of` maps a replication and its windows to scenes.
     """
     found = []
     for number, half in enumerate(setting.halves):
@@ -177,11 +160,7 @@ def score_scenes(
 
 
 def score_real(setting: Setting) -> list[dict[str, Float[Array, ""]]]:
-    """Scores of what really happened.
-
-    Returns:
-      One dictionary a replication.
-    """
+    """Scores of what really happened, a dictionary per replication."""
     future = setting.known.future
     return score_scenes(
         setting, lambda _, chosen: jax.tree.map(lambda x: x[chosen], future)
@@ -191,14 +170,7 @@ def score_real(setting: Setting) -> list[dict[str, Float[Array, ""]]]:
 def score_plans(
     setting: Setting, run: Callable[[Key, Condition], Scene]
 ) -> list[dict[str, Float[Array, ""]]]:
-    """Scores of plans.
-
-    Args:
-      run: From `plan_many`.
-
-    Returns:
-      One dictionary a replication.
-    """
+    """Scores of what `plan_many` runs, a dictionary per replication."""
     key = jax.random.key(setting.seed + 2)
 
     def scenes_of(number: int, chosen: Array) -> Scene:
@@ -222,15 +194,7 @@ def train_ball(
 ) -> Evaluator:
     """SMGDiff's evaluator of skills, of joints and ball.
 
-    Args:
-      train: Training clips.
-      held_out: Clips for its accuracy.
-      frames: Frames of a plan.
-      num_steps: Updates.
-      seed: Seeds parameters, batches and windows.
-
-    Returns:
-      The evaluator.
+    The held-out clips give its accuracy; `frames` is the length of a plan.
 
     Raises:
       ValueError: if clips are too short or too few.
@@ -324,14 +288,10 @@ def schedule_table(
     guided: Guidance,
     chunk: int,
 ) -> tuple[Rows, Places]:
-    """Table 4: where in the chain guidance acts.
+    """Table 4: where in the chain guidance acts, by names of `SCHEDULES`.
 
     Args:
-      run: The run.
-      names: Names of `SCHEDULES`.
-      steps: Motion model.
-      guided: Constants of the guidance.
-      chunk: Plans at a time.
+      steps: T of the motion model.
 
     Returns:
       The rows, and jerk and slide by place in a token.

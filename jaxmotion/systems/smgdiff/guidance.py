@@ -86,10 +86,6 @@ def on_schedule(guided: Guidance, name: str) -> Guidance:
 def segments(guided: Guidance, num_steps: int) -> tuple[tuple[bool, int, int], ...]:
     """Cuts a chain of T steps where guidance begins and ends.
 
-    Args:
-      guided: Says how many steps are guided at either end.
-      num_steps: T.
-
     Returns:
       (whether it is guided, first step, step of its result) of each segment, from T
       down to 0.
@@ -110,15 +106,9 @@ def segments(guided: Guidance, num_steps: int) -> tuple[tuple[bool, int, int], .
 def contact_objective(
     start: Float[Array, "3"], *, representation: Representation, guided: Guidance
 ) -> Objective:
-    """How far feet are from the ball where the ball is pushed.
+    """How far feet are from the ball where the ball is pushed, meters.
 
-    Args:
-      start: Where the ball was displayed last, in the frame of the plan, meters.
-      representation: What features mean.
-      guided: Thresholds and weights.
-
-    Returns:
-      Objective of a prediction's features, meters.
+    `start` is where the ball was displayed last, in the frame of the plan, meters.
 
     Source: SMGDiff, eq. 10-12.
     """
@@ -153,19 +143,14 @@ def sampler(
     step: chain.StepFactory = chain.ancestral_step,
     steps: tuple[int, ...] | None = None,
 ) -> SamplePlan:
-    """The sampler of plans; gradients are compiled into the guided segments only.
+    """The sampler of plans, `sample(key, condition) -> [future, features]`.
+
+    Gradients are compiled into the guided segments only.
 
     Args:
-      params: The network's parameters.
-      config: The method.
-      representation: What features mean.
-      guided: Where and how contact guidance acts.
       step: Makes the step of the unguided segments from the schedule and the denoiser;
         the default is the paper's.
       steps: Steps of the schedule to visit, increasing; None for all.
-
-    Returns:
-      `sample(key, condition) -> [future, features]`.
 
     Raises:
       ValueError: if more steps are guided than there are.

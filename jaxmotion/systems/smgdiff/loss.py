@@ -33,17 +33,11 @@ def situation(
     representation: Representation,
     config: Config,
 ) -> tuple[Condition, Float[Array, "future features"]]:
-    """What a plan is made for at a moment of a recording, and what then happened.
+    """What a plan is made for at a moment of a recording, and the future features.
 
     Args:
       window: Past and future frames, world.
       course: Path that is wanted in each of them, world.
-      label: Skill.
-      representation: What features mean.
-      config: The method.
-
-    Returns:
-      The condition, and the features of the future.
     """
     last = config.past - 1
     past = jax.tree.map(lambda x: x[: config.past], window)
@@ -68,18 +62,7 @@ def example(
     representation: Representation,
     config: Config,
 ) -> tuple[Condition, Float[Array, "future features"]]:
-    """One training example from one window: its path as a user might have asked for it.
-
-    Args:
-      key: Consumed.
-      window: Past and future frames, world.
-      label: Skill.
-      representation: What features mean.
-      config: The method.
-
-    Returns:
-      The condition, and the features of the future.
-    """
+    """One training example from one window (world), as a user might have asked."""
     course = trajectory.root_trajectory(representation.skeleton, window.motion)
     wanted = smooth_course(key, course, last=config.past - 1)
     return situation(
@@ -95,17 +78,9 @@ def loss(
     representation: Representation,
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The training loss of a batch of windows.
+    """The weighted sum of a batch's losses, and its terms by name, unweighted.
 
-    Args:
-      params: The network's parameters.
-      key: Consumed.
-      batch: Windows of `config.window` frames, and their skills.
-      representation: What features mean.
-      config: The method.
-
-    Returns:
-      The weighted sum, and its terms by name, unweighted.
+    The batch has windows of `config.window` frames, and their skills.
 
     Source: SMGDiff, eq. 4-9.
     """
@@ -156,18 +131,10 @@ def loss_terms(
     *,
     representation: Representation,
 ) -> dict[str, Float[Array, ""]]:
-    """The losses: data, velocity, position, position_velocity, foot, and of the ball.
+    """Unweighted means: data, velocity, position, position_velocity, foot, of the ball.
 
     A foot stands where the data say so. The ball's place is a quotient whose error
     grows without bound at the reach: it counts while the ball is nearer than that.
-
-    Args:
-      prediction: Predicted features.
-      target: True features.
-      representation: What features mean.
-
-    Returns:
-      Each unweighted mean.
 
     Source: SMGDiff, eq. 6-9; position_velocity from CAMDM; those of the ball are ours.
     """

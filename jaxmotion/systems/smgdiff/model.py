@@ -40,13 +40,8 @@ class Config:
       num_labels: Skills.
       past: Past frames of the condition.
       future: Frames of a sample.
-      fps: Frames per second.
       num_steps: T of the cosine schedule.
       width: Channels of a token (CAMDM's).
-      depth: Layers.
-      heads: Attention heads.
-      hidden: Channels of the feed-forward layers.
-      dropout: Rate.
       frames_per_token: Frames of one token; ours, 1 in CAMDM.
       token_margin: Frames beyond its own, on either side, that an output token predicts
         and shares with its neighbors; ours, 0 in the paper.
@@ -126,11 +121,7 @@ class Condition:
     ball: Float[Array, "*batch 3"]
 
     def arguments(self) -> tuple[Array, ...]:
-        """The network's arguments after x_t and t.
-
-        Returns:
-          past, path, facing (6D), label, and that the past is kept.
-        """
+        """Past, path, facing (6D), label, and that the past is kept."""
         facing = rotation.rot6d_from_matrix(
             rotation.matrix_from_facing(self.trajectory.facing)
         )
@@ -139,14 +130,7 @@ class Condition:
 
 
 def network(config: Config) -> transformer.CamdmTransformer:
-    """The denoiser's Flax module: CAMDM's.
-
-    Args:
-      config: Its sizes.
-
-    Returns:
-      A module with methods `encode`, `denoise` and their composition.
-    """
+    """The denoiser's Flax module: CAMDM's, with methods `encode` and `denoise`."""
     names = {field.name for field in dataclasses.fields(transformer.CamdmTransformer)}
     sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
     return transformer.CamdmTransformer(features=config.num_features, **sizes)
@@ -154,15 +138,7 @@ def network(config: Config) -> transformer.CamdmTransformer:
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
-    """Initial parameters.
-
-    Args:
-      key: Consumed.
-      config: The architecture.
-
-    Returns:
-      Parameters of `network(config)`.
-    """
+    """Initial parameters."""
     line = Trajectory(
         position=jnp.zeros((config.future, 2)), facing=jnp.ones((config.future, 2))
     )
@@ -187,7 +163,6 @@ class Model:
     Attributes:
       config: Config of the motion model.
       paths: Config of the trajectory generator.
-      representation: What features mean.
       labels: Names of the skills.
       speeds: Median speed of the root in each skill, meters per second.
       source: The data, and its license.
@@ -206,14 +181,7 @@ class Model:
 
 
 def to_json(model: Model) -> dict[str, Any]:
-    """JSON of a model.
-
-    Args:
-      model: The model.
-
-    Returns:
-      A JSON object.
-    """
+    """JSON of a model."""
     features = model.representation
     value = {
         "system": SYSTEM,
@@ -291,14 +259,7 @@ def _representation(value: Any) -> Representation:
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
-    """Inverse of `to_json`.
-
-    Args:
-      value: The JSON object.
-      where: The file, for error messages.
-
-    Returns:
-      The model.
+    """Inverse of `to_json`; `where` is the file, for messages.
 
     Raises:
       ValueError: names the file and the field that is missing or wrong.

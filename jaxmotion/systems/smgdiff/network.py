@@ -21,15 +21,6 @@ class TrajectoryGenerator(nn.Module):
     """The denoiser of paths: (x, z) and facing (x, z) of each frame.
 
     Attributes:
-      past: Past frames.
-      future: Frames to predict.
-      num_labels: Skills.
-      num_steps: T.
-      width: Channels of a token.
-      depth: Encoder layers.
-      heads: Attention heads.
-      hidden: Channels of the feed-forward layers.
-      frames_per_token: Frames of one token.
       token_margin: As in `transformer.CamdmTransformer`.
       token_window: The same.
     """
@@ -68,17 +59,9 @@ class TrajectoryGenerator(nn.Module):
         target: Float[Array, "*batch 2"],
         label: Int[Array, "*batch"],
     ) -> Float[Array, "*batch future 4"]:
-        """Prediction of the clean path.
+        """The clean path, predicted from step t in 1..T.
 
-        Args:
-          x_t: Noisy future path.
-          t: Step in 1..T.
-          past: Displayed path.
-          target: Where the user points to: wanted velocity times one second, meters.
-          label: Skill.
-
-        Returns:
-          Predicted path x_0.
+        `target` is where the user points to: wanted velocity times one second, meters.
         """
         n, batch = self.frames_per_token, x_t.shape[:-2]
         time = jnp.broadcast_to(

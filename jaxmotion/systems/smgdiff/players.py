@@ -46,12 +46,7 @@ Play = Callable[[Key, EvalWindows], Scene]
 def wishes(known: EvalWindows, model: Model) -> Wish:
     """What users would have asked for: the mean velocity of what was recorded.
 
-    Args:
-      known: Moments of recordings.
-      model: The model.
-
-    Returns:
-      Wishes in the frames of the plans.
+    In the frames of the plans.
     """
     skeleton, config = model.representation.skeleton, model.config
 
@@ -79,13 +74,9 @@ def player(
     """Rollouts of players that keep their first command, as one compiled program.
 
     Args:
-      generate: Paths.
-      plan: Plans.
-      model: The model.
       ticks: Frames of a rollout.
       repeats: Players of each start.
       chunk: Players at a time, at most (the largest number that divides theirs).
-      control: Constants of the run-time; None for the defaults.
 
     Returns:
       `play(key, known) -> scenes` [players, ticks, ...]; those of one start are
@@ -144,17 +135,15 @@ def _commanded(velocity: Array, *, future: int, fps: float) -> trajectory.Trajec
 def score_players(
     setting: Setting, model: Model, play: Play, *, repeats: int, starts: int
 ) -> list[dict[str, Float[Array, ""]]]:
-    """Scores of steered players: their second plan's length on, in windows of a plan.
+    """Scores of steered players, a dictionary per replication.
+
+    They are scored from their second plan on, in windows of a plan's length;
+    "pose_variance" is the variance of joints over players of one start, in the world.
 
     Args:
-      model: The model.
       play: From `player`, of two plans' length or more.
       repeats: Players of each start.
       starts: Starts of a replication.
-
-    Returns:
-      One dictionary a replication; "pose_variance" is the variance of joints over
-      players of one start, in the world.
     """
     key, future = jax.random.key(setting.seed + 3), model.config.future
     spread = jax.jit(lambda scene: _diversity(scene, model, repeats))
@@ -208,11 +197,8 @@ def path_spread(
     """How much paths vary at a fixed input, beside how much people's do.
 
     Args:
-      key: Consumed.
-      generate: Paths.
       known: Moments of held-out recordings.
       seen: Moments of recordings among which similar inputs are looked for.
-      model: The model.
       repeats: Paths of each wish, and similar inputs of each.
 
     Returns:
@@ -257,14 +243,7 @@ def path_spread(
 
 
 def straight(model: Model) -> SamplePath:
-    """The straight path of a model's lengths.
-
-    Args:
-      model: The model.
-
-    Returns:
-      As `smgdiff_trajectory.sampler`.
-    """
+    """The straight path of a model's lengths, for `smgdiff_trajectory.sampler`."""
     config = model.config
     return functools.partial(
         smgdiff_trajectory.straight, future=config.future, fps=config.fps
@@ -295,12 +274,9 @@ def path_table(
     """Table 2: steered players with and without generated paths and guidance.
 
     Args:
-      run: The run.
-      steps: Motion model.
-      guided: Constants of the guidance.
+      steps: T of the motion model.
       starts: Starts of players of a replication.
       repeats: Players of each start.
-      chunk: Players at a time.
 
     Returns:
       The rows, and how much each generator's paths vary (`path_spread`).
@@ -353,14 +329,6 @@ def skill_commands(
 ) -> trajectory.Command:
     """Each skill at its own speed, for an equal time, with turns to either side.
 
-    Args:
-      model: The model.
-      skills: In this order.
-      seconds: Length.
-
-    Returns:
-      One command a tick.
-
     Raises:
       ValueError: if the model has no such skill, or there is less than a tick of each.
     """
@@ -400,12 +368,9 @@ def play_one(
     """One player that starts with training frames of its first command's skill.
 
     Args:
-      run: The run.
       commands: One a tick.
-      steps: Motion model.
+      steps: T of the motion model.
       paths: As in `path_sampler`.
-      guided: Contact guidance.
-      seed: Seeds the start and the noise.
     """
     model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
     driver = smgdiff_controller.controller(

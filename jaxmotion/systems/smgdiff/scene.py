@@ -33,9 +33,7 @@ class Representation:
 
     Attributes:
       skeleton: The skeleton; its feet are what stands on the ground.
-      normalizer: Mean and deviation of the features.
       joints: Joints that may touch the ball.
-      fps: Frames per second.
       radius: Radius of the ball, meters.
       reach: Distance at which the ball fades out of the features, meters (paper 2).
       contact_speed: A foot slower than this stands, meters per second.
@@ -53,14 +51,9 @@ class Representation:
 def feature_layout(
     skeleton: Skeleton, joints: tuple[int, ...]
 ) -> features.FeatureLayout:
-    """Names of the slices of a frame: 147 + 7 + 8 for SMPL with four feet.
+    """The slices root, rotations, ball, ground and touch of a frame.
 
-    Args:
-      skeleton: The skeleton.
-      joints: Joints that may touch the ball.
-
-    Returns:
-      root, rotations, ball, ground, touch.
+    They have 147 + 7 + 8 numbers for SMPL with four feet; `joints` may touch the ball.
 
     Source: SMGDiff, section 3.
     """
@@ -106,14 +99,10 @@ def fit(
     """Mean of each feature, and one deviation for those of a kind.
 
     Args:
-      skeleton: The skeleton.
       scenes: Windows of the training data, batch first, seen from `plan_frame`.
-      joints: Joints that may touch the ball.
-      radius: Radius of the ball, meters.
+      joints: Those that may touch the ball.
+      radius: Of the ball, meters.
       floor: Least deviation, in the features' units.
-
-    Returns:
-      The representation.
     """
     size = feature_layout(skeleton, joints).size
     unit = features.Normalizer(mean=jnp.zeros(size), std=jnp.ones(size))
@@ -141,43 +130,19 @@ def fit(
 
 
 def plan_frame(skeleton: Skeleton, past: Motion) -> PlanarFrame:
-    """Frame of the next plan: at the last displayed pose, +z where it faces.
-
-    Args:
-      skeleton: The skeleton.
-      past: Displayed poses, world.
-
-    Returns:
-      The frame.
-    """
+    """Frame of the next plan: at the last displayed pose (world), +z where it faces."""
     last = jax.tree.map(lambda x: x[-1:], past)
     here = root_trajectory(skeleton, last)
     return PlanarFrame(origin=here.position[0], facing=here.facing[0])
 
 
 def to_frame(scene: Scene, frame: PlanarFrame) -> Scene:
-    """A world scene seen from a ground frame.
-
-    Args:
-      scene: World.
-      frame: One for the whole scene.
-
-    Returns:
-      The scene in that frame.
-    """
+    """A world scene seen from a ground frame, one for the whole scene."""
     return _move(scene, features.to_frame(scene.motion, frame), frame, out=False)
 
 
 def from_frame(scene: Scene, frame: PlanarFrame) -> Scene:
-    """Inverse of `to_frame`.
-
-    Args:
-      scene: In the frame.
-      frame: One for the whole scene.
-
-    Returns:
-      The scene in the world.
-    """
+    """Inverse of `to_frame`: the scene in the world."""
     return _move(scene, features.from_frame(scene.motion, frame), frame, out=True)
 
 
@@ -190,16 +155,10 @@ def _move(scene: Scene, motion: Motion, frame: PlanarFrame, *, out: bool) -> Sce
 def to_features(
     scene: Scene, representation: Representation
 ) -> Float[Array, "*batch frames features"]:
-    """Features of a scene in the frame of a plan.
+    """Features, in the network's units, of a scene in the frame of a plan.
 
-    Contacts with the ground and the ball's velocity come from the frames that are
-    given, so the first and the last differ from those of a longer scene.
-
-    Args:
-      scene: In that frame; at least two frames.
-
-    Returns:
-      Features in the network's units.
+    Contacts with the ground and the ball's velocity come from the (at least two) frames
+    that are given, so the first and the last differ from those of a longer scene.
     """
     return features.normalize(representation.normalizer, _raw(scene, representation))
 
@@ -212,13 +171,9 @@ def _parts(x: Array, representation: Representation) -> dict[str, Array]:
 def to_motion(
     x: Float[Array, "*batch frames features"], representation: Representation
 ) -> Motion:
-    """The person of some features; rotations are made orthonormal.
+    """The person of some features, in the frame of the plan.
 
-    Args:
-      x: Features, perhaps from a network.
-
-    Returns:
-      The motion in the frame of the plan.
+    Rotations are made orthonormal, so features may come from a network.
     """
     parts = _parts(x, representation)
     rot6d = parts["rotations"].reshape(*x.shape[:-1], -1, 6)
@@ -234,15 +189,10 @@ def to_scene(
     start: Float[Array, "*batch 3"],
     representation: Representation,
 ) -> tuple[Scene, Float[Array, "*batch frames feet"]]:
-    """Inverse of `to_features`.
+    """Inverse of `to_features`, in the frame of the plan, and which feet stand.
 
-    Args:
-      x: Features, perhaps from a network.
-      start: Where the ball was in the frame before the first, meters.
-
-    Returns:
-      The scene in the frame of the plan, and which feet stand; both kinds of contact
-      lie in 0..1.
+    Both kinds of contact lie in 0..1. Features may come from a network; `start` is
+    where the ball was in the frame before the first, meters.
     """
     parts = _parts(x, representation)
     place = ball.decode_ball(parts["ball"], parts["root"], start, representation.fps)

@@ -51,10 +51,7 @@ class SkillEvaluator:
     """A trained evaluator of skills, and what real windows look like to it.
 
     Attributes:
-      params: Its parameters.
       reference: Moments of its features over windows of training clips.
-      representation: Says what the skeleton and the ball are.
-      config: Its size.
     """
 
     params: Params
@@ -68,11 +65,7 @@ def evaluator_input(
 ) -> Float[Array, "*batch frames channels"]:
     """Joints and ball relative to the root, turned to face +z, in each frame.
 
-    Args:
-      scene: Frames.
-
-    Returns:
-      Meters; three channels a joint, and three of the ball, no longer than the reach.
+    Meters; three channels a joint, and three of the ball, no longer than the reach.
     """
     skeleton = representation.skeleton
     joints = style_evaluator.window_input(skeleton, scene.motion)
@@ -94,18 +87,11 @@ def make_evaluator(
     num_steps: int,
     frozen: Params | None = None,
 ) -> SkillEvaluator:
-    """Trains an evaluator of skills on real windows.
+    """Trains an evaluator of skills on real windows, which are its reference, too.
 
     Args:
-      key: Consumed.
       scenes: Windows of training clips, as long as those that are to be scored.
-      labels: Their skills.
-      num_labels: Skills.
-      num_steps: Updates.
       frozen: Parameters of one that was trained before; None to train one.
-
-    Returns:
-      The evaluator; the same windows are its reference.
     """
     config = style_evaluator.Config(
         num_classes=num_labels,
@@ -134,10 +120,6 @@ Score = Callable[..., dict[str, Float[Array, ""]]]
 
 def scorer(evaluator: SkillEvaluator, limits: Thresholds) -> Score:
     """Scores of a set of windows, as one compiled program.
-
-    Args:
-      evaluator: From `make_evaluator`.
-      limits: Where a touch begins.
 
     Returns:
       `score(scenes, wanted, labels) -> scores`: wanted is a path (world or frame of the
@@ -191,13 +173,8 @@ def contact_scores(
 ) -> dict[str, Float[Array, ""]]:
     """How well foot and ball go together.
 
-    Args:
-      scenes: Windows.
-      limits: Where a touch begins.
-
-    Returns:
-      Touches and missed ones a minute, missed part of the touches, distance at touches,
-      penetration of the ground and of the ball, acceleration without a touch.
+    Touches and missed ones per minute, missed part of the touches, distance at touches,
+    penetration of the ground and of the ball, acceleration without a touch.
     """
     skeleton, fps = representation.skeleton, representation.fps
     joints = jnp.array(representation.joints)
@@ -246,16 +223,7 @@ class EvalWindows:
 def eval_windows(
     data: BallClips, model: Model, *, number: int, seed: int
 ) -> EvalWindows:
-    """Moments spread at random over clips.
-
-    Args:
-      data: The clips.
-      model: The model; windows have its lengths.
-      number: How many, at most.
-      seed: Seeds the choice.
-
-    Returns:
-      The moments.
+    """At most `number` moments spread at random over clips, of the model's lengths.
 
     Raises:
       ValueError: if no clip is long enough, or there are fewer than 4 moments.
@@ -302,14 +270,9 @@ def _eval_windows(scenes: Scene, labels: Array, representation, config) -> EvalW
 def limits(data: BallClips, model: Model) -> Thresholds:
     """Thresholds of the figures, from real clips.
 
-    Args:
-      data: Training clips.
-      model: The model.
-
-    Returns:
-      Feet: where toes rest (their first percentile) and one centimeter more. Touches:
-      the ball's radius and 7 cm (half a foot, and 2 cm); and an acceleration of 12
-      meters per second squared, a change of 0.4 m/s within a frame of 1/30 s.
+    Feet: where toes rest (their first percentile) and one centimeter more. Touches: the
+    ball's radius and 7 cm (half a foot, and 2 cm); and an acceleration of 12 meters per
+    second squared, a change of 0.4 m/s within a frame of 1/30 s.
     """
     feet = jnp.array(model.representation.skeleton.feet)
     motion = Motion(

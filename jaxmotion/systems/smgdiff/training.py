@@ -27,8 +27,6 @@ class Run:
     """A run folder, its model and its data.
 
     Attributes:
-      record: What the folder is.
-      model: The model.
       train: Clips that it was trained on.
       held_out: Clips that it never saw.
     """
@@ -42,15 +40,12 @@ class Run:
 def make_model(
     data: BallClips, *, sizes: dict[str, Any], paths: dict[str, Any] | None = None
 ) -> Model:
-    """A model for clips with a ball.
+    """A model for clips with a ball, its features standardized on them.
 
     Args:
       data: Training clips; their skeleton, rate, skills and source become the model's.
       sizes: Fields of `smgdiff.Config`, but for those that the clips decide.
       paths: The same of `smgdiff_trajectory.Config`.
-
-    Returns:
-      The model, its features standardized on the clips.
 
     Raises:
       ValueError: if no clip is as long as a window.
@@ -80,13 +75,7 @@ def make_model(
 
 
 def check_stage_name(stage: str) -> tuple[str, int]:
-    """Raises unless a stage has a kind and a number of steps.
-
-    Args:
-      stage: "motion_8", "paths_1", ...
-
-    Returns:
-      "motion" or "paths", and T.
+    """Kind ("motion" or "paths") and T of a stage such as "motion_8" or "paths_1".
 
     Raises:
       ValueError: if there is no such stage.
@@ -101,14 +90,7 @@ def check_stage_name(stage: str) -> tuple[str, int]:
 
 
 def with_steps(model: Model, stage: str) -> Model:
-    """The model with the number of steps that a stage's name says.
-
-    Args:
-      model: The model.
-      stage: "motion_8", "paths_1", ...
-
-    Returns:
-      The model, with that T in that stage.
+    """The model with the number of steps that a stage such as "motion_8" says.
 
     Raises:
       ValueError: if there is no such stage.
@@ -129,12 +111,8 @@ def prepare(
 ) -> Run:
     """Makes model and clips of a run folder, or loads those it has.
 
-    Args:
-      folder: The run folder.
-      data: Clips with a ball.
-      held_out: Part of the recordings to hold out.
-      sizes: As `make_model` takes them.
-      paths: As `make_model` takes them.
+    Sizes and paths are as `make_model` takes them; `held_out` is the part of the
+    recordings to hold out.
 
     Raises:
       OSError: if the clips cannot be read.
@@ -200,14 +178,7 @@ def init_stage(key: Key, model: Model, stage: str) -> Params:
 
 
 def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
-    """Averaged parameters of a stage.
-
-    Args:
-      run: The run.
-      stage: "motion_8", "paths_1", ...
-
-    Returns:
-      The model with the stage's number of steps, and the parameters.
+    """The model with a stage's number of steps, and the stage's averaged parameters.
 
     Raises:
       CheckpointError: if the stage was not trained, or with other sizes.
@@ -254,13 +225,9 @@ DRAFT = dict(
 def train_stage(
     run: Run, stage: str, *, budget: runs.Budget, draft_steps: int = 0
 ) -> None:
-    """Trains a stage, from its newest checkpoint if there is one.
+    """Trains a stage such as "motion_8", from its newest checkpoint if there is one.
 
-    Args:
-      run: The run.
-      stage: "motion_8", "paths_1", ...
-      budget: How long.
-      draft_steps: Updates of a motion model before these, with the weights `DRAFT`.
+    A motion model first gets `draft_steps` updates with the weights `DRAFT`.
 
     Raises:
       ValueError: if there is no such stage, or its checkpoint has other settings.

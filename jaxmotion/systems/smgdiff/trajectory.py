@@ -37,11 +37,6 @@ class Config:
       past: Displayed frames that are seen.
       future: Frames of a path.
       num_steps: T (paper 1).
-      width: Channels of a token.
-      depth: Layers.
-      heads: Attention heads.
-      hidden: Channels of the feed-forward layers.
-      frames_per_token: Frames of one token.
       token_margin: Frames beyond its own, on either side, that an output token predicts
         and shares with its neighbors; ours, 0 in the paper.
       token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
@@ -85,14 +80,7 @@ SamplePath = Callable[[Key, Wish], trajectory.Trajectory]
 
 
 def network(config: Config) -> TrajectoryGenerator:
-    """The denoiser's Flax module.
-
-    Args:
-      config: Its sizes.
-
-    Returns:
-      The module.
-    """
+    """The denoiser's Flax module."""
     names = {field.name for field in dataclasses.fields(TrajectoryGenerator)}
     sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
     return TrajectoryGenerator(**sizes)
@@ -100,15 +88,7 @@ def network(config: Config) -> TrajectoryGenerator:
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
-    """Initial parameters.
-
-    Args:
-      key: Consumed.
-      config: The architecture.
-
-    Returns:
-      Parameters of `network(config)`.
-    """
+    """Initial parameters."""
     x_t, past = (jnp.zeros((n, CHANNELS)) for n in (config.future, config.past))
     t, label = jnp.ones((), jnp.int32), jnp.zeros((), jnp.int32)
     return network(config).init(key, x_t, t, past, jnp.zeros(2), label)["params"]
@@ -137,17 +117,7 @@ def example(
     *,
     config: Config,
 ) -> tuple[Wish, trajectory.Trajectory]:
-    """One training example: the wish is the mean velocity of what then happened.
-
-    Args:
-      skeleton: The skeleton.
-      window: Past and future frames, world.
-      label: Skill.
-      config: The method.
-
-    Returns:
-      The wish, and the path of the future.
-    """
+    """The wish (mean velocity of what happened) and the path of a window (world)."""
     course = trajectory.root_trajectory(skeleton, window)
     last = config.past - 1
     here = trajectory.PlanarFrame(
@@ -171,17 +141,7 @@ def loss(
     skeleton: Skeleton,
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Error of the path and of its displacements.
-
-    Args:
-      params: The network's parameters.
-      key: Consumed.
-      batch: Windows, and their skills.
-      skeleton: The skeleton.
-      config: The method.
-
-    Returns:
-      The weighted sum, and its terms by name.
+    """Weighted error of the path and of its displacements, and its terms by name.
 
     Source: SMGDiff, eq. 3.
     """
@@ -207,11 +167,7 @@ def loss(
 def sampler(
     params: Params, *, config: Config, step: chain.StepFactory = chain.ancestral_step
 ) -> SamplePath:
-    """The sampler of paths.
-
-    Returns:
-      `sample(key, wish) -> path` in the frame of the last displayed pose.
-    """
+    """The sampler of paths, in the frame of the last displayed pose."""
 
     def sample(key: Key, wish: Wish) -> trajectory.Trajectory:
         def denoise(key: Key, x_t: Array, t: Array) -> Array:
@@ -231,14 +187,7 @@ def sampler(
 def straight(key: Key, wish: Wish, *, future: int, fps: float) -> trajectory.Trajectory:
     """The path without a generator: straight to the target, facing along it.
 
-    Args:
-      key: Unused; there so that it can stand for a generator.
-      wish: What the user wants.
-      future: Frames.
-      fps: Frames per second.
-
-    Returns:
-      The path. Where the user wants to stand, the facing stays.
+    Where the user wants to stand, the facing stays. The key is not used.
 
     Source: SMGDiff, section 5.2 ("w/o TGM").
     """
