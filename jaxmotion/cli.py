@@ -112,10 +112,7 @@ LIMITS: dict[str, Range] = {
 
 
 def check(args: Arguments) -> Arguments:
-    """Raises for an option out of range, before any work.
-
-    Args:
-      args: Dataclass of a command line; None stands for a default.
+    """Raises for an option out of range, before any work; None stands for a default.
 
     Raises:
       ValueError: names the option, its value and what is expected.
@@ -134,14 +131,7 @@ def check(args: Arguments) -> Arguments:
 
 
 def given(kind: type, args: Any) -> dict[str, Any]:
-    """Options that are fields of a settings dataclass too, but for those that are None.
-
-    Args:
-      kind: A dataclass of the library.
-
-    Returns:
-      Values by name, for `kind(**...)`.
-    """
+    """Values by name, for `kind(**...)`: options that are its fields, but for None."""
     names = {field.name for field in dataclasses.fields(kind)}
     return {k: x for k, x in vars(args).items() if k in names and x is not None}
 
@@ -206,9 +196,8 @@ def join_processes(distributed: tuple[str, ...]) -> None:
 def part_processes() -> bool:
     """Ends the company of `join_processes`, when the work that they share is done.
 
-    Returns:
-      Whether this is the first process, whose JAX has its own devices alone from here
-      on; arrays made before are gone. The others have nothing left to do.
+    True for the first process, whose JAX has its own devices alone from here on; arrays
+    made before are gone. The others have nothing left to do.
     """
     first = jax.process_index() == 0
     if jax.distributed.is_initialized():
@@ -218,11 +207,9 @@ def part_processes() -> bool:
 
 
 def announce(what: str, seconds: int) -> None:
-    """Says what a silence is for.
+    """Says what a silence is for, such as "compiling the rollout".
 
-    Args:
-      what: Such as "compiling the rollout".
-      seconds: How long it takes on two CPU cores.
+    It takes so many seconds on two CPU cores.
     """
     print(f"{what}, about {seconds} s", file=sys.stderr, flush=True)
 

@@ -107,10 +107,7 @@ def write_arrays(
 
 
 def read_object(path: str | os.PathLike, *, what: str) -> dict[str, Any]:
-    """JSON object of a file.
-
-    Args:
-      what: What it is, or who writes it, for messages.
+    """JSON object of a file; `what` is what it is, or who writes it, for messages.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -148,10 +145,7 @@ def _check_sizes(members: list[zipfile.ZipInfo], archive_bytes: int) -> None:
 def read_members(
     path: str | os.PathLike, wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, bytes]]:
-    """Names and contents of members of a zip, sorted by name.
-
-    Args:
-      wanted: Which members, by their names.
+    """Names and contents of the wanted members of a zip, sorted by name.
 
     Raises:
       OSError: if it cannot be read.
@@ -193,13 +187,10 @@ def read_arrays(
     what: str,
     only: Collection[str] | None = None,
 ) -> dict[str, np.ndarray]:
-    """All arrays of an npz file without pickles.
+    """All arrays of an npz file, a path or its content, without pickles.
 
-    Args:
-      file: Its path, or its content.
-      name: Its path, for messages.
-      what: What it holds, for messages.
-      only: Fields to read, of those that are there; None for all.
+    The name (its path) and what it holds are for messages; only some fields may be
+    read.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -234,10 +225,8 @@ def read_versioned(
 ) -> dict[str, np.ndarray]:
     """Arrays of a file that states its format and version, each of the expected kind.
 
-    Args:
-      wanted: For each field the kind of its numbers ("f" float, "i" integer, "U" text)
-        and how many axes it has.
-      what: What the file holds, for messages.
+    For each field is wanted the kind of its numbers ("f" float, "i" integer, "U" text)
+    and how many axes it has; what the file holds is for messages.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -266,11 +255,7 @@ def read_versioned(
 def check_fields(
     path: str, fields: Mapping[str, np.ndarray], wanted: Mapping[str, tuple[str, int]]
 ) -> None:
-    """Raises unless all arrays are there and of the expected kind.
-
-    Args:
-      path: The file, for messages.
-      wanted: For each field the kind of its numbers and how many axes it has.
+    """Raises unless all arrays are there and of the wanted kind and number of axes.
 
     Raises:
       ValueError: names the file and the field.

@@ -86,12 +86,10 @@ def write_table(
     report: dict[str, Any],
     notes: tuple[str, ...] = (),
 ) -> None:
-    """Writes metrics.json and table.md, and prints the table.
+    """Writes metrics.json and table.md (folder made if missing), prints the table.
 
-    Args:
-      folder: Where to; made if missing.
-      report: What belongs beside it: arguments, versions, hardware, bounds.
-      notes: Lines below the table.
+    The report is what belongs beside it: arguments, versions, hardware, bounds. Notes
+    are lines below the table.
     """
     whole = report | {"rows": table.to_json(rows)}
     files.write_text(folder / "metrics.json", json.dumps(whole, indent=1))
@@ -178,11 +176,7 @@ def _draw(
 
 
 def processor() -> str:
-    """Name of the processor.
-
-    Returns:
-      As Linux or Python name it.
-    """
+    """Name of the processor, as Linux or Python name it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(x.split(":")[1].strip() for x in lines if "model name" in x)
@@ -191,10 +185,9 @@ def processor() -> str:
 
 
 def git_commit() -> str | None:
-    """Commit of this code.
+    """Hash of this code's commit, with "+" after it if files differ from it.
 
-    Returns:
-      Its hash, with "+" after it if files differ from it; None outside a repository.
+    None outside a repository.
     """
 
     def git(*words: str) -> str:
@@ -215,15 +208,11 @@ def git_commit() -> str | None:
 
 
 def provenance(arguments: Any = None) -> dict[str, Any]:
-    """What a table was made with.
+    """What a table was made with, as a JSON object.
 
-    Args:
-      arguments: Dataclass of a command line; None where there is none.
-
-    Returns:
-      Versions, hardware, commit, command and date, and the "arguments", as a JSON
-      object; where these name a run folder, also its "seeds", its "data", the
-      "training" of its stages, and its "minutes", without compiling.
+    Versions, hardware, commit, command and date, and the "arguments" of a command
+    line's dataclass, if there is one; where these name a run folder, also its "seeds",
+    its "data", the "training" of its stages, and its "minutes", without compiling.
     """
     given = {} if arguments is None else {"arguments": arguments_json(arguments)}
     if (run := getattr(arguments, "run", None)) is not None and run.is_dir():
@@ -270,11 +259,7 @@ def _minutes(folder: Path) -> dict[str, float]:
 
 
 def arguments_json(arguments: Any) -> dict[str, Any]:
-    """Arguments of an experiment as JSON.
-
-    Args:
-      arguments: A dataclass of plain values and paths.
-    """
+    """Arguments of an experiment, plain values and paths, as JSON."""
     return {
         name: str(value) if isinstance(value, Path) else value
         for name, value in dataclasses.asdict(arguments).items()

@@ -159,14 +159,13 @@ def _stretches(
 def cut_actions(clips: Clips, *, longest: float = 4.0, shortest: float = 3.0) -> Clips:
     """Stretches of takes with what is done in them in a new label field "action".
 
+    They do not overlap, and are named "<clip>@<first frame>+<frames>".
+
     Args:
       clips: Takes, with styles "neutral", "crouch", "jump" or "push" in the field
         "style"; those of other styles are left out.
       longest: Longest stretch, seconds.
       shortest: Shortest stretch, seconds.
-
-    Returns:
-      The stretches, which do not overlap, named "<clip>@<first frame>+<frames>".
 
     Raises:
       ValueError: if the clips have no field "style" or one "action", or no stretch has

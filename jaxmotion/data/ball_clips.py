@@ -99,10 +99,7 @@ def ball_clips(
 
 
 def save_ball_clips(path: str | os.PathLike, data: BallClips) -> None:
-    """Writes clips with a ball; the file appears under its name only when it is whole.
-
-    Args:
-      path: File to write, conventionally .npz.
+    """Writes clips with a ball (.npz); the file appears under its name only when whole.
 
     Raises:
       OSError: if the file cannot be written.
@@ -158,12 +155,7 @@ def take_ball_clips(data: BallClips, indices: Sequence[int] | np.ndarray) -> Bal
 
 
 def cut_scene(data: BallClips, start: Int[Array, ""], length: int) -> Scene:
-    """The frames from `start`.
-
-    Args:
-      start: First frame, counted over all clips.
-      length: Frames.
-    """
+    """The `length` frames from `start`, counted over all clips."""
     take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, length)  # noqa: E731
     return Scene(
         motion=Motion(

@@ -41,11 +41,9 @@ def bvh_transforms(
 ) -> tuple[
     Float[np.ndarray, "frames joints 3"], Float[np.ndarray, "frames joints 3 3"]
 ]:
-    """Parent-local positions and rotations of all joints in all frames.
+    """Parent-local positions and rotations of all joints in all frames, both float64.
 
-    Returns:
-      Positions in the file's units (position channels replace OFFSET), and rotation
-      matrices, both float64.
+    Positions are in the file's units; position channels replace OFFSET.
     """
     shape = (bvh.num_frames, bvh.num_joints)
     positions = np.broadcast_to(bvh.offsets, (*shape, 3)).copy()
@@ -77,10 +75,7 @@ def _subtree(bvh: Bvh, root: int) -> list[int]:
 
 
 def without_joints(bvh: Bvh, names: Collection[str]) -> Bvh:
-    """The file's content without some joints and everything below them.
-
-    Args:
-      names: Joints to drop, such as those of the fingers; never the root.
+    """The file's content without some joints, never the root, and all below them.
 
     Raises:
       BvhError: for an unknown joint name, or the root's.
@@ -196,14 +191,11 @@ def motion_from_bvh(
 
 
 def frame_rate(frame_time: float) -> float:
-    """Frames per second, freed of the rounding of a written frame time.
+    """Frames per second, freed of the rounding of a written frame time in seconds.
 
     Files write 1/30 s as 0.033333, 0.0333 or 0.033. A rate is meant when it alone of
     the customary ones, or of all whole ones, rounds or is cut to the written decimals;
     or the nearest whole one within 0.05 %, half of what separates 30 from 29.97.
-
-    Args:
-      frame_time: Seconds per frame.
     """
     rate = 1.0 / frame_time
     error = abs(rate - round(rate)) / rate
@@ -259,9 +251,6 @@ def bvh_from_motion(
       motion: Frames of that skeleton, without batch axes.
       scale: Units of the file per meter; 100 for centimeters.
       name: Name for messages.
-
-    Returns:
-      What `write_bvh` writes.
 
     Raises:
       ValueError: if the motion has batch axes, no frames, another number of joints,

@@ -277,14 +277,9 @@ def _rows(lines: list[str], start: int, shape: tuple[int, int], name: str):
 
 
 def parse_bvh(text: str, *, name: str = "bvh") -> Bvh:
-    r"""Parses BVH text.
+    r"""What BVH text says, in its own units; line ends may be \n, \r\n or \r.
 
-    Args:
-      text: Content of a file; line ends may be \n, \r\n or \r.
-      name: File name for messages.
-
-    Returns:
-      What the file says, in its own units.
+    The file's name is for messages.
 
     Raises:
       BvhError: for anything malformed; names the file and the line.
@@ -330,14 +325,10 @@ def parse_bvh(text: str, *, name: str = "bvh") -> Bvh:
 def read_bvh(
     source: str | os.PathLike | bytes | Readable, *, name: str | None = None
 ) -> Bvh:
-    """Reads a BVH file.
+    """What a BVH file says, in its own units.
 
-    Args:
-      source: Path, the bytes of a file, or an open binary file (such as a zip member).
-      name: Name for messages; by default the path.
-
-    Returns:
-      What the file says, in its own units.
+    The source is a path, the bytes of a file, or an open binary file (such as a zip
+    member); the name, by default the path, is for messages.
 
     Raises:
       BvhError: for anything malformed; names the file and the line.
@@ -400,16 +391,10 @@ def _numbers(values) -> str:
 
 
 def format_bvh(bvh: Bvh, *, decimals: int = 6) -> str:
-    """BVH text of a file's content.
+    """BVH text of a file's content, with Unix line ends and so many decimals.
 
     Joints are written depth first, so the channels of a skeleton that is ordered
     otherwise are permuted with them.
-
-    Args:
-      decimals: Digits after the point of a channel value.
-
-    Returns:
-      The text, with Unix line ends.
     """
     joints, order = _joint_lines(bvh)
     lines = ["HIERARCHY", *joints, "MOTION"]
@@ -424,10 +409,7 @@ def format_bvh(bvh: Bvh, *, decimals: int = 6) -> str:
 
 
 def write_bvh(path: str | os.PathLike, bvh: Bvh, *, decimals: int = 6) -> None:
-    """Writes a BVH file, whole or not at all.
-
-    Args:
-      decimals: Digits after the point of a channel value.
+    """Writes a BVH file with so many decimals, whole or not at all.
 
     Raises:
       OSError: if the file cannot be written.

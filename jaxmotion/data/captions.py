@@ -229,15 +229,12 @@ def _sentences(template: str, content: str, style: str) -> Iterator[str]:
 def all_captions(
     content: str, style: str, *, templates: Sequence[str] = TEMPLATES
 ) -> tuple[tuple[str, str], ...]:
-    """Every caption of a content in a style, always in the same order.
+    """Every (sentence, tokens) of a content in a style, always in the same order.
 
     Args:
       content: Label such as "walk-turn-left", of either set.
       style: Label such as "elderly", of either set.
-      templates: Templates to use, of `TEMPLATES`; for example all but a held-out one.
-
-    Returns:
-      (sentence, tokens) of each caption, without repetitions.
+      templates: Some of `TEMPLATES`, for example all but a held-out one.
 
     Raises:
       ValueError: if a label or a template is unknown; lists the known ones.
@@ -271,14 +268,10 @@ def captions_for(
     count: int,
     templates: Sequence[str] = TEMPLATES,
 ) -> list[tuple[str, str]]:
-    """Some captions of a clip, drawn without repetition from all.
+    """Some (sentence, tokens) of a clip, drawn without repetition from all.
 
-    Args:
-      index: Number of the clip, so that clips with the same labels differ.
-      templates: Templates to use, of `TEMPLATES`.
-
-    Returns:
-      (sentence, tokens) of each; the same for the same arguments.
+    The clip's index makes clips with the same labels differ; the same arguments give
+    the same captions. Templates are of `TEMPLATES`.
 
     Raises:
       ValueError: if a name is unknown, or there are fewer captions than that.

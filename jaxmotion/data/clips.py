@@ -51,10 +51,7 @@ class Clips:
         return self.root_position.shape[0]
 
     def names(self, field: str) -> tuple[str, ...]:
-        """Names of a label field.
-
-        Args:
-          field: For example "style".
+        """Names of a label field such as "style".
 
         Raises:
           ValueError: if the clips have no such field; names those they have.
@@ -72,10 +69,7 @@ def check_skeletons(
 ) -> None:
     """Raises unless all skeletons have the first one's joints and bones.
 
-    Args:
-      skeletons: One skeleton a clip.
-      names: One name a clip.
-      tolerance: Largest difference between the offsets of two skeletons, meters.
+    Offsets may differ by the tolerance, meters.
 
     Raises:
       ValueError: names the two clips and the joint.
@@ -252,10 +246,6 @@ def stretches(
     Args:
       owners: Number of each stretch's clip.
       firsts: Its first frame, counted over all clips.
-      lengths: Its frames.
-
-    Returns:
-      The stretches in that order.
     """
     frames = np.concatenate(
         [np.arange(a, a + n) for a, n in zip(firsts, lengths, strict=True)]

@@ -59,10 +59,9 @@ def to_fields(clips: Clips) -> dict[str, np.ndarray]:
 
 
 def save_clips(path: str | os.PathLike, clips: Clips) -> None:
-    """Writes clips; the file appears under its name only when it is whole.
+    """Writes clips (.npz); the file appears under its name only when it is whole.
 
-    Args:
-      path: File to write, conventionally .npz; its folder is made if need be.
+    Its folder is made if need be.
 
     Raises:
       OSError: if the file cannot be written.
@@ -194,10 +193,7 @@ def check_rate(path: str, fps: np.ndarray | float) -> None:
 
 
 def load_clips(path: str | os.PathLike) -> Clips:
-    """Reads what `save_clips` wrote; checks every field.
-
-    Returns:
-      The clips, on the default device.
+    """Clips on the default device, as `save_clips` wrote them; checks every field.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -208,13 +204,7 @@ def load_clips(path: str | os.PathLike) -> Clips:
 
 
 def from_fields(path: str, fields: dict[str, np.ndarray]) -> Clips:
-    """Clips of what `read_fields` read; checks every field.
-
-    Args:
-      path: The file, for messages.
-
-    Returns:
-      The clips, on the default device.
+    """Clips, on the default device, of what `read_fields` read; checks every field.
 
     Raises:
       ValueError: if the fields do not agree; names the file and the field.

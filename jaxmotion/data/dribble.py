@@ -127,11 +127,7 @@ class Touches:
 
 
 def possible_touches(body: Body, settings: Dribble) -> Touches:
-    """Frames in which a foot could touch a ball, and where that would be.
-
-    Args:
-      settings: What counts as a touch.
-    """
+    """Frames in which a foot could touch a ball, and where that would be."""
     speed = np.linalg.norm(body.velocity, axis=-1)
     direction = body.velocity / np.maximum(speed, 1e-9)[..., None]
     ahead = np.sum((body.toes[..., ::2] - body.root[:, None]) * direction, axis=-1)
@@ -165,9 +161,8 @@ def is_free(
     """Whether a ball on the ground is clear of the legs and within reach of the root.
 
     Args:
-      place: Place of the ball's center on the ground plane, meters.
+      place: Of the ball's center on the ground plane, meters.
       near: Whether a touch is so near in time that a leg may come nearer.
-      settings: What is clear and what is near.
     """
     height = np.full(place.shape[:-1], body.ground + settings.radius)
     ball = np.stack([place[..., 0], height, place[..., 1]], axis=-1)
@@ -218,14 +213,9 @@ def next_touches(
     arrive: Float[np.ndarray, "2"],
     settings: Dribble,
 ) -> tuple[Int[np.ndarray, "ways"], Float[np.ndarray, "ways 2"]]:
-    """Touches to which the ball can be sent by one touch.
+    """Touches to which the touch `now` can send the ball, and its velocity there.
 
-    Args:
-      now: The touch that sends it.
-      arrive: Velocity with which the ball came to it, meters per second.
-
-    Returns:
-      Those touches, and the velocity with which the ball comes to each.
+    It came to this one with the velocity `arrive`, meters per second.
     """
     first = int(touches.frame[now])
     shortest, longest = (first + seconds * body.fps for seconds in settings.gap)
@@ -260,14 +250,11 @@ def find_chain(
     settings: Dribble,
     generator: np.random.Generator,
 ) -> list[int]:
-    """Touches one after the other, as many as chance finds.
+    """Touches one after the other, as many as chance finds, the first one at least.
 
     Args:
       tried: Touches from which no way led on; those that are tried are added.
       generator: Draws the order in which ways are tried.
-
-    Returns:
-      The touches, the first one at least.
     """
 
     def ways(now: int, arrive: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
@@ -322,13 +309,9 @@ def _segment(
 def find_segments(
     body: Body, settings: Dribble, generator: np.random.Generator
 ) -> list[Segment]:
-    """Stretches of a clip beside which a ball can be dribbled; they do not overlap.
+    """Stretches of a clip beside which a ball can be dribbled, perhaps none.
 
-    Args:
-      settings: What a ball may do, and how long a stretch is.
-
-    Returns:
-      The segments in their order, perhaps none.
+    They are in order and do not overlap.
     """
     touches = possible_touches(body, settings)
     tried, earliest, found = set(), 0, []
@@ -348,17 +331,11 @@ def find_segments(
 def dribble_clips(
     clips: Clips, *, skill: str, settings: Dribble, seed: int
 ) -> BallClips:
-    """Stretches of clips beside which a ball is dribbled.
+    """Stretches of clips beside which a ball is dribbled, with the label "skill".
 
-    Each clip has its own random numbers, so that further clips after it change
-    nothing.
-
-    Args:
-      skill: Label of all stretches in a new field "skill".
-
-    Returns:
-      The stretches, each from the ball's rest (or its first touch) to its last touch,
-      named "<clip>@<first frame>+<frames>".
+    Each is from the ball's rest (or its first touch) to its last touch and is named
+    "<clip>@<first frame>+<frames>". Each clip has its own random numbers, so that
+    further clips after it change nothing.
 
     Raises:
       ValueError: if no clip has such a stretch, the clips have a field "skill", or are
@@ -434,26 +411,22 @@ def resting_clips(
     radius: float = 0.11,
     thickness: float = 0.03,
 ) -> BallClips:
-    """Clips beside which a ball lies.
+    """Whole clips beside which a ball lies that nobody touches, with the label "skill".
 
     From the root's farthest place in a random direction the ball lies that much
     farther, so that it is never nearer than that to the root. Clips whose legs go
     through wherever it might lie are left out.
 
     Args:
-      skill: Label of all clips in a new field "skill".
-      distance: Least and largest distance of the ball from where the root comes
-        nearest to it on the ground plane, meters. (2.5, 5) is a ball off which the
-        person is; (0.4, 0.8) one in front of the feet.
+      distance: Least and largest distance of the ball from where the root comes nearest
+        to it on the ground plane, meters. (2.5, 5) is a ball off which the person is;
+        (0.4, 0.8) one in front of the feet.
       seed: Seeds the places; each clip has its own random numbers.
       angle: Largest angle between the clip's mean facing and the ball's direction,
         radians; pi for anywhere.
       travel: Clips whose root goes farther from its mean place are left out, meters.
-      radius: Radius of the ball, meters.
-      thickness: Thickness of foot and shank about their bones, meters.
-
-    Returns:
-      The clips, whole, without any touch.
+      radius: Of the ball, meters.
+      thickness: Of foot and shank about their bones, meters.
 
     Raises:
       ValueError: if no clip is left, the clips have a field "skill", or the distances
@@ -511,11 +484,9 @@ def _room(body: Body, ball: Float[np.ndarray, "tries 3"]) -> Float[np.ndarray, "
 
 
 def concatenate_ball_clips(parts: Sequence[BallClips]) -> BallClips:
-    """Concatenates several sets of clips with a ball.
+    """Sets of clips with the same skeleton, label fields, rate, joints and ball as one.
 
-    Args:
-      parts: Sets with the same skeleton, label fields and rate, joints and ball; the
-        names of labels, skills among them, are merged.
+    The names of labels, skills among them, are merged.
 
     Raises:
       ValueError: if there is no part, or they differ in any of that.

@@ -33,26 +33,12 @@ class Footsteps:
 
 
 def wrap(angle: np.ndarray | float) -> np.ndarray | float:
-    """The same angle in [-pi, pi).
-
-    Args:
-      angle: Radians.
-
-    Returns:
-      Radians.
-    """
+    """The same angle in [-pi, pi), radians."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def smoothstep(s: np.ndarray | float) -> np.ndarray | float:
-    """Rises from 0 to 1 with no velocity or acceleration at either end.
-
-    Args:
-      s: In [0, 1].
-
-    Returns:
-      In [0, 1].
-    """
+    """Rises over [0, 1] from 0 to 1 with no velocity or acceleration at either end."""
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 

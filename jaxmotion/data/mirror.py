@@ -74,11 +74,8 @@ def _other_side(found: str) -> str:
 def swap_sides(name: str) -> str:
     """A name with left and right swapped; unchanged if it names no side.
 
-    Args:
-      name: Such as "LeftArm", "Hand_R", "lHip" or "walk-turn-left".
-
-    Returns:
-      "RightArm", "Hand_L", "rHip", "walk-turn-right".
+    "LeftArm", "Hand_R", "lHip" and "walk-turn-left" become "RightArm", "Hand_L", "rHip"
+    and "walk-turn-right".
     """
     for pattern in _SIDE_PATTERNS:
         if pattern.search(name):
@@ -229,14 +226,10 @@ def mirror(
 
 
 def mirror_clips(clips: Clips, *, plan: MirrorPlan | None = None) -> Clips:
-    """Mirror images of all clips; left and right are swapped in the labels too.
+    """Mirror images of all clips, named "<name>_mirrored", with swapped labels.
 
-    Args:
-      plan: By default worked out from the skeleton and all frames.
-
-    Returns:
-      As many clips, named "<name>_mirrored". A swapped label that is new to its field
-      is added to the field's names.
+    A swapped label that is new to its field is added to the field's names. The plan is
+    by default worked out from the skeleton and all frames.
 
     Raises:
       ValueError: as `mirror_plan`.

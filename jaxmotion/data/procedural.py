@@ -43,15 +43,10 @@ class Walk:
 def follow_commands(
     commands: Command, fps: Float[Array, ""], half_life: Float[Array, ""]
 ) -> tuple[Float[Array, "frames 2"], Float[Array, "frames 2"]]:
-    """Path and facing of a body that follows commands as the controller's springs do.
+    """Path (x, z), meters, and facing of a body that follows the controller's springs.
 
-    Args:
-      commands: One a frame; the body starts at the origin, at rest, facing as the
-        first command.
-      half_life: Half-life of the springs, seconds.
-
-    Returns:
-      Ground positions (x, z), meters, and facings.
+    It starts at the origin, at rest, facing as the first command (one per frame); the
+    springs' half-life is in seconds.
     """
 
     def move(carry: tuple, command: Command) -> tuple[tuple, tuple]:
@@ -140,16 +135,11 @@ def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> 
 def random_commands(
     generator: np.random.Generator, *, frames: int, fps: float, max_speed: float
 ) -> Command:
-    """Commands that change every one to four seconds.
+    """Commands, one per frame with label 0, that change every one to four seconds.
 
     One in six stands still; of the others three in four face where they travel, the
-    rest strafe sideways or walk backwards.
-
-    Args:
-      max_speed: Meters per second; sideways and backwards half of it.
-
-    Returns:
-      One command a frame, label 0.
+    rest strafe sideways or walk backwards at up to half the maximum speed, meters per
+    second.
     """
     velocity, facing = np.zeros((frames, 2)), np.zeros((frames, 2))
     heading = generator.uniform(-np.pi, np.pi)
@@ -183,15 +173,13 @@ def make_clips(
     fps: float = 30.0,
     clip_seconds: float = 12.0,
 ) -> Clips:
-    """Clips of random walks, the same number in every gait.
+    """Clips of random walks, the same number in every gait, with labels "style".
+
+    The same seed gives the same clips.
 
     Args:
-      seed: Seeds everything; the same seed gives the same clips.
       minutes: Minutes of all clips together, rounded up to whole clips of each gait.
       gaits: Manners by name; None for all of `GAITS`.
-
-    Returns:
-      The clips, with labels "style".
 
     Raises:
       ValueError: if minutes or fps is not positive, a clip has fewer than two frames,

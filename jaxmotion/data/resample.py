@@ -17,13 +17,7 @@ def slerp(
 ) -> Float[Array, "*batch 4"]:
     """Spherical interpolation of unit quaternions along the shorter arc.
 
-    Args:
-      a: Quaternions at t = 0.
-      b: Quaternions at t = 1.
-      t: Position between them, in [0, 1].
-
-    Returns:
-      Unit quaternions.
+    From a at t = 0 to b at t = 1.
 
     Source: Shoemake 1985.
     """
@@ -51,10 +45,6 @@ def resample(motion: Motion, fps: float) -> Motion:
     whole number n, every nth frame is taken unchanged. Otherwise positions are
     interpolated linearly and rotations by slerp. Nothing is filtered. The last frame is
     the last one that is not after the motion's own last frame.
-
-    Args:
-      motion: Frames, with any batch axes.
-      fps: Frames per second that are wanted.
 
     Raises:
       ValueError: if the rate is not positive and finite, the motion has no frames, or
@@ -116,11 +106,8 @@ def _between(
 def resample_clips(clips: Clips, fps: float) -> Clips:
     """All clips at another rate, as `resample` makes each, in one compiled call.
 
-    Args:
-      fps: Frames per second, at most 16 times and at least 1/16 of theirs.
-
-    Returns:
-      The clips; a clip's first frame stays its first.
+    A clip's first frame stays its first. The rate is at most 16 times and at least 1/16
+    of theirs.
 
     Raises:
       ValueError: if the rate is out of that range.

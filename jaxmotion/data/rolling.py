@@ -32,15 +32,10 @@ def start_speed(
     seconds: Float[np.ndarray, "*batch"],
     deceleration: float,
 ) -> Float[np.ndarray, "*batch"]:
-    """Speed with which a ball has to leave to be somewhere in time.
+    """Speed, meters per second, with which a ball has to leave to be somewhere in time.
 
-    Args:
-      distance: Meters to roll.
-      seconds: Time to do so, positive; the ball may be early.
-      deceleration: Deceleration of a rolling ball, positive, meters per second squared.
-
-    Returns:
-      Meters per second.
+    It rolls the distance (meters) in at most the (positive) seconds; the deceleration
+    is positive, meters per second squared.
     """
     rolls = distance / seconds + deceleration * seconds / 2
     stops = np.sqrt(2 * deceleration * distance)
@@ -53,16 +48,13 @@ def roll(
     deceleration: float,
     times: Float[np.ndarray, "*batch times"],
 ) -> Float[np.ndarray, "*batch times 2"]:
-    """Where a ball is on its way to a place: (1).
+    """Where a ball is, meters on the ground, on its way to a place: (1).
 
     Args:
       displacement: From where it starts to that place, meters on the ground.
       seconds: Time of arrival, positive; the ball may stop there before.
-      deceleration: Deceleration of a rolling ball, positive, meters per second squared.
+      deceleration: Of a rolling ball, positive, meters per second squared.
       times: Between 0 and `seconds`.
-
-    Returns:
-      Displacement at those times, meters.
     """
     distance = np.linalg.norm(displacement, axis=-1)
     speed = start_speed(distance, seconds, deceleration)[..., None]
@@ -77,15 +69,14 @@ def end_velocities(
     seconds: Float[np.ndarray, "*batch"],
     deceleration: float,
 ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 2"]]:
-    """Velocities of a ball that leaves, and of one that has arrived.
+    """Velocities, m/s, of a ball that leaves, and of one that has arrived.
+
+    The second is zero where the ball stopped on the way.
 
     Args:
       displacement: From where it starts to where it has to be, meters on the ground.
       seconds: Time of arrival, positive.
-      deceleration: Deceleration of a rolling ball, positive, meters per second squared.
-
-    Returns:
-      Meters per second; the second is zero where the ball stopped on the way.
+      deceleration: Of a rolling ball, positive, meters per second squared.
     """
     distance = np.linalg.norm(displacement, axis=-1)
     speed = start_speed(distance, seconds, deceleration)
@@ -119,9 +110,7 @@ class Body:
 def bodies(clips: Clips, *, thickness: float) -> list[Body]:
     """What a ball meets of each clip.
 
-    Args:
-      clips: At least two frames a clip.
-      thickness: How high the joint of a standing toe is above the ground, meters.
+    A standing toe's joint is the thickness, meters, above the ground.
 
     Raises:
       ValueError: if a clip has one frame, or the skeleton no feet.
@@ -172,14 +161,10 @@ def _body(
 def ground_height(
     heights: Float[np.ndarray, "frames feet"], standing: Bool[np.ndarray, "frames feet"]
 ) -> float:
-    """Height at which toes stand: few of those that stand are lower.
+    """Height at which toes stand, meters: few of those that stand are lower.
 
-    Args:
-      heights: Heights of the toes, meters.
-      standing: Which of them stand; where none does, all count.
-
-    Returns:
-      The fifth percentile, meters: a lowest foot that no outlier pulls down.
+    The fifth percentile: a lowest foot that no outlier pulls down. Where none stands,
+    all count.
     """
     return float(np.percentile(heights[standing] if standing.any() else heights, 5))
 
@@ -188,15 +173,7 @@ def leg_distances(
     ball: Float[np.ndarray, "*batch frames 3"],
     legs: Float[np.ndarray, "frames bones 2 3"],
 ) -> Float[np.ndarray, "*batch frames"]:
-    """Distance from a point to the nearest bone of the legs in the same frame.
-
-    Args:
-      ball: The center of the ball, meters.
-      legs: Both ends of each bone, meters.
-
-    Returns:
-      Meters.
-    """
+    """Distance, meters, from the ball's center to the legs' nearest bone."""
     start, along = legs[:, :, 0], legs[:, :, 1] - legs[:, :, 0]
     square = np.maximum(np.sum(along**2, axis=-1), 1e-12)
     away = ball[..., None, :] - start

@@ -23,14 +23,9 @@ def _indices(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
 
 
 def select(clips: Clips, field: str, names: Sequence[str]) -> Clips:
-    """Clips whose label is one of those; label indices stay as they were.
+    """Clips with one of some labels of a field, in the same order.
 
-    Args:
-      field: Label field, such as "content".
-      names: Labels to keep.
-
-    Returns:
-      Those clips, in the same order.
+    Label indices stay as they were.
 
     Raises:
       ValueError: if the field or a name is unknown (lists the known ones), or no clip
@@ -46,12 +41,9 @@ def select(clips: Clips, field: str, names: Sequence[str]) -> Clips:
 
 
 def relabel(clips: Clips, field: str) -> Clips:
-    """Renumbers a label field so that only labels that occur are left.
+    """Renumbers a label field to the labels that occur, in the old order.
 
     After `select`, a network needs as many label embeddings as labels that occur.
-
-    Returns:
-      The same clips with labels 0..number of labels that occur - 1, in the old order.
 
     Raises:
       ValueError: if the field is unknown.
@@ -69,11 +61,7 @@ def relabel(clips: Clips, field: str) -> Clips:
 def merge_labels(clips: Clips, field: str, merge: Mapping[str, str]) -> Clips:
     """Gives clips of some labels another one, for sets that name one thing twice.
 
-    Args:
-      merge: Label to take away, and the label its clips get.
-
-    Returns:
-      The same clips; labels that no clip has any more are gone.
+    Labels that no clip has any more are gone.
 
     Raises:
       ValueError: if the field or a label is unknown; lists the known ones.
@@ -89,13 +77,7 @@ def merge_labels(clips: Clips, field: str, merge: Mapping[str, str]) -> Clips:
 
 
 def frequent_labels(clips: Clips, field: str, *, least: int) -> tuple[str, ...]:
-    """Labels that at least so many clips have.
-
-    Args:
-      least: Clips.
-
-    Returns:
-      The labels, in their order.
+    """Labels that at least so many clips have, in their order.
 
     Raises:
       ValueError: if the field is unknown.
@@ -108,18 +90,11 @@ def frequent_labels(clips: Clips, field: str, *, least: int) -> tuple[str, ...]:
 def split_clips(
     clips: Clips, *, fraction: float, seed: int, field: str = "style"
 ) -> tuple[Clips, Clips]:
-    """Splits whole clips at random, label by label.
+    """Splits whole clips at random, label by label, into training and held-out clips.
 
-    Of each label with n clips, round(n * fraction) are held out, but at least one stays
-    in the training part and, where n > 1, at least one is held out.
-
-    Args:
-      fraction: Part of each label's clips to hold out, in (0, 1).
-      seed: Seed of the shuffle; the same seed splits the same clips alike.
-      field: Label field by which to stratify.
-
-    Returns:
-      The training clips and the held-out clips, both in the original order.
+    Of each label (of `field`) with n clips, round(n * fraction) are held out, but at
+    least one stays in the training part and, where n > 1, at least one is held out.
+    Both parts keep the original order; the same seed splits the same clips alike.
 
     Raises:
       ValueError: if the fraction is out of range, the field is unknown, or no label has
@@ -140,13 +115,7 @@ def split_clips(
 
 
 def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
-    """Splits clips by their names.
-
-    Args:
-      held_out: Names of the clips to hold out.
-
-    Returns:
-      The training clips and the held-out clips, both in the original order.
+    """Training clips and those held out by name, both in the original order.
 
     Raises:
       ValueError: if a name is unknown, or no clip would be left to train on.
@@ -165,13 +134,10 @@ def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
 
 
 def cut(clips: Clips, spans: Sequence[tuple[int, int, int]]) -> Clips:
-    """Stretches of clips, each as one clip with its labels.
+    """Stretches of clips, each as one clip with its labels, in that order.
 
-    Args:
-      spans: Clip, first frame within it and number of frames of each stretch.
-
-    Returns:
-      The stretches in that order, named "<clip>@<first frame>+<frames>".
+    Their spans are clip, first frame within it and number of frames; their names
+    "<clip>@<first frame>+<frames>".
     """
     owners, starts, lengths = np.array(spans, np.int64).reshape(-1, 3).T
     names = clips.clip_names or [f"clip {i}" for i in range(clips.num_clips)]
@@ -185,16 +151,11 @@ def cut(clips: Clips, spans: Sequence[tuple[int, int, int]]) -> Clips:
 
 
 def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
-    """Concatenates several sets of clips of one skeleton.
+    """Sets of clips with the same skeleton, label fields and rate as one.
 
-    Label names are merged, in the order in which they first occur.
-
-    Args:
-      parts: Sets of clips with the same label fields and rate.
-      tolerance: Largest difference between the offsets of two skeletons, meters.
-
-    Returns:
-      One set with the first part's skeleton; its source lists those of the parts.
+    Label names are merged, in the order in which they first occur; the source lists
+    those of the parts. The first part's skeleton is kept, whose offsets others may
+    differ from by the tolerance, meters.
 
     Raises:
       ValueError: if there is no part, or the fields, rates or skeletons differ.
@@ -243,14 +204,10 @@ def _merged(parts: Sequence[Clips], field: str, words: tuple[str, ...]) -> Array
 
 
 def label_speeds(clips: Clips, *, field: str) -> Float[Array, " labels"]:
-    """Median speed of the root in each style: the speed to command it at.
+    """Median speed of the root in each style (`field`), to command it at.
 
-    Args:
-      clips: Locomotion clips; jumps from clip to clip do not count.
-      field: Label field that is the style.
-
-    Returns:
-      Meters per second; 0 for a style without clips.
+    Meters per second; 0 for a style without clips. Jumps from clip to clip do not
+    count.
     """
     step = np.diff(np.asarray(clips.root_position)[:, ::2], axis=0)
     speed = np.linalg.norm(step, axis=-1) * clips.fps

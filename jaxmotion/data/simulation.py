@@ -28,12 +28,8 @@ _CHESTS = ("spine2", "chest2", "chest", "spine1")
 def upsample(motion: Motion, fps: float) -> Motion:
     """The motion at a higher rate, by cubic splines through its frames.
 
-    Args:
-      fps: Frames per second that are wanted.
-
-    Returns:
-      The motion; the same one if it has that rate. Its last frame is the last that is
-      not after the motion's own.
+    The same one if it has that rate. The last frame is the last that is not after the
+    motion's own.
 
     Raises:
       ValueError: if the rate is lower than the motion's or more than 16 times as high,
@@ -72,11 +68,10 @@ def upsample(motion: Motion, fps: float) -> Motion:
 
 
 def chest_joint(skeleton: Skeleton) -> int:
-    """Finds the joint under which the simulation bone runs.
+    """Index of the joint under which the simulation bone runs.
 
-    Returns:
-      Index of Spine2, Chest2, Chest or Spine1, the first of these that exists, in any
-      case and after a prefix like "mixamorig:".
+    Spine2, Chest2, Chest or Spine1, the first of these that exists, in any case and
+    after a prefix like "mixamorig:".
 
     Raises:
       ValueError: if there is none; names the joints.
@@ -97,23 +92,15 @@ def _window(seconds: float, fps: float) -> int:
 
 
 def least_frames(fps: float) -> int:
-    """Frames that a clip needs to have a simulation bone.
-
-    Returns:
-      The longest window of the filters.
-    """
+    """Frames that a simulation bone needs: the filters' longest window."""
     return max(_window(_FACING, fps), _DEGREE + 2)
 
 
 def simulation_bone(skeleton: Skeleton, motion: Motion) -> Trajectory:
-    """The smooth path on the ground that carries a clip.
+    """The smooth path on the ground that carries a clip (world).
 
-    Args:
-      motion: One clip, world.
-
-    Returns:
-      Position under the chest and facing of the hips, both filtered (Savitzky-Golay of
-      degree 3 over about half a second and a second).
+    Position under the chest and facing of the hips, both filtered (Savitzky-Golay of
+    degree 3 over about half a second and a second).
 
     Raises:
       ValueError: if a joint that it needs is missing, or the clip is too short.

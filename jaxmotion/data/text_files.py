@@ -66,13 +66,7 @@ def _parse_time(where: str, field: str, text: str) -> float:
 
 
 def parse_captions(text: str, *, path: str) -> list[Caption]:
-    """Captions of a file.
-
-    Args:
-      path: Its path, for messages.
-
-    Returns:
-      One caption a line; empty lines are skipped.
+    """Captions of a file, one per line; empty lines are skipped.
 
     Raises:
       ValueError: if there is no caption, or a line lacks its tags or times; names the

@@ -86,10 +86,7 @@ class TextMotions:
         return self.features.shape[1]
 
     def clips_of(self, split: str) -> Int[np.ndarray, "_"]:
-        """Numbers of the clips of a split.
-
-        Returns:
-          Ascending; empty if it has none.
+        """Numbers of the clips of a split, ascending; empty if it has none.
 
         Raises:
           ValueError: if there is no such split; names those there are.
@@ -268,10 +265,9 @@ def text_motions(
 
 
 def save_text_motions(path: str | os.PathLike, motions: TextMotions) -> None:
-    """Writes clips with captions; the file appears only when it is whole.
+    """Writes clips with captions (.npz); the file appears only when it is whole.
 
-    Args:
-      path: File to write, conventionally .npz; its folder is made if need be.
+    Its folder is made if need be.
 
     Raises:
       OSError: if the file cannot be written.
@@ -341,10 +337,7 @@ def _check_ranges(
 
 
 def load_text_motions(path: str | os.PathLike) -> TextMotions:
-    """Reads what `save_text_motions` wrote; checks every field.
-
-    Returns:
-      The clips, on the host.
+    """Clips on the host, as `save_text_motions` wrote them; checks every field.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -375,11 +368,7 @@ def load_text_motions(path: str | os.PathLike) -> TextMotions:
 def is_text_motions(path: str | os.PathLike) -> bool:
     """Whether a file says that it holds text motions; nothing else of it is checked.
 
-    Args:
-      path: A file.
-
-    Returns:
-      False also for what is no npz file.
+    False also for what is no npz file.
 
     Raises:
       OSError: if it cannot be read.
@@ -426,15 +415,12 @@ def text_arrays(
     max_frames: int,
     unit_length: int = 4,
 ) -> TextArrays:
-    """Puts the clips of a split on the default device, z-scored.
+    """The z-scored clips of a split on the default device, for `sample_text_batch`.
 
     Args:
       split: "train", "val" or "test".
       max_frames: Frames of a sample; 196 in the published experiments.
       unit_length: Lengths of samples are multiples of it, frames.
-
-    Returns:
-      What `sample_text_batch` draws from.
 
     Raises:
       ValueError: if the split has no clips, a clip is shorter than a unit (names it),

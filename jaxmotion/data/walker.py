@@ -51,11 +51,7 @@ _BONES = [
 
 
 def walker_skeleton() -> Skeleton:
-    """The walker's bones: 22 joints, about 1.7 m tall.
-
-    Returns:
-      The skeleton; its feet are the toe joints, left first.
-    """
+    """The walker's 22 joints, about 1.7 m tall; its feet are the toes, left first."""
     return Skeleton(
         offsets=jnp.asarray([bone[2] for bone in _BONES], jnp.float32),
         parents=tuple(bone[1] for bone in _BONES),
@@ -156,15 +152,9 @@ def _pelvis_height(
 def solve_pose(
     path: np.ndarray, yaw: np.ndarray, steps: Footsteps, gait: Gait, *, fps: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Root positions and local rotations of the whole body.
+    """Root positions, meters, and parent-local rotations of the whole body.
 
-    Args:
-      path: [F, 2] ground position of the body, meters.
-      yaw: [F] its facing, radians.
-      steps: Where the feet are.
-
-    Returns:
-      [F, 3] meters, and [F, 22, 3, 3] parent-local rotation matrices.
+    The path is the body's ground position, meters; yaw its facing, radians.
 
     Raises:
       ValueError: if the legs do not reach the steps; names the first such frame.

@@ -37,16 +37,14 @@ class WindowIndex:
 def window_starts(
     offsets: Int[np.ndarray, "boundaries"], length: int, *, stride: int = 1
 ) -> tuple[Int[np.ndarray, "windows"], Int[np.ndarray, "windows"]]:
-    """First frame and clip of all windows that lie within one clip.
+    """First frame (over all clips) and clip of all windows that lie within one clip.
+
+    Both are empty if no clip is long enough.
 
     Args:
       offsets: First frame of each clip, and the number of frames at the end.
       length: Frames per window.
       stride: Frames between the starts of windows of one clip.
-
-    Returns:
-      Starts, counted over all clips, and the clip of each; empty if none is long
-      enough.
     """
     starts = [
         np.arange(a, b - length + 1, stride)
@@ -100,7 +98,7 @@ TURN_BORDERS = (-np.pi / 2, -np.pi / 6, np.pi / 6, np.pi / 2)
 def balance(
     clips: Clips, index: WindowIndex, *, last: int, power: float = 0.5
 ) -> tuple[WindowIndex, Float[np.ndarray, "classes 2"]]:
-    """An index in which what happens rarely stands more often.
+    """An index in which what happens rarely stands more often, and classes' shares.
 
     A window's class is its speed at frame `last`, its speed at the end, both over a
     third of a second, and the turn of the facing between them. Its number of entries
@@ -108,7 +106,6 @@ def balance(
     walking: a model that has seen few stops slides into them.
 
     Args:
-      index: Where windows may start.
       last: Frame that the future begins after.
       power: 0 leaves the index as it is; 1 gives all classes the same share.
 
@@ -148,10 +145,8 @@ def motion_kinds(
 ) -> Int[np.ndarray, " windows"]:
     """Classes of windows by what changes in them.
 
-    Args:
-      now: Speed at the beginning, meters per second.
-      end: Speed at the end.
-      turned: Angle by which the facing turns between, radians.
+    Speeds at the beginning and the end are in meters per second, the angle by which the
+    facing turns between in radians.
     """
     speeds, turns = len(SPEED_BORDERS) + 1, len(TURN_BORDERS) + 1
     kinds = np.digitize(now, SPEED_BORDERS) * speeds + np.digitize(end, SPEED_BORDERS)
@@ -162,13 +157,10 @@ def motion_kinds(
 def repeat_rare(
     kinds: Int[np.ndarray, " windows"], *, power: float
 ) -> tuple[Int[np.ndarray, " chosen"], Float[np.ndarray, "classes 2"]]:
-    """Windows in which rare classes stand more often, each n^-power for n windows.
+    """About twice as many windows' numbers, n^-power for each class of n windows.
 
-    Args:
-      power: 0 draws all windows alike; 1 gives all classes the same share.
-
-    Returns:
-      Numbers of windows, about twice as many, and each class's share before and after.
+    The power 0 draws all windows alike; 1 gives all classes the same share. With the
+    numbers comes each class's share before and after.
     """
     _, kind, count = np.unique(kinds, return_inverse=True, return_counts=True)
     weight = count[kind] ** -power
@@ -183,12 +175,7 @@ def repeat_rare(
 
 
 def cut(clips: Clips, start: Int[Array, ""], length: int) -> Motion:
-    """The frames from `start`.
-
-    Args:
-      start: First frame, counted over all clips.
-      length: Frames.
-    """
+    """The `length` frames from `start`, counted over all clips."""
     take = lambda x: jax.lax.dynamic_slice_in_dim(x, start, length)  # noqa: E731
     return Motion(
         root_position=take(clips.root_position),
@@ -200,14 +187,7 @@ def cut(clips: Clips, start: Int[Array, ""], length: int) -> Motion:
 def sample_windows(
     key: Key, clips: Clips, index: WindowIndex, *, batch: int
 ) -> tuple[Motion, Int[Array, "{batch}"]]:
-    """Draws windows, uniformly over all starts.
-
-    Args:
-      index: Where windows may start.
-
-    Returns:
-      Windows [batch, length, ...] and the clip of each.
-    """
+    """Windows [batch, length, ...], uniformly over all starts, and the clip of each."""
     chosen = jax.random.randint(key, (batch,), 0, index.starts.shape[0])
     windows = jax.vmap(lambda start: cut(clips, start, index.length))(
         index.starts[chosen]
@@ -241,13 +221,8 @@ class EvalWindows:
 def eval_windows(clips: Clips, *, stride: int, field: str) -> EvalWindows:
     """Windows of real clips; what is wanted is their own path, smoothed.
 
-    Args:
-      clips: The clips; those shorter than a window are left out.
-      stride: Frames between the starts of windows.
-      field: Label field that is the style.
-
-    Returns:
-      The windows; wanted paths are filtered with sigma 10 frames, as in training.
+    The path is filtered with sigma 10 frames, as in training. Clips shorter than a
+    window are left out. The label field `field` is the style.
     """
     index = window_index(clips, EVAL_WINDOW, stride=stride, short="skip")
     motion = jax.vmap(lambda s: cut(clips, s, EVAL_WINDOW))(index.starts)
@@ -265,10 +240,7 @@ def eval_windows(clips: Clips, *, stride: int, field: str) -> EvalWindows:
 
 
 def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
-    """Raises unless rollouts are long enough to be measured; for use before the work.
-
-    Args:
-      skip: Ticks to leave out at the start.
+    """Raises unless rollouts are long enough to be measured, the first `skip` left out.
 
     Raises:
       ValueError: names the length that is needed.
@@ -284,14 +256,10 @@ def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
 def rollout_windows(
     frames: Any, labels: Int[Array, " characters"], *, skip: int
 ) -> EvalWindows:
-    """Consecutive windows of rollouts.
+    """Consecutive windows of the rollouts' frames [characters, ticks, ...].
 
-    Args:
-      frames: A `control.frame.Frame` [characters, ticks, ...].
-      skip: Ticks to leave out at the start, where the data's own pose still shows.
-
-    Returns:
-      The windows; their group is the character.
+    Their group is the character. The first `skip` ticks, where the data's own pose
+    still shows, are left out.
 
     Raises:
       ValueError: if the rollouts are shorter than what is left out and one window.

@@ -53,12 +53,9 @@ class Multistep:
 def respaced(make: StepFactory, steps: tuple[int, ...] | None) -> StepFactory:
     """A factory of steps that visit only some steps of the schedule it is given.
 
-    Args:
-      steps: Steps to visit, as for `schedule.respace`; None for all.
-
-    Returns:
-      The factory. Its steps count 1..len(steps); the denoiser, trained on the given
-      schedule, is told that schedule's own step.
+    The steps to visit are as for `schedule.respace`; None for all. The factory's steps
+    count 1..len(steps); the denoiser, trained on the given schedule, is told that
+    schedule's own step.
     """
     if steps is None:
         return make
@@ -164,12 +161,8 @@ def ancestral_step(
     """Step that samples the posterior given the predicted clean sample.
 
     At t = 1 the result is the prediction itself, without noise. With a stochastic
-    denoiser this is the sampler of denoising-diffusion GANs.
-
-    Args:
-      denoise: Predicts x_0 from x_t.
-      noise: Normal noise of steps 1..T, for who does not want it drawn anew from the
-        key; None draws it.
+    denoiser this is the sampler of denoising-diffusion GANs. The normal noise of steps
+    1..T may be given; None draws it from the key.
 
     Source: Ho et al. 2020, eq. 6-7, with the smaller of its two variances; the released
     code of CAMDM.
@@ -195,13 +188,9 @@ def ddim_step(
 ) -> Step:
     """Step of DDIM, from t to t - 1; `respace` the schedule to skip steps.
 
-    eta = 0 draws no noise; eta = 1 is `ancestral_step`. At t = 1 the result is the
-    prediction itself.
-
-    Args:
-      denoise: Predicts x_0 from x_t.
-      eta: Share of the posterior's standard deviation that is drawn as noise, in
-        [0, 1].
+    eta, in [0, 1], is the share of the posterior's standard deviation that is drawn as
+    noise: 0 draws none; 1 is `ancestral_step`. At t = 1 the result is the prediction
+    itself.
 
     Raises:
       ValueError: if eta is a Python number out of range.
@@ -296,10 +285,7 @@ def sample(
 ) -> Float[Array, "..."]:
     """Draws a sample: normal noise, then the whole reverse chain.
 
-    Args:
-      step: Maps (key, x_t, t) to x_{t-1}.
-      shape: Shape of the sample; static.
-      num_steps: T of the step's schedule; static.
+    The shape and T (`num_steps`) of the step's schedule are static.
 
     Raises:
       ValueError: if num_steps is negative or no integer.

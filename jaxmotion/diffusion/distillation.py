@@ -47,13 +47,8 @@ def chain_pairs(
 ) -> Pairs:
     """The student's predictions at some steps, and where the teacher's chain ends.
 
-    Args:
-      x_0: Clean sample, which noise is added to.
-      teacher: Who is learned from; called once per step of each chain.
-      steps: Steps in 1..T that the student is taught at; static.
-
-    Returns:
-      Both; no gradient flows through the targets.
+    The steps, in 1..T, are static; the teacher is called once per step of each chain.
+    No gradient flows through the targets.
     """
     solve = chain.ddim_step(table, teacher)
 
@@ -81,15 +76,9 @@ def consistency_pairs(
 ) -> Pairs:
     """The student's predictions at random steps, and its own one step further on.
 
-    At t = 1 the target is the teacher's prediction.
-
-    Args:
-      x_0: Clean sample, which noise is added to.
-      teacher: Who is learned from; called once per pair.
-      number: Pairs; each is of a step uniform in 1..T, and they are spread evenly.
-
-    Returns:
-      Both; no gradient flows through the targets.
+    At t = 1 the target is the teacher's prediction, which is called once per pair. Each
+    of the pairs is of a step uniform in 1..T, and they are spread evenly. No gradient
+    flows through the targets.
     """
     solve, total = chain.ddim_step(table, teacher), table.num_steps
     key_step, key_pairs = jax.random.split(key)

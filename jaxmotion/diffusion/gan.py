@@ -31,15 +31,10 @@ def q_pair(
     x_0: Float[Array, "*shape"],
     t: Int[Array, "*#batch"],
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
-    """A pair of neighboring noise levels of the same clean sample.
+    """A pair x_{t-1}, x_t of neighboring noise levels of the same clean sample.
 
-    The noise of the second step is independent of that of the first.
-
-    Args:
-      t: Step of the noisier of the two, in 1..T.
-
-    Returns:
-      x_{t-1} and x_t; at t = 1 the first is x_0 itself.
+    The noise of the second step is independent of that of the first. t is in 1..T; at t
+    = 1 the first is x_0 itself.
     """
     key_prev, key_t = jax.random.split(key)
     noise = lambda k: jax.random.normal(k, x_0.shape, x_0.dtype)  # noqa: E731
@@ -55,15 +50,7 @@ def posterior_sample(
     x_t: Float[Array, "*shape"],
     t: Int[Array, "*#batch"],
 ) -> Float[Array, "*shape"]:
-    """Draws x_{t-1} given x_t and (a prediction of) x_0.
-
-    Args:
-      x_0: Clean sample, or a generator's prediction.
-      t: Step in 1..T.
-
-    Returns:
-      x_{t-1}; at t = 1 it is x_0.
-    """
+    """Draws x_{t-1} given x_t and (a prediction of) x_0, t in 1..T; x_0 at t = 1."""
     mean, variance = _schedule.posterior(schedule, x_0, x_t, t)
     return mean + jnp.sqrt(variance) * jax.random.normal(key, x_t.shape, x_t.dtype)
 
@@ -72,10 +59,9 @@ def posterior_sample(
 def discriminator_loss(
     real_logits: Float[Array, "*reals"], fake_logits: Float[Array, "*fakes"]
 ) -> Float[Array, ""]:
-    """Non-saturating loss of the discriminator.
+    """Non-saturating: mean softplus(-real) plus mean softplus(fake).
 
-    Returns:
-      Mean softplus(-real) plus mean softplus(fake); 2 ln 2 where it is undecided.
+    2 ln 2 where it is undecided.
     """
     real = jnp.mean(jax.nn.softplus(-real_logits))
     return real + jnp.mean(jax.nn.softplus(fake_logits))
@@ -83,11 +69,7 @@ def discriminator_loss(
 
 @jax.jit
 def generator_loss(fake_logits: Float[Array, "*batch"]) -> Float[Array, ""]:
-    """Non-saturating loss of the generator.
-
-    Returns:
-      Mean softplus(-fake).
-    """
+    """Non-saturating: mean softplus(-fake)."""
     return jnp.mean(jax.nn.softplus(-fake_logits))
 
 
@@ -97,12 +79,8 @@ def r1_penalty(
 ) -> Float[Array, ""]:
     """Squared gradient of the logits at real samples, averaged over the batch.
 
-    Args:
-      discriminate: Maps samples to their logits, each from its own sample only.
-      x: Real samples.
-
-    Returns:
-      The mean of the squared norms; the customary loss is gamma / 2 times it.
+    The customary loss is gamma / 2 times it. `discriminate` maps samples to their
+    logits, each from its own sample only.
 
     Source: Mescheder et al. 2018, eq. 9.
     """

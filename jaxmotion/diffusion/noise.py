@@ -38,14 +38,9 @@ _NORMAL = "_normal"
 
 
 def draw_noise(function: Callable[..., Any], key: Key, *args: Any) -> Tape:
-    """The noise that `function(key, *args)` draws.
+    """The standard normal noise that `function(key, *args)` draws, as a tape.
 
-    Args:
-      function: Takes a key first.
-      *args: Its other arguments; only their shapes matter, and may stand for them.
-
-    Returns:
-      Standard normal noise, as the module's text says.
+    Only the shapes of the arguments matter, and may stand for them.
 
     Raises:
       ValueError: if the function draws something else than normal noise, or its keys
@@ -55,10 +50,7 @@ def draw_noise(function: Callable[..., Any], key: Key, *args: Any) -> Tape:
 
 
 def with_noise(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of its noise instead of its key.
-
-    Args:
-      function: Takes a key first.
+    """A function of its noise instead of its key, which it takes first.
 
     Returns:
       `(tape, *args)`, which gives what `function(key, *args)` gives where the tape is

@@ -31,14 +31,7 @@ def heading_error(
 ) -> Float[Array, "*batch"]:
     """Signed angle from the expected direction to the actual one, wrapped.
 
-    Args:
-      expected: Ground directions (x, z) of any length.
-      actual: Ground directions of any length.
-
-    Returns:
-      Angle in [-pi, pi] radians, positive from +z toward +x.
-
-    Source: own.
+    In [-pi, pi] radians, positive from +z toward +x; directions (x, z) have any length.
     """
     return ground.angle_from_to(expected, actual)
 
@@ -53,19 +46,16 @@ def trajectory_error(
 ) -> TrajectoryError:
     """Mean absolute angle between the wanted and the actual direction of the root.
 
-    Frame f's actual velocity is the step from f to f + 1; it is compared with the
-    velocity wanted at f. A direction means nothing at rest, so frames in which either
-    speed is below `min_speed` are left out; the part that remains is returned.
+    In [0, pi] radians, zero where no frame remains. Frame f's actual velocity is the
+    step from f to f + 1; it is compared with the velocity wanted at f. A direction
+    means nothing at rest, so frames in which either speed is below `min_speed` are left
+    out; the part that remains is returned.
 
     Args:
-      wanted_velocity: Velocity (x, z) that the user asked for in each frame, meters a
-        second; the last is not used.
+      wanted_velocity: Velocity (x, z) that the user asked for in each frame, m/s; the
+        last is not used.
       position: Root position (x, z) in each frame, meters.
       min_speed: Meters per second.
-
-    Returns:
-      Mean error in [0, pi] radians (zero where no frame remains), and the part of the
-      frames used.
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -92,14 +82,9 @@ def trajectory_error(
 def orientation_error(
     wanted: Float[Array, "*batch frames 2"], actual: Float[Array, "*batch frames 2"]
 ) -> Float[Array, "*batch"]:
-    """Mean absolute angle between the wanted and the actual facing.
+    """Mean absolute angle between the wanted and the actual facing (x, z).
 
-    Args:
-      wanted: Facing (x, z) that the user asked for in each frame.
-      actual: Facing of the root in each frame.
-
-    Returns:
-      Mean error in [0, pi] radians.
+    In [0, pi] radians.
 
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 6; wrapped.
     """
@@ -110,15 +95,11 @@ def orientation_error(
 def commanded_path(
     velocity: Float[Array, "*batch frames 2"], fps: Scalar
 ) -> Float[Array, "*batch frames 2"]:
-    """Where a point is after each frame that starts at the origin and goes as told.
+    """Where a point is, meters, after each frame that starts at the origin and obeys.
 
-    Args:
-      velocity: Wanted velocity at the end of each frame (after the springs, in systems
-        that have them), meters per second.
-
-    Returns:
-      Positions, meters: the trapezoidal integral, which is within a millimeter of the
-      springs' own for half-lives from a quarter of a second.
+    The velocity is wanted at the end of each frame (after the springs, in systems that
+    have them), meters per second. The integral is trapezoidal, which is within a
+    millimeter of the springs' own for half-lives from a quarter of a second.
     """
     ends = jnp.cumsum(velocity, axis=-2)
     return (ends - 0.5 * (velocity - velocity[..., :1, :])) / fps
@@ -131,18 +112,11 @@ def path_offset(
     *,
     reach: int,
 ) -> Float[Array, "*batch frames 2"]:
-    """Way on the ground from where a character should be by now to where it is.
+    """Way, meters, from where a character should be by now to where its root (x, z) is.
 
-    What lags behind is off its path as what strays to a side.
-
-    Args:
-      position: Root position (x, z) in each frame, meters.
-      wanted: Where it was told to be.
-      reach: Frames to either side over which the difference is averaged; the first and
-        the last one stand for those outside.
-
-    Returns:
-      Meters.
+    What lags behind is off its path as what strays to a side. The difference is
+    averaged over `reach` frames to either side; the first and the last one stand for
+    those outside.
     """
     gap = position - wanted
     frame, last = np.arange(gap.shape[-2]), gap.shape[-2] - 1
@@ -156,15 +130,10 @@ def path_offset(
 def steady_speed(
     position: Float[Array, "*batch frames 2"], fps: Scalar, *, reach: int
 ) -> Float[Array, "*batch frames"]:
-    """Speed of the root without its sway.
+    """Speed of the root (x, z; meters) without its sway, meters per second.
 
-    Args:
-      position: Root position (x, z) in each frame, meters.
-      reach: The speed is that from so many frames before to so many after; less at
-        both ends of the path.
-
-    Returns:
-      Meters per second.
+    It is that from `reach` frames before to as many after; less at both ends of the
+    path.
     """
     frame = np.arange(position.shape[-2])
     before = np.maximum(frame - reach, 0)
@@ -178,15 +147,10 @@ def steady_speed(
 def creep(
     position: Float[Array, "*batch frames 2"], *, length: int
 ) -> Float[Array, "*batch"]:
-    """How far a character that should stand goes from its place within some time.
+    """How far a character that should stand goes from its place within `length` frames.
 
-    Args:
-      position: Root position (x, z) in each frame, meters.
-      length: Frames of that time.
-
-    Returns:
-      Largest distance from the first frame of a part of that length, meters; mean
-      over all whole parts.
+    Largest distance, meters, of the root (x, z) from the first frame of a part of that
+    length; mean over all whole parts.
 
     Raises:
       ValueError: if there is no whole part.
@@ -217,10 +181,8 @@ def reaction(
 ) -> Reaction:
     """Time from each new command until it is obeyed for the first time.
 
-    Args:
-      reached: Whether a frame does what the command says.
-      begins: First frame of each command.
-      ends: First frame that it no longer holds in.
+    Commands hold from their first frame to their (exclusive) end; `reached` says
+    whether a frame does what they say.
     """
     reached = np.asarray(reached)
     lead, number = reached.shape[:-1], len(begins)

@@ -86,16 +86,13 @@ def foot_ball_distance(
     """How near the nearest joint comes to the ball's center when the ball is pushed.
 
     Of each event of `touch_events` the smallest distance of any joint, over the event's
-    frames and one frame on either side.
+    frames and one frame on either side: meters, added over events, and the number of
+    events. A touch by the surface of a foot leaves the ball's radius and half a foot.
 
     Args:
       ball: Positions, meters.
       joints: World positions of the joints that may touch it (feet, or hands), meters.
       threshold: Acceleration of an event, meters per second squared, exclusive.
-
-    Returns:
-      Meters, added over events, and the number of events. A touch by the surface of a
-      foot leaves the ball's radius and half a foot.
 
     Raises:
       ValueError: if there are fewer than three frames.
@@ -183,15 +180,9 @@ def untouched_acceleration(
 def ground_penetration(
     ball: Float[Array, "*batch frames 3"], *, radius: Scalar, ground: Scalar = 0.0
 ) -> Depth:
-    """How deep the ball's lowest point lies below the ground.
+    """How deep the ball's lowest point lies below the ground, millimeters.
 
-    Args:
-      ball: Positions, meters.
-      radius: Radius of the ball, meters.
-      ground: Height of the ground, meters.
-
-    Returns:
-      Millimeters, not negative: mean over all frames, and largest.
+    Mean over all frames, and largest; not negative. Arguments are in meters.
     """
     return _depth(radius + ground - ball[..., 1])
 
@@ -203,17 +194,10 @@ def joint_penetration(
     *,
     radius: Scalar,
 ) -> Depth:
-    """How deep the deepest joint lies inside the ball.
+    """How deep the deepest joint (world) lies inside the ball, millimeters.
 
-    Joints lie inside the limbs, hence zero here does not yet keep their surface out.
-
-    Args:
-      ball: Positions, meters.
-      joints: World positions of the joints, meters.
-      radius: Radius of the ball, meters.
-
-    Returns:
-      Millimeters, not negative: mean over all frames, and largest.
+    Mean over all frames, and largest; not negative. Arguments are in meters. Joints lie
+    inside the limbs, hence zero here does not yet keep their surface out.
     """
     return _depth(radius - _nearest(ball, joints))
 

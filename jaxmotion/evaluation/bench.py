@@ -87,14 +87,10 @@ def plain_points(texts: Sequence[str]) -> tuple[Point, ...]:
 
 
 def taught_points(texts: Sequence[str]) -> tuple[Point, ...]:
-    """Numbers of steps T, and students of such models.
+    """Numbers of steps T, and students of such models, in this order.
 
-    Args:
-      texts: "8" for a model of 8 steps, or "1/8" for its student of 1 step, which comes
-        after it.
-
-    Returns:
-      The points, in this order.
+    A text is "8" for a model of 8 steps, or "1/8" for its student of 1 step, which
+    comes after it.
 
     Raises:
       ValueError: if one is neither, is given twice, or is a student of none before it.
@@ -124,14 +120,10 @@ def taught_points(texts: Sequence[str]) -> tuple[Point, ...]:
 
 
 def paired_points(texts: Sequence[str]) -> tuple[Point, ...]:
-    """Polish steps preceded by draft steps.
+    """Polish steps preceded by draft steps, in this order.
 
-    Args:
-      texts: "2+3" for 2 polish steps after 3 draft steps (either may be 0), or "2" for
-        2 after the paper's 3 draft steps.
-
-    Returns:
-      The points, in this order.
+    A text is "2+3" for 2 polish steps after 3 draft steps (either may be 0), or "2" for
+    2 after the paper's 3 draft steps.
 
     Raises:
       ValueError: if one is neither, has no step at all, or is given twice.
@@ -180,14 +172,9 @@ Budget = dict[str, Any]
 
 
 def resolve(amounts: Amounts, name: str, changes: Sequence[str] = ()) -> Budget:
-    """The numbers of a budget, some of them changed.
+    """The numbers of a budget ("quick" or "full"), some changed by "number=value".
 
-    Args:
-      name: "quick" or "full".
-      changes: "number=value", for numbers of the budget.
-
-    Returns:
-      Whole numbers where the budget's are whole.
+    They are whole where the budget's are whole.
 
     Raises:
       ValueError: names the field that is wrong.
@@ -299,16 +286,15 @@ def _key(i: int) -> tuple[Key]:
 def call_time(
     run: Callable[[Key], Any], *, parts: int = 1, seconds: float = 2.0, least: int = 5
 ) -> Cell:
-    """Time of one call, for a column beside the scores; benchmarks measure better.
+    """Median time of one call, milliseconds, with the ends of the middle half.
+
+    For a column beside the scores; benchmarks measure better.
 
     Args:
       run: A jitted function of a key.
       parts: Parts of the call's time that is given, such as its frames.
       seconds: Calls go on for so long, but for no more than 200 of them.
       least: Number of calls, at least.
-
-    Returns:
-      Median in milliseconds, with the ends of the middle half.
     """
     times = timing.time_calls(
         run, arguments=_key, rounds=200, warmup=2, limit_s=seconds, least=least
@@ -320,14 +306,7 @@ def call_time(
 
 
 def time_cells(times: np.ndarray, *, seed: int) -> Row:
-    """Median with its 95 % bootstrap interval, and 95th percentile.
-
-    Args:
-      times: Milliseconds.
-
-    Returns:
-      Two columns.
-    """
+    """Median of milliseconds with its 95 % bootstrap interval, and 95th percentile."""
     found = statistics.bootstrap_interval(times, np.median, seed=seed)
     return {
         "p50": Cell(
@@ -340,8 +319,7 @@ def time_cells(times: np.ndarray, *, seed: int) -> Row:
 def measure(evaluation: Evaluation, job: Job) -> tuple[Rows, dict[str, float]]:
     """Scores all models, then times them in turn.
 
-    Returns:
-      The table, and the seconds that each row's scores took.
+    With the table come the seconds that each row's scores took.
     """
     rows, seconds = dict(evaluation.real), {}
     for point in job.points:

@@ -38,12 +38,9 @@ def place_sums(
     num_places: int,
     weights: Float[Array, "*batch frames"] | None = None,
 ) -> Float[Array, "2 places"]:
-    """Sums of values and of weights by place.
+    """Sums of values (one per frame) and of their weights by place.
 
-    Args:
-      values: One a frame.
-      place: Place of each frame, in 0..num_places-1; others are left out.
-      weights: Weights of the values; None for equal ones.
+    Places beyond 0..num_places-1 are left out; without weights all are equal.
     """
     at = jax.nn.one_hot(place, num_places)
     weights = jnp.ones(values.shape) if weights is None else weights
@@ -95,7 +92,7 @@ def by_frame(
     num_places: int,
     contact_height: Scalar,
 ) -> ByFrame:
-    """Jerk (m/s^3) and slide of low toes (m/s) by place.
+    """Jerk (m/s^3) and slide of low toes (m/s) by place, over the batch and time.
 
     A difference belongs to its last frame: a jump from frame 4 to frame 5 shows in the
     jerk of frames 5, 6 and 7 (as 1 : 2 : 1) and in the slide of frame 5.
@@ -105,9 +102,6 @@ def by_frame(
       feet: Joints whose sliding counts.
       place: Place of each frame, in 0..num_places-1; others are left out.
       contact_height: A foot joint below this height should not move, meters.
-
-    Returns:
-      Means over the batch and time.
     """
     return means(
         rough_sums(
@@ -133,11 +127,9 @@ def to_json(rows: dict[str, ByFrame]) -> dict[str, dict[str, list[float | None]]
 
 
 def to_markdown(rows: dict[str, ByFrame], *, places: str = "by frame") -> str:
-    """One table: a line per row and column, a column per place.
+    """One table of `by_frame`: a line per row and column, a column per place.
 
-    Args:
-      rows: As `by_frame` returns them; a place without frames (NaN) is a dash.
-      places: What the places are.
+    `places` names these; one without frames (NaN) is a dash.
     """
 
     def text(x: float) -> str:

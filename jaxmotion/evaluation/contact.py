@@ -22,13 +22,7 @@ class Slide(NamedTuple):
 def foot_steps(
     foot_positions: Float[Array, "*batch frames feet 3"],
 ) -> Float[Array, "*batch frames-1 feet"]:
-    """Distance on the ground from each frame to the next.
-
-    Args:
-      foot_positions: World positions, meters.
-
-    Returns:
-      Meters.
+    """Distance, meters, on the ground from each frame to the next.
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -56,8 +50,8 @@ def slide_distance(
       max_height: Meters, exclusive ("below, e.g., 1 cm" in the paper).
 
     Returns:
-      Speed in meters per second (zero where no foot is ever low) and the seconds that
-      feet were low, added over feet.
+      Meters per second (zero where no foot is ever low) and the seconds that feet were
+      low, added over feet.
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -81,7 +75,7 @@ def skate_ratio(
     max_height: Scalar = 0.05,
     min_speed: Scalar = 0.5,
 ) -> Float[Array, "*batch"]:
-    """Part of the frames in which any foot skates.
+    """Part of the frames, in [0, 1], in which any foot skates.
 
     A foot skates from one frame to the next if it is lower than `max_height` in both
     and moves faster than `min_speed` on the ground.
@@ -90,9 +84,6 @@ def skate_ratio(
       foot_positions: World positions of feet or toes, meters, ground at y = 0.
       max_height: Meters, exclusive.
       min_speed: Meters per second, exclusive. The source's 2.5 cm a frame at 20 fps.
-
-    Returns:
-      Ratio in [0, 1].
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -114,19 +105,16 @@ def skating_frame_ratio(
     height: Scalar = 0.025,
     min_speed: Scalar = 0.2,
 ) -> Float[Array, "*batch"]:
-    """Part of the frames in which any foot skates, by MANN's measure of skating.
+    """Part of the frames, in [0, 1], in which any foot skates, by MANN's measure.
 
-    A foot at height h that moves at v on the ground skates by v (2 - 2^(h / H)), with
-    h / H clipped to [0, 1]: fully on the ground, not at all from H on. A frame counts
-    if that exceeds `min_speed`.
+    A foot at height h that moves at v on the ground skates by v (2 - 2^(h / H)), with h
+    / H clipped to [0, 1]: fully on the ground, not at all from H on. A frame counts if
+    that exceeds `min_speed`.
 
     Args:
       foot_positions: World positions of feet or toes, meters, ground at y = 0.
       height: H, meters.
       min_speed: Meters per second, exclusive; ours, since the source sums the measure.
-
-    Returns:
-      Ratio in [0, 1].
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -162,10 +150,9 @@ def swing_height(
     ground: Scalar,
     least_speed: float = 0.3,
 ) -> Swing:
-    """Height of feet that move faster over the ground than the body.
+    """Height of feet (world, meters) that move faster over the ground than the body.
 
     Args:
-      foot_positions: World positions, meters.
       body_speed: Speed of the body without its sway, meters per second.
       ground: Height at which a foot rests, meters.
       least_speed: A foot of a body that is slower than this, m/s, must be faster than

@@ -23,7 +23,7 @@ def _random_pairs(key: Key, count: int, num_pairs: int) -> tuple[Array, Array]:
 def diversity(
     key: Key, features: Float[Array, "samples features"], *, num_pairs: int
 ) -> Float[Array, ""]:
-    """Mean distance of random pairs of samples.
+    """Mean Euclidean distance of random pairs of samples, in the features' units.
 
     Differs from the source: pairs are of two different samples, drawn anew each, so
     that the mean is unbiased; there two random subsets are paired, and a sample may
@@ -32,9 +32,6 @@ def diversity(
     Args:
       features: One row a sample, of all conditions together.
       num_pairs: Pairs to draw (the source: 200 or 300).
-
-    Returns:
-      Mean Euclidean distance, in units of the features.
 
     Raises:
       ValueError: if there are fewer than two samples.
@@ -50,14 +47,10 @@ def diversity(
 def multimodality(
     key: Key, features: Float[Array, "conditions repeats features"], *, num_pairs: int
 ) -> Float[Array, ""]:
-    """Mean distance of random pairs of samples of the same condition.
+    """Mean Euclidean distance of random pairs of samples of the same condition.
 
-    Args:
-      features: Features of several samples of each condition.
-      num_pairs: Pairs to draw for each condition (the source: 10 or 20).
-
-    Returns:
-      Mean Euclidean distance, in units of the features.
+    In the features' units, of `num_pairs` pairs for each condition (the source: 10 or
+    20).
 
     Raises:
       ValueError: if a condition has fewer than two samples.
@@ -76,17 +69,12 @@ def multimodality(
 def joint_distance(
     key: Key, positions: Float[Array, "samples frames joints 3"], *, num_pairs: int
 ) -> Float[Array, ""]:
-    """Mean distance of a joint in one sample to the same joint in another.
+    """Mean distance, meters, of a joint in one sample to the same joint in another.
 
     Over random pairs of two different samples, their frames and joints. Unlike
     `diversity` it has the unit of a length and does not grow with frames or joints.
-
-    Args:
-      positions: Joint positions, meters, in the frame they are to be compared in:
-        world for the whole rollout, root-local for the pose alone.
-
-    Returns:
-      Meters.
+    Positions are in the frame they are to be compared in: world for the whole rollout,
+    root-local for the pose alone.
 
     Raises:
       ValueError: if there are fewer than two samples.
@@ -107,17 +95,12 @@ def intra_style_variance(
 ) -> Float[Array, ""]:
     """Variance of joint positions over repeats of one style and one control.
 
-    The paper's definition of diversity is a sentence: the variance of each joint's
-    spatial location, averaged over all joints, of motions generated with the same
-    control. Here: at each frame and joint the mean squared distance to the mean over
-    the repeats, unbiased, averaged over frames and joints.
-
-    Args:
-      positions: Joint positions, meters, in the frame they are to be compared in:
-        world for the whole rollout, root-local for the pose alone.
-
-    Returns:
-      Variance, square meters (summed over the three axes).
+    Square meters, summed over the three axes. The paper's definition of diversity is a
+    sentence: the variance of each joint's spatial location, averaged over all joints,
+    of motions generated with the same control. Here: at each frame and joint the mean
+    squared distance to the mean over the repeats, unbiased, averaged over frames and
+    joints. Positions are in meters, in the frame they are to be compared in: world for
+    the whole rollout, root-local for the pose alone.
 
     Raises:
       ValueError: if there are fewer than two repeats.

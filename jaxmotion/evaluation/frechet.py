@@ -34,10 +34,7 @@ class Moments:
 
 @jax.jit
 def moments(features: Float[Array, "samples features"]) -> Moments:
-    """Mean and unbiased covariance.
-
-    Args:
-      features: One row a sample.
+    """Mean and unbiased covariance of one row per sample.
 
     Raises:
       ValueError: if there are fewer than two samples.
@@ -59,16 +56,10 @@ def moments(features: Float[Array, "samples features"]) -> Moments:
 def masked_moments(
     features: Float[Array, "samples features"], mask: Bool[Array, " samples"]
 ) -> Moments:
-    """Moments of some of the rows; how many is no part of the shape.
+    """Moments of the rows that count; how many is no part of the shape.
 
-    One program thus serves subsets of any size.
-
-    Args:
-      features: One row a sample.
-      mask: Which rows count.
-
-    Returns:
-      The moments; the covariance is NaN where fewer than two rows count.
+    One program thus serves subsets of any size. The covariance is NaN where fewer than
+    two rows count.
 
     Source: Heusel et al. 2017.
     """
@@ -92,14 +83,11 @@ def _square_root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def frechet_distance(a: Moments, b: Moments) -> Float[Array, ""]:
     """Squared Fréchet (Wasserstein-2) distance of two Gaussians: (1) of this module.
 
-    The usual FID, not divided by the number of features. Fewer samples than features
-    are allowed, though the estimate is then biased upwards: compare only distances of
-    equal counts. In float32 the error measured with 512 features is 1e-4 of tr A + tr B
-    where covariances are nearly singular, below 1e-6 elsewhere; 64-bit inputs need
-    `jax.enable_x64`.
-
-    Returns:
-      Distance, in squared units of the features, not negative.
+    The usual FID, not divided by the number of features, in their squared units, not
+    negative. Fewer samples than features are allowed, though the estimate is then
+    biased upwards: compare only distances of equal counts. In float32 the error
+    measured with 512 features is 1e-4 of tr A + tr B where covariances are nearly
+    singular, below 1e-6 elsewhere; 64-bit inputs need `jax.enable_x64`.
 
     Source: Dowson and Landau 1982; Heusel et al. 2017.
     """
@@ -121,16 +109,10 @@ def frechet_distance_of_rows(
 ) -> Float[Array, ""]:
     """Squared Fréchet distance of the Gaussians fitted to two sets of few rows.
 
+    In squared units of the features, not negative; NaN where fewer than two rows count.
     With centered rows X and Y divided by the root of their number less one, the last
-    trace of (1) is the sum of the singular values of X Y^T: no covariance is formed,
-    so that singular ones lose nothing.
-
-    Args:
-      a: Rows from `count_a` on are padding.
-
-    Returns:
-      Distance, in squared units of the features, not negative; NaN where fewer than
-      two rows count.
+    trace of (1) is the sum of the singular values of X Y^T: no covariance is formed, so
+    that singular ones lose nothing. Rows from their count on are padding.
     """
 
     def centered(x: Array, count: Array) -> tuple[Array, Array]:

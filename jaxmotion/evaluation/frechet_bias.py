@@ -42,15 +42,12 @@ class BiasCheck(NamedTuple):
 
 
 def subset_sizes(count: int, *, number: int = 15, least: int) -> tuple[int, ...]:
-    """Sizes evenly spaced from the least to all samples, as in the source.
+    """Ascending sizes evenly spaced from the least to all samples, as in the source.
 
     Args:
       number: Sizes; 15 in the source.
       least: The smallest. At least the number of features (the source: 5,000 for
         2,048): below it (1) has further terms, and the line misses them.
-
-    Returns:
-      The sizes, ascending.
 
     Raises:
       ValueError: if fewer than two different sizes fit.
@@ -86,9 +83,6 @@ def frechet_bias(
         are.
       sizes: Sizes of the subsets, see `subset_sizes`.
       repeats: Subsets of each size.
-
-    Returns:
-      Sizes, distances, the extrapolated one and the slope.
 
     Raises:
       ValueError: if there are fewer than two different sizes or one is not in

@@ -25,15 +25,9 @@ def diverged_frames(
 ) -> Bool[Array, "*batch frames"]:
     """Which frames are outside what a body can show.
 
-    Args:
-      positions: World positions of the joints, meters; joint 0 is the root.
-      min_root: Lowest root height, meters.
-      max_root: Highest root height, meters.
-      max_speed: Largest speed of any joint, meters per second.
-
-    Returns:
-      True where a number is not finite, the root is outside its heights, or a joint
-      came there from the frame before faster than the bound.
+    A number is not finite, the root is outside its heights, or a joint came there from
+    the frame before faster than the bound. World positions, meters, joint 0 the root;
+    heights are in meters, the largest speed of any joint in meters per second.
     """
     finite = jnp.all(jnp.isfinite(positions), axis=(-2, -1))
     height = positions[..., 0, 1]
@@ -54,18 +48,7 @@ def has_diverged(
     max_root: Scalar,
     max_speed: Scalar = 20.0,
 ) -> Bool[Array, "*batch"]:
-    """Whether any frame is outside what a body can show.
-
-    Args:
-      positions: World positions of the joints, meters; joint 0 is the root.
-      min_root: Lowest root height, meters.
-      max_root: Highest root height, meters.
-      max_speed: Largest speed of any joint, meters per second.
-
-    Returns:
-      True where a number is not finite, the root is outside its heights, or a joint is
-      faster than the bound.
-    """
+    """Whether any frame is outside what a body can show; see `diverged_frames`."""
     found = diverged_frames(
         positions, fps=fps, min_root=min_root, max_root=max_root, max_speed=max_speed
     )
@@ -84,19 +67,12 @@ def frozen_frames(
 ) -> Bool[Array, "*batch frames"]:
     """Which frames lie in a window of time in which the limbs stand though told to go.
 
-    Time is cut into windows of `seconds`. A window is frozen if the joints' mean speed
-    relative to the root is below `min_speed` while the slowest velocity wanted in it is
-    above `commanded`: a statue is frozen whether it stands or glides.
-
-    Args:
-      positions: World positions of the joints, meters; joint 0 is the root.
-      wanted_velocity: Velocity (x, z) asked for in each frame, meters per second.
-      seconds: Length of a window.
-      min_speed: Meters per second.
-      commanded: Meters per second.
-
-    Returns:
-      True for all frames of frozen windows; never after the last whole window.
+    Time is cut into windows of `seconds`. A window is frozen, in all its frames, if the
+    joints' mean speed relative to the root is below `min_speed` while the slowest
+    velocity wanted in it is above `commanded`: a statue is frozen whether it stands or
+    glides. After the last whole window no frame is. World positions, meters, joint 0
+    the root; speeds and the velocity (x, z) asked for in each frame are in meters per
+    second.
 
     Raises:
       ValueError: if a window is shorter than a frame.
@@ -131,15 +107,8 @@ def is_frozen(
 ) -> Bool[Array, "*batch"]:
     """Whether a character stops moving its limbs for some seconds while told to travel.
 
-    Args:
-      positions: World positions of the joints, meters; joint 0 is the root.
-      wanted_velocity: Velocity (x, z) asked for in each frame, meters per second.
-      seconds: Length of a window of `frozen_frames`.
-      min_speed: Meters per second.
-      commanded: Meters per second.
-
-    Returns:
-      True where any window is frozen; never for motions shorter than a window.
+    True where any window of `frozen_frames` is frozen; never for motions shorter than
+    one.
 
     Raises:
       ValueError: if a window is shorter than a frame.

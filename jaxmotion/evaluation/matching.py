@@ -79,14 +79,9 @@ def r_precision(
 def matching_distance(
     text: Float[Array, "samples embedding"], motion: Float[Array, "samples embedding"]
 ) -> Float[Array, ""]:
-    """Mean distance of sentences to their own motions (MM-Dist).
+    """Mean Euclidean distance of sentences to their own motions (MM-Dist).
 
-    Args:
-      text: Embeddings of sentences.
-      motion: Embeddings of their motions.
-
-    Returns:
-      Mean Euclidean distance over all rows, in units of the embedding.
+    In units of the embedding, over all rows.
 
     Raises:
       ValueError: if shapes differ.

@@ -31,18 +31,11 @@ def penetration(
     ground: Scalar = 0.0,
     tolerance: Scalar = 0.005,
 ) -> Float[Array, "*batch"]:
-    """How deep the lowest joint lies below the ground, mean over all frames.
+    """How deep the lowest joint lies below the ground, millimeters, mean over frames.
 
-    A frame whose depth is within the tolerance counts as zero; of a deeper one the
-    whole depth counts.
-
-    Args:
-      positions: World positions, meters.
-      ground: Height that the lowest joint has when the body stands, meters.
-      tolerance: Depth that is no penetration, meters, inclusive.
-
-    Returns:
-      Millimeters, not negative.
+    A frame whose depth is within the tolerance (meters, inclusive) counts as zero; of a
+    deeper one the whole depth counts. The ground is the height that the lowest joint
+    has when the body stands; world positions, meters.
 
     Source: Yuan et al. 2023 (PhysDiff), with joints instead of vertices.
     """
@@ -57,19 +50,12 @@ def floating(
     ground: Scalar = 0.0,
     tolerance: Scalar = 0.005,
 ) -> Float[Array, "*batch"]:
-    """How high the lowest joint lies above the ground, mean over all frames.
+    """How high the lowest joint lies above the ground, millimeters, mean over frames.
 
-    A frame whose height is within the tolerance counts as zero; of a higher one the
-    whole height counts. Jumps and the flight phases of a run float as well: compare
-    with real motions.
-
-    Args:
-      positions: World positions, meters.
-      ground: Height that the lowest joint has when the body stands, meters.
-      tolerance: Height that is no floating, meters, inclusive.
-
-    Returns:
-      Millimeters, not negative.
+    A frame whose height is within the tolerance (meters, inclusive) counts as zero; of
+    a higher one the whole height counts. Jumps and the flight phases of a run float as
+    well: compare with real motions. The ground is the height that the lowest joint has
+    when the body stands; world positions, meters.
 
     Source: Yuan et al. 2023 (PhysDiff), with joints instead of vertices.
     """
@@ -84,19 +70,13 @@ def skating(
     ground: Scalar = 0.0,
     tolerance: Scalar = 0.005,
 ) -> Float[Array, "*batch"]:
-    """How far feet move on the ground from a frame to the next while they touch it.
+    """How far feet move on the ground per frame while they touch it, millimeters.
 
     The mean horizontal displacement over all feet and pairs of adjacent frames in both
-    of which the foot is at most `tolerance` above the ground (or below it). It is a
-    distance a frame, hence compare only motions of one frame rate.
-
-    Args:
-      foot_positions: World positions of feet or toes, meters.
-      ground: Height that these joints have when the body stands, meters.
-      tolerance: Height up to which a foot touches the ground, meters, inclusive.
-
-    Returns:
-      Millimeters a frame; zero where no foot touches the ground in two such frames.
+    of which the foot is at most `tolerance` above the ground (or below it); zero where
+    there are none. It is a distance a frame, hence compare only motions of one frame
+    rate. World positions of feet or toes, meters; the ground is the height that these
+    have when the body stands.
 
     Raises:
       ValueError: if there are fewer than two frames.

@@ -48,13 +48,9 @@ def _table(count: int) -> tuple[np.ndarray, np.ndarray]:
 def log_evidence(samples: np.ndarray) -> np.ndarray:
     """Evidence that the mean of normal samples is above zero, after each of them.
 
-    Args:
-      samples: [*batch, n], in the order in which they were drawn.
-
-    Returns:
-      Natural logarithms of e_1, ..., e_n; the first is 0: one sample says nothing of a
-      deviation. Not a number from the first sample on that is none. Samples that are
-      all zero are no evidence either way.
+    Natural logarithms of e_1, ..., e_n for samples in the order in which they were
+    drawn; the first is 0: one sample says nothing of a deviation. Not a number from the
+    first sample on that is none. Samples that are all zero are no evidence either way.
     """
     values = np.asarray(samples, np.float64)
     # Scaled first: squares of tiny or huge numbers would vanish or overflow.
@@ -75,14 +71,10 @@ def log_evidence(samples: np.ndarray) -> np.ndarray:
 def interval(samples: np.ndarray, *, level: float = 0.95) -> Interval:
     """Values that the mean may have: it holds the true one at all counts at once.
 
-    Args:
-      samples: [n] normal ones.
-      level: Probability that the intervals after 2, 3, ... samples all hold the mean.
-
-    Returns:
-      The interval after the last sample, wider than Student's, which holds the mean at
-      one count that is chosen beforehand. Its ends are infinite where no mean could
-      be excluded by so few samples.
+    The level is the probability that the intervals after 2, 3, ... normal samples all
+    hold the mean. The interval after the last one is wider than Student's, which holds
+    the mean at one count that is chosen beforehand. Its ends are infinite where no mean
+    could be excluded by so few samples.
     """
     values = np.asarray(samples, np.float64)
     mean, size = float(values.mean()), float(np.std(values))

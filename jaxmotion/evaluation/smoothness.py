@@ -21,16 +21,10 @@ def _mean_derivative(positions: Array, fps: Scalar, order: int) -> Array:
 def acceleration(
     positions: Float[Array, "*batch frames joints 3"], fps: Scalar
 ) -> Float[Array, "*batch"]:
-    """Mean length of the joints' acceleration, over frames and joints.
+    """Mean length of the joints' acceleration (world), over frames and joints, m/s^2.
 
     Second differences times fps^2. Real motion does not score zero, and a frozen one
     does: compare with the data's own value.
-
-    Args:
-      positions: World positions of the joints, meters.
-
-    Returns:
-      Meters per second squared.
 
     Raises:
       ValueError: if there are fewer than three frames.
@@ -45,15 +39,9 @@ def acceleration(
 def jerk(
     positions: Float[Array, "*batch frames joints 3"], fps: Scalar
 ) -> Float[Array, "*batch"]:
-    """Mean length of the joints' jerk, over frames and joints.
+    """Mean length of the joints' jerk (world), over frames and joints, m/s^3.
 
     Third differences times fps^3.
-
-    Args:
-      positions: World positions of the joints, meters.
-
-    Returns:
-      Meters per second cubed.
 
     Raises:
       ValueError: if there are fewer than four frames.

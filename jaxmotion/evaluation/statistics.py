@@ -22,13 +22,10 @@ def confidence_interval(
 ) -> Interval:
     """Mean of independent samples with its confidence interval by Student's t.
 
-    The interval is right for few samples of a Gaussian; the deviation is with n - 1.
-    The literature on text to motion takes 1.96 instead of t, and its released scripts
+    The level is the probability that the interval holds the mean, in (0, 1). The
+    interval is right for few samples of a Gaussian; the deviation is with n - 1. The
+    literature on text to motion takes 1.96 instead of t, and its released scripts
     divide by n: for n = 20 their half widths are 9 % less.
-
-    Args:
-      samples: For example one value per seed or clip.
-      level: Probability that the interval holds the mean, in (0, 1).
 
     Raises:
       ValueError: if there are fewer than two samples.
@@ -95,10 +92,8 @@ def bootstrap_interval(
 ) -> Interval:
     """Percentile interval of a statistic such as `np.median`, by resampling.
 
-    Args:
-      samples: Independent ones, [samples].
-      statistic: Function of them, with an argument `axis`.
-      level: Part of the resampled values that the interval holds, in (0, 1).
+    The statistic takes independent samples and an argument `axis`; the interval holds
+    the part `level`, in (0, 1), of the resampled values.
 
     Raises:
       ValueError: if there are fewer than two samples.

@@ -44,15 +44,9 @@ def group_means(
     groups: Int[Array | np.ndarray, " windows"],
     weights: Float[Array | np.ndarray, " windows"] | None = None,
 ) -> Float[Array, " groups"]:
-    """Mean of the windows of each clip; clips without weight are left out.
+    """Mean of the windows of each clip that occurs; clips without weight are left out.
 
-    Args:
-      values: One a window.
-      groups: Its clip.
-      weights: Weights of the windows; None for equal ones.
-
-    Returns:
-      One a clip that occurs.
+    Weights are of the windows; None for equal ones.
     """
     groups = np.asarray(groups)
     weights = np.ones(groups.shape) if weights is None else np.asarray(weights)
@@ -71,14 +65,9 @@ def cell(
 ) -> Cell:
     """Mean of independent samples with its 95 % interval (Student's t).
 
-    Args:
-      samples: One a clip or rollout.
-      scale: Factor for the unit of the table.
-      bounds: Bounds of what the mean can be, before scaling, such as 0 and 1 of a
-        proportion; the interval is cut to them.
-
-    Returns:
-      The cell; without an interval for a single sample, not a number for none.
+    No interval for a single sample, not a number for none. The scale is for the unit of
+    the table; the interval is cut to the bounds of what the mean can be before scaling,
+    such as 0 and 1 of a proportion.
     """
     count = int(samples.shape[0])
     if count == 0:
@@ -91,14 +80,10 @@ def cell(
 
 
 def row(scores: Sequence[dict[str, Array]]) -> Row:
-    """Means over replications with 95 % intervals, within the columns' bounds.
+    """Means over replications, a dictionary each, with 95 % intervals within bounds.
 
-    Args:
-      scores: One dictionary a replication, of the same names.
-
-    Returns:
-      Columns in the order of their declaration; others follow. (Compiled programs
-      return dictionaries in alphabetical order.)
+    Columns stand in the order of their declaration; others follow. (Compiled programs
+    return dictionaries in alphabetical order.)
     """
     known = columns.COLUMNS
     places = {name: i for i, name in enumerate(known)}
@@ -110,14 +95,7 @@ def row(scores: Sequence[dict[str, Array]]) -> Row:
 
 
 def to_json(rows: Rows) -> dict[str, Any]:
-    """Rows as a JSON object.
-
-    Args:
-      rows: Row names to column names to cells.
-
-    Returns:
-      The same, with cells as objects; null for what is not a finite number.
-    """
+    """Rows of columns of cells as JSON; null for what is not a finite number."""
 
     def plain(x: float | int | None) -> float | int | None:
         return None if x is None or not math.isfinite(x) else x
@@ -144,11 +122,7 @@ def _text(x: Cell | None) -> str:
 def to_markdown(rows: Rows) -> str:
     """Rows as a Markdown table; a cell that a row lacks is a dash.
 
-    Args:
-      rows: Row names to column names to cells.
-
-    Returns:
-      The table, intervals in brackets, sample counts in parentheses.
+    Intervals stand in brackets, sample counts in parentheses.
     """
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     titles = " | ".join(columns.header(name) for name in names)
@@ -162,9 +136,7 @@ def to_markdown(rows: Rows) -> str:
 def to_csv(rows: Rows, names: dict[str, str]) -> str:
     """Rows as CSV, a line for each cell, so that columns of any name can be read.
 
-    Args:
-      rows: Row names to column names to cells.
-      names: What stands in the column "steps", for rows that have any.
+    `names` is what stands in the column "steps", for rows that have any.
     """
     text = io.StringIO(newline="")
     writer = csv.writer(text)

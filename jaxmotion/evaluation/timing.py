@@ -45,9 +45,7 @@ def peak_mib(program: Any) -> float:
 def matmul_rate(*, size: int = 1024, **options: Any) -> float:
     """FLOP per second of a float32 product of square matrices, the machine's floor.
 
-    Args:
-      size: Rows and columns.
-      **options: As for `time_in_turn`.
+    Further options are those of `time_in_turn`.
     """
     x = jnp.ones((size, size), jnp.float32)
     program, _ = compile_program(jax.jit(jnp.matmul), x, x)
@@ -57,11 +55,7 @@ def matmul_rate(*, size: int = 1024, **options: Any) -> float:
 
 
 def compile_program(function: Callable, *arguments: Any) -> tuple[Callable, float]:
-    """Compiles a jitted function.
-
-    Returns:
-      The program, which cannot compile again, and the seconds it took.
-    """
+    """A jitted function as a program that cannot compile, and the seconds it took."""
     start = time.perf_counter()
     program = function.lower(*arguments).compile()
     return program, time.perf_counter() - start

@@ -48,11 +48,7 @@ def _initial_state(key: Key, batch: int, config: Config) -> Array:
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
-    """Initial parameters.
-
-    Returns:
-      Parameters of `ActionClassifier`.
-    """
+    """Initial parameters of `ActionClassifier`."""
     x = jnp.zeros((1, 1, 3 * config.num_joints))
     state = jnp.zeros((1, 2, config.hidden))
     return config.network.init(key, x, state)["params"]
@@ -65,15 +61,11 @@ def classify(
     *,
     config: Config,
 ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
-    """Features and logits of motions.
+    """Features (for Fréchet distance and diversity) and logits of motions.
 
-    Args:
-      key: Consumed by the states before the first frame; the same key, batch size and
-        motions give the same features.
-      x: Joint positions, meters, of motions that start at the origin facing +z.
-
-    Returns:
-      Features (for Fréchet distance and diversity), and logits.
+    The key draws the states before the first frame; the same key, batch size and
+    motions give the same features. Joint positions are in meters, of motions that start
+    at the origin facing +z.
     """
     state = _initial_state(key, x.shape[0], config)
     return blocks.apply(params, config.network, x, state)
@@ -86,15 +78,7 @@ def loss(
     *,
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Cross entropy of a batch.
-
-    Args:
-      key: Consumed by the states before the first frame.
-      batch: Joint positions as above, and the classes of the motions.
-
-    Returns:
-      The loss, and the accuracy.
-    """
+    """Cross entropy and accuracy of a batch: joint positions as above, and classes."""
     x, labels = batch
     _, logits = classify(params, key, x, config=config)
     return style_evaluator.cross_entropy(logits, labels)
@@ -114,9 +98,8 @@ def train(
 
     Args:
       x: Joint positions, meters, of motions that start at the origin facing +z.
-      num_steps: Updates.
       batch: Motions an update, drawn with replacement.
-      learning_rate: Rate of Adam, with cosine decay to a tenth.
+      learning_rate: Of Adam, with cosine decay to a tenth.
 
     Returns:
       The moving average of the parameters, and losses and accuracies by step.

@@ -94,10 +94,7 @@ class Evaluator:
 
 
 def released_style(path: Path) -> Evaluator:
-    """The style classifier released with CAMDM.
-
-    Args:
-      path: Its file, 100style_position_classifier.pth.
+    """The style classifier released with CAMDM, 100style_position_classifier.pth.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -204,14 +201,9 @@ def params_for(
     fps: float,
     frames: int,
 ) -> Params | None:
-    """Parameters of a frozen evaluator for a run that it fits.
+    """Parameters of a frozen evaluator for a run that it fits; None without one.
 
-    Args:
-      evaluator: The evaluator; None if one is to be trained.
-      frames: Frames that are scored at a time.
-
-    Returns:
-      The parameters; None without an evaluator.
+    It scores `frames` frames at a time.
 
     Raises:
       ValueError: if it does not fit; names its file and the field.
@@ -230,13 +222,9 @@ def params_for(
 
 
 def clips_fingerprint(data: Clips | BallClips, field: str) -> str:
-    """Fingerprint of clips, of their labels, and of the ball if there is one.
+    """Fingerprint of clips, their labels of `field`, and of the ball if there is one.
 
-    Args:
-      field: Label field that counts; others do not.
-
-    Returns:
-      12 hexadecimal digits.
+    12 hexadecimal digits.
     """
     clips = data.clips if isinstance(data, BallClips) else data
     arrays = {
@@ -256,10 +244,8 @@ def describe(
 ) -> dict[str, Any]:
     """Who scored a table, for what stands beside it.
 
-    Args:
-      evaluator: The frozen evaluator that they are of; None if they were trained for
-        this table.
-      reference: Fingerprint of the clips that Fréchet distances refer to.
+    The evaluator is None if it was trained for this table; the reference is the
+    fingerprint of the clips that Fréchet distances refer to.
     """
     found = {"fingerprint": fingerprint(params), "reference_clips": reference}
     if evaluator is None:
@@ -273,11 +259,7 @@ def describe(
 
 
 def note(description: dict[str, Any]) -> str:
-    """A line below a table that says who scored.
-
-    Args:
-      description: From `describe`; at least a fingerprint and an origin.
-    """
+    """A line below a table that says who scored: at least fingerprint and origin."""
     line = f"Evaluator {description['fingerprint']} ({description['origin']})"
     if "reference_clips" in description:
         line += f"; Fréchet distances to clips {description['reference_clips']}"

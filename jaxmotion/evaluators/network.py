@@ -62,11 +62,7 @@ class ResidualConvolution(nn.Module):
     def __call__(
         self, x: Float[Array, "batch frames channels_in"]
     ) -> Float[Array, "batch frames channels"]:
-        """Applies it along time.
-
-        Returns:
-          As many frames.
-        """
+        """Applies it along time, to as many frames."""
         return nn.leaky_relu(self.norm(self.main(x))) + self.side(x)
 
 
@@ -102,15 +98,10 @@ class WindowClassifier(nn.Module):
     def __call__(
         self, x: Float[Array, "batch frames channels"], *, train: bool = False
     ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
-        """Classifies windows.
+        """Features and logits of windows, all of the length it was initialized with.
 
-        Args:
-          x: Joint positions, root-relative and facing +z in each frame, meters;
-            all windows of the length that it was initialized with.
-          train: Whether to drop; needs rngs={"dropout": key}.
-
-        Returns:
-          Features, and logits.
+        Joint positions are root-relative and facing +z in each frame, meters. Training
+        needs rngs={"dropout": key}.
         """
         x = self.convolution_2(self.convolution_1(x))
         x = self.drop(x, deterministic=not train).reshape(x.shape[0], -1)
@@ -144,14 +135,10 @@ class ActionClassifier(nn.Module):
         x: Float[Array, "batch frames channels"],
         state: Float[Array, "batch 2 hidden"],
     ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
-        """Classifies motions.
+        """Features in (-1, 1), and logits, of motions of any length.
 
-        Args:
-          x: Joint positions in the frame of the first pose, meters; any length.
-          state: States of the lower and the upper layer before the first frame.
-
-        Returns:
-          Features in (-1, 1), and logits.
+        Joint positions are in the frame of the first pose, meters; the states are the
+        lower and the upper layer's before the first frame.
         """
         lower = jnp.asarray(self.lower(x, initial_carry=state[:, 0]))
         upper = jnp.asarray(self.upper(lower, initial_carry=state[:, 1]))
@@ -192,14 +179,10 @@ class MovementEncoder(nn.Module):
     def __call__(
         self, x: Float[Array, "batch frames channels"], *, train: bool = False
     ) -> Float[Array, "batch units width"]:
-        """Encodes movements.
+        """Encodes movements: one row per `UNIT` frames.
 
-        Args:
-          x: Frames; those beyond the last whole movement are dropped.
-          train: Whether to drop; needs rngs={"dropout": key}.
-
-        Returns:
-          One row for `UNIT` frames. A row sees 3 frames on each side of its own.
+        A row sees 3 frames on each side of its own; frames beyond the last whole
+        movement are dropped. Training needs rngs={"dropout": key}.
         """
         for convolution in (self.convolution_1, self.convolution_2):
             x = self.drop(convolution(x), deterministic=not train)
@@ -230,12 +213,7 @@ class SequenceEncoder(nn.Module):
     def __call__(
         self, x: Float[Array, "batch rows channels"], length: Int[Array, " batch"]
     ) -> Float[Array, "batch embedding"]:
-        """Embeds sequences of different lengths.
-
-        Args:
-          x: Sequences; rows at and after a sequence's length are not read.
-          length: In 1..rows.
-        """
+        """Embeds sequences of a length in 1..rows each; later rows are not read."""
         x = self.input(x)
         states = []
         for start, pass_over in zip(
@@ -267,9 +245,8 @@ class TextEncoder(nn.Module):
     ) -> Float[Array, "batch embedding"]:
         """Embeds sentences of different lengths.
 
-        Args:
-          tags: One-hot parts of speech.
-          words: Words of each sentence, with its marks of start and end; in 1..slots.
+        Tags are one-hot parts of speech; words count each sentence's, with its marks of
+        start and end, in 1..slots.
         """
         tagged = nn.Dense(vectors.shape[-1], kernel_init=_XAVIER, name="tags")(tags)
         encoder = SequenceEncoder(self.width, self.embedding, name="sequence")
@@ -305,16 +282,14 @@ class Matcher(nn.Module):
         train: bool = False,
         padding: Padding = "zeros",
     ) -> Float[Array, "batch embedding"]:
-        """Embeds motions of different lengths.
+        """Embeds motions of different lengths, at least `UNIT` frames.
 
         Only whole movements count, but as in the source the last one's convolutions
         reach 3 frames beyond it, so motions that are to be compared are padded to one
-        length (there 196 frames).
+        length (there 196 frames). Training needs rngs={"dropout": key}.
 
         Args:
           features: Normalized to mean 0 and deviation 1, without contact labels.
-          frames: Frames of each motion, at least `UNIT`.
-          train: Whether to drop; needs rngs={"dropout": key}.
           padding: What is seen beyond the whole movements: "zeros", or "kept", what is
             there.
         """
@@ -330,13 +305,7 @@ class Matcher(nn.Module):
         tags: Float[Array, "batch slots classes"],
         words: Int[Array, " batch"],
     ) -> Float[Array, "batch embedding"]:
-        """Embeds sentences of different lengths.
-
-        Args:
-          vectors: As `TextEncoder`.
-          tags: As `TextEncoder`.
-          words: As `TextEncoder`.
-        """
+        """Embeds sentences of different lengths; arguments as `TextEncoder`'s."""
         return self.text(vectors, tags, words)
 
     def __call__(
@@ -349,18 +318,9 @@ class Matcher(nn.Module):
         *,
         train: bool = False,
     ) -> tuple[Float[Array, "batch embedding"], Float[Array, "batch embedding"]]:
-        """Both embeddings; see the two methods.
+        """Embeddings of the sentences and of the motions; see the two methods.
 
-        Args:
-          features: As `embed_motion`.
-          frames: As `embed_motion`.
-          vectors: As `embed_text`.
-          tags: As `embed_text`.
-          words: As `embed_text`.
-          train: Whether to drop; needs rngs={"dropout": key}.
-
-        Returns:
-          Embeddings of the sentences and of the motions.
+        Training needs rngs={"dropout": key}.
         """
         motion = self.embed_motion(features, frames, train=train)
         return self.embed_text(vectors, tags, words), motion

@@ -91,14 +91,11 @@ def _state(content: dict[str, Any], field: str) -> dict[str, Stored]:
 def load_style_classifier(
     path: str | os.PathLike, *, frames: int = 60
 ) -> tuple[Params, tuple[str, ...]]:
-    """Reads CAMDM's style classifier (100style_position_classifier.pth); runs no code.
+    """Parameters of `network.StyleClassifier`, and the names of the styles.
 
-    Args:
-      path: A file of PyTorch with its state dict under "state_dict", and "class_names".
-      frames: Frames of a window.
-
-    Returns:
-      Parameters of `network.StyleClassifier`, and the names of the styles.
+    Reads CAMDM's style classifier (100style_position_classifier.pth), a file of PyTorch
+    with its state dict under "state_dict", and "class_names"; runs no code. A window
+    has `frames` frames.
 
     Raises:
       FileNotFoundError: if there is no such file.

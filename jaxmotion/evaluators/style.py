@@ -100,16 +100,10 @@ def released_joints(skeleton: Skeleton) -> tuple[int, ...]:
 def released_input(
     skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames channels"]:
-    """What the released classifier looks at.
+    """What the released classifier looks at, meters; three channels a joint.
 
-    Positions of 15 joints relative to the root, each frame turned so that hips and
-    shoulders face +x.
-
-    Args:
-      motion: Frames of it, at 30 per second.
-
-    Returns:
-      Meters; three channels a joint.
+    Positions of 15 joints relative to the root, each frame (of 30 per second) turned so
+    that hips and shoulders face +x.
 
     Raises:
       ValueError: see `released_joints`.
@@ -128,13 +122,10 @@ def released_input(
 def window_input(
     skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames channels"]:
-    """Joint positions relative to the root and turned to face +z, in each frame.
+    """Joint positions, meters, relative to the root and facing +z in each frame.
 
     So neither where a character walks nor how fast or where it faces is visible, but
-    what its limbs do.
-
-    Returns:
-      Meters; three channels a joint, the root's height in place of its zeros.
+    what its limbs do. The root's height stands in place of its zeros.
     """
     positions = joint_positions(skeleton, motion)
     facing = trajectory.root_trajectory(skeleton, motion).facing
@@ -148,14 +139,7 @@ def window_input(
 def cross_entropy(
     logits: Float[Array, "batch classes"], labels: Int[Array, " batch"]
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Mean cross entropy, and how often the largest logit is the right one.
-
-    Args:
-      logits: One row a sample.
-
-    Returns:
-      The loss in nats, and the accuracy.
-    """
+    """Mean cross entropy in nats, and how often the largest logit is the right one."""
     log_probability = jax.nn.log_softmax(logits)
     losses = -jnp.take_along_axis(log_probability, labels[:, None], axis=-1)
     accuracy = jnp.mean(jnp.argmax(logits, axis=-1) == labels)
@@ -164,11 +148,7 @@ def cross_entropy(
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
-    """Initial parameters.
-
-    Returns:
-      Parameters of `WindowClassifier`.
-    """
+    """Initial parameters of `WindowClassifier`."""
     x = jnp.zeros((1, config.frames, 3 * config.num_joints))
     return config.network.init(key, x)["params"]
 
@@ -180,14 +160,9 @@ def loss(
     *,
     config: Config,
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Cross entropy of a batch.
+    """Cross entropy and accuracy of windows of `window_input`, and their classes.
 
-    Args:
-      key: Consumed by dropout.
-      batch: Windows of `window_input`, and their classes.
-
-    Returns:
-      The loss, and the accuracy.
+    The key is consumed by dropout.
     """
     x, labels = batch
     _, logits = blocks.apply(
@@ -202,14 +177,7 @@ def classify(
     *,
     config: Config,
 ) -> tuple[Float[Array, "batch features"], Float[Array, "batch classes"]]:
-    """Features and logits of windows.
-
-    Args:
-      x: Windows of `window_input`.
-
-    Returns:
-      Features (for Fréchet distances), and logits.
-    """
+    """Features (for Fréchet distances) and logits of windows of `window_input`."""
     return blocks.apply(params, config.network, x)
 
 
@@ -223,17 +191,7 @@ def train(
     batch: int = 128,
     learning_rate: float = 1e-3,
 ) -> tuple[Params, dict[str, Array]]:
-    """Trains an evaluator as one compiled program.
-
-    Args:
-      x: Windows of `window_input`.
-      num_steps: Updates.
-      batch: Windows per update, drawn with replacement.
-      learning_rate: Rate of Adam, with cosine decay to a tenth.
-
-    Returns:
-      The moving average of the parameters, and losses and accuracies by step.
-    """
+    """Trains an evaluator on windows of `window_input`, as `train_classifier` does."""
     return train_classifier(
         key,
         lambda key: init(key, config),
@@ -262,10 +220,8 @@ def train_classifier(
 
     Args:
       init: Initial parameters from a key.
-      loss: Loss of a batch of samples and classes.
-      num_steps: Updates.
       batch: Samples per update, drawn with replacement.
-      learning_rate: Rate of Adam, with cosine decay to a tenth.
+      learning_rate: Of Adam, with cosine decay to a tenth.
       weight_decay: Decoupled.
       max_norm: Clip the gradient to this global norm; None to leave it.
 
@@ -294,12 +250,7 @@ def train_classifier(
 
 
 def in_batches(function: Callable[[Any], Any], x: Any, *, size: int = 256) -> Any:
-    """Applies a jitted function to slices of the first axis, to bound the memory.
-
-    Args:
-      function: Array or pytree with a first axis to the like.
-      size: Rows at a time.
-    """
+    """Applies a jitted function to slices of the first axis, to bound the memory."""
     number = jax.tree.leaves(x)[0].shape[0]
     parts = [
         jax.device_get(function(jax.tree.map(lambda a: a[i : i + size], x)))  # noqa: B023
@@ -324,12 +275,7 @@ class StyleEvaluator:
 def fit(
     key: Key, clips: Clips, *, field: str, num_steps: int = 1500, batch: int = 128
 ) -> StyleEvaluator:
-    """Trains the style evaluator on windows with a stride of 10 frames.
-
-    Args:
-      field: Label field that is the style.
-      num_steps: Updates.
-    """
+    """Trains the evaluator of styles (`field`) on windows every 10 frames."""
     found = eval_windows(clips, stride=10, field=field)
     config = Config(
         num_classes=len(clips.names(field)),
@@ -347,14 +293,7 @@ def fit(
 def features_and_hits(
     skeleton: Skeleton, found: EvalWindows, evaluator: StyleEvaluator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Features of windows, and whether each one's style is recognized.
-
-    Args:
-      evaluator: From `fit`.
-
-    Returns:
-      Features [windows, 512], and hits [windows] (0 or 1).
-    """
+    """Features [windows, 512], and whether each style is recognized (0 or 1)."""
     run = functools.partial(_classify, evaluator.params, skeleton, evaluator.config)
     label = found.label
     if evaluator.classes:

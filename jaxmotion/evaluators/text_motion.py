@@ -112,11 +112,7 @@ class Pairs:
 
 @functools.partial(jax.jit, static_argnames="config")
 def init_matcher(key: Key, config: MatcherConfig) -> Params:
-    """Initial parameters.
-
-    Returns:
-      Parameters of `Matcher`.
-    """
+    """Initial parameters of `Matcher`."""
     one = jnp.ones((1,), jnp.int32)
     return config.network.init(
         key,
@@ -137,16 +133,13 @@ def embed_motion(
     config: MatcherConfig,
     padding: Padding = "zeros",
 ) -> Float[Array, "batch embedding"]:
-    """Embeds motions.
+    """Embeds motions, for every measure of text-to-motion.
 
     Args:
       features: As in `Pairs`; all padded to the length used in training.
       frames: Frames of each motion, at least 4; those beyond a multiple of 4 do not
         count.
       padding: What is seen beyond a motion's frames: "zeros", or "kept", what is there.
-
-    Returns:
-      Embeddings, for every measure of text-to-motion.
     """
     return blocks.apply(
         params, config.network, features, frames, padding=padding, method="embed_motion"
@@ -162,13 +155,7 @@ def embed_text(
     *,
     config: MatcherConfig,
 ) -> Float[Array, "batch embedding"]:
-    """Embeds sentences.
-
-    Args:
-      vectors: As `encode_tokens` gives them.
-      tags: As `encode_tokens` gives them.
-      words: As `encode_tokens` gives them.
-    """
+    """Embeds sentences that `encode_tokens` encoded."""
     return blocks.apply(
         params, config.network, vectors, tags, words, method="embed_text"
     )
@@ -177,14 +164,11 @@ def embed_text(
 def matcher_loss(
     params: Params, key: Key, batch: Pairs, *, config: MatcherConfig
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """Contrastive loss of a batch: (1) of this module.
+    """Contrastive loss of a batch of at least two pairs: (1) of this module.
 
     A mismatched pair is a sentence and the motion some rows on, one number of rows for
-    the batch. If it has the same sentence, the pair is pushed apart all the same.
-
-    Args:
-      key: Consumed by dropout and the shift.
-      batch: At least two pairs.
+    the batch. If it has the same sentence, the pair is pushed apart all the same. The
+    key is consumed by dropout and the shift.
 
     Raises:
       ValueError: if there is one pair only.
@@ -224,9 +208,8 @@ def train_matcher(
 
     Args:
       sample_batch: `(key, data) -> Pairs`, traced.
-      num_steps: Updates.
-      optimizer: None for the source's: Adam at 1e-4, gradients clipped to 0.5 (here
-        of all parts together, there of each encoder).
+      optimizer: None for the source's: Adam at 1e-4, gradients clipped to 0.5 (here of
+        all parts together, there of each encoder).
 
     Returns:
       The moving average of the parameters, and losses by step.
@@ -249,14 +232,12 @@ def train_matcher(
 
 
 def word_vectors(words: Sequence[str]) -> Float[np.ndarray, "words 300"]:
-    """Vectors that stand in for GloVe's: of one norm, each in a direction of its own.
+    """Vectors that stand in for GloVe's: of norm 6, each in a direction of its own.
 
-    They tell words apart and nothing more: "run" is as far from "jog" as from "table".
-    The numbers are a hash of the word (SHAKE-256), so they are the same everywhere,
-    which NumPy does not promise of its generators.
-
-    Returns:
-      One row a word, of norm 6, as GloVe's are within a factor of two.
+    GloVe's norms are within a factor of two of that. They tell words apart and nothing
+    more: "run" is as far from "jog" as from "table". The numbers are a hash of the word
+    (SHAKE-256), so they are the same everywhere, which NumPy does not promise of its
+    generators.
     """
     size = 2 * WORD_SIZE
     digests = [hashlib.shake_256(word.encode()).digest(size) for word in words]

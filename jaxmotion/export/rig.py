@@ -430,10 +430,7 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def to_glb(rig: Rig, motion: Motion) -> bytes:
-    """The rig's own file with one animation, in place of those that it had.
-
-    Args:
-      motion: Of `rig.skeleton`, one character.
+    """The rig's own file with one animation of one character, in place of its own.
 
     Raises:
       ValueError: if a frame is not finite.
@@ -512,8 +509,7 @@ def save_onto(
 ) -> None:
     """Writes a rig's file, animated by the motion of another skeleton.
 
-    Args:
-      roles: Joints of some of the rig's roles; see `roles.find_roles`.
+    For the rig's roles see `roles.find_roles`.
 
     Raises:
       OSError, ValueError: see `transfer.rest` and `to_glb`.

@@ -280,10 +280,7 @@ def rig_mesh(rig: Rig) -> RigMesh:
 def page_body(
     rig: Rig, mesh: RigMesh, scale: float
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What `viz.packed.pack` takes, for the page: the rig's skeleton and its mesh.
-
-    Args:
-      scale: By how much all is enlarged.
+    """What `viz.packed.pack` takes, for the page: the rig's skeleton and mesh, scaled.
 
     Raises:
       ValueError: if there are more than 256 joints.

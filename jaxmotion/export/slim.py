@@ -35,8 +35,7 @@ class Weights:
     def add(self, values: np.ndarray, *, half: bool) -> tuple[int, int]:
         """Where a constant begins in the file, and its length there, bytes.
 
-        Args:
-          half: Pack it as 16-bit floats; its values there are those, widened.
+        Half packs it as 16-bit floats; its values there are those, widened.
         """
         small = values.astype(np.float16) if half else values
         raw = np.ascontiguousarray(small.astype(values.dtype)).tobytes()
@@ -60,11 +59,9 @@ class Weights:
 
 
 def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:
-    """A model's content with fewer nodes, and its large constants elsewhere.
+    """A model's content with fewer nodes, and its large constants in `weights`.
 
-    Args:
-      weights: Takes the large constants.
-      half: Round all large constants to 16-bit floats, not only those that are such.
+    Half rounds all large constants to 16-bit floats, not only those that are such.
     """
     import onnx
 

@@ -48,10 +48,7 @@ def save(
 ) -> None:
     """Writes one step, whole or not at all, and removes the oldest beyond `keep`.
 
-    Args:
-      folder: The run's checkpoint folder; made if missing.
-      config: What rebuilds the model; must be JSON.
-      keep: Newest steps to keep.
+    The folder is made if missing; the config, which rebuilds the model, must be JSON.
 
     Raises:
       OSError: if the folder cannot be written.
@@ -163,14 +160,9 @@ def load_config(folder: str | Path, step: int | None = None) -> dict[str, Any]:
 
 
 def restore(folder: str | Path, like: Any, step: int | None = None) -> Any:
-    """State of a step.
+    """State of a step (None: the newest), equal to what was saved to the bit.
 
-    Args:
-      like: A state of the same structure and shapes (arrays or ShapeDtypeStructs).
-      step: Which; None for the newest.
-
-    Returns:
-      The state, equal to what was saved to the bit.
+    `like` has the same structure and shapes (arrays or ShapeDtypeStructs).
 
     Raises:
       CheckpointError: if there is none, it is corrupt, or of another model; names the
@@ -223,7 +215,7 @@ def restore_part(
     Args:
       like: Field names to nested dicts of arrays (or ShapeDtypeStructs), of the same
         structure and shapes.
-      step: Which; None for the newest.
+      step: None for the newest.
       within: Field of the state whose fields they are, such as "generator"; None for
         the state itself.
 
@@ -287,10 +279,8 @@ def export_params(
 ) -> None:
     """Writes parameters and config as one small npz file, whole or not at all.
 
-    Args:
-      params: Nested dict of arrays.
-      config: What rebuilds the model; must be JSON.
-      dtype: Stored type; float16 halves the size at three decimal digits.
+    The parameters are a nested dict, the config (what rebuilds the model) JSON; float16
+    halves the size at three decimal digits.
     """
     leaves = jax.tree_util.tree_leaves_with_path(params)
     arrays = {
@@ -365,10 +355,7 @@ def export_config(path: str | Path) -> dict[str, Any]:
 
 
 def import_params(path: str | Path) -> tuple[Params, dict[str, Any]]:
-    """Reads what `export_params` wrote.
-
-    Returns:
-      Parameters as float32, and the config.
+    """Parameters as float32, and the config, as `export_params` wrote them.
 
     Raises:
       CheckpointError: if the file is no such export, or damaged.

@@ -30,11 +30,9 @@ def _update(digest: Any, name: str, array: np.ndarray) -> None:
 def fingerprint(tree: Any) -> str:
     """Names arrays by their content: other values, another name.
 
-    The same for any order of the dicts' entries, and for device and host arrays; other
+    The first 12 hexadecimal digits of the SHA-256 of names, types, shapes and bytes:
+    the same for any order of the dicts' entries, and for device and host arrays; other
     if one bit of one number, a shape, a type or a name differs.
-
-    Returns:
-      The first 12 hexadecimal digits of the SHA-256 of names, types, shapes and bytes.
     """
     named = _named(tree)
     digest = hashlib.sha256()

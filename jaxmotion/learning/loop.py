@@ -88,12 +88,9 @@ def check_writable(folder: str | Path) -> None:
 
 
 def check_finite(info: dict[str, Any], first_step: int, folder: Path) -> None:
-    """Raises at the first loss that is not finite.
+    """Raises at the first loss of a chunk, one row per step, that is not finite.
 
-    Args:
-      info: Values of a chunk, one row a step.
-      first_step: Step of the first row, counted from 1.
-      folder: The run's checkpoint folder, to name the last good checkpoint.
+    Steps are counted from 1; the run's checkpoint folder names the last good one.
 
     Raises:
       TrainingDiverged: names the step, the losses and the last good checkpoint.
@@ -220,9 +217,7 @@ class _Pieces:
 def _any_process(stop: bool, pieces: int) -> bool:
     """Whether any process is to stop: by Ctrl-C, or SIGTERM where there are several.
 
-    Args:
-      stop: Whether this one is.
-      pieces: How often all of them have asked.
+    `stop` says whether this one is, `pieces` how often all of them have asked.
     """
     if jax.process_count() == 1:
         return stop

@@ -35,15 +35,10 @@ def masked_mse(
     *,
     average: Average = "frames",
 ) -> Float[Array, ""]:
-    """Mean squared error over the frames that count.
+    """Mean squared error over kept frames (or samples) and all features.
 
-    Args:
-      mask: Frames that count. Without any, a batch gives 0; so does a sample, which
-        still counts as one (the released code divides by zero).
-      average: See the module.
-
-    Returns:
-      Mean over kept frames (or samples) and all features.
+    Without a frame that counts a batch gives 0; so does a sample, which still counts as
+    one (the released code divides by zero). For averages see the module.
 
     Source: MDM's masked L2; Chen et al. 2024 (CAMDM), eq. 2.
     """
@@ -56,11 +51,7 @@ def masked_mse(
 
 
 def displacement(x: Float[Array, "*batch frames n"]) -> Array:
-    """Difference of neighboring frames.
-
-    Returns:
-      One frame less, per frame.
-    """
+    """Difference of neighboring frames, per frame; one frame less."""
     return x[..., 1:, :] - x[..., :-1, :]
 
 
@@ -73,12 +64,7 @@ def velocity_loss(
 ) -> Float[Array, ""]:
     """Mean squared error of displacements; both frames of a pair must count.
 
-    Args:
-      mask: Frames that count.
-      average: See the module.
-
-    Returns:
-      Mean over kept pairs (or samples) and all features, per frame squared.
+    Over kept pairs (or samples; see the module) and all features, per frame squared.
 
     Source: MDM (Tevet et al. 2023), eq. 5.
     """
@@ -95,21 +81,16 @@ def foot_slide_loss(
     *,
     average: Average = "frames",
 ) -> Float[Array, ""]:
-    """Squared displacement of feet that stand on the ground.
+    """Squared displacement of feet that stand, square meters per frame squared.
 
     The mean runs over all frames that count and all feet, standing or not, as in the
     released code of CAMDM: so a moving character's loss is not dominated by its few
-    stances.
+    stances. Both frames of a pair must count; for averages see the module.
 
     Args:
       foot_positions: Predicted world positions, meters.
-      contact: Whether the foot stands between this frame and the next (the last
-        frame's value is unused).
-      mask: Frames that count; both of a pair must.
-      average: See the module.
-
-    Returns:
-      Mean squared displacement, square meters per frame squared.
+      contact: Whether the foot stands between this frame and the next (the last frame's
+        value is unused).
 
     Source: MDM, eq. 4; released code of CAMDM.
     """

@@ -24,9 +24,8 @@ def decode(
 ) -> dict[str, Any]:
     """Fields of a JSON object, each made into what it stands for.
 
-    Args:
-      where: Its file, for messages.
-      parts: What makes each field; other fields are left out.
+    The file `where` is for messages; of each field one part makes it, others are left
+    out.
 
     Raises:
       ValueError: names the file and the field that is missing or wrong.
@@ -127,12 +126,10 @@ def _check_field(name: str, kind: Any, value: Any) -> Any:
 
 
 def config_from_json(kind: type, value: Any) -> Any:
-    """A configuration from its JSON, of which every field is checked.
+    """A configuration from the JSON of `dataclasses.asdict`, with every field checked.
 
-    Args:
-      kind: Its dataclass; fields are whole numbers, numbers, truth values, choices,
-        lists and such dataclasses.
-      value: What `dataclasses.asdict` gave, read back.
+    Fields of its dataclass are whole numbers, numbers, truth values, choices, lists and
+    such dataclasses.
 
     Raises:
       ValueError: names the field that is missing, unknown, of another kind or out of
@@ -257,13 +254,9 @@ def differences(
 ) -> str:
     """Fields of a JSON object that another does not agree with, in one line.
 
-    Args:
-      found: What was stored; fields that `given` lacks do not count.
-      given: What should be the same; fields within fields are compared on their own.
-      prefix: Precedes the names of fields.
-
-    Returns:
-      Such as "seed is 0, given 7; config.width is 64, given 16"; empty for none.
+    Such as "seed is 0, given 7; config.width is 64, given 16"; empty for none. Fields
+    that `given` lacks do not count, fields within fields are compared on their own, and
+    the prefix precedes their names.
     """
     lines = []
     found, given = json.loads(json.dumps([found, given]))  # tuples to lists

@@ -259,8 +259,7 @@ def _read(folder: Path, system: str | None) -> dict[str, Any]:
 def load(folder: Path, *, system: str | None = None) -> Run:
     """Loads a run folder and checks that its data are those it was made with.
 
-    Args:
-      system: Whose run it must be; None for any system's.
+    It must be the system's; None for any.
 
     Raises:
       OSError: if a file is missing or cannot be read.
@@ -398,8 +397,7 @@ def check_model(run: Run, stage: str, model: dict[str, Any]) -> None:
 def stage_config(run: Run, stage: str, kind: type, **more: Any) -> Any:
     """The configuration that a stage was trained with.
 
-    Args:
-      **more: Fields that stages of that kind do not decide.
+    `more` gives fields that stages of that kind do not decide.
 
     Raises:
       CheckpointError: if there is no checkpoint, or it is of another stage or system.
@@ -421,8 +419,7 @@ def _stage_json(run: Run, stage: str, model: dict[str, Any]) -> dict[str, Any]:
 def store(run: Run, stage: str, state: Any, *, model: dict[str, Any]) -> None:
     """Writes what is made without training as a stage: its checkpoint of step 0.
 
-    Args:
-      model: JSON of what rebuilds its structure.
+    The model is the JSON of what rebuilds its structure.
 
     Raises:
       OSError: if it cannot be written.
@@ -554,11 +551,9 @@ def load_params(
     *,
     adversarial: bool = False,
 ) -> Params:
-    """Averaged parameters of a stage.
+    """Averaged parameters of a stage, or of the generator of an adversarial one.
 
-    Args:
-      init: Makes parameters of the same shapes; never run.
-      adversarial: Whether the stage trained a generator against a discriminator.
+    `init` makes parameters of the same shapes; it is never run.
 
     Raises:
       CheckpointError: if there is none, or it is of another stage or size.
@@ -575,11 +570,9 @@ def load_params(
 def restore_evaluator(
     folder: Path, value: dict[str, Any], init: Callable[[], Params]
 ) -> Params:
-    """Parameters of an evaluator that must have been trained as told.
+    """Parameters of an evaluator that must have been trained as the JSON `value` says.
 
-    Args:
-      value: JSON of how it must have been trained.
-      init: Makes parameters of the same shapes; never run.
+    `init` makes parameters of the same shapes; it is never run.
 
     Raises:
       CheckpointError: if there is none.

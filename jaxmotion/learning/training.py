@@ -120,13 +120,9 @@ def make_optimizer(
 
 
 def init_train_state(params: Params, optimizer: Optimizer) -> TrainState:
-    """State before the first step.
+    """State before the first step; its EMA starts at the parameters.
 
-    Args:
-      optimizer: As given to `make_update`.
-
-    Returns:
-      The state; its EMA starts at the parameters.
+    The optimizer is that of `make_update`.
     """
     return TrainState(
         step=jnp.zeros((), jnp.int32),
@@ -233,11 +229,9 @@ def _sharding(mesh: Mesh, *axes: str) -> NamedSharding:
 
 
 def replicate(tree: Any, mesh: Mesh | None) -> Any:
-    """Puts a whole copy of each array on every device of a mesh.
+    """Puts a whole copy of each array on every device of a mesh; without one, nothing.
 
-    Args:
-      tree: Arrays; in a run of several processes each has the same values.
-      mesh: The mesh, or None to leave the tree as it is.
+    In a run of several processes each has the same values.
     """
     if mesh is None:
         return tree

@@ -154,9 +154,8 @@ def find_limbs(
 def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> Anatomy:
     """What the joints of a skeleton are.
 
-    Args:
-      sides: LEFT, RIGHT or MIDDLE of each joint; None for what the names say, and
-        where they say nothing, the zero pose.
+    Sides are LEFT, RIGHT or MIDDLE of each joint; None for what the names say, and
+    where they say nothing, the zero pose.
 
     Raises:
       ValueError: if `sides` are not one a joint.
@@ -257,10 +256,11 @@ def t_pose(
     *,
     found: Anatomy | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The skeleton standing with its arms level to the sides, facing +z.
+    """Positions and world rotations in the T-pose: arms level to the sides, facing +z.
 
-    The trunk, the feet's slope and what has no part in the pose stay as in the zero
-    pose; a skeleton that is no person's stays so whole.
+    Positions [J, 3] are in meters, the root at the origin; rotations are [J, 3, 3]. The
+    trunk, the feet's slope and what has no part in the pose stay as in the zero pose; a
+    skeleton that is no person's stays so whole.
 
     Args:
       sides: See `find_anatomy`.
@@ -268,9 +268,6 @@ def t_pose(
         motion's limbs are turned about themselves against it, nothing else tells how:
         elbows bend ahead, knees back, and feet are level on average.
       found: What the joints are, where it is known; `sides` then say nothing.
-
-    Returns:
-      Positions [J, 3], meters, the root at the origin; world rotations [J, 3, 3].
     """
     offsets = np.asarray(skeleton.offsets, float)
     parents = skeleton.parents
@@ -372,11 +369,7 @@ def _foot_turn(
 def kinematics(skeleton: Skeleton, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """`skeleton.global_transforms` in NumPy: pictures and files compile nothing.
 
-    Args:
-      motion: [*batch, frames, ...].
-
-    Returns:
-      Positions [*batch, frames, J, 3], meters; rotations [*batch, frames, J, 3, 3].
+    Positions [*batch, frames, J, 3] are in meters; rotations [*batch, frames, J, 3, 3].
     """
     turns = np.asarray(motion.joint_rotation, float)
     offsets = np.asarray(skeleton.offsets, float)
@@ -405,12 +398,9 @@ def local_columns(
 
 
 def as_t_pose(skeleton: Skeleton, motion: Motion) -> tuple[Skeleton, Motion]:
-    """The same positions on a skeleton whose zero pose is the T-pose.
+    """The positions [frames, ...] of one character, on a T-posed skeleton.
 
     All joints' axes are those of the world there: x left, y up, z ahead.
-
-    Args:
-      motion: [frames, ...] of one character.
     """
     _, world = kinematics(skeleton, motion)
     points, turns = t_pose(skeleton, motion=world)

@@ -55,13 +55,8 @@ def control_weight(
 ) -> Float[Array, "*batch"]:
     """How much the person controls the ball: w of (1), kept in 0..1.
 
-    Args:
-      ball: World position of the ball, meters.
-      root: World position of the root, meters.
-      reach: Distance on the ground at which control ends, meters.
-
-    Returns:
-      1 above or below the root, 0 from the reach on.
+    1 above or below the root, 0 from the reach (meters on the ground) on. World
+    positions, meters.
 
     Source: SMGDiff, eq. 1; the clamp is ours.
     """
@@ -75,13 +70,9 @@ def control_weight(
 def ball_velocities(
     ball: Float[Array, "*batch frames 3"], fps: Scalar
 ) -> Float[Array, "*batch frames 3"]:
-    """Velocity with which the ball arrived in each frame.
+    """Velocity, meters per second, with which the ball arrived in each frame.
 
-    Args:
-      ball: Positions, meters.
-
-    Returns:
-      Meters per second; the first frame's is that of the second.
+    Positions are in meters; the first frame's velocity is that of the second.
 
     Raises:
       ValueError: if there are fewer than two frames.
@@ -95,14 +86,10 @@ def ball_velocities(
 def ball_accelerations(
     ball: Float[Array, "*batch frames 3"], fps: Scalar
 ) -> Float[Array, "*batch frames 3"]:
-    """Second difference of the ball's position about each frame.
+    """Second difference of the ball's position about each frame, m/s^2.
 
-    Args:
-      ball: Positions, meters.
-
-    Returns:
-      Meters per second squared; zero in the first and the last frame, which have no
-      neighbor.
+    Positions are in meters. Zero in the first and the last frame, which have no
+    neighbor.
 
     Raises:
       ValueError: if there are fewer than three frames.
@@ -129,16 +116,11 @@ def encode_ball(
     *,
     reach: Scalar,
 ) -> Float[Array, "*batch frames 7"]:
-    """Features of a ball: (1).
+    """Features of a ball: (1), relative to the root.
 
-    Args:
-      ball: Positions, meters.
-      velocity: Velocity of the ball, meters per second.
-      root: Positions of the root, meters.
-      reach: Distance on the ground at which control ends, meters.
-
-    Returns:
-      Weighted place relative to the root 3, velocity 3, weight 1.
+    Weighted place relative to the root 3, velocity 3, weight 1; positions are in
+    meters, the velocity in meters per second. Control ends at the reach, meters on the
+    ground.
 
     Source: SMGDiff, eq. 1-2.
     """
@@ -152,15 +134,10 @@ def place_ball(
     *,
     least_weight: float = MIN_CONTROL,
 ) -> Float[Array, "*batch frames 3"]:
-    """Where each frame by itself says that the ball is: b of (1).
+    """Where each frame by itself says that the ball is: b of (1), meters.
 
-    Args:
-      features: Features of the ball, perhaps from a network.
-      root: Positions of the root, meters.
-      least_weight: Weights below are taken to be this.
-
-    Returns:
-      Positions of the ball, meters; wrong where the true weight is below the least.
+    Features may come from a network; weights below the least are taken to be this, and
+    the place is wrong where the true one is below. The root is in meters.
 
     Source: SMGDiff, eq. 2; the clamp is ours.
     """
@@ -175,20 +152,13 @@ def decode_ball(
     start: Float[Array, "*batch 3"],
     fps: Scalar,
 ) -> Float[Array, "*batch frames 3"]:
-    """Inverse of `encode_ball` for any features, finite everywhere.
+    """Positions of the ball, meters: inverse of `encode_ball`, finite for any features.
 
     A weight of 0.3 and more is trusted wholly, one of 0.1 not at all: there the ball
-    goes on with its velocity channel from where it was in the frame before, and between
-    it is in between. A place within 0.5 m of where the velocity leads is trusted too,
-    one 1 m away is not. Features of a ball that moves as they say come back exactly.
-
-    Args:
-      features: Features of the ball, perhaps from a network.
-      root: Positions of the root, meters.
-      start: Where the ball was in the frame before the first, meters.
-
-    Returns:
-      Positions of the ball, meters.
+    goes on with its velocity channel from where it was in the frame before (before the
+    first at `start`, meters), and between it is in between. A place within 0.5 m of
+    where the velocity leads is trusted too, one 1 m away is not. Features of a ball
+    that moves as they say come back exactly.
 
     Source: SMGDiff, eq. 2, made safe.
     """
@@ -217,16 +187,7 @@ def decode_ball(
 def move_points(
     points: Float[Array, "*batch frames 3"], frame: PlanarFrame, *, out: bool
 ) -> Float[Array, "*batch frames 3"]:
-    """Points seen from a ground frame, or back in the world; heights stay.
-
-    Args:
-      points: Positions, meters.
-      frame: One for all frames.
-      out: From the frame to the world, instead of into the frame.
-
-    Returns:
-      Positions, meters.
-    """
+    """Points (meters) in a ground frame, one for all, or `out` of it; heights stay."""
     facing = jnp.broadcast_to(frame.facing[..., None, :], points[..., ::2].shape)
     origin = frame.origin[..., None, :]
     if out:

@@ -47,16 +47,13 @@ def foot_contacts(
 def ball_contact_gate(
     ball: Float[Array, "*batch frames 3"], fps: Scalar, *, threshold: Scalar
 ) -> Bool[Array, "*batch frames"]:
-    """Frames in which something must have pushed the ball.
+    """Frames in which something must have pushed the ball, never the first and last.
 
     Args:
       ball: Positions of the ball's center, meters.
       threshold: Least acceleration, meters per second squared. The paper's 2 is 2.2 mm
         of second difference at 30 fps, which a model's jitter exceeds; a ball that
         flies falls with 9.8.
-
-    Returns:
-      Whether the ball was pushed; never in the first and the last frame.
 
     Raises:
       ValueError: if there are fewer than three frames.
@@ -77,8 +74,9 @@ def ball_contact_loss(
     max_distance: Scalar,
     grounded_weight: Scalar,
 ) -> Float[Array, "*batch"]:
-    """How far the nearest joint is from the ball in the frames of a touch.
+    """How far the nearest joint is from the ball in the frames of a touch, meters.
 
+    The sum over frames of the weighted distances (whole) that exceed `max_distance`.
     Distances of joints that stand on the ground count `grounded_weight` times, so that
     the lifted foot is chosen. The gate, the choice and the comparison are constants of
     the gradient, which is zero where a joint is at the ball's center.
@@ -90,10 +88,6 @@ def ball_contact_loss(
       gate: Frames of a touch.
       max_distance: Weighted distances up to here count as a touch, meters.
       grounded_weight: At least 1.
-
-    Returns:
-      Sum over frames of the weighted distances (whole) that exceed `max_distance`,
-      meters.
 
     Source: SMGDiff, eq. 11-12, with the missing norm; the quotient there divides a
     frame's term by one.

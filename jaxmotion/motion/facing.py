@@ -32,23 +32,19 @@ _SHOULDERS = (
 
 
 def plain_names(skeleton: Skeleton) -> list[str]:
-    """Joint names in lower case, without separators and rig prefix.
+    """Joint names in lower case, without separators: "spine2" of "mixamorig:Spine".
 
-    Returns:
-      One name a joint: "spine2" of "mixamorig:Spine_2".
+    The prefix of a rig goes, too.
     """
     return [name.lower().split(":")[-1].replace("_", "") for name in skeleton.names]
 
 
 def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
-    """Finds the hip joints by their names.
+    """Indices of the left and the right hip joint, found by their names.
 
     Knows LeftUpLeg/RightUpLeg (Mixamo, LaFAN1), UpperLeg_L/UpperLeg_R (Bandai Namco),
     LeftHip/RightHip (100STYLE, SMPL) and L_Hip/R_Hip (BallPlay-M), in any case and
     after a prefix like "mixamorig:".
-
-    Returns:
-      Indices of the left and the right hip joint.
 
     Raises:
       ValueError: if no pair is found; names the pairs it knows and the joints.
@@ -77,13 +73,9 @@ def shoulder_joints(skeleton: Skeleton) -> tuple[int, int] | None:
 
 @jax.jit
 def facing_from_across(across: Float[Array, "*batch 3"]) -> Float[Array, "*batch 2"]:
-    """Facing of a body from the vector that points from its right to its left.
+    """Unit facing (x, z) of a body from its right-to-left vector: across x up.
 
-    Args:
-      across: World vectors of any length; a vertical one gives +z.
-
-    Returns:
-      Unit directions (x, z): across x up, on the ground.
+    World vectors of any length; a vertical one gives +z.
 
     Source: Chen et al. 2024 (CAMDM), released code.
     """
@@ -96,14 +88,13 @@ def hip_facing(
     *,
     hips: tuple[int, int] | None = None,
 ) -> Float[Array, "*batch 2"]:
-    """Facing of poses from their hips.
+    """Unit facing (x, z) of poses from their hips, world.
+
+    +z where the hips lie above each other.
 
     Args:
       joint_rotation: Parent-local rotations, two columns each; the root's is global.
       hips: Left and right hip joint; found by name if not given.
-
-    Returns:
-      Unit directions (x, z), world; +z where the hips lie above each other.
 
     Raises:
       ValueError: if `hips` is not given and the names are unknown.
@@ -120,13 +111,9 @@ def hip_facing(
 def body_facing(
     skeleton: Skeleton, positions: Float[Array, "*batch joints 3"]
 ) -> Float[Array, "*batch 2"]:
-    """Facing of poses from hips and shoulders alike, as CAMDM's evaluation has it.
+    """Unit facing (x, z) from hips and shoulders alike, as in CAMDM's evaluation.
 
-    Args:
-      positions: World positions of its joints.
-
-    Returns:
-      Unit directions (x, z), world.
+    All in the world.
 
     Raises:
       ValueError: if hips or shoulders are not found by name.

@@ -50,15 +50,10 @@ class FeatureLayout:
 
 
 def feature_layout(**sizes: int) -> FeatureLayout:
-    """Layout of fields that follow each other.
-
-    Args:
-      **sizes: For each field, in order, how many numbers it has.
+    """Layout of fields that follow each other, with so many numbers each.
 
     Raises:
       ValueError: if a size is not positive.
-
-    Source: own.
     """
     fields, start = [], 0
     for name, size in sizes.items():
@@ -70,15 +65,10 @@ def feature_layout(**sizes: int) -> FeatureLayout:
 def pack(
     layout: FeatureLayout, parts: Mapping[str, Float[Array, "*batch _"]]
 ) -> Float[Array, "*batch features"]:
-    """Joins named parts into feature vectors.
-
-    Args:
-      parts: One array for each field, of its size along the last axis.
+    """Joins named parts, one of each field's size, into feature vectors.
 
     Raises:
       ValueError: if names or sizes are not those of the layout.
-
-    Source: own.
     """
     names = [name for name, _, _ in layout.fields]
     if set(parts) != set(names):
@@ -99,8 +89,6 @@ def unpack(
 
     Raises:
       ValueError: if the vectors are not of the layout's size.
-
-    Source: own.
     """
     if features.shape[-1] != layout.size:
         raise ValueError(
@@ -131,12 +119,8 @@ def fit_normalizer(
 ) -> Normalizer:
     """Mean and standard deviation of each feature over all other axes.
 
-    Args:
-      features: Feature vectors of the training data.
-      floor: Least deviation, in the features' units, so that constant channels stay
-        finite (they map to zero).
-
-    Source: own.
+    The least deviation `floor`, in the features' units, keeps constant channels finite
+    (they map to zero).
     """
     rows = features.reshape(-1, features.shape[-1])
     mean = jnp.mean(rows, axis=0)
@@ -153,14 +137,7 @@ def _like(vector: Array, x: Array) -> Array:
 def normalize(
     normalizer: Normalizer, x: Float[Array, "*batch features"]
 ) -> Float[Array, "*batch features"]:
-    """Maps features to zero mean and unit deviation.
-
-    Args:
-      normalizer: Fitted on the training data.
-      x: Features in their own units.
-
-    Source: own.
-    """
+    """Maps features from their own units to zero mean and unit deviation."""
     return (x - _like(normalizer.mean, x)) / _like(normalizer.std, x)
 
 
@@ -168,17 +145,7 @@ def normalize(
 def denormalize(
     normalizer: Normalizer, x: Float[Array, "*batch features"]
 ) -> Float[Array, "*batch features"]:
-    """Inverse of `normalize`.
-
-    Args:
-      normalizer: Fitted on the training data.
-      x: Normalized features.
-
-    Returns:
-      Features in their own units.
-
-    Source: own.
-    """
+    """Inverse of `normalize`."""
     return x * _like(normalizer.std, x) + _like(normalizer.mean, x)
 
 
@@ -210,27 +177,15 @@ def _move(motion: Motion, facing: Array, before: Array, after: Array, turn) -> M
 def to_frame(motion: Motion, frame: PlanarFrame) -> Motion:
     """A world motion seen from a ground frame: origin at zero, facing along +z.
 
-    Rigid: only the root's position and rotation change, heights stay.
-
-    Args:
-      motion: Frames in the world.
-      frame: One for the whole motion.
-
-    Source: own.
+    Rigid: only the root's position and rotation change, heights stay. One frame serves
+    the whole motion.
     """
     zero = jnp.zeros_like(frame.origin)
     return _move(motion, frame.facing, -frame.origin, zero, ground.into_frame)
 
 
 def to_first_pose(skeleton: Skeleton, motion: Motion) -> Motion:
-    """Moves motions so that they start at the ground's origin facing +z.
-
-    Args:
-      motion: In the world.
-
-    Returns:
-      The same motions elsewhere; heights stay.
-    """
+    """Moves motions (world) to the ground's origin facing +z; heights stay."""
     first = Motion(
         root_position=motion.root_position[..., :1, :],
         joint_rotation=motion.joint_rotation[..., :1, :, :],
@@ -245,17 +200,7 @@ def to_first_pose(skeleton: Skeleton, motion: Motion) -> Motion:
 
 @jax.jit
 def from_frame(motion: Motion, frame: PlanarFrame) -> Motion:
-    """Inverse of `to_frame`.
-
-    Args:
-      motion: Frames in the ground frame.
-      frame: One for the whole motion.
-
-    Returns:
-      The motion in the world.
-
-    Source: own.
-    """
+    """Inverse of `to_frame`: the motion in the world."""
     zero = jnp.zeros_like(frame.origin)
     return _move(motion, frame.facing, zero, frame.origin, ground.out_of_frame)
 
@@ -273,13 +218,8 @@ def motion_features(
 ) -> Float[Array, "*batch frames features"]:
     """CAMDM's features: 6D of each joint, then the root as (x, y, z, 0, 0, 0).
 
-    Args:
-      motion: Frames; positions in meters.
-      rotation_layout: First two "rows" of each matrix, as in the released code, or its
-        first two "columns".
-
-    Returns:
-      (J + 1) * 6 features a frame.
+    (J + 1) * 6 per frame; positions are in meters, and 6D is the first two "rows" of
+    each matrix, as in the released code, or its first two "columns".
 
     Raises:
       ValueError: if the layout is neither.
@@ -302,15 +242,9 @@ def motion_from_features(
     *,
     rotation_layout: RotationLayout = "rows",
 ) -> Motion:
-    """Inverse of `motion_features`; any finite features give rotations.
+    """Inverse of `motion_features`; any finite features give rotations (Gram-Schmidt).
 
-    Args:
-      features: (J + 1) * 6 numbers a frame, as a network predicts them; the last three
-        are ignored.
-      rotation_layout: As in `motion_features`.
-
-    Returns:
-      The motion, with orthonormal 6D rotations (Gram-Schmidt).
+    The last three of a frame's (J + 1) * 6 numbers are ignored.
 
     Raises:
       ValueError: if the layout is neither, or the size is not (J + 1) * 6, J >= 1.

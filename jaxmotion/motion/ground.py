@@ -14,18 +14,10 @@ _TINY = 1e-12
 def unit(
     vector: Float[Array, "*batch 2"], fallback: Float[Array, "*batch 2"] | None = None
 ) -> Float[Array, "*batch 2"]:
-    """Unit vector along a ground vector; `fallback` where that is zero.
+    """Unit vector along a ground vector (x, z); `fallback`, or +z, where that is zero.
 
-    The gradient is finite everywhere: at a zero vector it is zero.
-
-    Args:
-      vector: Ground vectors (x, z) of any length.
-      fallback: Unit vectors for lengths below 1e-6; +z by default.
-
-    Returns:
-      Unit vectors.
-
-    Source: own.
+    Zero is a length below 1e-6; the fallback is of unit length. The gradient is finite
+    everywhere: at a zero vector it is zero.
     """
     if fallback is None:
         fallback = jnp.broadcast_to(jnp.array([0.0, 1.0], vector.dtype), vector.shape)
@@ -39,14 +31,7 @@ def unit(
 def turn(
     vector: Float[Array, "*batch 2"], yaw: Float[Array, "*batch"]
 ) -> Float[Array, "*batch 2"]:
-    """Turns ground vectors about +y.
-
-    Args:
-      vector: Ground vectors (x, z).
-      yaw: Angle in radians; positive turns +z toward +x.
-
-    Source: own.
-    """
+    """Turns ground vectors (x, z) about +y, by radians from +z toward +x."""
     x, z = vector[..., 0], vector[..., 1]
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     return jnp.stack([cos * x + sin * z, cos * z - sin * x], axis=-1)
@@ -55,16 +40,10 @@ def turn(
 def angle_from_to(
     start: Float[Array, "*batch 2"], end: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch"]:
-    """Yaw that turns one direction into another, by the shorter way.
+    """Yaw that turns one direction (x, z) into another, by the shorter way.
 
-    Args:
-      start: Directions (x, z) of any length; a zero vector counts as +z.
-      end: Directions of any length; a zero vector counts as +z.
-
-    Returns:
-      Angle in [-pi, pi] radians, positive from +z toward +x.
-
-    Source: own.
+    In [-pi, pi] radians, positive from +z toward +x. Directions have any length; a zero
+    vector counts as +z.
     """
     # Unit vectors never have both products zero, where atan2 has no gradient.
     a, b = unit(start), unit(end)
@@ -75,14 +54,7 @@ def angle_from_to(
 def into_frame(
     vector: Float[Array, "*batch 2"], facing: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch 2"]:
-    """World ground vectors in the axes of a frame whose +z is `facing`.
-
-    Args:
-      vector: World vectors (x, z).
-      facing: Unit vectors, world.
-
-    Source: own.
-    """
+    """World ground vectors (x, z) in the axes of a frame with unit +z `facing`."""
     x, z = vector[..., 0], vector[..., 1]
     fx, fz = facing[..., 0], facing[..., 1]
     return jnp.stack([fz * x - fx * z, fx * x + fz * z], axis=-1)
@@ -91,17 +63,7 @@ def into_frame(
 def out_of_frame(
     vector: Float[Array, "*batch 2"], facing: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch 2"]:
-    """Inverse of `into_frame`.
-
-    Args:
-      vector: Vectors in the axes of a frame whose +z is `facing`.
-      facing: Unit vectors, world.
-
-    Returns:
-      World vectors (x, z).
-
-    Source: own.
-    """
+    """Inverse of `into_frame`."""
     x, z = vector[..., 0], vector[..., 1]
     fx, fz = facing[..., 0], facing[..., 1]
     return jnp.stack([fz * x + fx * z, fz * z - fx * x], axis=-1)

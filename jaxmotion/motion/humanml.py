@@ -49,11 +49,9 @@ FACING_SIGMA = 20.0  # frames; of the filter on the facing
 def minimal_swing(
     start: Float[Array, "*#batch 3"], end: Float[Array, "*batch 3"]
 ) -> Float[Array, "*batch 3 3"]:
-    """Smallest rotation that turns one direction onto another.
+    """Smallest rotation that turns one unit vector onto another.
 
-    Args:
-      start: Unit vectors.
-      end: Unit vectors; opposite ones turn about some axis at right angles.
+    Opposite ones turn about some axis at right angles.
     """
     axis = jnp.eye(3, dtype=start.dtype)[jnp.argmin(jnp.abs(start), axis=-1)]
     start, half_turn = jnp.broadcast_arrays(start, jnp.cross(start, axis), end)[:2]
@@ -105,11 +103,7 @@ def canonical_joints(
 ) -> Float[Array, "*batch frames joints 3"]:
     """Moves clips to the origin, onto the floor, and turns frame 0 to +z.
 
-    Args:
-      joints: World positions, y up.
-
-    Returns:
-      Positions; a second call changes nothing.
+    World positions, y up; a second call changes nothing.
 
     Raises:
       ValueError: if the number of joints is not the layout's.
@@ -156,14 +150,9 @@ def _chain_rotations(joints: Array, facing: Array, layout: Layout) -> Array:
 def features_from_joints(
     joints: Float[Array, "*batch frames joints 3"], layout: Layout
 ) -> Float[Array, "*batch frames-1 features"]:
-    """Features of clips; see the module for what they are.
+    """Features of clips, not normalized, a vector per frame but for the last one.
 
-    Args:
-      joints: World positions, y up, at the frame rate of the data set; need not be
-        canonical.
-
-    Returns:
-      One vector a frame but for the last one, not normalized.
+    World positions, y up, at the frame rate of the data set; need not be canonical.
 
     Raises:
       ValueError: if the number of joints is not the layout's, or there are fewer than
@@ -216,16 +205,11 @@ def _added(a: Array, b: Array) -> Array:
 def joints_from_features(
     features: Float[Array, "*batch frames features"], layout: Layout
 ) -> Float[Array, "*batch frames {layout.num_joints} 3"]:
-    """Joint positions that features mean.
+    """Joint positions that features, not normalized, mean.
 
-    Only the root's channels and `joint_position` count; the others repeat what is in
-    them and may contradict it where a network has made them.
-
-    Args:
-      features: Vectors, not normalized.
-
-    Returns:
-      Positions; the root of the first frame is above the origin and faces +z.
+    The root of the first frame is above the origin and faces +z. Only the root's
+    channels and `joint_position` count; the others repeat what is in them and may
+    contradict it where a network has made them.
 
     Raises:
       ValueError: if the vectors do not have the layout's length.

@@ -86,14 +86,9 @@ _RIGS = (
 def joint_mapping(skeleton: Skeleton) -> Float[Array, "22 joints"]:
     """Weights that make HumanML3D's joints from those of a skeleton.
 
-    Knows the joint names of SMPL, LaFAN1, Mixamo and Bandai Namco Research, in any case
-    and after a prefix like "mixamorig:".
-
-    Args:
-      skeleton: The bones; joints that are not needed are left out.
-
-    Returns:
-      One row a joint of `SMPL_JOINTS`; rows sum to 1.
+    One row per joint of `SMPL_JOINTS`, which sums to 1. Knows the joint names of SMPL,
+    LaFAN1, Mixamo and Bandai Namco Research, in any case and after a prefix like
+    "mixamorig:"; joints that are not needed are left out.
 
     Raises:
       ValueError: if no rig fits; names what is missing from the one that fits best.
@@ -121,15 +116,7 @@ def joint_mapping(skeleton: Skeleton) -> Float[Array, "22 joints"]:
 def mapped_joints(
     mapping: Float[Array, "22 joints"], positions: Float[Array, "*batch joints 3"]
 ) -> Float[Array, "*batch 22 3"]:
-    """Positions of HumanML3D's joints from those of a skeleton.
-
-    Args:
-      mapping: From `joint_mapping`.
-      positions: World positions, meters.
-
-    Returns:
-      World positions, meters.
-    """
+    """World positions, meters, of HumanML3D's joints, by a `joint_mapping`."""
     # In full precision also where matrix products are rounded by default.
     return jnp.einsum("kj,...jc->...kc", mapping, positions, precision="highest")
 
@@ -180,14 +167,9 @@ def motion_from_joints(
 ) -> tuple[Skeleton, Motion]:
     """Skeleton and motion that follow joint positions, for example for a BVH file.
 
-    The bones have constant lengths, so positions whose bones stretch are only
-    approximated. In rest the person stands as a T and faces +z.
-
-    Args:
-      positions: World positions of HumanML3D's joints, meters, y up.
-
-    Returns:
-      A skeleton with the joints `SMPL_JOINTS`, and the motion.
+    The joints are `SMPL_JOINTS`, the positions in the world, meters, y up. The bones
+    have constant lengths, so positions whose bones stretch are only approximated. In
+    rest the person stands as a T and faces +z.
     """
     parents = HUMANML3D.parents
     bones = positions - positions[:, jnp.array((0, *parents[1:]))]

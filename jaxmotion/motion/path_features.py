@@ -16,10 +16,7 @@ SECONDS = (1 / 3, 2 / 3, 1.0)
 
 
 def path_offsets(fps: float) -> tuple[int, ...]:
-    """How many frames ahead the path is looked at.
-
-    Returns:
-      Three numbers of frames; 20, 40, 60 at 60 frames per second.
+    """How many frames ahead the path is looked at; 20, 40, 60 at 60 per second.
 
     Source: Li et al. 2024 (AAMDM), section 3.6.
     """
@@ -27,14 +24,9 @@ def path_offsets(fps: float) -> tuple[int, ...]:
 
 
 def query(path: Trajectory, frame: PlanarFrame) -> Float[Array, "*batch 12"]:
-    """Features of three points of a path.
+    """Features of three points of a path (world).
 
-    Args:
-      path: The three points, world.
-
-    Returns:
-      Three positions (x, z), meters, then three facings (x, z), in the axes of the
-      frame.
+    Three positions (x, z), meters, then three facings (x, z), in the axes of the frame.
 
     Source: Li et al. 2024 (AAMDM), section 3.6.
     """
@@ -46,13 +38,9 @@ def query(path: Trajectory, frame: PlanarFrame) -> Float[Array, "*batch 12"]:
 
 @functools.partial(jax.jit, static_argnames=("fps",))
 def path_features(bone: Trajectory, *, fps: float) -> Float[Array, "frames 12"]:
-    """Features of every frame of a clip; beyond its end the last frame counts.
+    """`query` of every frame of a clip; beyond its end the last frame counts.
 
-    Args:
-      bone: Simulation bone of one clip, world.
-
-    Returns:
-      One row a frame, as `query`.
+    The simulation bone of one clip is in the world.
 
     Source: Li et al. 2024 (AAMDM), section 3.6; clamped as in Holden et al. 2020.
     """

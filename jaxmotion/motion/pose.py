@@ -36,10 +36,7 @@ _CONTACT_FILTER = 6  # frames of the median at 60 frames per second
 
 
 def pose_layout(num_joints: int) -> FeatureLayout:
-    """Fields of a pose vector.
-
-    Returns:
-      The layout, 15 J + 8 features.
+    """Fields of a pose vector, 15 J + 8 features.
 
     Source: Li et al. 2024 (AAMDM), section 3.6.
     """
@@ -102,15 +99,11 @@ def _local(skeleton: Skeleton, motion: Motion, bone: Trajectory) -> tuple[Array,
 def pose_vectors(
     skeleton: Skeleton, motion: Motion, bone: Trajectory
 ) -> Float[Array, "frames features"]:
-    """Pose vector of every frame of a clip.
+    """Pose vector, 15 J + 8 features, of every frame of a clip (world).
 
-    Args:
-      skeleton: The bones; it has two feet, the left one first.
-      motion: One clip, world.
-
-    Returns:
-      15 J + 8 features a frame; velocities are central differences, extrapolated at
-      the clip's ends (of three frames, the first and the last step).
+    Velocities are central differences, extrapolated at the clip's ends (of three
+    frames, the first and the last step). Of the skeleton's two feet the left one is
+    first.
 
     Raises:
       ValueError: if there are fewer than three frames, or the feet are not two.
@@ -154,7 +147,7 @@ def character_transforms(
     network that predicts them is told how they move the joints after them.
 
     Args:
-      parents: Parent of each joint, -1 for joint 0.
+      parents: -1 for joint 0.
       position: Local translations, meters.
       rot6d: Local rotations, two columns each; made orthonormal.
 
@@ -179,15 +172,11 @@ def advance_frame(
     *,
     fps: float,
 ) -> PlanarFrame:
-    """Moves the simulation bone on by one frame.
+    """Moves the simulation bone (world) on by one frame.
 
     Args:
-      frame: Where it is, world.
       velocity: In its own axes, meters per second; the vertical part is not used.
       angular_velocity: In its own axes, radians per second; the vertical part counts.
-
-    Returns:
-      Where it is one frame later.
 
     Source: Holden et al. 2020, released code: p += R v dt, R = exp(w dt) R.
     """
@@ -205,18 +194,9 @@ def point_velocities(
 ) -> Float[Array, "*batch frames-1 points 3"]:
     """How fast points that poses carry move over the ground; planted feet do not.
 
-    The bone's own movement counts, as `integrate_root` has it.
-
-    Args:
-      poses: Pose vectors, frame after frame.
-      points: Points in the axes of each frame's simulation bone, meters, such as joints
-        of `character_transforms`.
-
-    Returns:
-      Velocity from each frame to the next in the axes of the former's bone, meters per
-      second.
-
-    Source: own.
+    From each frame to the next, meters per second, in the axes of the former's bone,
+    whose own movement counts, as `integrate_root` has it. The points are in the axes of
+    each frame's simulation bone, meters, such as joints of `character_transforms`.
     """
     parts = unpack(pose_layout(num_joints), poses[..., 1:, :])
     moves = parts["root_velocity"], parts["root_angular_velocity"]
@@ -234,14 +214,10 @@ def point_velocities(
 def place(
     poses: Float[Array, "*batch features"], frame: PlanarFrame, *, num_joints: int
 ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch joints 6"]]:
-    """Puts poses into the world.
+    """Root positions, meters, and parent-local 6D columns of poses in the world.
 
-    Translations of other joints than the first are not used: a `Motion` has the bones
-    of its skeleton.
-
-    Returns:
-      Root positions, meters, and parent-local rotations, two columns each: the fields
-      of a `Motion`.
+    The fields of a `Motion`. Translations of other joints than the first are not used:
+    a `Motion` has the bones of its skeleton.
 
     Source: Li et al. 2024 (AAMDM), section 3.6.
     """
@@ -263,15 +239,9 @@ def integrate_root(
     num_joints: int,
     fps: float,
 ) -> PlanarFrame:
-    """Path of the simulation bone that pose vectors mean.
+    """Path (world) of the simulation bone that pose vectors mean, from its first frame.
 
     A pose's velocity is what leads to it: that of the first pose has no effect.
-
-    Args:
-      frame: The simulation bone of the first frame.
-
-    Returns:
-      The simulation bone of every frame, world.
 
     Source: Holden et al. 2020, released code.
     """

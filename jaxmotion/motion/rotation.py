@@ -21,15 +21,7 @@ _TINY = 1e-12
 def safe_normalize(
     x: Float[Array, "*batch n"], fallback: Float[Array, " n"]
 ) -> Float[Array, "*batch n"]:
-    """Unit vector along x; `fallback`, with zero gradient, where x is zero.
-
-    Args:
-      x: Vectors of any length.
-      fallback: Unit vector to return where the length is below 1e-6.
-
-    Returns:
-      Unit vectors.
-    """
+    """Unit vector along x; the unit `fallback`, with zero gradient, below 1e-6."""
     square = jnp.sum(x * x, axis=-1, keepdims=True)
     is_zero = square < _TINY
     length = jnp.sqrt(jnp.where(is_zero, 1.0, square))
@@ -73,18 +65,12 @@ def _axes_and_lengths(rot6d: Array) -> tuple[Array, Array, Array, Array]:
 
 @jax.custom_vjp
 def columns_from_rot6d(rot6d: Float[Array, "6 *batch"]) -> Float[Array, "3 3 *batch"]:
-    """`matrix_from_rot6d` with the batch last: for long chains of such products.
+    """`matrix_from_rot6d`, rows then columns, the batch last: for long products.
 
     The compiler makes loops over the last axis, and three numbers are too short for
     one: with the batch there, kinematics and its gradient are several times as fast.
     The gradient is written out, since the compiler's version computes the roots again
     for each of its terms. It is 0 where a fallback stands.
-
-    Args:
-      rot6d: Two columns, not necessarily orthonormal.
-
-    Returns:
-      Rotation matrices; rows first, then columns.
     """
     x, y, _, _ = _axes_and_lengths(rot6d)
     return jnp.stack([x, y, _cross(x, y)], axis=1)
@@ -123,9 +109,6 @@ def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3
     becomes +x, and where the second is parallel to it another axis takes its place.
     Differentiable in reverse mode only: its gradient is written out.
 
-    Args:
-      rot6d: Two columns, not necessarily orthonormal.
-
     Source: Zhou et al. 2019, eq. 15.
     """
     return jnp.moveaxis(
@@ -135,10 +118,7 @@ def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3
 
 @jax.jit
 def rot6d_from_matrix(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 6"]:
-    """First two columns of a rotation matrix.
-
-    Returns:
-      `[c1, c2]`, six numbers.
+    """The first two columns of a rotation matrix, `[c1, c2]`.
 
     Source: Zhou et al. 2019, eq. 14.
     """
@@ -151,12 +131,6 @@ def rot6d_rows_to_columns(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*bat
 
     The six numbers are Gram-Schmidted on the way, so they may come from a network.
 
-    Args:
-      rot6d: Two rows (or two columns) of a rotation matrix.
-
-    Returns:
-      The first two columns (or rows) of the same matrix.
-
     Source: rows as in the released code of CAMDM, MDM, EMDM and AMDM.
     """
     return rot6d_from_matrix(jnp.swapaxes(matrix_from_rot6d(rot6d), -1, -2))
@@ -166,11 +140,7 @@ def rot6d_rows_to_columns(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*bat
 def matrix_from_quaternion(
     quaternion: Float[Array, "*batch 4"],
 ) -> Float[Array, "*batch 3 3"]:
-    """Rotation matrix of a quaternion.
-
-    Args:
-      quaternion: wxyz of any non-zero length; zero gives the identity.
-    """
+    """Rotation matrix of a quaternion wxyz of any length; zero gives the identity."""
     identity = jnp.array([1.0, 0.0, 0.0, 0.0], quaternion.dtype)
     w, x, y, z = jnp.moveaxis(safe_normalize(quaternion, identity), -1, 0)
     rows = [
@@ -185,13 +155,10 @@ def matrix_from_quaternion(
 def quaternion_from_matrix(
     matrix: Float[Array, "*batch 3 3"],
 ) -> Float[Array, "*batch 4"]:
-    """Quaternion of a rotation matrix, with w >= 0.
+    """Unit quaternion wxyz of a rotation matrix, with w >= 0.
 
     Of the four algebraically equal forms the best conditioned one is taken, so the
     result and its gradient are finite everywhere, half turns included.
-
-    Returns:
-      Unit quaternions, wxyz.
 
     Source: Shepperd 1978.
     """
@@ -228,11 +195,7 @@ def quaternion_from_matrix(
 
 @jax.jit
 def matrix_from_facing(facing: Float[Array, "*batch 2"]) -> Float[Array, "*batch 3 3"]:
-    """Rotation about +y that turns +z onto a ground direction.
-
-    Args:
-      facing: Direction (x, z), unit length.
-    """
+    """Rotation about +y that turns +z onto a unit ground direction (x, z)."""
     x, z = facing[..., 0], facing[..., 1]
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
     rows = [[z, zero, x], [zero, one, zero], [-x, zero, z]]

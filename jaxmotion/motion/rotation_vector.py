@@ -13,13 +13,7 @@ _TINY = 1e-12
 
 @jax.jit
 def from_matrix(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
-    """Rotation vector of a rotation matrix.
-
-    Returns:
-      Rotation vectors, at most pi long.
-
-    Source: own.
-    """
+    """Rotation vector, at most pi long, of a rotation matrix."""
     quaternion = rotation.quaternion_from_matrix(matrix)
     w, axis = quaternion[..., :1], quaternion[..., 1:]
     square = jnp.sum(axis * axis, axis=-1, keepdims=True)
@@ -31,13 +25,7 @@ def from_matrix(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 3"]:
 
 @jax.jit
 def to_matrix(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
-    """Rotation matrix of a rotation vector.
-
-    Args:
-      vector: Rotation vectors of any length.
-
-    Source: own.
-    """
+    """Rotation matrix of a rotation vector of any length."""
     square = jnp.sum(vector * vector, axis=-1, keepdims=True)
     is_zero = square < _TINY
     angle = jnp.sqrt(jnp.where(is_zero, 1.0, square))
@@ -50,19 +38,10 @@ def to_matrix(vector: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3 3"]:
 def nearest(
     vector: Float[Array, "*batch 3"], reference: Float[Array, "*batch 3"]
 ) -> Float[Array, "*batch 3"]:
-    """The nearest to another vector among those of the same rotation.
+    """A rotation vector, or the other of the same rotation if nearer to the reference.
 
     Without it the difference of two rotation vectors near a half turn jumps by a full
-    turn.
-
-    Args:
-      vector: Rotation vectors, at most pi long.
-      reference: Rotation vectors, at most pi long.
-
-    Returns:
-      `vector`, or the same rotation the other way round.
-
-    Source: own.
+    turn. Both are at most pi long.
     """
     square = jnp.sum(vector * vector, axis=-1, keepdims=True)
     is_zero = square < _TINY

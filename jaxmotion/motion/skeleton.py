@@ -196,16 +196,10 @@ def global_transforms(
     root_position: Float[Array, "*batch 3"],
     joint_rotation: Float[Array, "*batch joints 6"],
 ) -> tuple[Float[Array, "*batch joints 3"], Float[Array, "*batch joints 3 3"]]:
-    """World positions and world rotations of all joints.
+    """World positions, meters, and world rotation matrices of all joints.
 
-    Differentiable in reverse mode only: its gradient is written out.
-
-    Args:
-      root_position: World position of the root, meters.
-      joint_rotation: Parent-local rotations, two columns each.
-
-    Returns:
-      Positions in meters, and rotation matrices.
+    Rotations are parent-local, two columns each. Differentiable in reverse mode only:
+    its gradient is written out.
 
     Raises:
       ValueError: if the number of rotations is not the skeleton's number of joints.
@@ -233,14 +227,9 @@ def forward_kinematics(
     root_position: Float[Array, "*batch 3"],
     joint_rotation: Float[Array, "*batch joints 6"],
 ) -> Float[Array, "*batch joints 3"]:
-    """World positions of all joints.
+    """World positions of all joints, meters.
 
-    Args:
-      root_position: World position of the root, meters.
-      joint_rotation: Parent-local rotations, two columns each.
-
-    Returns:
-      Positions, meters.
+    Rotations are parent-local, two columns each.
 
     Raises:
       ValueError: if the number of rotations is not the skeleton's number of joints.
@@ -253,10 +242,7 @@ def forward_kinematics(
 def joint_positions(
     skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames joints 3"]:
-    """World positions of all joints in all frames of a motion.
-
-    Returns:
-      Positions, meters.
+    """World positions, meters, of all joints in all frames of a motion.
 
     Raises:
       ValueError: if the motion has another number of joints.
@@ -267,13 +253,9 @@ def joint_positions(
 def from_root(
     skeleton: Skeleton, joint_rotation: Float[Array, "*batch joints 6"], joint: int
 ) -> Float[Array, "*batch 3"]:
-    """World vector from the root to a joint: kinematics of its own chain only.
+    """World vector, meters, from the root to a joint: kinematics of its own chain only.
 
-    Args:
-      joint_rotation: Parent-local rotations, two columns each; the root's is global.
-
-    Returns:
-      Meters; zeros for the root.
+    Rotations are parent-local, two columns each; the root's is global.
     """
     chain = []
     while joint > 0:
@@ -292,12 +274,5 @@ def from_root(
 def joint_velocities(
     positions: Float[Array, "*batch frames joints 3"], fps: float
 ) -> Float[Array, "*batch frames-1 joints 3"]:
-    """Velocity of each joint between neighboring frames.
-
-    Args:
-      positions: World positions, meters.
-
-    Returns:
-      Forward differences, meters per second.
-    """
+    """Forward differences of world positions in meters, meters per second."""
     return (positions[..., 1:, :, :] - positions[..., :-1, :, :]) * fps

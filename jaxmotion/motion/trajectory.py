@@ -76,14 +76,9 @@ class Command:
 def root_trajectory(
     skeleton: Skeleton, motion: Motion, *, hips: tuple[int, int] | None = None
 ) -> Trajectory:
-    """Path of the root and the facing of the hips in every frame.
+    """Path of the root and the facing of the hips in every frame, world.
 
-    Args:
-      motion: Frames of that skeleton, world.
-      hips: Left and right hip joint; found by name if not given.
-
-    Returns:
-      The path, one point a frame, world.
+    The left and right hip joint are found by name if not given.
 
     Raises:
       ValueError: if `hips` is not given and the names are unknown.
@@ -233,14 +228,7 @@ def blend(
 
 @jax.jit
 def to_local(trajectory: Trajectory, frame: PlanarFrame) -> Trajectory:
-    """A world path in a frame: the frame's origin at zero, its facing along +z.
-
-    Args:
-      trajectory: World path.
-      frame: Frame, one for the whole path.
-
-    Source: own.
-    """
+    """A world path in one frame: the frame's origin at zero, its facing along +z."""
     moved = trajectory.position - frame.origin[..., None, :]
     facing = jnp.broadcast_to(frame.facing[..., None, :], moved.shape)
     return Trajectory(
@@ -252,14 +240,9 @@ def to_local(trajectory: Trajectory, frame: PlanarFrame) -> Trajectory:
 def smoothing_matrices(
     frames: int, sigmas: tuple[float, ...]
 ) -> Float[Array, "sigmas {frames} {frames}"]:
-    """Gaussian filters along time as matrices; the border reflects.
+    """Gaussian filters along time as matrices with rows that sum to 1.
 
-    Args:
-      frames: Length of the window.
-      sigmas: Standard deviations in frames; 0 gives the identity.
-
-    Returns:
-      One matrix each; rows sum to 1.
+    The border reflects; standard deviations are in frames, 0 gives the identity.
     """
     matrices = []
     for sigma in sigmas:
@@ -277,12 +260,9 @@ def smoothing_matrices(
 def smooth_course(key: Key, course: Trajectory, *, last: int) -> Trajectory:
     """A recorded path as a user might have asked for it.
 
-    The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4,
-    1/4); the facings are smoothed with sigma 5 or 10.
-
-    Args:
-      course: Path of one window.
-      last: Frame in which the smoothed path stays where it was.
+    The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4, 1/4)
+    such that it stays where it was in frame `last`; the facings are smoothed with sigma
+    5 or 10.
 
     Source: released code of CAMDM. Differs: facings are smoothed within the window,
     there within the whole clip.
@@ -300,23 +280,15 @@ def smooth_course(key: Key, course: Trajectory, *, last: int) -> Trajectory:
 def smooth(
     x: Float[Array, "*batch frames n"], matrix: Float[Array, "frames frames"]
 ) -> Float[Array, "*batch frames n"]:
-    """Filters along time with a matrix of weights.
-
-    Args:
-      matrix: Row f holds the weights of frame f.
-    """
+    """Filters along time with a matrix whose row f holds the weights of frame f."""
     return jax.numpy.einsum("fg,...gn->...fn", matrix, x)
 
 
 def integrate_path(
     velocity: Float[Array, "*batch frames 2"], fps: float
 ) -> Float[Array, "*batch frames 2"]:
-    """Path of a point that starts at the origin and moves with given velocities.
+    """Path, meters, from the origin with given velocities, meters per second.
 
-    Args:
-      velocity: Meters per second, one a frame.
-
-    Returns:
-      Positions after each frame, meters.
+    A point stands at its entry after each frame.
     """
     return jnp.cumsum(velocity, axis=-2) / fps

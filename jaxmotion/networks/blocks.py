@@ -32,9 +32,8 @@ from jaxmotion.typing import Params
 def apply(params: Params, module: Any, *args: Any, **options: Any) -> Any:
     """What a module makes of its parameters and arguments.
 
-    Args:
-      module: Flax module without collections but these; or what has its `apply`.
-      **options: Of its method; Flax's own `method` and `rngs`.
+    It has no collections but these; options are its method's, and Flax's own `method`
+    and `rngs`.
     """
     return module.apply({"params": params}, *args, **options)
 
@@ -61,11 +60,7 @@ def known_labels(
 def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
     """Table of sinusoidal position codes: sine on even channels, cosine on odd.
 
-    Args:
-      width: Channels; even.
-
-    Returns:
-      The table. It is made in float64, so high positions stay exact.
+    It is made in float64, so high positions stay exact.
 
     Raises:
       ValueError: if width is odd.
@@ -83,23 +78,12 @@ def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
 def add_rows(
     x: Float[Array, "*batch tokens width"], rows: Float[Array, "*rows width"]
 ) -> Float[Array, "*batch tokens width"]:
-    """Adds the same rows (positions) to the tokens of every sample.
-
-    Args:
-      rows: One row for each token, or one for all.
-    """
+    """Adds rows (positions), one per token or one for all, to all samples' tokens."""
     return x + jnp.broadcast_to(rows, x.shape)
 
 
 def fold_frames(x: Float[Array, "*batch frames features"], n: int) -> Array:
-    """Puts n neighboring frames into one row.
-
-    Args:
-      x: Frames; their number is a multiple of n.
-      n: Frames a row.
-
-    Returns:
-      Rows of n times as many features.
+    """Puts n neighboring frames into one row of n times as many features.
 
     Raises:
       ValueError: if the number of frames is not a multiple of n.
@@ -118,17 +102,11 @@ def unfold_weights(
 ) -> Float[np.ndarray, "frames predictions"]:
     """How overlapping tokens share their frames: the matrix of `unfold_frames`.
 
-    Token i speaks for the frames [i n - margin, (i + 1) n + margin) that exist. Its
-    window is sin^2 over all of them ("hann"), or rises over the margin, is flat over
-    its own frames and falls ("trapezoid"). Windows are normalized over tokens: the
-    weights of a frame sum to 1.
-
-    Args:
-      n: Own frames of a token.
-      margin: Frames beyond them on either side.
-
-    Returns:
-      One row per frame, one column per prediction (token by token).
+    One row per frame, one column per prediction (token by token). Token i speaks for
+    the frames [i n - margin, (i + 1) n + margin) that exist. Its window is sin^2 over
+    all of them ("hann"), or rises over the margin, is flat over its own frames and
+    falls ("trapezoid"). Windows are normalized over tokens: the weights of a frame sum
+    to 1.
     """
     size = n + 2 * margin
     place = np.arange(size) + 0.5
@@ -154,17 +132,10 @@ def unfold_frames(
 ) -> Float[Array, "*batch frames features"]:
     """Frames of tokens that each predict n frames and `margin` more on either side.
 
-    Without a margin this is the inverse of `fold_frames`, and the motion may jump
-    where one token ends and the next begins: nothing but the network's own effort
-    joins them. With one, neighbors predict the same frames and are cross-faded.
-
-    Args:
-      x: Outputs, n + 2 margin frames of features in each token.
-      n: Own frames of a token.
-      margin: Frames beyond them on either side.
-
-    Returns:
-      n frames per token.
+    Without a margin this is the inverse of `fold_frames`, and the motion may jump where
+    one token ends and the next begins: nothing but the network's own effort joins them.
+    With one, neighbors predict the same frames and are cross-faded. Each token has n +
+    2 margin frames of features.
     """
     *batch, tokens, channels = x.shape
     features = channels // (n + 2 * margin)
@@ -227,9 +198,6 @@ class TimeEmbedding(nn.Module):
 
         Step t reads row t - 1 of the sinusoid, as the released weights of CAMDM do
         (their least noisy step is 0); row 0 (clean data) repeats row 1.
-
-        Returns:
-          One row a step.
         """
         codes = sinusoidal_positions(num_steps, self.width)
         codes = jnp.concatenate([codes[:1], codes])
@@ -291,11 +259,7 @@ class EncoderLayer(nn.Module):
     def project(
         self, x: Float[Array, "*batch tokens width"], *, last: int | None = None
     ) -> Projections:
-        """Queries, keys and values of tokens.
-
-        Args:
-          last: Make queries of only the last so many tokens; None for all.
-        """
+        """Queries (of only the `last` tokens, if given), keys and values of tokens."""
         if self.norm == "pre":
             x = self.norm_1(x)
         key, value = jnp.split(self.key_value(x), 2, axis=-1)

@@ -106,15 +106,11 @@ class ClipText(nn.Module):
     def __call__(
         self, ids: Int[Array, "batch tokens"]
     ) -> Float[Array, "batch dimensions"]:
-        """Encodes texts.
+        """Encodes texts, not normalized.
 
-        Args:
-          ids: Token ids in 0..vocabulary-1, at most `context` of them; every row holds
-            the end-of-text token, and its first one ends the text. (The released code
-            takes the largest id of a row: with its vocabulary the same place.)
-
-        Returns:
-          One vector a text, not normalized.
+        Ids are in 0..vocabulary-1, at most `context` of them; every row holds the
+        end-of-text token, and its first one ends the text. (The released code takes the
+        largest id of a row: with its vocabulary the same place.)
 
         Raises:
           ValueError: at trace time, if the rows are longer than the context.

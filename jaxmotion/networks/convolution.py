@@ -27,17 +27,9 @@ def convolve(
 ) -> Float[Array, "batch steps channels"]:
     """What `jax.lax.conv_general_dilated` makes of frames, for `nn.Conv`.
 
-    Args:
-      frames: Batch, time, channels: the order of `nn.Conv`.
-      window_strides: Frames between results.
-      padding: "SAME", "VALID", or zeros before and after.
-      lhs_dilation: 1: nothing else is here.
-      rhs_dilation: 1.
-      dimension_numbers: Those of `nn.Conv`, whatever they say.
-      feature_group_count: 1.
-
-    Returns:
-      Sums over the width of the kernel.
+    Sums over the width of the kernel of frames in the order batch, time, channels.
+    Dilations and `feature_group_count` are 1; padding is "SAME", "VALID", or zeros
+    before and after.
 
     Raises:
       ValueError: if something is dilated or grouped.

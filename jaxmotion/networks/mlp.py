@@ -49,15 +49,12 @@ class ConditionedMlp(nn.Module):
         condition: Float[Array, "*batch condition"],
         latent: Float[Array, "*batch latent"] | None = None,
     ) -> Float[Array, "*batch out"]:
-        """The network.
+        """A vector of `features` channels.
 
         Args:
           t: Step in 1..T, one for all or one a sample.
           condition: What the result depends on besides.
           latent: Noise of a generator; None for none.
-
-        Returns:
-          A vector of `features` channels.
         """
         step = _step_embedding(self.time_width, self.num_steps, t, x_t.shape[:-1])
         given = [x_t, condition, step] + ([] if latent is None else [latent])
@@ -90,12 +87,7 @@ class PairDiscriminator(nn.Module):
         t: Int[Array, "*#batch"],
         condition: Float[Array, "*batch condition"],
     ) -> Float[Array, "*batch"]:
-        """The network.
-
-        Args:
-          t: Step in 1..T.
-          condition: What the pair depends on.
-        """
+        """The logit of a pair at step t in 1..T, which depends on the condition."""
         step = _step_embedding(self.time_width, self.num_steps, t, x_t.shape[:-1])
         h = jnp.concatenate([x_prev, x_t, condition, step], axis=-1)
         for _ in range(self.depth):

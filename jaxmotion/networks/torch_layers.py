@@ -21,12 +21,6 @@ class Layers:
     """Takes arrays by name; `finish` tells of all that did not fit at once."""
 
     def __init__(self, path: str, weights: Mapping[str, Stored], *, what: str):
-        """Begins.
-
-        Args:
-          path: The file, for messages.
-          what: What they should be of, for messages.
-        """
         self.path, self.weights, self.what = path, weights, what
         self.missing: list[str] = []
         self.differ: list[str] = []
@@ -68,10 +62,7 @@ class Layers:
         return np.zeros(shape, np.float32)
 
     def finish(self, params: Params, *, ignore: Collection[str] = ()) -> Params:
-        """The parameters on the device.
-
-        Args:
-          ignore: How names may begin that nobody took.
+        """The parameters on the device; names may be left that begin as `ignore` says.
 
         Raises:
           ValueError: if arrays are missing, unknown, of another shape or not finite;

@@ -83,14 +83,10 @@ def continuing(
     """Frames moved so that they go on from the last past pose.
 
     Where the frames would have been one frame earlier is extrapolated from the first
-    two; the last pose's offset to that decays over the frames. A network alone misses a
-    pose that it is given by some 2 cm a joint, which is a jump where plans meet.
-
-    Args:
-      last: Features of the pose before the first frame.
-      keep_past: Frames stay as they are where it is False.
-      half_life: Of the offset, frames.
-      moved: Leading channels that are moved.
+    two; the last pose's offset to that decays over the frames, with a half-life in
+    frames. A network alone misses a pose that it is given by some 2 cm a joint, which
+    is a jump where plans meet. Only the first `moved` channels are, and nothing where
+    the past is not kept.
     """
     offset = last - (2.0 * frames[..., 0, :] - frames[..., 1, :])
     offset = jnp.where(keep_past[..., None], offset, 0.0)
@@ -228,11 +224,7 @@ class CamdmTransformer(nn.Module):
         *,
         train: bool = False,
     ) -> Float[Array, "*batch future features"]:
-        """Prediction of the clean sample.
-
-        Args:
-          t: Step in 1..T, one for all or one a sample.
-        """
+        """The clean sample, predicted from step t in 1..T, one for all or a sample."""
         batch, outputs = x_t.shape[:-2], self.num_outputs
         step = jnp.broadcast_to(blocks.row_of(context.steps, t), (*batch, self.width))
         noisy = blocks.add_rows(
@@ -308,22 +300,13 @@ class CamdmTransformer(nn.Module):
     ) -> Float[Array, "*batch future features"]:
         """`encode`, then `denoise`; arguments as there.
 
-        Args:
-          t: Step in 1..T.
-          path: Ground positions of the future, meters.
-          facing: 6D rotations of the future facings.
-          keep_past: False for the null condition.
-          train: Whether to drop; needs rngs={"dropout": key}.
+        Training needs rngs={"dropout": key}.
         """
         context = self.encode(past, path, facing, label, keep_past, train=train)
         return self.denoise(context, x_t, t, train=train)
 
     def positions(self) -> Float[Array, "tokens width"]:
-        """Position codes of all tokens, in the order of the module's docstring.
-
-        Returns:
-          One row a token.
-        """
+        """Position codes, one row a token, in the order of the module's docstring."""
         return blocks.sinusoidal_positions(self.num_tokens, self.width)
 
     def _drop(self, x: Array, train: bool) -> Array:

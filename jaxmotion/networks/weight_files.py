@@ -93,15 +93,11 @@ class Record:
 
 
 def read_weights(path: str | os.PathLike) -> dict[str, Any]:
-    """What a file holds.
+    """What a file of PyTorch (recognized by its content), .safetensors or .onnx holds.
 
-    Args:
-      path: A file of PyTorch (recognized by its content), .safetensors or .onnx.
-
-    Returns:
-      Dictionaries within dictionaries, with `Stored` arrays, plain values, and records
-      for what is neither; objects with attributes are dictionaries of them. For the
-      flat formats one dictionary of arrays.
+    Dictionaries within dictionaries, with `Stored` arrays, plain values, and records
+    for what is neither; objects with attributes are dictionaries of them. For the flat
+    formats one dictionary of arrays.
 
     Raises:
       FileNotFoundError: if there is no such file.
@@ -136,14 +132,7 @@ def read_weights(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def arrays(content: dict[str, Any]) -> dict[str, Stored]:
-    """All arrays of nested dictionaries.
-
-    Args:
-      content: From `read_weights`, or a part of it.
-
-    Returns:
-      Arrays by their names joined with dots, as in a state dict.
-    """
+    """All arrays of nested dictionaries by dotted names, as in a state dict."""
     found = {}
     for name, value in content.items():
         if isinstance(value, Stored):

@@ -290,13 +290,9 @@ def tokenize(
 ) -> Int[np.ndarray, "texts tokens"]:
     """Token ids of texts, with the tokens of start and end.
 
-    Args:
-      model: Its tokenizer and context are used.
-      max_tokens: Cut longer texts to so many tokens, those of start and end included;
-        22 in EMDM and MDM (HumanML3D). None: a text beyond the context is an error.
-
-    Returns:
-      Rows of one length, filled up with the end-of-text token.
+    Rows have one length, filled up with the end-of-text token. Longer texts are cut to
+    `max_tokens`, those of start and end included (22 in EMDM and MDM on HumanML3D);
+    None: a text beyond the context is an error.
 
     Raises:
       ValueError: if max_tokens is not in 3..context, or a text is too long or contains
@@ -341,13 +337,9 @@ def _forward(
 def encode(
     model: ClipModel, texts: Sequence[str], *, max_tokens: int | None = None
 ) -> Float[np.ndarray, "texts dimensions"]:
-    """Vectors of texts, not normalized: what EMDM and MDM take as condition.
+    """Vectors of texts, float32, not normalized: what EMDM and MDM take as condition.
 
-    Args:
-      max_tokens: See `tokenize`, also for what is raised.
-
-    Returns:
-      One vector a text, float32.
+    For `max_tokens`, and what is raised, see `tokenize`.
     """
     network, ids = model.network, tokenize(model, texts, max_tokens=max_tokens)
     vectors = np.zeros((len(ids), network.dimensions), np.float32)

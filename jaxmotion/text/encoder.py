@@ -39,13 +39,7 @@ class TextEncoder:
     embed: Callable[[Sequence[str]], np.ndarray]
 
     def encode(self, texts: Sequence[str]) -> Float[np.ndarray, "texts dimensions"]:
-        """Vectors of texts.
-
-        Args:
-          texts: Some sentences; runs of white space count as one space.
-
-        Returns:
-          One vector a text, float32.
+        """Vectors of texts, float32; runs of white space count as one space.
 
         Raises:
           ValueError: if a text is empty, or the encoder cannot take it; names it.
@@ -103,13 +97,9 @@ def clip_encoder(
 ) -> TextEncoder:
     """CLIP's text tower; see `jaxmotion.text.clip`, also for what is raised.
 
-    Args:
-      folder: With its weights, config and tokenizer.
-      max_tokens: Cut longer texts to so many tokens (22 in EMDM and MDM on HumanML3D);
-        None: a text beyond the context is an error.
-
-    Returns:
-      The encoder. Its name has the folder's, and a fingerprint of what is in it.
+    The folder has its weights, config and tokenizer; the encoder's name has the
+    folder's, and a fingerprint of what is in it. Longer texts are cut to `max_tokens`
+    (22 in EMDM and MDM on HumanML3D); None: a text beyond the context is an error.
     """
     model = clip.load_clip(folder)
     network, called = model.network, Path(folder).resolve().name
@@ -122,11 +112,9 @@ def clip_encoder(
 
 
 def make_encoder(name: str, *, max_tokens: int | None = None) -> TextEncoder:
-    """The encoder that a user asks for.
+    """The encoder "wordllama", "hashed" (256 components), or a folder's CLIP.
 
-    Args:
-      name: "wordllama", "hashed" (256 components), or a folder with CLIP's files.
-      max_tokens: See `clip_encoder`; the others read any text whole.
+    For `max_tokens` see `clip_encoder`; the others read any text whole.
 
     Raises:
       ModuleNotFoundError: if a package is missing; says how to install it.
@@ -164,12 +152,9 @@ def encode_unique(
 ) -> UniqueTexts:
     """Encodes every text once, and none that the cache has.
 
-    Args:
-      texts: Some sentences, with repetitions.
-      cache: An npz file, made or extended with what was missing; one for each encoder.
-
-    Returns:
-      Vectors of the different texts, and where each text is among them.
+    The cache is an npz file, made or extended with what was missing; one for each
+    encoder. With the vectors of the different texts comes where each text is among
+    them.
 
     Raises:
       OSError: if the cache cannot be written.

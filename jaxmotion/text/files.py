@@ -21,11 +21,7 @@ def require(package: str) -> ModuleType:
 
 
 def missing(package: str) -> ModuleNotFoundError:
-    """The error of a package that is not installed.
-
-    Returns:
-      The error, to be raised.
-    """
+    """The error, to be raised, of a package that is not installed."""
     return ModuleNotFoundError(
         f"text needs the package {package!r}, which is not installed: "
         'pip install "jaxmotion[text]"',
@@ -34,10 +30,9 @@ def missing(package: str) -> ModuleNotFoundError:
 
 
 def read_tokenizer(path: str | os.PathLike) -> Any:
-    """Reads a tokenizer.json; it neither pads nor cuts.
+    """Reads a tokenizer.json into a `tokenizers.Tokenizer`; it neither pads nor cuts.
 
-    Returns:
-      A `tokenizers.Tokenizer`. Its `encode_batch` may be called by several threads.
+    Its `encode_batch` may be called by several threads.
 
     Raises:
       FileNotFoundError: if there is no such file.

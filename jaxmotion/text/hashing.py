@@ -28,9 +28,8 @@ _EDGE = ""
 def features(text: str) -> Iterator[tuple[str, float]]:
     """Features of a sentence with their weights; one that occurs twice comes twice.
 
-    Returns:
-      An iterator: words and pairs weigh 1; the groups of letters of a word have a
-      Euclidean length of 1 together, so that long words do not drown the rest.
+    Words and pairs weigh 1; the groups of letters of a word have a Euclidean length of
+    1 together, so that long words do not drown the rest.
     """
     words = _WORD.findall(text.lower())
     for word in words:
@@ -54,13 +53,7 @@ def _hash(feature: str) -> int:
 def encode(
     texts: Sequence[str], *, dimensions: int
 ) -> Float[np.ndarray, "texts dimensions"]:
-    """Hashed n-grams of texts.
-
-    Args:
-      dimensions: D, at least 1.
-
-    Returns:
-      One vector of length 1 a text, float32.
+    """Hashed n-grams of texts, of at least one dimension: float32 vectors of length 1.
 
     Raises:
       ValueError: if dimensions is not positive, or a text has no words; names it.

@@ -65,13 +65,9 @@ def load_wordllama() -> WordLlama:
 def encode(
     model: WordLlama, texts: Sequence[str]
 ) -> Float[np.ndarray, "texts dimensions"]:
-    """Means of token embeddings, not normalized (their length is about 4).
+    """Means of token embeddings, not normalized (their length is about 4), float32.
 
-    Args:
-      texts: Some sentences, none of them empty. Case matters.
-
-    Returns:
-      One vector a text, float32; it does not depend on the texts beside it.
+    Case matters, no text is empty, and none depends on the texts beside it.
     """
     encodings = model.tokenizer.encode_batch(list(texts), add_special_tokens=False)
     vectors = np.empty((len(texts), model.embedding.shape[1]), np.float32)

@@ -40,18 +40,14 @@ def ball_example(
     joints: Sequence[int],
     radius: float,
 ) -> tuple[str, dict]:
-    """Key and features of one clip with a ball.
+    """Key and features of one clip with a ball, as a builder's generator yields them.
 
     Args:
       name: Unique name of the clip.
       labels: One word for each label field.
       ball: World position of the ball's center in every frame, meters, y up.
       touch: Which of the joints touch the ball in every frame.
-      joints: Joints that may touch the ball.
-      radius: Radius of the ball, meters.
-
-    Returns:
-      What a builder's generator yields.
+      radius: Of the ball, meters.
     """
     _, features = base.example(name, skeleton, motion, labels)
     features |= {
@@ -66,13 +62,9 @@ def ball_example(
 def ball_clips_from_source(
     builder: BallBuilder, *, tolerance: float = 1e-3
 ) -> BallClips:
-    """All clips of a prepared builder, with their ball.
+    """All clips of a prepared builder, with their ball, sorted by name.
 
-    Args:
-      tolerance: Largest difference between the offsets of two skeletons, meters.
-
-    Returns:
-      The clips, sorted by name.
+    Offsets of skeletons may differ by the tolerance, meters.
 
     Raises:
       ValueError: if the clips have different skeletons, rates, balls or touching

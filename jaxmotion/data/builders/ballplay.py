@@ -122,22 +122,12 @@ class Ballplay(ball_base.BallBuilder):
 
 
 def read_skill(label: str) -> str:
-    """The skill that a clip's label names.
-
-    Returns:
-      The label, or "other" for those of the authors' experiments.
-    """
+    """The skill that a clip's label names; "other" for the authors' experiments."""
     return OTHER if label.startswith(("exp", "ablation")) else label
 
 
 def read_fields(path: str, data: bytes) -> dict[str, np.ndarray]:
-    """The arrays of the file, checked.
-
-    Args:
-      path: The file's path, for messages.
-
-    Returns:
-      The arrays; numbers are float64.
+    """The arrays of the file, checked; numbers are float64.
 
     Raises:
       ValueError: if a field is missing, of another shape or not finite, or the clips'

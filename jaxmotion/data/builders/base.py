@@ -99,11 +99,9 @@ def motion_from_matrices(
     *,
     fps: float,
 ) -> Motion:
-    """A motion of rotation matrices.
+    """A motion of parent-local rotation matrices; the root's are global.
 
-    Args:
-      root_position: World position of the root, meters, y up.
-      local: Parent-local rotations; the root's is global.
+    Root positions are in the world, meters, y up.
     """
     columns = np.concatenate([local[..., 0], local[..., 1]], axis=-1)
     return Motion(
@@ -116,14 +114,9 @@ def motion_from_matrices(
 def example(
     name: str, skeleton: Skeleton, motion: Motion, labels: Mapping[str, str]
 ) -> tuple[str, dict]:
-    """Key and features of one clip.
+    """Key and features of one clip, as a builder's generator yields them.
 
-    Args:
-      name: Unique name of the clip.
-      labels: One word for each label field.
-
-    Returns:
-      What a builder's generator yields.
+    The name is unique; each label field has one word.
     """
     features = {
         "root_position": np.asarray(motion.root_position, np.float32),
@@ -211,10 +204,8 @@ def prepare(
 ) -> tfds.core.DatasetBuilder:
     """Reads the published files into the builder's folder, unless it is there.
 
-    Args:
-      builder: One of the builders, made with `file_format="array_record"`.
-      manual_dir: Folder with the published files.
-      overwrite: Read them again although the builder's folder is there.
+    The builder was made with `file_format="array_record"`; with `overwrite` the files
+    are read again.
 
     Raises:
       FileNotFoundError: if the folder or its files are missing.
@@ -259,23 +250,15 @@ def _word(value) -> str:
 
 
 def read_records(builder: MotionBuilder) -> list[dict]:
-    """All examples of a prepared builder.
-
-    Returns:
-      Features of each clip, sorted by name.
-    """
+    """Features of each clip of a prepared builder, sorted by name."""
     records = builder.as_data_source(split="train")  # pyright: ignore[reportCallIssue]
     return sorted(records, key=lambda r: r["name"])
 
 
 def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Clips:
-    """All clips of a prepared builder.
+    """All clips of a prepared builder, sorted by name.
 
-    Args:
-      tolerance: Largest difference between the offsets of two skeletons, meters.
-
-    Returns:
-      The clips, sorted by name.
+    Offsets of skeletons may differ by the tolerance, meters.
 
     Raises:
       ValueError: if the clips have different skeletons or rates; names two.
@@ -286,13 +269,9 @@ def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Cli
 def clips_from_records(
     builder: MotionBuilder, records: Sequence[Mapping], *, tolerance: float
 ) -> Clips:
-    """Clips of what `read_records` read.
+    """Clips of what `read_records` read, in that order.
 
-    Args:
-      tolerance: Largest difference between the offsets of two skeletons, meters.
-
-    Returns:
-      The clips, in the order of the records.
+    Offsets of skeletons may differ by the tolerance, meters.
 
     Raises:
       ValueError: if the clips have different skeletons or rates; names two.

@@ -16,11 +16,9 @@ _KEEP = 1e-4
 def world_rotations(
     local: Float[np.ndarray, "frames joints 3 3"], parents: Sequence[int]
 ) -> Float[np.ndarray, "frames joints 3 3"]:
-    """World rotations of all joints.
+    """World rotations of all joints, from parent-local ones; the root's are global.
 
-    Args:
-      local: Parent-local rotations; the root's is global.
-      parents: Parent of each joint, smaller than the joint.
+    Each parent is smaller than its joint.
     """
     world = np.array(local)
     for joint, parent in enumerate(parents[1:], start=1):
@@ -31,15 +29,7 @@ def world_rotations(
 def local_rotations(
     world: Float[np.ndarray, "frames joints 3 3"], parents: Sequence[int]
 ) -> Float[np.ndarray, "frames joints 3 3"]:
-    """Inverse of `world_rotations`.
-
-    Args:
-      world: World rotations.
-      parents: Parent of each joint, smaller than the joint.
-
-    Returns:
-      Parent-local rotations; the root's is global.
-    """
+    """Inverse of `world_rotations`."""
     above = world[:, list(parents[1:])]
     local = np.swapaxes(above, -1, -2) @ world[:, 1:]
     return np.concatenate([world[:, :1], local], axis=1)
@@ -51,16 +41,13 @@ def joint_positions(
     offsets: Float[np.ndarray, "joints 3"],
     parents: Sequence[int],
 ) -> Float[np.ndarray, "frames joints 3"]:
-    """World positions of all joints.
+    """World positions of all joints, meters.
 
     Args:
       root: World position of the root, meters.
       world: World rotations.
       offsets: Joint position in its parent's frame, meters; the root's is unused.
       parents: Parent of each joint, smaller than the joint.
-
-    Returns:
-      Positions, meters.
     """
     found = [root]
     for joint, parent in enumerate(parents[1:], start=1):
@@ -85,7 +72,6 @@ def fit_rotations(
     Args:
       position: World positions of the joints, meters.
       world: World rotations to start from.
-      parents: Parent of each joint, smaller than the joint.
 
     Returns:
       Joint positions in their parents' frames (the root's is zero), and rotations.

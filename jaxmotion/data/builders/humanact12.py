@@ -84,14 +84,9 @@ def _clip_array(where: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
 def read_clips(
     path: str, data: bytes
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[str]]:
-    """Poses, joint positions and actions of all clips.
+    """Rotation vectors [frames, 72], positions [frames, 24, 3] and action of each clip.
 
-    Args:
-      path: The file's path, for messages.
-
-    Returns:
-      For each clip rotation vectors [frames, 72], positions [frames, 24, 3] in meters,
-      and the name of its action.
+    Positions are in meters.
 
     Raises:
       ValueError: if the file is no plain pickle or a field is not as it should be;
@@ -140,14 +135,9 @@ def read_clips(
 def fit_skeleton(
     poses: list[Float[np.ndarray, "_ 72"]], joints: list[Float[np.ndarray, "_ 24 3"]]
 ) -> Skeleton:
-    """SMPL's joints with bone vectors that fit rotations and positions.
+    """SMPL's joints with bone vectors that fit rotation vectors and positions (meters).
 
-    Args:
-      poses: Rotation vectors of each clip.
-      joints: Joint positions of each clip, meters.
-
-    Returns:
-      The skeleton; its feet are SMPL's foot joints.
+    Its feet are SMPL's foot joints.
     """
     position = np.concatenate(joints)
     local = smpl.matrices(np.concatenate(poses))

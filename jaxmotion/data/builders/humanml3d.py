@@ -200,15 +200,13 @@ def text_motions_from_source(
     """All clips of a prepared builder, selected as the released loaders do.
 
     Kept are recordings of 40 to 199 frames (KIT-ML: 24 to 199) and, as clips of their
-    own, the parts of them that captions with times cut out, if they are as long.
+    own, the parts of them that captions with times cut out, if they are as long. They
+    come split by split, sorted by name.
 
     Args:
       builder: A prepared `HumanML3D`.
       cut_fps: Frames per second by which the times of captions become frames. The
         released loaders take 20 for both sets; KIT-ML's own rate is 12.5.
-
-    Returns:
-      The clips, split by split, sorted by name.
 
     Raises:
       ValueError: if no clip is left.

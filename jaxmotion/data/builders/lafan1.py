@@ -15,12 +15,8 @@ _NAME = re.compile(
 def read_name(name: str) -> dict[str, str]:
     """Labels from a file name such as walk1_subject5 or aiming1_subject1_walk2.
 
-    Args:
-      name: File name without its ending.
-
-    Returns:
-      theme ("walk", "aiming"), subject ("subject5") and action: the label of a cut, or
-      the theme of a whole take.
+    theme ("walk", "aiming"), subject ("subject5") and action: the label of a cut, or
+    the theme of a whole take. The name comes without its ending.
 
     Raises:
       ValueError: if the name is none of these.

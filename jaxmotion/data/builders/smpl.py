@@ -15,13 +15,6 @@ PARENTS = (*HUMANML3D.parents, 20, 21)
 def matrices(
     poses: Float[np.ndarray, "frames 72"],
 ) -> Float[np.ndarray, "frames 24 3 3"]:
-    """Rotation matrices of SMPL's pose parameters.
-
-    Args:
-      poses: Rotation vectors of the joints, radians.
-
-    Returns:
-      Parent-local rotations; the root's is global.
-    """
+    """Parent-local matrices (the root's global) of SMPL's rotation vectors, radians."""
     vectors = poses.reshape(-1, 3)
     return Rotation.from_rotvec(vectors).as_matrix().reshape(-1, 24, 3, 3)

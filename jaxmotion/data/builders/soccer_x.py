@@ -110,12 +110,8 @@ def _arrays(
 def read_skeleton(path: str, data: bytes) -> Skeleton:
     """SMPL's joints with the bones of a skeleton.npz.
 
-    Args:
-      path: The file's path, for messages.
-
-    Returns:
-      The skeleton. Its feet are ankles and feet, left before right; row 0 of its
-      offsets is where the pelvis lies from the model's origin.
+    Its feet are ankles and feet, left before right; row 0 of its offsets is where the
+    pelvis lies from the model's origin.
 
     Raises:
       ValueError: if the offsets are missing, malformed or not finite; names the file.
@@ -130,13 +126,7 @@ def read_skeleton(path: str, data: bytes) -> Skeleton:
 
 
 def read_skill(path: str) -> str:
-    """The skill that a sequence's file name or folder names.
-
-    Args:
-      path: The file's path.
-
-    Returns:
-      One of the six skills.
+    """The skill, one of six, that a sequence's file name or folder names.
 
     Raises:
       ValueError: if neither names one.
@@ -154,13 +144,7 @@ def read_skill(path: str) -> str:
 
 
 def read_sequence(path: str, data: bytes, skeleton: Skeleton) -> tuple[str, dict]:
-    """One sequence at 30 frames per second, y up.
-
-    Args:
-      path: The file's path.
-
-    Returns:
-      Key and features, as a builder's generator yields them.
+    """Key and features of one sequence at 30 frames per second, y up.
 
     Raises:
       ValueError: if a field is missing, malformed or not finite, the name says no
@@ -226,12 +210,8 @@ def ball_touch(
 ) -> Bool[np.ndarray, "frames touching"]:
     """Which joints touch the ball: near it while its velocity changes.
 
-    Args:
-      joints: World positions at 30 frames per second, meters.
-      ball: World position of the ball's center, meters.
-
-    Returns:
-      True where a joint touches it; never in the first and the last frame.
+    Never in the first and the last frame. World positions, meters, at 30 frames per
+    second; the ball's is its center's.
 
     Source: SMGDiff, section 3.2; the threshold is ours.
     """

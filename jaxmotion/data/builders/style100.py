@@ -130,12 +130,9 @@ def toes(skeleton: Skeleton, path: str) -> tuple[int, ...]:
 def cut_clip(content: bvh_text.Bvh, cut: tuple[int, int]) -> bvh_text.Bvh:
     """The cut at 30 frames per second, without fingers and eyes.
 
-    Args:
-      content: A recording at 60 frames per second, or one already taken at 30.
-      cut: First and last (exclusive) frame at 60 frames per second.
-
-    Returns:
-      The frames start//2 : stop//2 of every second frame.
+    The content is a recording at 60 frames per second, of which every second one of the
+    frames start//2 : stop//2 is taken, or one already taken at 30. The cut's first and
+    last (exclusive) frame are at 60.
 
     Raises:
       BvhError: if the rate is another, or the cut is not within the recording.
@@ -169,15 +166,10 @@ def without_fingers(content: bvh_text.Bvh) -> bvh_text.Bvh:
 
 
 def read_cuts(path: str, text: str) -> dict[tuple[str, str], tuple[int, int]]:
-    """Start and stop of each style and action.
+    """Start and stop, in frames at 60 per second, by style and action.
 
-    Args:
-      path: Name for messages.
-      text: Frame_Cuts.csv: a header, then style and start, stop for each action in the
-        order of `ACTIONS`. An empty cell or one with an "n" (NA, nan) means missing.
-
-    Returns:
-      Start and stop in frames at 60 per second, by style and action.
+    The text is Frame_Cuts.csv: a header, then style and start, stop for each action in
+    the order of `ACTIONS`. An empty cell or one with an "n" (NA, nan) means missing.
 
     Raises:
       ValueError: names the file, the line and the cell.
@@ -208,13 +200,8 @@ def read_cuts(path: str, text: str) -> dict[tuple[str, str], tuple[int, int]]:
 def read_symmetric(path: str, text: str) -> dict[str, bool]:
     """Whether each listed style is symmetric.
 
-    Args:
-      path: Name for messages.
-      text: Dataset_List.csv: a header, then name, description, stochastic y/n,
-        symmetric y/n, notes.
-
-    Returns:
-      True for symmetric styles, by style.
+    The text is Dataset_List.csv: a header, then name, description, stochastic y/n,
+    symmetric y/n, notes.
 
     Raises:
       ValueError: names the file and the line.
