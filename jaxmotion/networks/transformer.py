@@ -93,7 +93,8 @@ def continuing(
     *_, number, channels = frames.shape
     fade = 0.5 ** (np.arange(1, number + 1) / half_life)
     fades = np.outer(fade, np.arange(channels) < moved).astype(frames.dtype)
-    return frames + jnp.einsum("fc,...c->...fc", fades, offset)
+    # Not an einsum: its outer product has no ONNX form.
+    return frames + fades * offset[..., None, :]
 
 
 class CamdmTransformer(nn.Module):
