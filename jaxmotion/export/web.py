@@ -25,6 +25,8 @@ import numpy as np
 
 from jaxmotion import files
 from jaxmotion.export import graph, onnx, slim
+from jaxmotion.motion.skeleton import Skeleton
+from jaxmotion.retarget import transfer
 from jaxmotion.typing import Exported
 from jaxmotion.viz import packed
 
@@ -157,9 +159,19 @@ def write_character(
     if about["past"]:
         poses = starts[about["past"]["rotation"]]
         poses = poses.reshape(-1, *poses.shape[-2:])
+    about["wear"] = _wear(character.skeleton, poses)
     arrays = starts | packed.body_arrays(character.skeleton, poses)
     say(_write(folder / WEIGHTS, weights.packed()))
     say(_write(folder / "character.bin", packed.pack(about, arrays)))
+
+
+def _wear(skeleton: Skeleton, poses: np.ndarray | None) -> dict[str, Any] | None:
+    """What dropped rigs are worn by; None for a skeleton that is no person's."""
+    turns = None if poses is None else packed.world_turns(skeleton, poses)
+    try:
+        return transfer.page_json(transfer.rest(skeleton, rotations=turns))
+    except ValueError:
+        return None
 
 
 def _ports(ports: tuple[graph.Port, ...]) -> list[dict[str, Any]]:

@@ -25,7 +25,7 @@ _SIDES = (
 )
 _TIP = re.compile(r"end|top|site|nub|tip")
 # How far the sole's bone falls, per length, where the zero pose does not tell.
-_SOLE = 0.45
+SOLE = 0.45
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -80,6 +80,11 @@ def side_of(name: str) -> str:
     if found is None:
         return MIDDLE
     return LEFT if found.group(1).lower().startswith("l") else RIGHT
+
+
+def side_patterns() -> list[tuple[str, str]]:
+    """What `side_of` looks for, in its order: patterns, and "i" where case is none."""
+    return [(x.pattern, "i" if x.flags & re.IGNORECASE else "") for x in _SIDES]
 
 
 def chain(parents: tuple[int, ...], joint: int) -> list[int]:
@@ -285,7 +290,7 @@ def t_pose(
                 sole = places[leg.after[0]] - places[leg.end]
                 fall = -sole[1] / max(np.linalg.norm(sole), 1e-9)
                 if not (found.upright and 0.0 <= fall < 0.8):
-                    fall = _SOLE
+                    fall = SOLE
                 ahead = np.array([0.0, -fall, np.sqrt(1 - fall**2)])
                 wanted[leg.end] = (leg.after[0], ahead)
         for number, arm in enumerate(found.arms):

@@ -10,6 +10,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -287,6 +288,20 @@ def anatomy_of(skeleton: Skeleton, roles: Mapping[str, str]) -> Anatomy:
         sides=tuple(sides),
         upright=bool(rise[1] > 0.8 * np.linalg.norm(rise)),
     )
+
+
+def tables() -> dict[str, Any]:
+    """The words of names, for `viz/web/person.js`; patterns with their flags."""
+    return {
+        "roles": list(ROLES),
+        "words": {part: list(words) for part, words in _WORDS.items()},
+        "heads": list(_HEADS),
+        "necks": list(_NECKS),
+        "noise": sorted(_NOISE),
+        "helpers": sorted(_HELPERS),
+        "token": _TOKEN.pattern,
+        "sides": anatomy.side_patterns(),
+    }
 
 
 def to_json(roles: Mapping[str, str]) -> str:

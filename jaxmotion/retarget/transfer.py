@@ -24,6 +24,7 @@ import functools
 import operator
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -547,7 +548,8 @@ class Retarget:
             )
             bone = anatomy.unit(self.target.places[child] - self.target.places[joint])
             x, y, z = bone.astype(np.float32)
-            between = _times(turned[a].T, turned[b])
+            above = turned[self._rows[1][a]]  # a joint between may have no role
+            between = _times(above.T, turned[b])
             skew = between - between.T
             about = skew[2, 1] * x + skew[0, 2] * y + skew[1, 0] * z
             trace = jnp.maximum(1.0 + jnp.trace(between), 1e-6)
@@ -557,6 +559,36 @@ class Retarget:
             turn = turn + (1 - jnp.cos(angle)) * np.outer(bone, bone).astype("f4")
             found[twist] = _times(turned[joint], turn)
         return found
+
+
+def page_json(source: Rest) -> dict[str, Any]:
+    """What the page needs to bring a person's frames onto a rig: see `viz/web/rig.js`.
+
+    The person itself, with lengths of limbs; the words of names; the module's numbers.
+    """
+    found = source.anatomy
+    limbs = {
+        kind: [
+            {**dataclasses.asdict(limb), "lengths": source.lengths(limb)}
+            for limb in getattr(found, kind)
+        ]
+        for kind in ("arms", "legs")
+    }
+    count = source.skeleton.num_joints
+    person = {
+        "parents": source.skeleton.parents,
+        "offsets": np.asarray(source.skeleton.offsets, float).round(7).tolist(),
+        "roles": {role: source.joint(role) for role in source.roles},
+        "trunk": found.trunk,
+        **limbs,
+        "places": source.places.round(7).tolist(),
+        "turns": source.turns.reshape(count, 9).round(7).tolist(),
+        "sole": source.sole,
+        "leg": source.leg,
+    }
+    numbers = {"ankle": _ANKLE, "leg": _LEG, "heel": _HEEL, "sole": anatomy.SOLE}
+    numbers |= {"reach": _REACH, "pull": _PULL}
+    return {"source": person, "tables": names.tables(), "numbers": numbers}
 
 
 def retarget(

@@ -62,14 +62,18 @@ def body_arrays(
     rotations = None
     # A few standing poses say less than a zero pose that stands.
     if poses is not None and not find_anatomy(skeleton).upright:
-        root = jnp.zeros((len(poses), 3))
-        turns = global_transforms(skeleton, root, jnp.asarray(poses))[1]
-        rotations = np.asarray(turns)
+        rotations = world_turns(skeleton, poses)
     fine = mannequin.describe(skeleton, rotations=rotations)
     crowd = _mesh(mannequin.describe(skeleton, rotations=rotations, detail="crowd"))
     inverse = fine.inverse_bind.reshape(count, 12).astype(np.float32)
     plainer = {f"crowd.{name}": values for name, values in crowd.items()}
     return _mesh(fine) | {"inverse": inverse} | plainer
+
+
+def world_turns(skeleton: Skeleton, poses: np.ndarray) -> np.ndarray:
+    """World rotations [frames, J, 3, 3] of rotations [frames, J, 6] as `Motion` has."""
+    root = jnp.zeros((len(poses), 3))
+    return np.asarray(global_transforms(skeleton, root, jnp.asarray(poses))[1])
 
 
 def _mesh(body: mannequin.Mannequin) -> dict[str, np.ndarray]:

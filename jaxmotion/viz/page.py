@@ -43,8 +43,9 @@ _STICKS = ("stick", "face")
 _WEB = Path(__file__).with_name("web")
 # What the page is made of; `local.js` and what it needs are the static page's.
 _FILES = (
-    *("body.js", "camera.js", "figures.js", "input.js", "page.js", "panel.js"),
-    *("save.js", "scene.js", "socket.js"),
+    *("body.js", "camera.js", "figures.js", "gltf.js", "input.js", "linear.js"),
+    *("page.js", "panel.js", "person.js", "rig.js", "save.js", "scene.js"),
+    *("socket.js", "transfer.js"),
 )
 
 # Writes a take: (path, skeleton, motion).

@@ -1,5 +1,6 @@
 """The page without a server in a real browser: keys, pad, thumb, mouse, bad input."""
 
+import base64
 import contextlib
 import functools
 import http.server
@@ -17,8 +18,11 @@ import pytest
 import jaxmotion as jm
 from jaxmotion.control import steering
 from jaxmotion.data import bvh, bvh_text
+from jaxmotion.export import rig as rigging
 from jaxmotion.export import web
 from jaxmotion.motion.skeleton import joint_positions
+from jaxmotion.retarget import transfer
+from tests.retarget import rigs
 from tests.viz.strider import strider
 from tests.viz.test_page import CHROMIUM, OPTIONS, PATIENCE
 
@@ -296,6 +300,51 @@ def test_the_last_seconds_are_saved_as_they_were_shown(browser, address, tmp_pat
     text = json.loads(content[20 : 20 + size])
     assert len(text["nodes"]) == len(body.parents) + 1 and text["animations"]
     assert math.isclose(len(content), int.from_bytes(content[8:12], "little"))
+
+
+DROP = """([content, name]) => {
+  const bytes = Uint8Array.from(atob(content), x => x.charCodeAt(0));
+  const dataTransfer = new DataTransfer();
+  dataTransfer.items.add(new File([bytes], name));
+  for (const kind of ["dragover", "drop"])
+    window.dispatchEvent(new DragEvent(kind, { dataTransfer, cancelable: true }));
+}"""
+
+
+def test_a_rig_that_is_dropped_walks(browser, address, tmp_path):
+    hero = rigs.glb(rigs.person("child"))
+    drop = lambda tab, content, name: tab.evaluate(  # noqa: E731
+        DROP, [base64.b64encode(content).decode(), name]
+    )
+    with opened(browser, address) as tab:
+        before = tab.screenshot()
+        drop(tab, hero, "hero.glb")
+        tab.wait_for_selector("#wear:has-text('hero.glb')", timeout=PATIENCE)
+        drop(tab, hero[:-99], "broken.glb")
+        tab.wait_for_selector("#note.bad", state="visible", timeout=PATIENCE)
+        said = tab.inner_text("#note")
+        assert said == "broken.glb: damaged: its second part is cut off"
+        assert tab.inner_text("#wear") == "hero.glb"  # as before
+        tab.click("#bare")
+        assert tab.inner_text("#wear") == "choose a .glb"
+        tab.set_input_files(
+            "#file", {"name": "hero.glb", "mimeType": "", "buffer": hero}
+        )
+        tab.wait_for_selector("#wear:has-text('hero.glb')", timeout=PATIENCE)
+        assert tab.screenshot() != before
+        tab.keyboard.down("w")
+        walks(tab, (0, 1))
+        with tab.expect_download(timeout=PATIENCE) as download:
+            tab.click("#last button:has-text('.glb')")
+        download.value.save_as(tmp_path / "last.glb")
+    found = rigging.read_rig(tmp_path / "last.glb")
+    names = {"mixamorig:Hips", "mixamorig:LeftFoot", "mixamorig:RightHand"}
+    assert names <= set(found.skeleton.names)
+    # As large as the character, whose legs are as long.
+    leg = transfer.rest(strider()[0].skeleton).leg
+    assert abs(found.rest().leg - leg) < 1e-3
+    animated = found.content["animations"][0]["channels"]
+    assert len(animated) == len(found.skeleton.names) + 1
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 // Runs functions of the page's modules on JSON from the standard input.
-// Usage: node web.mjs <folder of the modules> < {"module", "function", "calls": [[...]]}
+// Usage: node web.mjs <folder of the modules> < {"module", "name", "calls": [[...]]}
+// A name such as "dress.pose" is a method of what a function makes: its calls are the
+// function's arguments and then those of each call of the method.
 
 import { pathToFileURL } from "node:url";
 import { readFileSync } from "node:fs";
@@ -18,6 +20,16 @@ const outward = (_, x) => {
   if (x instanceof Uint8Array) return { base64: Buffer.from(x).toString("base64") };
   return ArrayBuffer.isView(x) ? [...x] : x;
 };
-const results = calls.map(args =>
-  found[name](...JSON.parse(JSON.stringify(args), inward)));
+const [first, method] = name.split(".");
+const results = calls.map(call => {
+  const args = JSON.parse(JSON.stringify(call), inward);
+  try {
+    if (!method) return found[first](...args);
+    const made = found[first](...args[0]);
+    return args.slice(1).map(each => made[method](...each));
+  } catch (error) {
+    if (error.constructor !== Error) throw error;
+    return { error: error.message };  // one that is meant for whoever looks
+  }
+});
 process.stdout.write(JSON.stringify(results, outward));

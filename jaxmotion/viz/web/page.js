@@ -6,6 +6,7 @@ import { Camera } from "./camera.js";
 import { Figures } from "./figures.js";
 import { Input, KEYS } from "./input.js";
 import { Panel } from "./panel.js";
+import { dress } from "./rig.js";
 import { bvh, glb } from "./save.js";
 import { Scene } from "./scene.js";
 
@@ -51,7 +52,8 @@ function mix(from, to, part) {
 
 export function start(source) {
   const view = $("view"), camera = new Camera(), hash = readHash(location.hash);
-  let body = null, number = 0, told = "", trail = [], remembering = 0;
+  // body: the character's; drawn: what is shown, a dropped file or the body itself.
+  let body = null, drawn = null, file = null, number = 0, told = "", trail = [], remembering = 0;
   let frame = null;  // shown: from, to, when it was due
   const due = [], history = [], arrivals = [], kept = [];
   const spent = window.spent = [];
@@ -60,6 +62,7 @@ export function start(source) {
     reset() { input.target = null; trail = []; tell(); },
     save(suffix) { download(suffix); },
     link() { copyLink(); },
+    wear,
   });
   window.panel = panel;
   let lastNews = 0;
@@ -90,6 +93,14 @@ export function start(source) {
   for (const name of ["keydown", "keyup", "pointermove", "pointerdown", "resize"])
     window.addEventListener(name, news);
 
+  for (const name of ["dragover", "dragleave", "drop"])
+    window.addEventListener(name, event => {
+      event.preventDefault();
+      view.classList.toggle("over", name === "dragover");
+      const { files } = event.dataTransfer;
+      if (name === "drop" && files.length) wear(files[0]);
+    });
+
   function tell() {
     const asked = input.asked(), text = JSON.stringify(asked);
     if (text !== told) { told = text; say(asked); }
@@ -115,7 +126,9 @@ export function start(source) {
     body(buffer, engine) {
       body = unpack(buffer); number = engine;
       frame = null; due.length = 0; trail = []; kept.length = 0;
-      scene.show(body);
+      const worn = file;
+      clothe(null);
+      if (worn) clothe(worn);
     },
     frame(data, time) {
       const found = readFrame(data);
@@ -129,6 +142,30 @@ export function start(source) {
     error(text) { panel.fail(text); },
     saved(name) { panel.saved(name); },
   };
+
+  // Shows a file, or the character's own body; what cannot be worn changes nothing.
+  function clothe(next) {
+    if (!body) { file = next; return; }
+    try {
+      if (next && !body.wear) throw new Error(source.base
+        ? "this model's skeleton is no person's" : "start the page with it: steer.py --rig");
+      drawn = next ? dress(next.content, body.wear) : body;
+    } catch (error) { panel.fail(`${next.name}: ${error.message}`); return; }
+    file = next;
+    scene.show(drawn);
+    panel.wears(file && file.name);
+    news();
+  }
+  async function wear(chosen) {
+    if (!chosen) { clothe(null); return; }
+    let content;
+    try {
+      content = await chosen.arrayBuffer();
+    } catch { panel.fail(`${chosen.name} cannot be read`); return; }
+    clothe({ name: chosen.name, content });
+  }
+  // A frame of the character as what is drawn has it.
+  const worn = (root, rotation) => (drawn.pose ? drawn.pose(root, rotation) : { root, rotation });
 
   // Takes over the frames that are due; what is on the screen goes over into them.
   function advance(now) {
@@ -172,7 +209,7 @@ export function start(source) {
     const w = Math.round(view.clientWidth * ratio), h = Math.round(view.clientHeight * ratio);
     if (view.width !== w || view.height !== h) { view.width = w; view.height = h; }
     const pose = frame && between(began), n = frame ? frame.to.n : 0;
-    const joints = body ? body.skeleton.parents.length : 0;
+    const joints = drawn ? drawn.skeleton.parents.length : 0;
     let reach = 3.5, ghosts = null, balls = null;
     if (pose) {
       follow(pose, n, seconds);
@@ -207,10 +244,11 @@ export function start(source) {
   }
 
   function place(roots, rotations, i, out, at) {
-    const joints = body.skeleton.parents.length;
-    kinematics(body.skeleton, roots.subarray(3 * i, 3 * i + 3),
-      rotations.subarray(6 * joints * i, 6 * joints * (i + 1)), world);
-    skin(world, body.arrays.inverse, out, at);
+    const count = 6 * body.skeleton.parents.length;
+    const { root, rotation } = worn(roots.subarray(3 * i, 3 * i + 3),
+      rotations.subarray(count * i, count * (i + 1)));
+    kinematics(drawn.skeleton, root, rotation, world);
+    skin(world, drawn.arrays.inverse, out, at);
   }
 
   function follow(pose, n, seconds) {
@@ -266,9 +304,10 @@ export function start(source) {
   // The first character's last ten seconds as a file.
   function download(suffix) {
     if (!kept.length || !body) { panel.fail("nothing was shown yet"); return; }
-    const fps = frame.to.fps, [roots, rotations] = [0, 1].map(i => kept.map(x => x[i]));
-    const data = suffix === ".glb" ? glb(body, fps, roots, rotations)
-      : bvh(body.skeleton, fps, roots, rotations);
+    const fps = frame.to.fps, poses = kept.map(one => worn(...one));
+    const [roots, rotations] = ["root", "rotation"].map(name => poses.map(x => x[name]));
+    const data = suffix === ".glb" ? glb(drawn, fps, roots, rotations)
+      : bvh(drawn.skeleton, fps, roots, rotations);
     const link = document.createElement("a");
     link.href = URL.createObjectURL(new Blob([data]));
     link.download = `${panel.state.model.split(/[/\\]/).pop()}${suffix}`;

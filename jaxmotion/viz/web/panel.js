@@ -5,7 +5,8 @@ const RANGES = ["speed", "num_steps", "scale", "characters"];
 const DIGITS = { speed: 1, scale: 2 };
 
 export class Panel {
-  // say: sends a message to the source; on: `reset()`, `save(suffix)`, `link()`.
+  // say: sends a message to the source; on: `reset()`, `save(suffix)`, `link()`,
+  // `wear(file or null)`.
   constructor(say, on) {
     this.say = say; this.state = null; this.error = ""; this.until = 0; this.waiting = "";
     for (const name of RANGES) {
@@ -24,6 +25,12 @@ export class Panel {
     $("record").onclick = e => { say({ do: "record" }); e.target.blur(); };
     $("reset").onclick = e => { on.reset(); say({ do: "reset" }); e.target.blur(); };
     $("link").onclick = e => { on.link(); e.target.blur(); };
+    $("wear").onclick = e => { $("file").click(); e.target.blur(); };
+    $("file").onchange = e => {
+      if (e.target.files.length) on.wear(e.target.files[0]);
+      e.target.value = "";
+    };
+    $("bare").onclick = e => { on.wear(null); e.target.blur(); };
     $("fold").onclick = e => { $("panel").classList.toggle("folded"); e.target.blur(); };
     for (const button of $("save").querySelectorAll("button"))
       button.onclick = e => { say({ save: button.textContent }); e.target.blur(); };
@@ -110,6 +117,12 @@ export class Panel {
     $("taken").textContent = `take of ${state.taken.toFixed(1)} s:`;
     $("source").textContent = state.source;
     this.note();
+  }
+
+  // The name of the file that is worn; null for none.
+  wears(name) {
+    $("wear").textContent = name || "choose a .glb";
+    $("bare").hidden = !name;
   }
 
   // An error, for six seconds.

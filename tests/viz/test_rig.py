@@ -1,0 +1,209 @@
+"""Files that are dropped on the page: worn in Node as `jm.retarget` wears them."""
+
+import json
+import shutil
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmotion as jm
+from jaxmotion.export import rig as rigging
+from jaxmotion.motion import anatomy
+from jaxmotion.motion.skeleton import Motion
+from jaxmotion.retarget import transfer
+from tests.fuzz import mutations
+from tests.retarget import rigs
+from tests.viz import samples
+from tests.viz.test_web import data, floats, run
+
+pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
+
+
+def unnamed(version):
+    """A VRM whose joints' names say nothing."""
+    content, rest = rigs.split(rigs.glb(rigs.person("child")))
+    names = rigging.names.find_roles(rigs.person("child"))
+    index = {node["name"]: n for n, node in enumerate(content["nodes"])}
+    bones = {role: {"node": index[name]} for role, name in names.items()}
+    for number, node in enumerate(content["nodes"]):
+        node["name"] = f"n{number}"
+    listed = [{"bone": bone, **about} for bone, about in bones.items()]
+    human = bones if version == "VRMC_vrm" else listed
+    content["extensions"] = {version: {"humanoid": {"humanBones": human}}}
+    return rigs.joined(content, rest)
+
+
+def with_twists():
+    """Twist bones, a finger, and a joint without a role above an upper arm."""
+    base = rigs.proportioned(1.1, 0.9, 1.0)
+    names, parents = list(base.names), list(base.parents)
+    offsets = np.asarray(base.offsets).tolist()
+    arm = names.index("LeftArm")
+    for name, parent, offset in (
+        ("LeftForeArmTwist", "LeftForeArm", [0.12, 0, 0]),
+        ("LeftArmTwist", "LeftArm", [0.07, 0, 0]),
+        ("RightLegTwist", "RightLeg", [0, -0.2, 0]),
+        ("LeftIndex", "LeftHand", [0.09, 0, 0]),
+    ):
+        parents.append(names.index(parent))
+        names.append(name)
+        offsets.append(offset)
+    # The joint that only carries the arm.
+    above = lambda j: j + (j >= arm)  # noqa: E731
+    parents = [above(up) if up >= 0 else -1 for up in parents]
+    parents.insert(arm, parents[arm])
+    parents[arm + 1] = arm
+    names.insert(arm, "Carrier")
+    offsets.insert(arm, [0.01, 0, 0])
+    return rigs.glb(rigs.plain(offsets, parents, tuple(names)))
+
+
+RIGS = {
+    "a Mixamo child in an A-pose": lambda: rigs.glb(rigs.person("child")),
+    "an Unreal giant": lambda: rigs.glb(
+        rigs.person("giant", "Unreal"), unit=1.0, seed=3
+    ),
+    "long arms, as VRM 1": lambda: unnamed("VRMC_vrm"),
+    "VRM 0": lambda: unnamed("VRM"),
+    "twist bones": with_twists,
+}
+
+
+SLOW = {"an Unreal giant", "VRM 0", "long arms, as VRM 1"}  # each compiles its own
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=pytest.mark.slow if x in SLOW else ()) for x in RIGS],
+)
+def test_a_dropped_rig_moves_as_retarget_moves_it(name, tmp_path):
+    content = RIGS[name]()
+    (tmp_path / "a.glb").write_bytes(content)
+    skeleton, motion = samples.person(seconds=2.0)
+    some = [x[::6] for x in (motion.root_position, motion.joint_rotation)]
+    frames = [[floats(x) for x in pose] for pose in zip(*some, strict=True)]
+    first = [data(content), transfer.page_json(transfer.rest(skeleton))]
+    (found,) = run("rig.js", "dress.pose", [first, *frames])
+    target = rigging.read_rig(tmp_path / "a.glb")
+    function = jm.retarget(skeleton, target.rest())
+    # On the page its legs are as long as the character's.
+    made = Motion(
+        root_position=jnp.array([x["root"] for x in found]) * function.scale,
+        joint_rotation=jnp.array([x["rotation"] for x in found]).reshape(
+            len(frames), -1, 6
+        ),
+        fps=30.0,
+    )
+    want = function(Motion(root_position=some[0], joint_rotation=some[1], fps=30.0))
+    places, turns = anatomy.kinematics(target.skeleton, made)
+    expected, wanted = anatomy.kinematics(target.skeleton, want)
+    assert np.linalg.norm(places - expected, axis=-1).max() < 1e-4
+    trace = np.einsum("...ij,...ij->...", turns, wanted)
+    assert np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))).max() < 0.1
+
+
+@pytest.fixture(scope="module")
+def hero():
+    return rigs.glb(rigs.person("child"))
+
+
+def changed(hero, change):
+    content, rest = rigs.split(hero)
+    change(content)
+    made = rigs.joined(content, rest)
+    if "uri" not in content.get("extras", {}):
+        return made
+    content, _ = rigs.split(made)
+    content["buffers"][0]["uri"] = content["extras"]["uri"]
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    head = made[:12] + len(text).to_bytes(4, "little") + b"JSON"
+    return head + text + made[20 + int.from_bytes(made[12:16], "little") :]
+
+
+def rename(content):
+    for number, node in enumerate(content["nodes"]):
+        node["name"] = f"n{number}"
+
+
+def footless(content):
+    """A foot at the root, as rigs have that are driven by their feet."""
+    index = {node["name"]: n for n, node in enumerate(content["nodes"])}
+    foot = index["mixamorig:LeftFoot"]
+    content["nodes"][index["mixamorig:LeftLeg"]].pop("children")
+    content["nodes"][index["mixamorig:Hips"]]["children"].append(foot)
+
+
+def two_skins(content):
+    count = len(content["nodes"])
+    content["nodes"] += [{"name": "other", "children": [count + 1]}, {"name": "tip"}]
+    content["skins"].append({"joints": [count, count + 1]})
+
+
+def put(**values):
+    return lambda content: content.update(values)
+
+
+BAD = {
+    "no skin: expected a character with a skeleton": lambda c: c.pop("skins"),
+    "2 skins of 2 skeletons, expected one": two_skins,
+    "buffer 0 is outside of the file": put(extras={"uri": "hero.bin"}),
+    "KHR_draco_mesh_compression: expected meshes as they are": put(
+        extensionsRequired=["KHR_draco_mesh_compression"]
+    ),
+    "EXT_meshopt_compression: expected meshes as they are": put(
+        extensionsRequired=["EXT_meshopt_compression"]
+    ),
+    "no person: missing leftUpperLeg, ": rename,
+    "'mixamorig:LeftFoot' is not below 'mixamorig:LeftLeg'": footless,
+    "node 2 has the scale zero": lambda c: c["nodes"][2].update(scale=[0, 0, 0]),
+    "damaged: rotation of node 2 is zero": lambda c: c["nodes"][2].update(
+        rotation=[0, 0, 0, 0]
+    ),
+    "damaged: node 0 is above itself": lambda c: (
+        c["nodes"][3].update(children=[0]),
+        c["nodes"][-1].pop("children"),
+    ),
+    "damaged: 'nodes' should be a list of objects": put(nodes="none"),
+    "no mesh to be drawn": put(meshes=[{"primitives": []}]),
+}
+
+
+def refused(*contents):
+    source = transfer.page_json(transfer.rest(rigs.walker()))
+    found = run("rig.js", "dress", *((data(x), source) for x in contents))
+    return [x.get("error") for x in found]
+
+
+def test_what_cannot_be_worn_is_refused_in_one_line(hero):
+    files = [changed(hero, change) for change in BAD.values()]
+    files += [hero[:-40], hero[:300], b"glTF", b"\x89PNG and so on, for a while"]
+    lines = list(BAD) + ["damaged: its second part is cut off"]
+    lines += ["damaged: its first part is cut off"]
+    lines += ["no binary glTF: expected a .glb or .vrm"] * 2
+    for said, line in zip(refused(*files), lines, strict=True):
+        assert said and line in said and "\n" not in said and len(said) < 900
+
+
+@pytest.mark.slow
+def test_malformed_rigs_are_refused_in_one_line(hero):
+    """Mutated files are worn or refused; what else is thrown fails in `run`."""
+    whole, lines = [hero, unnamed("VRM")], []
+    for start in range(0, 1000, 50):
+        files = []
+        for seed in range(start, start + 50):
+            random = np.random.default_rng(seed)
+            content = whole[seed % 2]
+            if random.random() < 0.3:
+                content = mutations.mutate_bytes(random, content)
+            else:
+                text, rest = rigs.split(content)
+                mutated = mutations.mutate_json(random, text)
+                if isinstance(mutated, dict):
+                    content = rigs.joined(dict(mutated), rest)
+            files.append(content)
+        lines += refused(*files)
+    told = [x for x in lines if x]
+    assert 50 < len(told) < 950
+    assert all("\n" not in x for x in told)
