@@ -133,7 +133,8 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
         name: value
         for name, value in dataclasses.asdict(model.config).items()
         if name.startswith("weight_")
-        or name in ("attention", "noise_levels", "own_levels", "seam_half_life")
+        or name
+        in ("attention", "noise_levels", "own_levels", "seam_half_life", "spring_paths")
     }
     # The mean rotation is part of what the network has learned.
     mean = first.config.rotation_mean
