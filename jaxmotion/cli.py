@@ -96,6 +96,7 @@ LIMITS: dict[str, Range] = {
     "balance": Range(0, 1),
     **dict.fromkeys(("diffusion_steps", "visit"), Range(1, 1000)),
     "depth": Range(1, 256),
+    "crossing": Range(0, 10**4),
     "frames": Range(2, 10**5),
     "heads": Range(1, 1024),
     **dict.fromkeys(("width", "hidden", "discriminator_width"), _SIZE),

@@ -24,6 +24,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.control import rollout, steering
@@ -37,12 +38,12 @@ from jaxmotion.typing import Key, Params
 # point of it is sought within so many meters of the last one.
 AHEAD, NEAREST, REACH = 0.35, 0.25, 1.0
 # Nobody is asked to go slower or faster, m/s, but to stop; nor to be nearer than this
-# to a place, where he stands, meters. Times count to the last distance. Who is asked
-# to stop goes on for so many seconds.
+# to a place, where he stands, meters. Times count to the last distance. What is asked
+# for shows after so many seconds: decisions are made for where walkers will be then.
 SLOWEST, FASTEST, THERE, TIMELY, LAG = 0.6, 3.5, 0.05, 0.1, 0.25
 # Radius of a walker, meters; collisions within so many seconds count; what a collision
 # in one second is worth in m/s.
-RADIUS, HORIZON, FEAR = 0.35, 3.0, 1.0
+RADIUS, HORIZON, FEAR = 0.35, 3.0, 2.0
 _ANGLES, _PARTS = 16, (0.35, 0.7, 1.0)
 
 
@@ -92,7 +93,7 @@ class Follow:
     """Whom to follow.
 
     Attributes:
-      leader: Index of another walker.
+      leader: Index of another walker; his own: he is led by commands.
       distance: Meters.
     """
 
@@ -124,18 +125,18 @@ def pursue(
 
     He has come `way` meters and never goes back, so that a path may cross itself.
     """
+    here = walker.position + LAG * walker.velocity
     ways = way + jnp.linspace(0.0, REACH, 41)
     points, _, length = _along(path, ways)
-    near = jnp.argmin(_length(points - walker.position[None]))
+    near = jnp.argmin(_length(points - here[None]))
     way = jnp.minimum(ways[near], length)
     _, speed, _ = _along(path, way)
     goal, _, _ = _along(path, way + jnp.maximum(AHEAD * speed, NEAREST))
     # Slower to the end.
-    left = length - way + _length(path.points[-1] - walker.position) * (way >= length)
-    left = jnp.maximum(left - LAG * _length(walker.velocity), 0.0)
+    left = length - way + _length(path.points[-1] - here) * (way >= length)
     speed = jnp.minimum(speed, left / ARRIVE)
     speed = jnp.where(left < THERE, 0.0, speed)
-    heading = ground.unit(goal - walker.position, walker.facing)
+    heading = ground.unit(goal - here, walker.facing)
     return speed * heading, way
 
 
@@ -233,7 +234,8 @@ def avoid(
     )
 
     def penalty(i: Array, choices: Array) -> Array:
-        gap = walkers.position[i][None] - walkers.position  # from each other one
+        soon_at = walkers.position + LAG * walkers.velocity
+        gap = soon_at[i][None] - soon_at  # from each other one
         # Each goes half of the way round: the other is taken to do the other half.
         both = walkers.velocity[i][None] + walkers.velocity
         mean = 2.0 * choices[:, None] - both[None]
@@ -255,9 +257,9 @@ def avoid(
 
 
 def _wish(
-    goal: Goal, walkers: Walker, memory: Array, seconds: Array
+    goal: Goal, walkers: Walker, memory: Array, seconds: Array, told: Command | None
 ) -> tuple[Array, Array, Array]:
-    """Velocity, facing and memory of each walker."""
+    """Velocity, facing and memory of each walker; leaders do as they are told."""
     if isinstance(goal, Path):
         velocity, memory = jax.vmap(pursue)(goal, walkers, memory)
     elif isinstance(goal, Place):
@@ -267,6 +269,12 @@ def _wish(
     else:
         leaders = jax.tree.map(lambda x: x[goal.leader], walkers)
         velocity = jax.vmap(follow)(leaders, walkers, goal.distance)
+        facing = ground.unit(velocity, walkers.facing)
+        if told is not None:
+            leads = (goal.leader == jnp.arange(len(goal.leader)))[:, None]
+            velocity = jnp.where(leads, told.velocity, velocity)
+            facing = jnp.where(leads, told.facing, facing)
+        return velocity, facing, memory
     return velocity, ground.unit(velocity, walkers.facing), memory
 
 
@@ -301,6 +309,7 @@ def goal_rollouts(
     labels: Int[Array, " characters"] | None = None,
     avoiding: bool = False,
     circles: Float[Array, "circles 3"] | None = None,
+    commands: Command | None = None,
 ) -> Frame:
     """Frames of characters who go after goals, as one compiled program.
 
@@ -311,14 +320,16 @@ def goal_rollouts(
       places: Where each starts, (x, z) meters, instead of the origin.
       labels: Style of each; None for the first.
       circles: Center (x, z) and radius of what they keep clear of, meters.
+      commands: [characters, ticks, ...], which leaders obey.
 
     Returns:
       Frames [characters, ticks, ...]. Root positions are in the goals' world; what a
       system has as `extra` stays relative to each one's start.
 
     Raises:
-      ValueError: if goals, states and places are of different numbers of characters,
-        or a label is none of the model's.
+      ValueError: if goals, states, places and commands are of different numbers of
+        characters or seconds, somebody leads without commands, or a label is none of
+        the model's.
     """
     number = jax.tree.leaves(states)[0].shape[0]
     places = jnp.zeros((number, 2)) if places is None else jnp.asarray(places)
@@ -331,6 +342,14 @@ def goal_rollouts(
         if found != number:
             raise ValueError(f"{found} {what} for {number} characters")
     steering.check_labels(labels, character.labels)
+    ticks = round(seconds * character.fps)
+    if commands is not None and commands.label.shape != (number, ticks):
+        raise ValueError(
+            f"commands of shape {commands.label.shape}, expected {(number, ticks)}"
+        )
+    if isinstance(goal, Follow) and commands is None:
+        if alone := np.flatnonzero(np.asarray(goal.leader) == np.arange(number)).size:
+            raise ValueError(f"{alone} leaders without commands")
     return _rollouts(
         character.params,
         key,
@@ -339,8 +358,9 @@ def goal_rollouts(
         places.astype(jnp.float32),
         labels,
         circles,
+        commands,
         method=character.method,
-        ticks=round(seconds * character.fps),
+        ticks=ticks,
         fps=character.fps,
         avoiding=avoiding or circles is not None,
     )
@@ -355,6 +375,7 @@ def _rollouts(
     places: Array,
     labels: Array,
     circles: Array | None,
+    commands: Command | None,
     *,
     method: steering.Method,
     ticks: int,
@@ -372,7 +393,8 @@ def _rollouts(
 
     def body(carry: tuple, tick: Array) -> tuple[tuple, Frame]:
         states, walkers, told, memory = carry
-        velocity, facing, memory = _wish(goal, walkers, memory, tick / fps)
+        led = jax.tree.map(lambda x: x[:, tick], commands)
+        velocity, facing, memory = _wish(goal, walkers, memory, tick / fps, led)
         if avoiding:
             clear = avoid(velocity, walkers, circles)
             moved = _length(clear - velocity)[:, None] > 1e-3

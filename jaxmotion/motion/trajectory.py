@@ -285,7 +285,7 @@ def spring_course(key: Key, course: Trajectory, *, last: int, fps: float) -> Tra
     with a half-life of 0.15 to 0.5 s, answer a command for the velocity and facing that
     are recorded 0.5 s later, or at some moment from then to the end. A person prepares
     a turn before the hips show it and walks an arc; springs turn at once, whichever
-    foot stands. Velocities are of the path smoothed with sigma 5 frames.
+    foot stands. Velocities and facings are smoothed with sigma 5 frames.
 
     Raises:
       ValueError: if fewer than 0.5 s follow on frame `last`.
@@ -297,7 +297,7 @@ def spring_course(key: Key, course: Trajectory, *, last: int, fps: float) -> Tra
         )
     key_moment, key_half_life = jax.random.split(key)
     filtered = smoothing_matrices(frames, (5.0,))[0]
-    velocity = jnp.gradient(filtered @ course.position, 1.0 / fps, axis=0)
+    velocity = filtered @ jnp.gradient(course.position, 1.0 / fps, axis=0)
     facing = safe_normalize(filtered @ course.facing, jnp.array([0.0, 1.0]))
     turns = ground.angle_from_to(facing[last - 1], facing[last + 1])
     moment = jax.random.randint(key_moment, (), soon, frames)
