@@ -169,6 +169,38 @@ def test_numbers_of_goals_and_characters_agree():
         )
 
 
+def test_leaders_need_commands_of_all_characters_and_seconds():
+    model = jm.load("walker")
+    goal = goals.Follow(leader=jnp.array([0, 0]), distance=jnp.array([1.5, 1.5]))
+    roll = functools.partial(
+        goals.goal_rollouts, model, jax.random.key(0), model.start(2), goal, seconds=1.0
+    )
+    with pytest.raises(ValueError, match="1 leaders without commands"):
+        roll()
+    short = jm.commands("straight", model, 2, seconds=0.5)
+    with pytest.raises(ValueError, match=r"shape \(2, 15\), expected \(2, 30\)"):
+        roll(commands=short)
+
+
+@pytest.mark.slow
+def test_a_leader_is_steered_and_followed():
+    model = jm.load("walker")
+    goal = goals.Follow(leader=jnp.array([0, 0]), distance=jnp.array([0.0, 1.5]))
+    frames = goals.goal_rollouts(
+        model,
+        jax.random.key(0),
+        model.start(2),
+        goal,
+        seconds=8.0,
+        places=jnp.array([[0.0, 0.0], [0.0, -1.5]]),
+        commands=jm.commands("straight", model, 2, seconds=8.0, speed=1.2),
+    )
+    walked = np.asarray(frames.root_position)[:, 120:, ::2]
+    assert walked[0, -1, 1] == pytest.approx(1.2 * 8.0, abs=1.0)
+    gap = np.linalg.norm(walked[0] - walked[1], axis=-1)
+    assert np.abs(gap - 1.5).max() < 0.4
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["locomotion", "locomotion_fast", "dribble", "walker"])
 def test_shipped_models_reach_their_places(name):

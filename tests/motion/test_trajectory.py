@@ -262,3 +262,52 @@ def test_everything_is_finite_at_zero_vectors():
 
     value, grads = jax.value_and_grad(total, (0, 1, 2))(zero, zero, jnp.zeros(3))
     assert np.isfinite(value) and all(np.isfinite(g).all() for g in grads)
+
+
+# --- paths as springs ask for them -------------------------------------------------
+
+
+def _course(velocity, facing):
+    """A path from velocities and facings [frames, 2] that ends at zero."""
+    position = np.cumsum(velocity, axis=0) / 30.0
+    return Trajectory(
+        position=jnp.asarray(position - position[-1], jnp.float32),
+        facing=jnp.asarray(facing, jnp.float32),
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_springs_ask_who_walks_straight_on_for_what_he_does(seed):
+    velocity = np.broadcast_to([0.8, -1.1], (55, 2))
+    facing = np.broadcast_to([0.6, 0.8], (55, 2))
+    course = _course(velocity, facing)
+    found = trajectory.spring_course(jax.random.key(seed), course, last=9, fps=30.0)
+    np.testing.assert_allclose(found.position, course.position, atol=1e-5)
+    np.testing.assert_allclose(found.facing, course.facing, atol=1e-6)
+
+
+def test_springs_turn_before_who_turns_late():
+    """From 1.5 m/s along +z to along +x, one second after the last past frame."""
+    turned = (np.arange(55) >= 39)[:, None]
+    facing = np.where(turned, [1.0, 0.0], [0.0, 1.0])
+    course = _course(1.5 * facing, facing)
+    keys = jax.random.split(jax.random.key(0), 64)
+    found = jax.vmap(
+        lambda key: trajectory.spring_course(key, course, last=9, fps=30.0)
+    )(keys)
+    np.testing.assert_allclose(
+        found.position[:, :10], np.broadcast_to(course.position[:10], (64, 10, 2))
+    )
+    aside = np.asarray(found.position)[:, 38] - np.asarray(course.position)[38]
+    assert aside[:, 0].max() > 0.4 and aside[:, 0].min() >= -1e-3
+    assert aside[:, 1].max() <= 1e-3
+    # Some commands are of moments before the turn: those go straight on.
+    assert np.mean(aside[:, 0] > 0.1) < 0.9
+    turns = np.linalg.norm(found.facing, axis=-1)
+    np.testing.assert_allclose(turns, 1.0, atol=1e-5)
+
+
+def test_springs_want_half_a_second_ahead():
+    course = _course(np.ones((20, 2)), np.broadcast_to([0.0, 1.0], (20, 2)))
+    with pytest.raises(ValueError, match="10 frames after frame 9, expected 0.5 s"):
+        trajectory.spring_course(jax.random.key(0), course, last=9, fps=30.0)
