@@ -482,3 +482,21 @@ def test_a_skeleton_without_legs_is_refused(skeleton):
         foot_lock.legs(skeleton)
     with pytest.raises(ValueError, match="names no feet"):
         foot_lock.legs(dataclasses.replace(SKELETON, feet=()))
+
+
+def test_a_toe_that_swings_is_off_the_ground():
+    """Slow, it stays where it is; from 0.9 m/s on it is lifted, and lands unlifted."""
+    speeds = np.concatenate([np.full(5, 0.55), np.full(5, 2.0), np.zeros(5)])
+    height = LOCK.toe_height + 0.001
+    toe = np.stack([np.cumsum(speeds / FPS), np.full(15, height), 0 * speeds], axis=1)
+    still = np.broadcast_to([0.0, height, 1.0], toe.shape)
+    toes = jnp.asarray(np.stack([toe, still], axis=1), jnp.float32)
+
+    def step(state, now):
+        state = foot_lock.step_lock(state, now, fps=FPS, lock=LOCK)
+        return state, state.shown[:, 1]
+
+    _, heights = jax.lax.scan(step, foot_lock.init_lock(SKELETON), toes)
+    expected = np.full((15, 2), height)
+    expected[5:10, 0] = LOCK.toe_height + LOCK.clearance
+    np.testing.assert_allclose(heights, expected, atol=1e-6)
