@@ -70,7 +70,6 @@ class Train:
       attention: "full", or "prefix": computed once per plan.
       noise_levels: Of each window in a step.
       own_levels: Probability of noise on own predictions at lower levels.
-      spring_paths: Probability of wanted paths that the run-time's springs make.
       seam_half_life: Half-life, frames, of the offset with which plans go on from the
         past; 0: none.
       frame_kernel: Frames of a last convolution.
@@ -110,7 +109,6 @@ class Train:
     attention: cli.Optional[Literal["full", "prefix"]] = None
     noise_levels: cli.Optional[int] = None
     own_levels: cli.Optional[float] = None
-    spring_paths: cli.Optional[float] = None
     seam_half_life: cli.Optional[float] = None
     frame_kernel: cli.Optional[int] = None
     weight_foot: cli.Optional[float] = None

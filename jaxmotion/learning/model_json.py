@@ -88,7 +88,7 @@ _LIMITS: dict[str, tuple[float | int, float | int]] = {
     **dict.fromkeys(("token_margin", "frame_kernel", "seam_features"), (0, 2**16)),
     **dict.fromkeys(("drafts", "polishes"), (0, 1000)),
     **dict.fromkeys(("drop_past", "drop_condition"), (0, 1)),
-    **dict.fromkeys(("own_previous", "own_levels", "spring_paths"), (0, 1)),
+    **dict.fromkeys(("own_previous", "own_levels"), (0, 1)),
     "dropout": (0, math.nextafter(1, 0)),
     "fps": (1e-3, 1000),
     **dict.fromkeys(("rotation_scale", "meters", "contact_speed"), (1e-6, 1e6)),

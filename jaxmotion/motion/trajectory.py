@@ -277,48 +277,6 @@ def smooth_course(key: Key, course: Trajectory, *, last: int) -> Trajectory:
     return Trajectory(position=path, facing=facings)
 
 
-@functools.partial(jax.jit, static_argnames=("last", "fps"))
-def spring_course(key: Key, course: Trajectory, *, last: int, fps: float) -> Trajectory:
-    """A recorded path as the springs of a run-time ask for it.
-
-    From frame `last` on it is the path on which the springs of `desired_trajectory`,
-    with a half-life of 0.15 to 0.5 s, answer a command for the velocity and facing that
-    are recorded 0.5 s later, or at some moment from then to the end. A person prepares
-    a turn before the hips show it and walks an arc; springs turn at once, whichever
-    foot stands. Velocities and facings are smoothed with sigma 5 frames.
-
-    Raises:
-      ValueError: if fewer than 0.5 s follow on frame `last`.
-    """
-    soon, frames = last + round(0.5 * fps), course.position.shape[0]
-    if soon >= frames:
-        raise ValueError(
-            f"{frames - 1 - last} frames after frame {last}, expected 0.5 s or more"
-        )
-    key_moment, key_half_life = jax.random.split(key)
-    filtered = smoothing_matrices(frames, (5.0,))[0]
-    velocity = filtered @ jnp.gradient(course.position, 1.0 / fps, axis=0)
-    facing = safe_normalize(filtered @ course.facing, jnp.array([0.0, 1.0]))
-    turns = ground.angle_from_to(facing[last - 1], facing[last + 1])
-    moment = jax.random.randint(key_moment, (), soon, frames)
-    ahead = desired_trajectory(
-        PlanarFrame(origin=course.position[last], facing=facing[last]),
-        velocity[last],
-        Command(
-            velocity=velocity[moment],
-            facing=facing[moment],
-            label=jnp.zeros((), jnp.int32),
-        ),
-        num_frames=frames - 1 - last,
-        fps=fps,
-        half_life=jax.random.uniform(key_half_life, (), minval=0.15, maxval=0.5),
-        acceleration=(velocity[last + 1] - velocity[last - 1]) * (0.5 * fps),
-        turn_rate=turns * (0.5 * fps),
-    )
-    joined = lambda a, b: jnp.concatenate([a[: last + 1], b])  # noqa: E731
-    return jax.tree.map(joined, course, ahead)
-
-
 def smooth(
     x: Float[Array, "*batch frames n"], matrix: Float[Array, "frames frames"]
 ) -> Float[Array, "*batch frames n"]:

@@ -62,7 +62,6 @@ def example(
 
     Source: released code of CAMDM.
     """
-    key, key_spring = jax.random.split(key) if config.spring_paths else (key, None)
     key_turn, key_course, key_keep = jax.random.split(key, 3)
     last = config.past - 1
     course = trajectory.root_trajectory(skeleton, window)
@@ -73,13 +72,8 @@ def example(
         facing = jnp.stack([jnp.sin(yaw), jnp.cos(yaw)])
     frame = trajectory.PlanarFrame(origin=course.position[last], facing=facing)
 
-    asked = trajectory.smooth_course(key_course, course, last=last)
-    if key_spring is not None:
-        key_spring, key_asked = jax.random.split(key_spring)
-        by_springs = jax.random.bernoulli(key_asked, config.spring_paths)
-        spring = trajectory.spring_course(key_spring, course, last=last, fps=config.fps)
-        asked = jax.tree.map(lambda a, b: jnp.where(by_springs, a, b), spring, asked)
-    wanted = trajectory.to_local(asked, frame)
+    smoothed = trajectory.smooth_course(key_course, course, last=last)
+    wanted = trajectory.to_local(smoothed, frame)
     poses = to_features(features.to_frame(window, frame), config=config)
     keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_past)
     condition = Condition(

@@ -67,9 +67,6 @@ class Config:
       own_levels: Probability that the lower half of a window's noise levels is noise on
         predictions from the upper half, as in sampling, instead of noise on the
         recording; ours, 0 in the paper.
-      spring_paths: Probability that a window's wanted path is what the run-time's
-        springs make of a command instead of the smoothed recording; ours, 0 in the
-        paper.
       rotation_layout: 6D as two rows (released code) or two columns.
       heading: Frame of a sample. "random": axes turned by a random yaw (released
         code). "facing": +z is where the character faces in the last past pose (ours:
@@ -113,7 +110,6 @@ class Config:
     seam_half_life: float = 0.0
     noise_levels: int = 1
     own_levels: float = 0.0
-    spring_paths: float = 0.0
     rotation_layout: Literal["rows", "columns"] = "rows"
     heading: Literal["random", "facing"] = "random"
     rotation_scale: float = 1.0

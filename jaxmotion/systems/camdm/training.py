@@ -133,8 +133,7 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
         name: value
         for name, value in dataclasses.asdict(model.config).items()
         if name.startswith("weight_")
-        or name
-        in ("attention", "noise_levels", "own_levels", "seam_half_life", "spring_paths")
+        or name in ("attention", "noise_levels", "own_levels", "seam_half_life")
     }
     # The mean rotation is part of what the network has learned.
     mean = first.config.rotation_mean

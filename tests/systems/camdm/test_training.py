@@ -183,7 +183,6 @@ def test_only_what_has_no_parameters_is_new(first):
         attention="prefix",
         noise_levels=2,
         own_levels=0.5,
-        spring_paths=0.5,
         seam_half_life=15.0,
     )
     config = dataclasses.replace(model.config, rotation_mean=(1.0,), **new)
