@@ -21,6 +21,7 @@ import suite
 
 import jaxmotion as jm
 from jaxmotion import cli
+from jaxmotion.control import rollout
 from jaxmotion.control.steering import Character
 from jaxmotion.motion import anatomy
 from jaxmotion.motion.skeleton import Motion, Skeleton, joint_positions
@@ -65,7 +66,14 @@ ROBOT = {
     "miss": "planted feet off m",
     "seconds": "s to solve",
 }
-COST = {"characters": "characters", "milliseconds": "ms a tick", "rate": "frames/s"}
+COST = {
+    "characters": "characters",
+    "milliseconds": "ms alone",
+    "rate": "frames/s",
+    "tick": "a tick, ms",
+    "with_rig": "with the rig, ms",
+    "share": "rig's part of a tick",
+}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -84,7 +92,7 @@ class Config(suite.Settings):
     robot: Path | None = None
     seconds: float = 6.0
     characters: tuple[int, ...] = (1, 64, 1024)
-    repeats: int = 50
+    repeats: int = 200
 
 
 def proportioned(
@@ -191,6 +199,52 @@ def cost(function: transfer.Retarget, motion: Motion, args: Config) -> list[dict
     return rows
 
 
+def share(
+    function: transfer.Retarget, model: Character, number: int, repeats: int
+) -> dict[str, float]:
+    """What a rig adds to a tick that it is compiled with, beside one without.
+
+    Both get the same states, by turns; medians, and the median of ratios.
+    """
+    patience = 1 if model.tuning is None else max(model.tuning.patience, 1)
+    at_most = -(-number // patience)
+
+    def tick(params, key, crowd, commands) -> tuple:
+        controller = model.method(params)
+        crowd, frames = rollout.crowd_tick(
+            controller, key, crowd, commands, at_most=at_most
+        )
+        return crowd, (frames.root_position, frames.joint_rotation)
+
+    def with_rig(*given) -> tuple:
+        crowd, pose = tick(*given)
+        return crowd, function.pose(*pose)
+
+    plain, worn = jax.jit(tick), jax.jit(with_rig)
+    commands = jm.commands("straight", model, number, seconds=1.0)
+    command = jax.tree.map(lambda x: x[:, 0], commands)
+    crowd = rollout.Crowd(
+        states=model.start(number), told=command, waited=jnp.zeros(number, jnp.int32)
+    )
+    times = []
+    for n in range(-10, repeats):
+        given = (model.params, jax.random.key(n + 10), crowd, command)
+        took = {}
+        for one in (plain, worn) if n % 2 else (worn, plain):
+            start = time.perf_counter()
+            after, _ = jax.block_until_ready(one(*given))
+            took[one] = time.perf_counter() - start
+        crowd = after
+        if n >= 0:
+            times.append((took[plain], took[worn]))
+    ticks = np.array(times)
+    return {
+        "tick": 1e3 * float(np.median(ticks[:, 0])),
+        "with_rig": 1e3 * float(np.median(ticks[:, 1])),
+        "share": float(np.median(ticks[:, 1] / ticks[:, 0])) - 1.0,
+    }
+
+
 def measure_robot(args: Config, model: Character, motions: dict[str, Motion]) -> None:
     """What a robot cannot do of each course, in a report."""
     robot = robots.read_robot(args.robot)
@@ -241,7 +295,10 @@ def main() -> None:
             rows.append({"body": name, "course": course, **measure(function, motion)})
     rows.sort(key=lambda row: list(bodies).index(row["body"]))
     suite.print_table(rows, COLUMNS)
-    costs = cost(next(iter(functions.values())), motion, args)
+    first = next(iter(functions.values()))
+    costs = cost(first, motion, args)
+    for row in costs:
+        row |= share(first, model, row["characters"], args.repeats)
     suite.print_table(costs, COST)
     metrics = [
         suite.Metric(f"{row['body']}, {row['course']}: slide", row["slide"], "m/s")
@@ -249,6 +306,7 @@ def main() -> None:
     ]
     for row in costs:
         name = f"{row['characters']} characters"
+        metrics.append(suite.Metric(f"{name}: share", row["share"], "of a tick"))
         metrics.append(suite.Metric(name, row["milliseconds"], "ms", tolerance=0.6))
     suite.report("retarget", metrics, args, rows=rows, costs=costs)
 

@@ -20,16 +20,20 @@ LEAST_BYTES = 1024
 class Weights:
     """Constants that several graphs share; each is kept once.
 
+    The packed file has the others first, then the upper bytes of all 16-bit floats,
+    then their lower bytes: sign and exponent repeat themselves, the rest is noise.
+
     Attributes:
       name: Name of the file, by which the graphs refer to it.
-      parts: Of the packed file, in its order: whether it has 16-bit floats, which are
-        32-bit ones in the file that the graphs refer to, and its bytes there.
+      parts: In the order of the file that the graphs refer to: whether it is packed as
+        16-bit floats, which are 32-bit ones there, and its bytes in the packed file.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.parts: list[tuple[bool, int]] = []
-        self._whole, self._packed = bytearray(), bytearray()
+        self._whole, self._others = bytearray(), bytearray()
+        self._halves: list[np.ndarray] = []
         self._places: dict[bytes, int] = {}
 
     def add(self, values: np.ndarray, *, half: bool) -> tuple[int, int]:
@@ -44,9 +48,12 @@ class Weights:
             self._places[digest] = len(self._whole)
             self._whole += raw + b"\0" * (-len(raw) % 4)
             packed = np.ascontiguousarray(small).tobytes()
-            packed += b"\0" * (-len(packed) % (2 if half else 4))
+            if half:
+                self._halves.append(np.frombuffer(packed, np.uint8).reshape(-1, 2))
+            else:
+                packed += b"\0" * (-len(packed) % 4)
+                self._others += packed
             self.parts.append((half, len(packed)))
-            self._packed += packed
         return self._places[digest], len(raw)
 
     def content(self) -> bytes:
@@ -55,7 +62,8 @@ class Weights:
 
     def packed(self) -> bytes:
         """The file that is written; `parts` say how to unpack it."""
-        return bytes(self._packed)
+        planes = np.concatenate([np.zeros((0, 2), np.uint8), *self._halves])
+        return bytes(self._others) + planes[:, 1].tobytes() + planes[:, 0].tobytes()
 
 
 def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:

@@ -44,7 +44,7 @@ _WEB = Path(__file__).with_name("web")
 # What the page is made of; `local.js` and what it needs are the static page's.
 _FILES = (
     *("body.js", "camera.js", "figures.js", "gltf.js", "input.js", "linear.js"),
-    *("page.js", "panel.js", "person.js", "rig.js", "save.js", "scene.js"),
+    *("page.js", "panel.js", "person.js", "rig.js", "save.js", "scene.js", "shape.js"),
     *("socket.js", "transfer.js"),
 )
 

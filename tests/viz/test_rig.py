@@ -1,5 +1,6 @@
 """Files that are dropped on the page: worn in Node as `jm.retarget` wears them."""
 
+import dataclasses
 import json
 import shutil
 
@@ -59,18 +60,33 @@ def with_twists():
     return rigs.glb(rigs.plain(offsets, parents, tuple(names)))
 
 
+def by_shape():
+    """Names that tell sides and nothing else."""
+    base = rigs.proportioned(*rigs.BODIES["long arms"])
+    word = lambda n: "Left" * ("Left" in n) + "Right" * ("Right" in n)  # noqa: E731
+    names = [f"{word(n)}_{j}" for j, n in enumerate(base.names)]
+    names[base.names.index("Head")] = "Head"
+    return rigs.glb(dataclasses.replace(base, names=tuple(names)))
+
+
 RIGS = {
     "a Mixamo child in an A-pose": lambda: rigs.glb(rigs.person("child")),
     "an Unreal giant": lambda: rigs.glb(
         rigs.person("giant", "Unreal"), unit=1.0, seed=3
     ),
-    "long arms, as VRM 1": lambda: unnamed("VRMC_vrm"),
+    "VRM 1": lambda: unnamed("VRMC_vrm"),
     "VRM 0": lambda: unnamed("VRM"),
     "twist bones": with_twists,
+    "names that say nothing": by_shape,
 }
 
 
-SLOW = {"an Unreal giant", "VRM 0", "long arms, as VRM 1"}  # each compiles its own
+SLOW = {
+    "an Unreal giant",
+    "VRM 0",
+    "VRM 1",
+    "names that say nothing",
+}  # each compiles its own
 
 
 @pytest.mark.parametrize(
@@ -123,8 +139,9 @@ def changed(hero, change):
 
 
 def rename(content):
+    """All on one side."""
     for number, node in enumerate(content["nodes"]):
-        node["name"] = f"n{number}"
+        node["name"] = f"left_{number}"
 
 
 def footless(content):

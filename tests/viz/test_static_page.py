@@ -302,6 +302,28 @@ def test_the_last_seconds_are_saved_as_they_were_shown(browser, address, tmp_pat
     assert math.isclose(len(content), int.from_bytes(content[8:12], "little"))
 
 
+def test_a_crowd_is_spread_over_cores(browser, address):
+    """More characters than one core is thought to bear; all walk, and go on walking."""
+    with opened(browser, address + "#characters=9&workers=3") as tab:
+        tab.wait_for_function("shown.n === 9 && shown.tick > 2", timeout=PATIENCE)
+        count = lambda: len(  # noqa: E731
+            [w for w in tab.workers if w.url.endswith("/worker.js")]
+        )
+        assert count() >= 2
+        places = np.reshape(tab.evaluate("[...shown.roots]"), (9, 3))
+        tab.keyboard.down("w")
+        walks(tab, (0, 1))
+        tab.wait_for_timeout(1500)
+        went = np.reshape(tab.evaluate("[...shown.roots]"), (9, 3)) - places
+        assert went[:, 2].min() > 0.5 and np.abs(went[:, 0]).max() < 0.3
+        tab.evaluate("panel.set('characters', 14)")
+        tab.wait_for_function("shown.n === 14", timeout=PATIENCE)
+        tab.evaluate("panel.set('characters', 1); panel.set('num_steps', 2)")
+        tab.wait_for_function("shown.n === 1", timeout=PATIENCE)
+        tab.click("#reset")
+        tab.wait_for_function("shown.tick < 60 && shown.roots[2] < 1", timeout=PATIENCE)
+
+
 DROP = """([content, name]) => {
   const bytes = Uint8Array.from(atob(content), x => x.charCodeAt(0));
   const dataTransfer = new DataTransfer();

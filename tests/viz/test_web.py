@@ -112,6 +112,62 @@ def test_formations_are_the_same():
         np.testing.assert_allclose(places, viewer.formation(number), atol=1e-6)
 
 
+def test_a_crowd_walks_the_same_on_several_cores():
+    """Helpers behind messages, as Workers are; graphs are written in the script."""
+    joint = {"names": ["a"], "parents": [-1], "offsets": [[0.0, 0.0, 0.0]]}
+    port = lambda *names: [  # noqa: E731
+        {"name": x, "dtype": "float32", "shape": [1]} for x in names
+    ]
+    graphs = {
+        "plan_level": (port("state.age"), port("out.level")),
+        "plan@2": (port("state.age"), port("out.state.age")),
+        "advance": (
+            port("state.age", "state.z", "command.velocity"),
+            port("out.state.age", "out.state.z", "out.frame.root_position")
+            + port("out.frame.joint_rotation"),
+        ),
+    }
+    about = {
+        "skeleton": joint,
+        "fps": 30,
+        "patience": 30,
+        "graphs": {
+            name: {"file": name, "inputs": takes, "outputs": gives}
+            for name, (takes, gives) in graphs.items()
+        },
+        "runs": {2: list(graphs)},
+        "plan": None,
+        "weights": {"file": "weights", "parts": []},
+    }
+    starts = {f"state.{x}": np.zeros((1, 1), np.float32) for x in ("age", "z")}
+    files = {name: name.split("@")[0].encode() for name in graphs}
+    files |= {"character.bin": packed.pack(about, starts), "weights": b""}
+    done = subprocess.run(
+        ["node", str(Path(__file__).with_name("crowd.mjs")), str(WEB)],
+        input=json.dumps({k: base64.b64encode(v).decode() for k, v in files.items()}),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout)
+    for one, other in zip(found["alone"], found["helped"], strict=True):
+        np.testing.assert_allclose(one["roots"], other["roots"], atol=1e-6)
+    last = [np.reshape(x["roots"], (-1, 3)) for x in found["helped"]]
+    assert [len(x) for x in last] == [9, 3, 14, 2]
+    # All walked for as long as they were there, and from the start after a reset.
+    assert (last[1][:, 2] > last[0][:3, 2] + 0.5).all()
+    assert (last[3][:, 2] < last[1][:2, 2]).all() and (last[3][:, 2] > 0.5).all()
+    # One core is thought to bear six until it was measured, and bears these easily.
+    assert [x["groups"] for x in found["alone"]] == [1] * 4
+    assert [x["groups"] for x in found["helped"]] == [2] * 4
+    owners = [x["owners"] for x in found["helped"]]
+    assert (
+        sorted(owners[0]) == [0] * 5 + [1] * 4
+        and sorted(owners[2]) == [0] * 7 + [1] * 7
+    )
+    assert found["asked"] == ["http://here/worker.js"]
+
+
 def test_the_pages_kinematics_and_skinning():
     """Positions of joints, and of points that stay where their joint carries them."""
     motion, skeleton = tiny.walk(3, turn=1.0), tiny.skeleton()

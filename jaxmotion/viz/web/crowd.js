@@ -1,5 +1,7 @@
-// Characters that are steered together: who plans when, and what is shown of a tick.
+// Characters that are steered together: what they are told, which core moves whom, and
+// what is shown of a tick.
 
+import { Group } from "./group.js";
 import { same, settled, still, wanted } from "./steer.js";
 
 const SPACING = 1.6;
@@ -16,85 +18,96 @@ export function formation(number) {
 }
 
 export class Crowd {
-  constructor(model, settings) {
-    this.model = model; this.settings = settings; this.tick = 0;
-    this.people = []; this.homes = [];
+  // helper: makes a group in another Worker; most: how many groups there may be.
+  constructor(model, settings, helper = null, most = 1) {
+    this.model = model; this.settings = settings; this.helper = helper;
+    this.most = helper ? most : 1;
+    this.groups = [new Group(model)];
+    this.restart();
+  }
+
+  // Nobody is there yet; groups stay.
+  restart() {
+    this.tick = 0; this.owners = []; this.homes = [];
     this.wish = still(); this.told = still(); this.leader = [0, 0];
-    this.planMs = 30; this.tickMs = 4;
+    for (const group of this.groups) group.resize(0);
   }
 
-  // Settings of this number; who is there goes on.
-  resize(number) {
-    const homes = formation(number);
-    const here = this.homes[0] ? [0, 1].map(i => this.leader[i] - homes[0][i]) : [0, 0];
-    this.people.length = Math.min(this.people.length, number);
-    while (this.people.length < number) {
-      const i = this.people.length;
-      const state = this.model.start(this.settings.label);
-      this.homes[i] = homes[i].map((x, k) => x + here[k]);
-      this.people.push({ state, told: null, waited: 0 });
-    }
-    this.homes.length = number;
+  get planMs() { return Math.max(...this.groups.map(group => group.planMs)); }
+  get tickMs() { return Math.max(...this.groups.map(group => group.tickMs)); }
+  // How many characters one core moves in real time.
+  get each() {
+    const known = this.groups.map(group => group.bears).filter(Boolean);
+    return known.reduce((a, b) => a + b) / known.length;
   }
 
-  // How many characters can be moved in real time, from what the last ticks took.
+  // How many characters can be moved in real time, with one more core where one is left.
   bears() {
-    const { fps, patience } = this.model.about, n = this.people.length;
-    const plan = patience ? this.planMs / patience : 0;
-    return Math.floor(900 / fps / (this.tickMs / n + plan));
+    return Math.floor(this.each * Math.min(this.groups.length + 1, this.most));
   }
 
-  command(wish) {
-    const { label, scale, foot_lock } = this.settings;
-    return this.model.told({ ...wish, label, scale, locks: foot_lock });
+  // Whether so many characters are more than the groups move, and there may be more.
+  needs(number) {
+    return this.groups.length < this.most && number > this.each * this.groups.length;
+  }
+
+  // Another group, ready to be used.
+  async enlist(steps) {
+    const made = this.helper(this.model);
+    await made.prepare(steps);
+    this.groups.push(made);
+  }
+
+  prepare(steps) { return Promise.all(this.groups.map(group => group.prepare(steps))); }
+
+  close() { for (const group of this.groups.slice(1)) group.close(); }
+
+  // Settings of this number; who is there goes on. Others join the smallest group.
+  resize(number) {
+    const homes = formation(number), { groups, owners } = this;
+    const here = this.homes[0] ? [0, 1].map(i => this.leader[i] - homes[0][i]) : [0, 0];
+    const size = g => owners.filter(x => x === g).length;
+    owners.length = this.homes.length = Math.min(owners.length, number);
+    while (owners.length < number) {
+      const i = owners.length, sizes = groups.map((_, g) => size(g));
+      this.homes[i] = homes[i].map((x, k) => x + here[k]);
+      owners.push(sizes.indexOf(Math.min(...sizes)));
+    }
+    groups.forEach((group, g) => group.resize(size(g), this.settings.label));
   }
 
   // One tick of all. `slack`: milliseconds that plans may take before frames run out.
   async next(inputs, slack) {
-    const began = performance.now(), { model, settings, people } = this;
-    const { fps, patience } = model.about, steps = settings.num_steps;
+    const began = performance.now(), { model, settings, homes, owners } = this;
+    const { label, scale, foot_lock, num_steps: steps } = settings;
     const wish = wanted(inputs, this.wish, {
-      position: this.leader, speed: settings.speed, seconds: 1 / fps,
+      position: this.leader, speed: settings.speed, seconds: 1 / model.about.fps,
     });
     this.told = settled(this.told, wish, same(wish, this.wish));
     this.wish = wish;
-    const command = this.command(this.told);
-    let planned = 0;
-    const asked = [];
-    for (const one of people) {
-      const level = await model.level(one.state, command);
-      if (!level) { one.told = command; one.waited = 0; continue; }
-      one.waited += 1;
-      asked.push([one, level]);
-    }
-    // Who has waited longest comes first; who cannot wait any longer plans in any case.
-    asked.sort((a, b) => b[0].waited - a[0].waited);
-    for (const [one, level] of asked) {
-      const must = !one.told || one.waited > Math.max(patience - 2, 0);
-      const late = performance.now() - began + this.planMs > slack;
-      if (!must && (planned || people.length === 1) && late) continue;
-      const from = performance.now();
-      await model.plan(level, steps, one.state, command);
-      const took = performance.now() - from;
-      this.planMs += 0.2 * (took - this.planMs);
-      one.told = command; one.waited = 0; planned += 1;
-      this.lastPlan = took;
-    }
-    const { homes } = this, shown = [];
-    for (const one of people)
-      shown.push(await model.show(one.state, one.told || command, steps));
+    const told = { ...this.told, label, scale, locks: foot_lock };
+    // The others first: this Worker's own group lets nobody speak meanwhile.
+    const made = [];
+    for (let g = this.groups.length - 1; g >= 0; g--)
+      made[g] = this.groups[g].next({ told, steps, slack, plan: settings.plan && !g });
+    const found = await Promise.all(made), at = found.map(() => 0);
+    const shown = owners.map(g => found[g].shown[at[g]++]);
+    const planned = found.reduce((sum, one) => sum + one.planned, 0);
     this.leader = [shown[0].root[0] + homes[0][0], shown[0].root[2] + homes[0][1]];
-    const took = performance.now() - began;
-    if (!planned) this.tickMs += 0.2 * (took - this.tickMs);
-    return this.pack(shown, planned, took);
+    return this.pack(shown, planned, performance.now() - began, found[0].rest);
+  }
+
+  // How all start, which is there before any graph is; null where none is stored.
+  standing() {
+    const own = this.owners.map(() => this.model.pose(this.model.start(this.settings.label)));
+    return own.every(Boolean) ? this.pack(own, 0, 0) : null;
   }
 
   // A frame as `jaxmotion.viz.page` sends it.
-  pack(shown, planned, took) {
+  pack(shown, planned, took, rest = null) {
     const { model, settings, homes, told, tick } = this, n = shown.length;
     const joints = model.about.skeleton.parents.length;
     const balls = shown[0].ball ? n : 0;
-    const rest = settings.plan ? model.rest(this.people[0].state) : null;
     const ahead = rest ? rest.path.length / 2 : 0;
     const head = [settings.engine, tick, took, planned, n, joints, balls, model.about.fps,
       ...told.velocity, ...told.facing, ahead];

@@ -1,4 +1,4 @@
-// Vectors of three numbers, and rotations as nine, row by row.
+// Vectors of three numbers, rotations as nine, row by row, and chains of joints.
 
 export const EYE = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
@@ -10,6 +10,7 @@ export const unit = a => scale(1 / Math.max(long(a), 1e-9), a);
 export const cross = (a, b) =>
   [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 export const mean = points => scale(1 / points.length, points.reduce(add));
+export const mean1 = values => values.reduce((a, b) => a + b, 0) / values.length;
 export const clip = (x, low, high) => Math.min(Math.max(x, low), high);
 
 export const turned = (m, v) => [dot3(m, 0, v), dot3(m, 3, v), dot3(m, 6, v)];
@@ -38,6 +39,13 @@ export function swing(a, b, half) {
     s * x * y + z, 1 - s * (x * x + z * z), s * y * z - x,
     s * x * z - y, s * y * z + x, 1 - s * (x * x + y * y),
   ];
+}
+
+// Joints from the root to one.
+export function chain(parents, joint) {
+  const found = [];
+  for (let j = joint; j >= 0; j = parents[j]) found.unshift(j);
+  return found;
 }
 
 // A rotation about a unit vector.

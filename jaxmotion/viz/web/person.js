@@ -1,20 +1,13 @@
 // Whose joints are whose on a rig, and how it stands in a T-pose: `retarget/roles.py`,
-// `motion/anatomy.py` and `transfer.rest` for rigs whose joints have names. The words
-// are theirs, too: `tables` is what `transfer.page_json` writes.
+// `motion/anatomy.py` and `transfer.rest`. The words of names are theirs, too: `tables` is what `transfer.page_json` writes.
 
 import {
-  EYE, clip, cross, dot, long, mean, scale, sub, swing, times, turned, unit,
+  EYE, add, chain, clip, cross, dot, long, mean, mean1, scale, sub, swing, times, turned, unit,
 } from "./linear.js";
+import { byShape } from "./shape.js";
 
 const LEFT = "left", RIGHT = "right", MIDDLE = "middle", SIDES = [LEFT, RIGHT];
 const ARM = ["UpperArm", "LowerArm", "Hand"], LEG = ["UpperLeg", "LowerLeg", "Foot"];
-
-// Joints from the root to one.
-export function chain(parents, joint) {
-  const found = [];
-  for (let j = joint; j >= 0; j = parents[j]) found.unshift(j);
-  return found;
-}
 
 function sideOf(tables, name) {
   for (const [pattern, flags] of tables.sides) {
@@ -84,8 +77,15 @@ const listed = names => names.slice(0, 12).map(x => x.slice(0, 40)).join(", ")
 export function findRoles(tables, skeleton, told = {}) {
   const taken = Object.values(told);
   const named = Object.entries(byNames(tables, skeleton)).filter(([, j]) => !taken.includes(j));
-  const found = { ...Object.fromEntries(named), ...told };
-  const { names, parents } = skeleton, lack = lacking(skeleton, found);
+  const { names, parents } = skeleton;
+  let found = { ...Object.fromEntries(named), ...told };
+  if (lacking(skeleton, found)) {
+    const sides = names.map(name => sideOf(tables, name));
+    const shaped = Object.entries(byShape(skeleton, zeroPose(skeleton), sides))
+      .filter(([, j]) => !taken.includes(j));
+    if (shaped.length) found = { ...Object.fromEntries(shaped), ...told };
+  }
+  const lack = lacking(skeleton, found);
   if (lack) {
     const have = Object.entries(found).map(([role, j]) => `${role} '${names[j]}'`);
     throw new Error(`no person: missing ${lack}; found ${listed(have) || "nothing"} among `
@@ -124,7 +124,12 @@ export function person({ tables, numbers }, skeleton, { told = {}, sole = null }
   return { ...one, sole: ankle - sole };
 }
 
-export const mean1 = values => values.reduce((a, b) => a + b, 0) / values.length;
+// Places where no joint is turned, from the root.
+function zeroPose({ parents, offsets }) {
+  const zero = [];
+  parents.forEach((up, j) => { zero[j] = up < 0 ? [0, 0, 0] : add(zero[up], offsets[j]); });
+  return zero;
+}
 
 function anatomy({ parents, offsets }, roles) {
   const top = roles.head ?? roles.neck ?? roles.chest, trunk = chain(parents, top);
@@ -134,9 +139,7 @@ function anatomy({ parents, offsets }, roles) {
     const toes = after && side + after in roles ? [roles[side + after]] : [];
     return { side, before, upper, middle, end, after: toes };
   });
-  const zero = offsets.map(x => [...x]);
-  zero[0] = [0, 0, 0];
-  parents.forEach((up, j) => { if (up >= 0) zero[j] = zero[j].map((x, k) => x + zero[up][k]); });
+  const zero = zeroPose({ parents, offsets });
   const arms = limbs(ARM), legs = limbs(LEG, "Toes");
   const rise = sub(zero[top], mean(legs.map(leg => zero[leg.end])));
   return { trunk, arms, legs, zero, upright: rise[1] > 0.8 * long(rise) };

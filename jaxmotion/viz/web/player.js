@@ -24,19 +24,22 @@ const QUICK = 700;
 const KINDS = { float32: Float32Array, int32: Int32Array, bool: Uint8Array };
 const size = shape => shape.reduce((a, b) => a * b, 1);
 
-// Constants as the graphs refer to them: `parts` of 16-bit floats become 32-bit ones, of
-// which each begins at a multiple of four bytes, as the others do.
+// Constants as the graphs refer to them, of a file of `jaxmotion.export.slim`: 16-bit
+// floats become 32-bit ones, of which each begins at a multiple of four bytes, as the
+// others do.
 export function widen(packed, parts) {
   const sizes = parts.map(([half, bytes]) => (half ? 2 * bytes : bytes));
-  const made = new Uint8Array(sizes.reduce((a, b) => a + b, 0));
-  const view = new DataView(packed.buffer, packed.byteOffset, packed.byteLength);
-  const wide = new Float32Array(made.buffer);
-  let from = 0, to = 0;
+  const sum = values => values.reduce((a, b) => a + b, 0);
+  const made = new Uint8Array(sum(sizes)), wide = new Float32Array(made.buffer);
+  const halves = sum(parts.map(([half, bytes]) => (half ? bytes : 0))) / 2;
+  // Others, then the floats' upper bytes, then their lower ones.
+  let other = 0, upper = packed.length - 2 * halves, to = 0;
   parts.forEach(([half, bytes], i) => {
     if (half)
-      for (let k = 0; k < bytes; k += 2) wide[(to + 2 * k) / 4] = float(view.getUint16(from + k, true));
-    else made.set(packed.subarray(from, from + bytes), to);
-    from += bytes; to += sizes[i];
+      for (let k = 0; k < bytes / 2; k++, upper++)
+        wide[to / 4 + k] = float(packed[upper] << 8 | packed[upper + halves]);
+    else { made.set(packed.subarray(other, other + bytes), to); other += bytes; }
+    to += sizes[i];
   });
   return made;
 }

@@ -1,8 +1,9 @@
 // A dropped file worn in the place of the mannequin: `steer.py --rig` in the browser.
 
-import { Transfer } from "./transfer.js";
-import { mean1, person } from "./person.js";
 import { readRig } from "./gltf.js";
+import { mean1 } from "./linear.js";
+import { person } from "./person.js";
+import { Transfer } from "./transfer.js";
 
 // Who wears a file.
 //   wear: of the character, as `transfer.page_json` writes it

@@ -3,10 +3,9 @@
 
 import { columns } from "./body.js";
 import {
-  EYE, about, add, clip, column, dot, long, mean, scale, sub, swing, times, trace,
-  transposed, turned, unit,
+  EYE, about, add, chain, clip, column, dot, long, mean, mean1, scale, sub, swing, times,
+  trace, transposed, turned, unit,
 } from "./linear.js";
-import { chain, mean1 } from "./person.js";
 
 // Parts of a chain's length at which each joint's bone begins, and the end.
 function segments({ places }, joints, end) {

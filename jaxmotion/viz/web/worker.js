@@ -1,8 +1,10 @@
 // The Worker of the static page: makes frames a little ahead of what is shown, so that a
-// plan that takes long holds up no picture. Obeys what the live page's server obeys.
+// plan that takes long holds up no picture. Obeys what the live page's server obeys. Where
+// one core is too slow for a crowd, others help: Workers of this file, too.
 
 import * as ort from "onnxruntime-web/wasm";
 import { Crowd } from "./crowd.js";
+import { Helper, help } from "./group.js";
 import { Model } from "./player.js";
 
 // Ticks to be ahead: at least so many, and never more.
@@ -18,6 +20,9 @@ let base = "", crowd = null, model = null, single = 0, inputs = null, due = 0, b
 const nothing = { held: [], azimuth: 0, target: null };
 inputs = nothing;
 const opened = new Map();
+// Groups of characters that there may be: the page draws on one of the cores.
+let most = Math.max((navigator.hardwareConcurrency || 2) - 1, 1);
+const helper = model => new Helper(base, model, ort.env.wasm.wasmBinary);
 
 const tell = () => postMessage({ state: { ...state } });
 function note(text) { state.note = text; tell(); }
@@ -61,6 +66,7 @@ async function open(message) {
   const about = await fetched("models.json");
   state.models = JSON.parse(new TextDecoder().decode(about)).models;
   const wish = message.settings || {};
+  if (wish.workers >= 1) most = wish.workers;
   await choose(wish.model || state.models[0], wish, runtime);
 }
 
@@ -81,6 +87,7 @@ async function choose(name, wish = {}, runtime = null) {
     scale: about.scale, foot_lock: "foot_lock" in wish ? wish.foot_lock : true,
   };
   model = next;
+  if (crowd) crowd.close();
   crowd = null;
   Object.assign(state, given, {
     model: name, labels: about.labels, fps: about.fps, source: about.source,
@@ -93,12 +100,15 @@ async function choose(name, wish = {}, runtime = null) {
   const waiting = new Crowd(next, state);
   waiting.resize(state.characters);
   postMessage({ body: await next.read("character.bin"), engine: state.engine });
-  const poses = waiting.people.map(one => next.pose(one.state));
-  if (poses.every(Boolean)) show(waiting.pack(poses, 0, 0), performance.now());
+  const standing = waiting.standing();
+  if (standing) show(standing, performance.now());
   for (const name of about.runs[state.num_steps])  // all at once, not one by one
     next.read(about.graphs[name].file).catch(() => {});
   await runtime;
   await next.prepare(state.num_steps, true);
+  const made = new Crowd(next, state, helper, most);
+  while (made.needs(state.characters)) await made.enlist(state.num_steps);
+  crowd = made;
   state.note = "";
   begin();
   tell();
@@ -118,7 +128,7 @@ function show(data, time) {
 }
 
 function begin() {
-  crowd = new Crowd(model, state);
+  crowd.restart();
   crowd.resize(state.characters);
   due = performance.now();
 }
@@ -128,14 +138,28 @@ const CHANGES = {
   async num_steps(value) {
     if (!state.steps.includes(value)) throw new Error(`${value} steps are none offered`);
     note(`loading ${value} steps`);
-    await model.prepare(value);
+    await crowd.prepare(value);
     state.num_steps = value; state.note = "";
   },
-  async characters(value) { state.characters = value; crowd.resize(value); },
+  async characters(value) {
+    state.characters = value;
+    if (!crowd.needs(value)) { crowd.resize(value); return; }
+    // Who is there goes on until another core is ready.
+    const grown = crowd;
+    grown.enlist(state.num_steps).then(() => {
+      queue.push({ grown });
+      work();
+    }, fail);
+  },
 };
 
 async function obey(message) {
   if (message.base) return open(message);
+  if (message.grown) {
+    if (message.grown === crowd) await CHANGES.characters(state.characters);
+    else message.grown.close();
+    return;
+  }
   if (message.held) { inputs = message; return; }
   // Where one model does not load, another one may.
   if (!crowd && !(message.set && message.set.model)) return;
@@ -161,7 +185,12 @@ function measure() {
 
 // Messages are obeyed in their order, between two ticks.
 const queue = [];
-onmessage = event => { queue.push(event.data); work(); };
+let helps = null;
+onmessage = ({ data }) => {
+  if (helps) helps(data);
+  else if (data.helps) helps = help(ort, data, message => postMessage(message));
+  else { queue.push(data); work(); }
+};
 const later = ms => new Promise(done => setTimeout(done, ms));
 
 async function work() {

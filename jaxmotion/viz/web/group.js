@@ -1,0 +1,131 @@
+// Characters that one core moves: in this Worker, or in another one (`Helper`, `help`).
+
+import { Model } from "./player.js";
+
+export class Group {
+  constructor(model) {
+    this.model = model; this.people = []; this.planMs = 30; this.tickMs = 4;
+  }
+
+  // So many people; who is there goes on, others start with a label.
+  resize(number, label) {
+    const { people } = this;
+    people.length = Math.min(people.length, number);
+    while (people.length < number)
+      people.push({ state: this.model.start(label), told: null, waited: 0 });
+  }
+
+  // Graphs for a number of diffusion steps.
+  prepare(steps) { return this.model.prepare(steps); }
+
+  // How many one core moves in real time, from what the last ticks took.
+  get bears() {
+    const { fps, patience } = this.model.about, n = Math.max(this.people.length, 1);
+    return 900 / fps / (this.tickMs / n + (patience ? this.planMs / patience : 0));
+  }
+
+  // One tick of all.
+  //   told: command and settings, as `Model.told` takes them, and the number of steps
+  //   slack: milliseconds that plans may take before frames run out
+  //   plan: whether the rest of the first one's plan is asked for
+  async next({ told, steps, slack, plan }) {
+    const began = performance.now(), { model, people } = this;
+    const command = model.told(told), { patience } = model.about;
+    let planned = 0;
+    const asked = [];
+    for (const one of people) {
+      const level = await model.level(one.state, command);
+      if (!level) { one.told = command; one.waited = 0; continue; }
+      one.waited += 1;
+      asked.push([one, level]);
+    }
+    // Who has waited longest comes first; who cannot wait any longer plans in any case.
+    asked.sort((a, b) => b[0].waited - a[0].waited);
+    for (const [one, level] of asked) {
+      const must = !one.told || one.waited > Math.max(patience - 2, 0);
+      const late = performance.now() - began + this.planMs > slack;
+      if (!must && (planned || people.length === 1) && late) continue;
+      const from = performance.now();
+      await model.plan(level, steps, one.state, command);
+      this.planMs += 0.2 * (performance.now() - from - this.planMs);
+      one.told = command; one.waited = 0; planned += 1;
+    }
+    const shown = [];
+    for (const one of people)
+      shown.push(await model.show(one.state, one.told || command, steps));
+    if (!planned && people.length) this.tickMs += 0.2 * (performance.now() - began - this.tickMs);
+    const { planMs, tickMs, bears } = this;
+    const rest = plan ? model.rest(people[0].state) : null;
+    return { shown, planned, rest, planMs, tickMs, bears };
+  }
+}
+
+// A group in another Worker: `help` answers there.
+export class Helper {
+  // base: the page's address; model: whose files it reads here; binary: the runtime.
+  constructor(base, model, binary) {
+    this.model = model; this.asked = new Map(); this.count = 0;
+    Object.assign(this, { planMs: 0, tickMs: 0, bears: 0 });
+    this.worker = new Worker(new URL("worker.js", base), { type: "module" });
+    this.worker.onmessage = ({ data }) => this.hear(data);
+    this.worker.onerror = event => {
+      event.preventDefault();
+      for (const [, , refuse] of this.asked.values())
+        refuse(new Error(`worker.js does not run: ${event.message || "it is missing"}`));
+    };
+    this.worker.postMessage({ helps: model.name, binary });
+  }
+
+  hear({ read, id, made, error }) {
+    if (read)
+      this.model.read(read).then(bytes => this.worker.postMessage({ read, bytes }),
+        reason => this.worker.postMessage({ read, error: reason.message }));
+    if (id === undefined) return;
+    const [, done, refuse] = this.asked.get(id);
+    this.asked.delete(id);
+    if (error) refuse(new Error(error)); else done(made);
+  }
+
+  call(name, ...args) {
+    const id = this.count++;
+    return new Promise((done, refuse) => {
+      this.asked.set(id, [name, done, refuse]);
+      this.worker.postMessage({ id, name, args });
+    });
+  }
+
+  prepare(steps) { return this.call("prepare", steps); }
+  resize(number, label) { return this.call("resize", number, label); }
+  async next(tick) {
+    const made = await this.call("next", tick), { planMs, tickMs, bears } = made;
+    Object.assign(this, { planMs, tickMs, bears });
+    return made;
+  }
+
+  close() { this.worker.terminate(); }
+}
+
+// Makes this Worker a helper; `first` is the message that asked for it, `say` answers who
+// did, from whom files come, too. Returns what is to be done with each message.
+export function help(ort, first, say) {
+  const waiting = new Map();
+  const read = file => new Promise((done, refuse) => {
+    waiting.set(file, [...(waiting.get(file) || []), [done, refuse]]);
+    say({ read: file });
+  });
+  ort.env.wasm.numThreads = 1;
+  ort.env.wasm.wasmBinary = first.binary;
+  const group = new Model(ort, read).open(first.helps).then(model => new Group(model));
+  group.catch(() => {});
+  return async ({ read, bytes, error, id, name, args }) => {
+    if (read) {
+      const [[done, refuse], ...others] = waiting.get(read);
+      waiting.set(read, others);
+      if (error) refuse(new Error(error)); else done(bytes);
+      return;
+    }
+    try {
+      say({ id, made: await (await group)[name](...args) });
+    } catch (error) { say({ id, error: error.message }); }
+  };
+}
