@@ -11,6 +11,7 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
+import json
 import math
 from pathlib import Path
 
@@ -130,14 +131,19 @@ def loss_panels(found: dict[str, dict[str, Stage]]) -> list[plots.Curves]:
     return panels
 
 
+def _data_of(measured: results.Measured) -> str:
+    return json.dumps(measured.about.get("data"), sort_keys=True)
+
+
 def metric_panels(
     args: Config, found: dict[str, dict[str, Stage]], names: dict[Path, str]
 ) -> list[plots.Curves]:
     """The metric of each row over the seconds of training of each run; or none.
 
-    A line joins runs of one seed of training. The seconds of a row are those of the
-    stage that has its name (or that it samples, as ddim_10 does), if one does, else of
-    all stages that are drawn. Recorded motion is a line across, of the last run.
+    A line joins runs of one seed of training on the same data. The seconds of a row are
+    those of the stage that has its name (or that it samples, as ddim_10 does), if one
+    does, else of all stages that are drawn. Recorded motion is a line across, of the
+    last run.
 
     Raises:
       OSError: if an evaluation cannot be read.
@@ -154,9 +160,15 @@ def metric_panels(
         if folder not in evaluations:
             print(f"not evaluated, so without a dot: no {folder / args.file}")
     several = len({one.seeds for one in evaluations.values()}) > 1
+    # Data go by the name of the first run that was trained on them.
+    data: dict[str, str] = {}
+    for folder, measured in evaluations.items():
+        data.setdefault(_data_of(measured), names[folder])
     for folder, measured in evaluations.items():
         evaluators.add(measured.evaluator)
         seed = f", seed {', '.join(map(str, measured.seeds)) or '?'}" if several else ""
+        if len(data) > 1:
+            seed += f", data of {data[_data_of(measured)]}"
         for row, cells in measured.rows.items():
             there |= cells.keys()
             cell = cells.get(args.metric)

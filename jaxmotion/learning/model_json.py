@@ -19,6 +19,18 @@ from jaxmotion.motion.features import Normalizer
 from jaxmotion.motion.skeleton import MAX_METERS, Skeleton, check_skeleton
 
 
+def check_system(value: dict[str, Any], system: str, *, where: str) -> None:
+    """Raises unless the JSON of the file `where` is of a system.
+
+    Raises:
+      ValueError: names the file, the system found and the one expected.
+    """
+    if value.get("system") != system:
+        raise ValueError(
+            f"{where}: field 'system' is {value.get('system')!r}, expected {system!r}"
+        )
+
+
 def decode(
     value: dict[str, Any], where: str, parts: Mapping[str, Callable[[Any], Any]]
 ) -> dict[str, Any]:
@@ -247,6 +259,32 @@ def arrays_from_json(
     if not all((np.abs(x) <= MAX_METERS).all() for x in found.values()):
         raise ValueError(f"has numbers that are not within {MAX_METERS:g}")
     return {name: jnp.asarray(x, jnp.float32) for name, x in found.items()}
+
+
+def starts_from_json(
+    value: Any,
+    *,
+    labels: int,
+    past: int,
+    frames: Mapping[str, tuple[int, ...]],
+    where: str,
+) -> dict[str, Array] | None:
+    """A model's `starts`, arrays [labels, number, past, ...]; None for none.
+
+    Args:
+      frames: Shape of a frame of each array, by name.
+      where: Its file, for messages.
+
+    Raises:
+      ValueError: names the file and the array that is missing or wrong.
+    """
+    if value is None:
+        return None
+    shapes = {name: (past, *shape) for name, shape in frames.items()}
+    try:
+        return arrays_from_json(value, lead=(labels,), shapes=shapes)
+    except ValueError as error:
+        raise ValueError(f"{where}: field 'starts' {error}") from None
 
 
 def differences(

@@ -17,6 +17,7 @@ It is cut in two, `project` and `attend`, so that a sampler can keep the project
 tokens that do not change between steps, and can skip the rows that nobody reads.
 """
 
+import dataclasses
 from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
@@ -36,6 +37,13 @@ def apply(params: Params, module: Any, *args: Any, **options: Any) -> Any:
     and `rngs`.
     """
     return module.apply({"params": params}, *args, **options)
+
+
+def sized(kind: type, config: Any, **more: Any) -> Any:
+    """A module whose fields have the values that a configuration gives them."""
+    names = {field.name for field in dataclasses.fields(kind)} - {"parent", "name"}
+    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
+    return kind(**sizes, **more)
 
 
 def known_labels(

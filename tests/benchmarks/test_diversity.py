@@ -129,19 +129,6 @@ def run_main(load, monkeypatch, *arguments):
     load("diversity").main()
 
 
-def test_help_has_an_example_and_says_what_the_columns_are(load, monkeypatch, capsys):
-    with pytest.raises(SystemExit) as stop:
-        run_main(load, monkeypatch, "--help")
-    assert stop.value.code == 0
-    printed = " ".join(capsys.readouterr().out.replace("\u2502", " ").split())
-    for text in (
-        "python benchmarks/diversity.py",
-        "default: runs/benchmarks",
-        "meters",
-    ):
-        assert text in printed
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

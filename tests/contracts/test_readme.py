@@ -154,9 +154,19 @@ def test_version_is_the_same_everywhere():
     assert citation.count("  - type: ") == 4
 
 
-def test_importing_the_package_loads_no_heavy_parts():
+def test_imports_load_no_more_than_they_need():
+    """One process: the package, then the registry, then what reads data sets."""
     heavy = ["tensorflow_datasets", "tensorflow", "matplotlib", "orbax", "torch"]
-    code = f"import sys, jaxmotion; print([m for m in {heavy} if m in sys.modules])"
+    code = f"""
+import sys, jaxmotion
+print([m for m in {heavy} if m in sys.modules])
+import jaxmotion.systems.registry
+print([m for m in sys.modules if m.startswith("jaxmotion.systems.")])
+from jaxmotion.data.builders import (
+    bandai_namco, base, humanact12, humanml3d, lafan1, style100
+)
+print("tensorflow" in sys.modules)
+"""
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=ROOT,
@@ -164,4 +174,4 @@ def test_importing_the_package_loads_no_heavy_parts():
         text=True,
         check=True,
     )
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.splitlines() == ["[]", "['jaxmotion.systems.registry']", "False"]

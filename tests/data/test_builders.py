@@ -1,7 +1,5 @@
 import json
 import re
-import subprocess
-import sys
 import zipfile
 
 import numpy as np
@@ -343,14 +341,6 @@ def test_style100_tables_must_be_there(tmp_path):
     del files["100STYLE/Dataset_List.csv"]
     with pytest.raises(FileNotFoundError, match="no Dataset_List.csv"):
         build(style100.Style100, tmp_path, put(tmp_path / "raw", files), "original")
-
-
-def test_tensorflow_is_never_imported():
-    code = (
-        "import sys; from jaxmotion.data.builders import base, bandai_namco, lafan1, "
-        "style100; sys.exit('tensorflow' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_files_of_one_name_in_two_folders_are_both_named(tmp_path):

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.data import clips as clips_module
 from jaxmotion.data import selection
 from jaxmotion.data.clips import clip_motion, clips_from_motions, take_clips
 from tests.data import samples
@@ -228,10 +227,3 @@ def test_concatenate_refuses_other_fields_rates_and_skeletons():
         selection.concatenate([clips, build(skeletons=moved, labels=labels)])
     with pytest.raises(ValueError, match="no clips"):
         selection.concatenate([])
-
-
-def test_checks_are_public():
-    with pytest.raises(ValueError, match="'p' and 'q'"):
-        clips_module.check_skeletons(
-            [samples.skeleton(), samples.skeleton(samples.TURNED)], ["p", "q"], 1e-3
-        )

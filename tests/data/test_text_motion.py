@@ -135,19 +135,6 @@ def test_round_trip_is_exact_and_leaves_one_file(saved):
     assert os.listdir(saved.parent) == ["m.npz"]
 
 
-def test_an_interrupted_write_leaves_the_old_file(saved, monkeypatch):
-    before = saved.read_bytes()
-
-    def stop(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "fsync", stop)
-    with pytest.raises(KeyboardInterrupt):
-        text_motion.save_text_motions(saved, motions())
-    assert saved.read_bytes() == before
-    assert os.listdir(saved.parent) == ["m.npz"]
-
-
 def test_missing_damaged_and_foreign_files_are_named(saved, tmp_path):
     load = text_motion.load_text_motions
     with pytest.raises(FileNotFoundError, match="no text motions file .*none.npz"):

@@ -50,14 +50,23 @@ def data(seed=0, shape=(3, 2)):
     return jnp.asarray(drawn, jnp.float32)
 
 
-def pairs(kind, table, student):
-    teacher = denoiser(*linear(table))
+def make_pairs(kind, table, student, teacher):
     if kind == "chain":
         run, more = distillation.chain_pairs, dict(steps=(1, 2, 5, table.num_steps))
     else:
         run, more = distillation.consistency_pairs, dict(number=table.num_steps)
-    run = functools.partial(run, table=table, student=student, teacher=teacher, **more)
-    return jax.jit(run)(jax.random.key(0), data())
+    key = jax.random.key(0)
+    return run(key, data(), table=table, student=student, teacher=teacher, **more)
+
+
+@functools.cache
+def program(kind):
+    """Pairs of linear denoisers, jitted once for all of them."""
+    return jax.jit(
+        lambda table, student, teacher: make_pairs(
+            kind, table, denoiser(*student), denoiser(*teacher)
+        )
+    )
 
 
 @pytest.mark.parametrize("kind", ["chain", "consistency"])
@@ -65,10 +74,10 @@ def pairs(kind, table, student):
 def test_the_exact_consistency_function_has_nothing_to_learn(kind, make):
     table = make(T)
     slope, offset = chain_ends(table)
-    found, wanted = pairs(kind, table, denoiser(slope, offset))
+    found, wanted = program(kind)(table, (slope, offset), linear(table))
     np.testing.assert_allclose(found, wanted, atol=2e-5)
     # One that is off at every step has: it is exactly so much off the chain's end.
-    found, wanted = pairs(kind, table, denoiser(slope, offset + 0.1))
+    found, wanted = program(kind)(table, (slope, offset + 0.1), linear(table))
     off = np.abs(np.asarray(found - wanted)).max(axis=(1, 2))
     if kind == "chain":
         np.testing.assert_allclose(off, 0.1, atol=2e-5)
@@ -116,11 +125,11 @@ def test_consistency_visits_each_step_once_and_anew():
     table = schedule.cosine_schedule(T)
     steps = denoiser(np.zeros(T + 1), np.arange(T + 1))  # predicts t
     make = functools.partial(
-        distillation.consistency_pairs, table=table, student=steps, number=T
+        distillation.consistency_pairs, table=table, student=steps, teacher=steps
     )
-    found, _ = make(jax.random.key(0), data(), teacher=steps)
+    found, _ = make(jax.random.key(0), data(), number=T)
     assert sorted(np.asarray(found)[:, 0, 0].tolist()) == list(range(1, T + 1))
-    one = functools.partial(make, teacher=steps, number=1)
+    one = jax.jit(functools.partial(make, number=1))
     drawn = {float(one(jax.random.key(i), data())[0][0, 0, 0]) for i in range(40)}
     assert drawn == set(range(1, T + 1))
 
@@ -131,7 +140,8 @@ def test_targets_are_constants_of_the_gradient(kind):
     table = schedule.cosine_schedule(T)
 
     def off(c):
-        found, wanted = pairs(kind, table, lambda key, x_t, t: c * x_t)
+        student, teacher = lambda key, x_t, t: c * x_t, denoiser(*linear(table))
+        found, wanted = make_pairs(kind, table, student, teacher)
         return jnp.sum((found - wanted) ** 2) / 2, (found, wanted)
 
     (_, (found, wanted)), slope = jax.value_and_grad(off, has_aux=True)(2.0)

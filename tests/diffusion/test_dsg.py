@@ -239,24 +239,6 @@ def test_end_two_is_what_the_formulas_say():
     np.testing.assert_allclose(run(key, start), expected, atol=2e-5)
 
 
-def test_vmap_over_characters_is_a_loop():
-    """The radius and the gradient are those of one sample, not of the batch."""
-    goals, x = random(1, (4, *SHAPE)), random(2, (4, *SHAPE))
-    # One character has nothing to guide.
-    active = jnp.array([1.0, 1.0, 0.0, 1.0])
-    keys = jax.random.split(jax.random.key(0), 4)
-
-    @jax.jit
-    def run(key, x, goal, active):
-        step = dsg(lambda x_0: active * jnp.sum(jnp.square(x_0 - goal)))
-        return chain.reverse_chain(step, key, x, start=3)
-
-    found = jax.vmap(run)(clone(keys), x, goals, active)
-    for i in range(4):
-        one = run(clone(keys[i]), x[i], goals[i], active[i])
-        np.testing.assert_allclose(found[i], one, atol=2e-6)
-
-
 def test_a_stochastic_network_is_called_once_and_keeps_its_key():
     calls = []
 
@@ -283,13 +265,6 @@ def test_rate_and_last_sigma_may_be_traced_and_compile_once():
         expected = chain.reverse_chain(step, jax.random.key(1), random(0), start=2)
         found = run(jax.random.key(1), jnp.array(rate), jnp.array(last_sigma))
         np.testing.assert_allclose(found, expected, atol=2e-6)
-
-
-def test_half_precision_network_in_a_float32_chain():
-    half = lambda key, x_t, t: network(key, x_t.astype(jnp.bfloat16), t)  # noqa: E731
-    step = dsg(lambda x_0: jnp.sum(jnp.square(x_0)), half)
-    x = chain.reverse_chain(step, jax.random.key(0), random(0), start=2)
-    assert x.dtype == jnp.float32
 
 
 MEAN, VARIANCE = 1.5, 0.3

@@ -80,24 +80,6 @@ def test_guided_chain_jits_with_a_traced_scale():
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-def test_vmap_over_characters_is_a_loop():
-    conds = {"past": random(4, (6, 3)), "label": jnp.array([0, 1, 2, 0, 1, 2])}
-    scales = jnp.linspace(0.5, 2.0, 6)
-    keys, x = jax.random.split(jax.random.key(0), 6), random(5, (6, 5, 3))
-
-    def run(key, x, cond, scale):
-        null = cond | {"past": jnp.zeros(3)}
-        return guidance.classifier_free(network, cond, null, scale)(
-            key, x, jnp.array(2)
-        )
-
-    found = jax.vmap(run)(jax.random.clone(keys), x, conds, scales)
-    for i in range(6):
-        cond = jax.tree.map(lambda leaf, i=i: leaf[i], conds)
-        one = run(jax.random.clone(keys[i]), x[i], cond, scales[i])
-        np.testing.assert_allclose(found[i], one, atol=1e-6)
-
-
 def test_python_numbers_are_leaves():
     def plain(key, x_t, t, cond):
         del key, t

@@ -246,41 +246,9 @@ def test_what_is_wrong_is_said_in_one_line(
     assert losses(trained) == before
 
 
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ("", ["train", "evaluate", "rollout", "--data data/lafan1.npz"]),
-        ("train", ["(default: 60.0)", "Windows per update", "Example:"]),
-        ("evaluate", ["seconds", "Meters per second", "epsilon", "Example:"]),
-        ("rollout", ["(default: 20.0)", "Meters per second", "Example:"]),
-    ],
-)
-def test_help_has_defaults_units_and_an_example(help_of, command, words):
-    text = help_of("aamdm", command)
-    for word in words:
-        assert word in text
-
-
 def run(line):
     command = [sys.executable, str(SCRIPT), *line.split()]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-
-
-@pytest.mark.slow
-def test_from_a_shell_train_twice_evaluate_and_roll_out(data, tmp_path):
-    folder = tmp_path / "run"
-    for line in (
-        f"train --data {data} --out {folder} {SETTINGS}",
-        f"train --data {data} --out {folder} {SETTINGS}".replace("aamdm lmm", "frame"),
-        f"evaluate --run {folder} --rollouts 4 --seconds 2 --long-minutes 0 "
-        "--rows aamdm frame",
-        f"rollout --run {folder} --row frame --seconds 1",
-    ):
-        done = run(line)
-        assert done.returncode == 0, done.stderr
-    found = json.loads((folder / "evaluation" / "metrics.json").read_text())["rows"]
-    assert {"aamdm", "frame"} < set(found) and "lmm" not in found
-    assert bvh_text.read_bvh(folder / "rollout" / "rollout.bvh").values.shape[0] == 60
 
 
 @pytest.mark.slow

@@ -73,26 +73,6 @@ def trained(call, data, tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize(
-    "command, words",
-    [
-        ("", ["train", "evaluate", "rollout", "Examples:", "--data data/bandai2.npz"]),
-        ("train", ["(default: 11000)", "in (0, 1)", "55 frames per step", "Example:"]),
-        ("distill", ["(default: 4000)", "55 frames per step", "Example:"]),
-        ("evaluate", ["(default: 60.0)", "seconds", "Meters per second", "Example:"]),
-        ("rollout", ["(default: 20.0)", "seconds", "Meters per second", "Example:"]),
-    ],
-)
-def test_help_has_defaults_units_and_an_example(help_of, command, words):
-    text = help_of("camdm", command)
-    for word in words:
-        assert word in text
-    if command:
-        # Those of the value X are the preset's where they are left out.
-        options = set(re.findall(r" --([a-z-]+)(?! X|[a-z-])", text)) - {"help"}
-        assert text.count("(default:") >= len(options) - text.count("--no-") - 3
-
-
 def how(folder):
     """Settings of the newest checkpoint."""
     return checkpoint.load_config(folder / "motion" / "checkpoints")["training"]

@@ -12,16 +12,6 @@ from tests import samples
 FOLDER = Path(__file__).parents[2] / "experiments"
 
 
-def test_the_help_has_units_and_defaults(help_of):
-    text = help_of("camdm_transitions")
-    for words in (
-        "Seconds after the command",
-        "(default: 20)",
-        "(default: 4.0)",
-    ):
-        assert words in text
-
-
 @pytest.mark.parametrize(
     ("line", "message"),
     [

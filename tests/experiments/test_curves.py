@@ -77,18 +77,27 @@ def test_a_metric_stands_over_the_time_of_its_rows_stages(load, tmp_path):
     assert list(panel.lines) == ["gan"] and not panel.references
 
 
-def test_lines_join_runs_of_one_seed_only(load, tmp_path):
+def test_lines_join_runs_of_one_seed_and_data_only(load, tmp_path):
     curves = load("curves")
     runs = {}
-    for name, seed, count in (("a", 0, 1), ("b", 0, 2), ("c", 1, 1)):
-        about = dict(rates=RATES * count, seeds={"training": [seed]})
-        runs[put(tmp_path / name, ("gan",), {"real": 0.5, "gan": 4.0}, **about)] = name
-    args = curves.Config(run=tuple(runs))
-    found = {name: curves.read_run(x, ()) for x, name in runs.items()}
-    (panel,) = curves.metric_panels(args, found, runs)
-    sizes = {label: len(x) for label, (x, _) in panel.lines.items()}
-    assert sizes == {"gan, seed 0": 2, "gan, seed 1": 1}
-    assert list(panel.references) == ["real"]
+    for name, seed, count, data in (
+        ("a", 0, 1, "x"), ("b", 0, 2, "x"), ("c", 1, 1, "x"), ("d", 1, 2, "y"),
+    ):  # fmt: skip
+        about = dict(seeds={"training": [seed]}, data={"train.npz": data})
+        rows = {"real": 0.5, "gan": 4.0}
+        folder = put(tmp_path / name, ("gan",), rows, rates=RATES * count, **about)
+        runs[folder] = name
+
+    def sizes(names):
+        chosen = {folder: name for folder, name in runs.items() if name in names}
+        found = {name: curves.read_run(x, ()) for x, name in chosen.items()}
+        args = curves.Config(run=tuple(chosen))
+        (panel,) = curves.metric_panels(args, found, chosen)
+        assert list(panel.references) == ["real"]
+        return {label: len(x) for label, (x, _) in panel.lines.items()}
+
+    assert sizes("abc") == {"gan, seed 0": 2, "gan, seed 1": 1}
+    assert sizes("cd") == {"gan, data of c": 1, "gan, data of d": 1}
 
 
 def test_a_picture_and_the_losses_in_words(call, tmp_path, capsys):

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import json
 import string
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,8 +16,6 @@ from jaxmotion.learning import runs
 from jaxmotion.systems.emdm import published as emdm_published
 from jaxmotion.systems.emdm import training as emdm_training
 
-ROOT = Path(__file__).parents[2]
-SCRIPT = ROOT / "experiments" / "emdm.py"
 SIZES = (
     "--steps 10 --ddpm-steps 10 --batch 8 --width 16 --hidden 16 --depth 1 "
     "--discriminator-width 64 --merge"
@@ -235,12 +232,6 @@ def test_bad_input_is_one_clear_error(call, line, actions, texts, data, tmp_path
     ):
         call("", *words)
     assert list(tmp_path.iterdir()) == []  # not even the folder of a typing error
-
-
-@pytest.mark.parametrize("command", ["train", "evaluate", "sample"])
-def test_help_says_what_every_option_does(help_of, command):
-    text = help_of("emdm", command)
-    assert "Example:" in text and "--seed" in text
 
 
 @pytest.fixture(scope="module")

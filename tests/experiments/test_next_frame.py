@@ -56,9 +56,3 @@ def test_examples_lie_within_clips(load, given):
     for back in range(1, given):
         part = state[:, 2 * back : 2 * back + 2] * size
         np.testing.assert_allclose(part, frames[now - back + 1] - frames[now - back])
-
-
-def test_the_help_names_every_option(help_of):
-    text = help_of("next_frame")
-    for option in ("--run", "--space", "--given", "--smooth", "--diffusion-steps"):
-        assert option in text

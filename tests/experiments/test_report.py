@@ -5,7 +5,6 @@ import functools
 import json
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ from PIL import Image
 
 from jaxmotion.systems import registry
 from jaxmotion.systems.camdm import release as camdm_release
-
-SCRIPT = Path(__file__).parents[2] / "experiments" / "report.py"
 
 
 @pytest.fixture(scope="module")
@@ -574,9 +571,3 @@ def test_a_damaged_file_is_named_with_its_field(call, runs, tmp_path, text):
         call(f"--runs {runs} --out {tmp_path}/out")
     assert str(path) in str(error.value) and "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()
-
-
-def test_the_help_names_every_option(help_of):
-    text = help_of("report")
-    for option in ("--runs", "--out", "--seeds", "--elsewhere"):
-        assert option in text

@@ -579,20 +579,6 @@ def script(monkeypatch):
     gc.unfreeze()
 
 
-def test_help_has_defaults_the_protocol_and_an_example(help_of):
-    text = help_of("serve")
-    for word in (
-        "(default: 127.0.0.1)",
-        "(default: 8)",
-        "no authentication",
-        "--run runs/smgdiff",
-        "(default: locomotion)",
-        '{"velocity": [0.0, 1.2], "facing": [0.0, 1.0], "label": "elderly"}',
-        '{"error": "busy"}',
-    ):
-        assert word in text, word
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_close_it(script, monkeypatch, capsys, number):
     seen = []

@@ -164,9 +164,3 @@ def test_a_job_has_the_commands_of_its_run_with_its_seed(load, tmp_path):
     assert len(set(job.commands)) == len(job.commands)
     assert {x.parents[2] for x in job.files} == {folder} and not job.done
     assert dataclasses.replace(job, files=()).done
-
-
-def test_the_help_names_every_option(help_of):
-    text = help_of("train_queue")
-    for option in ("--runs", "--only", "--least", "--most", "--cores", "--minutes"):
-        assert option in text

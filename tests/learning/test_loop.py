@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -285,56 +286,44 @@ def test_checking_a_folder_does_not_make_it(tmp_path):
 FILLED = """
 import resource, sys
 from pathlib import Path
-import jax, jax.numpy as jnp, optax
-from jaxmotion.learning import training
-from jaxmotion.learning.loop import Loop, train
+from tests.learning import test_loop
 from jaxmotion import cli
 def main():
-    def run(state, key, data, count):
+    run, state, key, data = test_loop.small_parts()
+    def fill(state, *rest):
         if int(state.step) == 2:
-            {fill}
-        return state, {{"loss": jnp.ones(2)}}
-    params = {{"w": jax.random.normal(jax.random.key(0), (200, 200))}}
-    state = training.init_train_state(params, optax.sgd(0.1))
-    folder = Path(sys.argv[1])
-    def counted(state, *rest):
-        state, info = run(state, *rest)
-        object.__setattr__(state, "step", state.step + rest[-1])
-        return state, info
-    settings = Loop(num_steps=6, chunk=2, save_every=2, folder=folder, config={{}})
-    train(counted, state, None, None, loop=settings)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
+        return run(state, *rest)
+    loop = test_loop.loop_of(Path(sys.argv[1]), 6)
+    test_loop.train(fill, state, key, data, loop=loop)
 cli.start(main)
 """
 
 
-def full_disk(folder, fill, *before):
-    """A training whose disk is full after its first checkpoint; its last line."""
-    done = subprocess.run(
-        [*before, sys.executable, "-c", FILLED.format(fill=fill), str(folder)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 1, done.stderr
-    line = done.stderr.strip().splitlines()[-1]
-    assert line.startswith(f"error: {folder / 'checkpoints'}: cannot write step 4: ")
-    assert line.endswith("last good checkpoint: step 2")
-    return done.stderr
-
-
 def test_a_disk_that_takes_no_more_ends_in_one_line_and_keeps_the_checkpoint(tmp_path):
     """A limit on the size of files needs no rights to set."""
-    full_disk(tmp_path, "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))")
-    assert checkpoint.latest_step(tmp_path / "checkpoints") == 2
+    command = [sys.executable, "-c", FILLED, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    line = done.stderr.strip().splitlines()[-1]
+    folder = tmp_path / "checkpoints"
+    assert line.startswith(f"error: {folder}: cannot write step 4: ")
+    assert line.endswith("last good checkpoint: step 2")
+    assert checkpoint.latest_step(folder) == 2
 
 
-def test_a_full_disk_is_noticed_before_a_checkpoint_is_begun(tmp_path):
-    fill = (
-        "import shutil; shutil.disk_usage = lambda _: shutil._ntuple_diskusage(9,9,9)"
-    )
-    text = full_disk(tmp_path, fill)
-    assert "disk full: step 4 needs 0.3 MB, 0.0 MB are free" in text
-    assert "Traceback" not in text
+def test_a_full_disk_is_noticed_before_a_checkpoint_is_begun(tmp_path, monkeypatch):
+    run, state, key, data = small_parts()
+
+    def fill(state, *rest):
+        if int(state.step) == 2:
+            full = shutil._ntuple_diskusage(9, 9, 9)
+            monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
+        return run(state, *rest)
+
+    message = "disk full: step 4 needs 0.0 MB, 0.0 MB are free.*checkpoint: step 2$"
+    with pytest.raises(OSError, match=message):
+        train(fill, state, key, data, loop=loop_of(tmp_path, 6))
     assert checkpoint.latest_step(tmp_path / "checkpoints") == 2
 
 

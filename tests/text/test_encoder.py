@@ -138,19 +138,6 @@ def test_only_what_the_cache_lacks_is_encoded(cached):
     assert os.listdir(cached.parent) == ["texts.npz"]
 
 
-def test_an_interrupted_write_leaves_the_old_cache(cached, monkeypatch):
-    before = cached.read_bytes()
-
-    def stop(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "fsync", stop)
-    with pytest.raises(KeyboardInterrupt):
-        encoder.encode_unique(Counting().encoder, TEXTS, cache=cached)
-    assert cached.read_bytes() == before
-    assert os.listdir(cached.parent) == ["texts.npz"]
-
-
 def test_damaged_and_foreign_caches_are_named(cached):
     def read():
         encoder.encode_unique(Counting().encoder, TEXTS, cache=cached)

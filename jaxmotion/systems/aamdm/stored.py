@@ -91,10 +91,7 @@ def load(path: Path) -> tuple[Model, Params]:
     """
     params, value = checkpoint.import_params(path)
     where = str(path)
-    if value.get("system") != SYSTEM:
-        raise ValueError(
-            f"{where}: field 'system' is {value.get('system')!r}, expected {SYSTEM!r}"
-        )
+    model_json.check_system(value, SYSTEM, where=where)
     parts = {
         "config": lambda x: model_json.config_from_json(aamdm_model.Config, x),
         "embedding": lambda x: model_json.config_from_json(aamdm_embedding.Config, x),

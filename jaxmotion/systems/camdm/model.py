@@ -190,9 +190,7 @@ def network(config: Config) -> Network:
         "mlp": camdm_network.CamdmMlp,
         "single_token": camdm_network.SingleTokenTransformer,
     }[config.network]
-    names = {field.name for field in dataclasses.fields(kind)} - {"parent", "name"}
-    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
-    return kind(features=config.num_features, **sizes)
+    return blocks.sized(kind, config, features=config.num_features)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -374,18 +372,14 @@ def to_json(model: Model) -> dict[str, Any]:
 
 
 def _starts_from_json(value: Any, config: Config, where: str) -> Motion | None:
-    if value is None:
-        return None
-    frames = {"root_position": (3,), "joint_rotation": (config.num_joints, 6)}
-    try:
-        found = model_json.arrays_from_json(
-            value,
-            lead=(config.num_labels,),
-            shapes={name: (config.past, *shape) for name, shape in frames.items()},
-        )
-    except ValueError as error:
-        raise ValueError(f"{where}: field 'starts' {error}") from None
-    return Motion(**found, fps=config.fps)
+    found = model_json.starts_from_json(
+        value,
+        labels=config.num_labels,
+        past=config.past,
+        frames={"root_position": (3,), "joint_rotation": (config.num_joints, 6)},
+        where=where,
+    )
+    return None if found is None else Motion(**found, fps=config.fps)
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
@@ -394,10 +388,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
     Raises:
       ValueError: names the file and the field that is missing or wrong.
     """
-    if value.get("system") != SYSTEM:
-        raise ValueError(
-            f"{where}: field 'system' is {value.get('system')!r}, expected {SYSTEM!r}"
-        )
+    model_json.check_system(value, SYSTEM, where=where)
     parts = {
         "config": lambda x: model_json.config_from_json(Config, x),
         "skeleton": model_json.skeleton_from_json,

@@ -198,9 +198,7 @@ def make_condition(
 
 def generator(config: Config) -> emdm_network.SequenceGenerator:
     """The generator's Flax module."""
-    kind = emdm_network.SequenceGenerator
-    names = {field.name for field in dataclasses.fields(kind)} - {"parent", "name"}
-    return kind(**{k: v for k, v in dataclasses.asdict(config).items() if k in names})
+    return blocks.sized(emdm_network.SequenceGenerator, config)
 
 
 def discriminator(config: Config) -> emdm_network.SequenceDiscriminator:

@@ -71,11 +71,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
     Raises:
       ValueError: names the file and the field that is missing or wrong.
     """
-    if value.get("system") != emdm_training.SYSTEM:
-        raise ValueError(
-            f"{where}: field 'system' is {value.get('system')!r}, expected "
-            f"{emdm_training.SYSTEM!r}"
-        )
+    model_json.check_system(value, emdm_training.SYSTEM, where=where)
     parts = {
         "config": lambda x: model_json.config_from_json(emdm_model.Config, x),
         "representation": _representation,

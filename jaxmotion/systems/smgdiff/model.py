@@ -25,7 +25,7 @@ from jaxmotion.motion import rotation
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.motion.trajectory import Trajectory
-from jaxmotion.networks import transformer
+from jaxmotion.networks import blocks, transformer
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.scene import Representation, feature_layout
 from jaxmotion.typing import Key, Params
@@ -131,9 +131,8 @@ class Condition:
 
 def network(config: Config) -> transformer.CamdmTransformer:
     """The denoiser's Flax module: CAMDM's, with methods `encode` and `denoise`."""
-    names = {field.name for field in dataclasses.fields(transformer.CamdmTransformer)}
-    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
-    return transformer.CamdmTransformer(features=config.num_features, **sizes)
+    kind = transformer.CamdmTransformer
+    return blocks.sized(kind, config, features=config.num_features)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -214,23 +213,21 @@ def to_json(model: Model) -> dict[str, Any]:
 
 
 def _starts_from_json(value: Any, model: Model, where: str) -> Scene | None:
-    if value is None:
+    features = model.representation
+    found = model_json.starts_from_json(
+        value,
+        labels=len(model.labels),
+        past=model.config.past,
+        frames={
+            "root_position": (3,),
+            "joint_rotation": (features.skeleton.num_joints, 6),
+            "ball": (3,),
+            "touch": (len(features.joints),),
+        },
+        where=where,
+    )
+    if found is None:
         return None
-    features, past = model.representation, model.config.past
-    frames = {
-        "root_position": (3,),
-        "joint_rotation": (features.skeleton.num_joints, 6),
-        "ball": (3,),
-        "touch": (len(features.joints),),
-    }
-    try:
-        found = model_json.arrays_from_json(
-            value,
-            lead=(len(model.labels),),
-            shapes={name: (past, *shape) for name, shape in frames.items()},
-        )
-    except ValueError as error:
-        raise ValueError(f"{where}: field 'starts' {error}") from None
     ball, touch = found.pop("ball"), found.pop("touch")
     return Scene(motion=Motion(**found, fps=model.config.fps), ball=ball, touch=touch)
 
@@ -264,10 +261,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
     Raises:
       ValueError: names the file and the field that is missing or wrong.
     """
-    if value.get("system") != SYSTEM:
-        raise ValueError(
-            f"{where}: field 'system' is {value.get('system')!r}, expected {SYSTEM!r}"
-        )
+    model_json.check_system(value, SYSTEM, where=where)
     parts = {
         "config": lambda x: model_json.config_from_json(Config, x),
         "paths": lambda x: model_json.config_from_json(smgdiff_trajectory.Config, x),

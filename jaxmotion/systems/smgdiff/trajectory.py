@@ -81,9 +81,7 @@ SamplePath = Callable[[Key, Wish], trajectory.Trajectory]
 
 def network(config: Config) -> TrajectoryGenerator:
     """The denoiser's Flax module."""
-    names = {field.name for field in dataclasses.fields(TrajectoryGenerator)}
-    sizes = {k: v for k, v in dataclasses.asdict(config).items() if k in names}
-    return TrajectoryGenerator(**sizes)
+    return blocks.sized(TrajectoryGenerator, config)
 
 
 @functools.partial(jax.jit, static_argnames="config")

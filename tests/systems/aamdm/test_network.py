@@ -57,14 +57,3 @@ def test_default_sizes_are_those_of_learned_motion_matching(net, size, layers):
     shapes = jax.eval_shape(net.init, jax.random.key(0), jnp.zeros(size))["params"]
     found = [shapes[f"Dense_{i}"]["kernel"].shape for i in range(len(shapes))]
     assert found == list(zip(layers[:-1], layers[1:], strict=True))
-
-
-@pytest.mark.parametrize(("net", "size"), [(ENCODER, 7), (DECODER, 5)])
-def test_a_batch_is_its_samples(net, size):
-    x = vectors(size, 2, 3)
-    params = tiny.random_params(net.init, x)
-    together = net.apply(params, x)
-    assert together.shape == (2, 3, 3 if net is ENCODER else 7)
-    for i in np.ndindex(2, 3):
-        alone = net.apply(params, x[i])
-        np.testing.assert_allclose(together[i], alone, rtol=1e-5, atol=1e-6)
