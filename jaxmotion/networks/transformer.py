@@ -102,17 +102,22 @@ class CamdmTransformer(nn.Module):
 
     Attributes:
       dropout: Rate, after the positions and in every layer.
-      frames_per_token: Frames of one token; 1 in the paper.
-      token_margin: Frames beyond its own, on either side, that a token predicts and
-        shares with its neighbors (ours; 0 in the paper).
-      token_window: How shared frames are cross-faded; see `blocks.unfold_weights`.
-      norm: "post" in the paper; "pre" (ours) has one more norm before the output.
-      attention: "full" in the paper; "prefix" (ours): condition tokens do not see the
-        step and the noisy frames.
+      frames_per_token: Frames of one token (ours; 1 in the paper).
+      token_margin: Frames beyond its own, on either side, that an output token predicts
+        and shares with its neighbors (ours; 0 in the paper).
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid";
+        see `blocks.unfold_weights`.
+      norm: Layer norms after each sum ("post", the paper's) or before each branch
+        ("pre", ours: learns the legs' phase in a tenth of the steps), with one more
+        norm before the output.
+      attention: "full" (the paper's), or "prefix" (ours): condition tokens attend among
+        themselves only, see neither the step nor the noisy frames, and are computed
+        once per plan.
       frame_kernel: Frames of a convolution over time that is added to the predicted
-        frames, and starts as zero (ours; odd, 0 for none).
+        frames, and starts as zero (ours; odd, 0 for none in the paper).
       seam_half_life: Half-life, frames, of the offset that makes a prediction go on
-        from the last past pose, as far as it is kept (ours; 0 for no such offset).
+        from the last past pose, as far as it is kept (ours; 0 for no such offset in the
+        paper).
       seam_features: Leading channels that it moves; 0 for all.
     """
 

@@ -49,20 +49,10 @@ class Config:
       network: "transformer", or the ablation's "mlp" or "single_token".
       width: Channels of a token (released code; the paper does not say).
       depth: Layers (released code 4; the ablation's MLP 8).
-      frames_per_token: Frames of one token; ours, 1 in the paper.
-      token_margin: Frames beyond its own, on either side, that an output token predicts
-        and shares with its neighbors; ours, 0 in the paper.
-      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
-      norm: Layer norms of the transformer after each sum ("post", the paper's) or
-        before each branch ("pre", ours: learns the legs' phase in a tenth of the
-        steps).
-      attention: "full" (the paper's), or "prefix": condition tokens attend among
-        themselves only, and are computed once per plan (ours).
-      frame_kernel: Frames of a convolution over time that corrects the output, and
-        starts as zero; odd, ours, 0 for none in the paper.
-      seam_half_life: Half-life, frames, of the offset that makes every prediction go on
-        from the last past pose; ours, 0 in the paper. With it the losses of
-        displacements, accelerations and feet reach over the seam.
+      frames_per_token, token_margin, token_window, norm, attention, frame_kernel: Of
+        the `CamdmTransformer`; the paper's by default.
+      seam_half_life: The same; with it the losses of displacements, accelerations and
+        feet reach over the seam.
       noise_levels: Noise levels of one window in training; ours, 1 in the paper.
       own_levels: Probability that the lower half of a window's noise levels is noise on
         predictions from the upper half, as in sampling, instead of noise on the

@@ -47,12 +47,8 @@ class Config:
       latent: Channels of z; 0 for a deterministic denoiser, that is a diffusion model.
       width: Channels of a token of the generator.
       depth: Its encoder layers.
-      frames_per_token: Frames of one token; ours, 1 in the paper.
-      token_margin: Frames beyond its own, on either side, that an output token predicts
-        and shares with its neighbors; ours, 0 in the paper.
-      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
-      norm: Layer norms after each sum ("post", the paper's) or before each branch
-        ("pre", ours: learns faster in short runs).
+      frames_per_token, token_margin, token_window, norm: Of the `SequenceGenerator`;
+        the paper's by default.
       mask_frames: What of the zeros that follow a motion's end is seen. True (ours):
         nothing; every frame of a batch counts the same in the losses. False, as
         released: attention and the discriminator see them, the losses do not; every

@@ -58,8 +58,11 @@ class SequenceGenerator(nn.Module):
       frames_per_token: Frames of one token; 1 in the paper. Divides `frames`.
       token_margin: Frames beyond its own, on either side, that a token predicts and
         shares with its neighbors (ours; 0 in the paper).
-      token_window: How shared frames are cross-faded; see `blocks.unfold_weights`.
-      norm: "post" in the paper; "pre" (ours) has one more norm before the output.
+      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid";
+        see `blocks.unfold_weights`.
+      norm: Layer norms after each sum ("post", the paper's) or before each branch
+        ("pre", ours: learns faster in short runs), with one more norm before the
+        output.
     """
 
     features: int

@@ -42,18 +42,10 @@ class Config:
       future: Frames of a sample.
       num_steps: T of the cosine schedule.
       width: Channels of a token (CAMDM's).
-      frames_per_token: Frames of one token; ours, 1 in CAMDM.
-      token_margin: Frames beyond its own, on either side, that an output token predicts
-        and shares with its neighbors; ours, 0 in the paper.
-      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
-      norm: Layer norms after each sum ("post") or before each branch ("pre", ours).
-      attention: "full" (the paper's), or "prefix": condition tokens attend among
-        themselves only, and are computed once per plan (ours).
-      frame_kernel: Frames of a convolution over time that corrects the output, and
-        starts as zero; odd, ours, 0 for none in the paper.
-      seam_half_life: Half-life, frames, of the offset that makes every prediction of
-        root and rotations go on from the last past pose; ours, 0 in the paper. With it
-        the losses of displacements and feet reach over the seam.
+      frames_per_token, token_margin, token_window, norm, attention, frame_kernel: Of
+        the `CamdmTransformer`; the paper's by default.
+      seam_half_life: The same, of root and rotations; with it the losses of
+        displacements and feet reach over the seam.
       seam_features: Channels of root and rotations, which come first; 0 without.
       noise_levels: Noise levels of one window in training; ours, 1 in the paper.
       own_levels: As in `camdm.Config`; ours, 0 in the paper.

@@ -21,8 +21,7 @@ class TrajectoryGenerator(nn.Module):
     """The denoiser of paths: (x, z) and facing (x, z) of each frame.
 
     Attributes:
-      token_margin: As in `transformer.CamdmTransformer`.
-      token_window: The same.
+      token_margin, token_window: As in `transformer.CamdmTransformer`.
     """
 
     past: int

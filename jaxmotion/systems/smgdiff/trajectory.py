@@ -37,9 +37,7 @@ class Config:
       past: Displayed frames that are seen.
       future: Frames of a path.
       num_steps: T (paper 1).
-      token_margin: Frames beyond its own, on either side, that an output token predicts
-        and shares with its neighbors; ours, 0 in the paper.
-      token_window: How shared frames are cross-faded: "hann" (sin^2) or "trapezoid".
+      token_margin, token_window: As in `transformer.CamdmTransformer`.
       meters: Unit of the network's positions.
       weight_velocity: Weight of the displacements, beside the data's 1.
     """
