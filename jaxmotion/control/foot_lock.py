@@ -9,11 +9,12 @@ bends the leg to reach it.
    a contact does not flicker.
 2. **Lock.** A contact that begins locks the toe at the point of the ground where it is
    displayed. The lock ends with the contact, or when the animated toe is farther than
-   `radius` from the point; during one contact it begins again where the toe has caught
-   up. Into and out of the lock, the offset between what was
-   displayed and what is wanted now decays as a critically damped spring: no jump. Only
-   the two horizontal coordinates are locked: the height stays the model's, since a
-   toe that is held down while it lifts would be dragged over the ground.
+   `radius` from the point, or when locks would cross the legs of who turns on the spot;
+   during one contact it begins again where the toe has caught up. Into and out of the
+   lock, the offset between what was displayed and what is wanted now decays as a
+   critically damped spring: no jump. Only the two horizontal coordinates are locked:
+   the height stays the model's, since a toe that is held down while it lifts would be
+   dragged over the ground.
 3. **Body.** While all feet are locked the body follows them: a character that is told
    to stand and whose plans creep away stays over its feet. The body moves back to its
    plan when a foot lifts; it strays from it by `body_reach` at most.
@@ -28,10 +29,10 @@ bends the leg to reach it.
    about already, so it never flips. As d approaches a + b, it does so exponentially
    (`softness`): a leg that is pulled too far does not snap straight. The foot keeps its
    orientation, but for what the leg cannot reach and a heel that would sink.
-5. **Swing.** A toe without contact that moves is off the ground: from `end_speed` to
-   1.5 times that, its least height rises by `clearance`. Networks that turn a body
-   at once let the swinging toe graze the ground at 2 m/s, where people lift it by 3 cm
-   and more.
+5. **Swing.** A toe that moves is off the ground: from `end_speed` to 1.5 times that,
+   its least height rises by `clearance`, be it animated so or on its way out of a lock.
+   Networks that turn a body at once let the swinging toe graze the ground at 2 m/s,
+   where people lift it by 3 cm and more.
 
 A frame that needs no correction comes back as it was. A controller that can be told
 what was displayed (`Controller.shown`) plans on from there: the next plan begins with
@@ -76,6 +77,8 @@ class FootLock:
       clearance: Height above `toe_height` that a swinging toe keeps, meters.
       radius: Distance of the animated toe from the locked point that ends a lock,
         meters.
+      crossing: Distance aside of the first toe from the second one, from hip to hip,
+        below which a lock that brings it there ends, meters.
       caught_up: Distance from the animated toe within which a toe that lost its lock
         during a contact is locked anew, meters.
       half_life: Half-life of the offset into and out of a lock, seconds.
@@ -93,6 +96,7 @@ class FootLock:
     end_height: float = 0.10
     clearance: float = 0.02
     radius: float = 0.2
+    crossing: float = 0.03
     caught_up: float = 0.01
     half_life: float = 0.05
     body_half_life: float = 0.2
@@ -185,23 +189,35 @@ def contacts(
 
 
 def least_heights(
-    speed: Float[Array, "*frames feet"],
-    contact: Bool[Array, "*frames feet"],
-    *,
-    lock: FootLock,
+    speed: Float[Array, "*frames feet"], *, lock: FootLock
 ) -> Float[Array, "*frames feet"]:
     """Heights below which toes are not displayed: part 5 of the module's text."""
     fast = jnp.clip(2.0 * (speed / lock.end_speed - 1.0), 0.0, 1.0)
-    return lock.toe_height + lock.clearance * jnp.where(contact, 0.0, fast)
+    return lock.toe_height + lock.clearance * fast
+
+
+def _would_cross(
+    toes: Array, wanted: Array, side: Float[Array, "3"], *, lock: FootLock
+) -> Bool[Array, ""]:
+    """Whether locks, but not the model, bring the first toe across the second one."""
+    gap, own = (jnp.sum((x[0] - x[1]) * side) for x in (wanted, toes))
+    return (gap < lock.crossing) & (own - gap > 0.05)
 
 
 def step_lock(
-    state: LockState, toes: Float[Array, "feet 3"], *, fps: float, lock: FootLock
+    state: LockState,
+    toes: Float[Array, "feet 3"],
+    *,
+    fps: float,
+    lock: FootLock,
+    side: Float[Array, "3"] | None = None,
 ) -> LockState:
-    """Where the toes are to be displayed: parts 1 and 2 of the module's text.
+    """Where the toes are to be displayed: parts 1, 2 and 5 of the module's text.
 
     From the state after the last frame and the animated toes of this one (world) comes
-    the state of this frame; its `shown` is where the toes belong.
+    the state of this frame; its `shown` is where the toes belong. `side` is the
+    horizontal direction from the second foot's hip to the first one's, if there are
+    two; without it locks may cross the legs.
     """
     dt = 1.0 / fps
     velocity = jnp.where(state.started, (toes - state.animated) * fps, 0.0)
@@ -230,6 +246,13 @@ def step_lock(
     point = jnp.where(begins[:, None], here, state.point)
     away = jnp.sqrt(jnp.sum((point - toes) ** 2 * level, axis=-1) + 1e-12)
     locked = (state.locked | begins) & contact & (away < lock.radius)
+    if side is not None:
+        kept = jnp.where(locked[:, None], point, toes)
+        crosses = _would_cross(toes, kept, side, lock=lock)
+        away = jnp.where(locked, away, -1.0)
+        # The one that is farther from where the model has it.
+        goes = (away >= jnp.max(away)) & crosses
+        locked = locked & ~goes
     wanted = jnp.where(locked[:, None], point, toes)
     wanted_velocity = jnp.where(locked[:, None], 0.0, velocity)
 
@@ -239,11 +262,15 @@ def step_lock(
     offset_velocity = jnp.where(
         changed, moving + offset_velocity - wanted_velocity, offset_velocity
     )
-    lifted = toes.at[:, 1].max(least_heights(speed, contact, lock=lock))
+    shown = jnp.where(level > 0, wanted + offset, toes)
+    swings = jnp.where(contact, 0.0, speed)
+    moved = jnp.sqrt(jnp.sum((shown - state.shown) ** 2 * level, axis=-1) + 1e-12)
+    steps = jnp.where(state.started & ~locked, moved * fps, 0.0)
+    least = least_heights(jnp.maximum(swings, steps), lock=lock)
     return dataclasses.replace(
         state,
         animated=toes,
-        shown=jnp.where(level > 0, wanted + offset, lifted),
+        shown=shown.at[:, 1].max(least),
         contact=contact,
         locked=locked,
         point=point,
@@ -424,7 +451,12 @@ def lock_frame(
     root_position = root_position.at[::2].add(state.body)
     pose = global_transforms(skeleton, root_position, joint_rotation)
     toes = pose[0][jnp.array(skeleton.feet)]
-    state = step_lock(state, toes, fps=fps, lock=lock)
+    hips = [pose[0][chain[0]] for chain in legs(skeleton)]
+    side = None
+    if len(hips) == 2:
+        level = (hips[0] - hips[1]) * jnp.array([1.0, 0.0, 1.0])
+        side = safe_normalize(level, jnp.array([1.0, 0.0, 0.0]))
+    state = step_lock(state, toes, fps=fps, lock=lock, side=side)
     shown = _place(skeleton, *pose, joint_rotation, state.shown, lock=lock)
     return state, root_position, shown
 
@@ -493,7 +525,8 @@ def clean_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motio
     toes = pose[0][:, jnp.array(skeleton.feet)]
     planted = _planted(toes, fps=motion.fps, lock=lock)
     steps = jnp.diff(toes, axis=0) * motion.fps
-    least = least_heights(jnp.sqrt(jnp.sum(steps**2, -1) + 1e-12), planted, lock=lock)
+    speed = jnp.sqrt(jnp.sum(steps**2, axis=-1) + 1e-12)
+    least = least_heights(jnp.where(planted, 0.0, speed), lock=lock)
     wanted = toes.at[..., ::2].add(toe_offsets(toes, planted))
     wanted = wanted.at[:-1, :, 1].max(least)
     place = jax.vmap(functools.partial(_place, skeleton, lock=lock))

@@ -500,3 +500,32 @@ def test_a_toe_that_swings_is_off_the_ground():
     expected = np.full((15, 2), height)
     expected[5:10, 0] = LOCK.toe_height + LOCK.clearance
     np.testing.assert_allclose(heights, expected, atol=1e-6)
+
+
+def test_locks_do_not_cross_legs():
+    """A body turns by 120 degrees over toes 20 cm apart that creep with it."""
+    angles = np.linspace(0.0, np.deg2rad(120.0), 90)
+    side = np.stack([np.cos(angles), 0 * angles, -np.sin(angles)], axis=1)
+    toes = jnp.asarray(np.stack([0.1 * side, -0.1 * side], axis=1), jnp.float32)
+
+    def run(with_side):
+        def step(state, now):
+            toes, side = now
+            state = foot_lock.step_lock(
+                state, toes, fps=FPS, lock=LOCK, side=side if with_side else None
+            )
+            return state, (state.shown, state.locked)
+
+        start = foot_lock.init_lock(SKELETON)
+        return jax.lax.scan(step, start, (toes, jnp.asarray(side, jnp.float32)))[1]
+
+    gaps, locks = {}, {}
+    for with_side in (False, True):
+        shown, locks[with_side] = map(np.asarray, run(with_side))
+        gaps[with_side] = np.sum((shown[:, 0] - shown[:, 1]) * side, axis=-1)
+    assert gaps[False].min() < -0.05
+    assert gaps[True].min() > -0.03
+    # One foot steps at a time, and stands again.
+    free = ~locks[True][5:]
+    assert 0 < free.any(axis=1).mean() < 0.5
+    assert locks[True][-10:].any()
