@@ -93,6 +93,7 @@ def continuing(
     *_, number, channels = frames.shape
     fade = 0.5 ** (np.arange(1, number + 1) / half_life)
     fades = np.outer(fade, np.arange(channels) < moved).astype(frames.dtype)
+    fades = fades.reshape((1,) * (frames.ndim - 2) + fades.shape)
     # Not an einsum: its outer product has no ONNX form.
     return frames + fades * offset[..., None, :]
 
