@@ -26,6 +26,7 @@ _DDPM = dict(latent=0, schedule="cosine", weight_recon=1.0)
 ROWS: dict[str, dict[str, Any]] = {
     "emdm": {},
     "emdm_5": dict(num_steps=5),
+    "emdm_3": dict(num_steps=3),
     "emdm_2": dict(num_steps=2),
     "emdm_1": dict(num_steps=1),
     "naive": dict(discriminator_condition=False, weight_recon=0.0, **_FLAT),
@@ -39,6 +40,10 @@ ROWS: dict[str, dict[str, Any]] = {
     "no_condition": dict(discriminator_condition=False),
     "no_r1": dict(weight_r1=0.0),
     "no_gan": dict(weight_adversarial=0.0),
+    "no_gan_5": dict(weight_adversarial=0.0, num_steps=5),
+    "no_gan_3": dict(weight_adversarial=0.0, num_steps=3),
+    "no_gan_2": dict(weight_adversarial=0.0, num_steps=2),
+    "no_gan_1": dict(weight_adversarial=0.0, num_steps=1),
 }
 # Ways to sample that need no training of their own: row, steps to visit.
 SAMPLERS: dict[str, tuple[str, int]] = {"ddim_10": ("ddpm_1000", 10)}
