@@ -76,6 +76,8 @@ class Train:
       ddpm_rate: Of rows without a discriminator (Muon).
       discriminator_rate: Of the discriminator (Adam), which falls as the generator's
         does (published: constant, 6 times the generator's).
+      alone: Part of a GAN's updates that its generator makes first, without the
+        discriminator (ours).
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with other settings than before.
     """
@@ -122,6 +124,7 @@ class Train:
     learning_rate: float = 2e-3
     ddpm_rate: float = 2e-3
     discriminator_rate: float = 5e-4
+    alone: float = 0.0
     distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False
@@ -277,7 +280,11 @@ def train(args: Train) -> None:
             constant=args.optimizer == "adam",
         )
         emdm_training.train_row(
-            task, row, generator=budget, discriminator=discriminator
+            task,
+            row,
+            generator=budget,
+            discriminator=discriminator,
+            alone=args.alone,
         )
         print(f"{row}: {time.perf_counter() - begun:.0f} s", flush=True)
 

@@ -69,7 +69,7 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("seeds", "most", "cores"), Range(1, 1000)),
     **dict.fromkeys(("held_out",), _PART),
     **dict.fromkeys(("learning_rate", "ddpm_rate", "discriminator_rate"), _RATE),
-    **dict.fromkeys(("dropout", "ema"), Range(0, 1, (1,))),
+    **dict.fromkeys(("dropout", "ema", "alone"), Range(0, 1, (1,))),
     **dict.fromkeys(("fps", "cut_fps"), _FPS),
     **dict.fromkeys(("seconds", "minutes", "limit", "longest"), _SPAN),
     **dict.fromkeys(("rate", "off_ball", "own_levels"), Range(0, 1)),

@@ -76,6 +76,7 @@ COLUMNS: dict[str, Column] = {
         _evaluated("mm_dist", "MM-Dist"),
         _evaluated("diversity", "diversity of features", "real"),
         _evaluated("multimodality", "multimodality", "higher"),
+        Column(id="deviation", title="deviation of poses", unit="cm", better="real"),
         Column(id="div", title="diversity of poses", better="real"),
         Column(id="pose_variance", title="diversity", unit="m²", better="higher"),
         # Following commands.

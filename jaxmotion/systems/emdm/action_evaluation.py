@@ -154,10 +154,12 @@ def scorer(
 
     Returns:
       `score(key, positions, actions) -> scores`. The actions are in ascending order,
-      each as often as the others.
+      each as often as the others. "deviation": of joints from where they are in the
+      mean motion of an action, root mean square, cm, with the hips above the origin.
     """
     config, skeleton = evaluator_config(run), run.clips.skeleton
     feet = jnp.asarray(skeleton.feet)
+    variance = jax.vmap(diversity.intra_style_variance)
 
     @jax.jit
     def score(
@@ -170,6 +172,8 @@ def scorer(
         by_action = features.reshape(config.num_classes, -1, features.shape[-1])
         fps = run.clips.fps
         toes = positions[..., feet, :]
+        poses = positions.at[..., ::2].add(-positions[..., :1, ::2])
+        poses = poses.reshape(config.num_classes, -1, *poses.shape[1:])
         return {
             "fid": frechet.frechet_distance(frechet.moments(features), reference),
             "accuracy": jnp.mean(jnp.argmax(logits, -1) == actions),
@@ -177,6 +181,7 @@ def scorer(
             "multimodality": diversity.multimodality(
                 key_modes, by_action, num_pairs=20
             ),
+            "deviation": 100 * jnp.sqrt(jnp.mean(variance(poses))),
             "penetration": jnp.mean(plausibility.penetration(positions, ground=ground)),
             "floating": jnp.mean(plausibility.floating(positions, ground=ground)),
             "skate": jnp.mean(plausibility.skating(toes, ground=ground)),
@@ -273,7 +278,9 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
         found = score(key_score, positions_of(x), wanted)
         if not conditional:
             found = {
-                k: found[k] for k in found if k not in ("accuracy", "multimodality")
+                k: found[k]
+                for k in found
+                if k not in ("accuracy", "multimodality", "deviation")
             }
         return found
 

@@ -131,6 +131,7 @@ def gan_update(
     config: Config,
     geometry: emdm_loss.Geometry | None,
     ema: float,
+    alone: int = 0,
 ) -> training.Update:
     """One update of the discriminator, then of the generator; R1 every k-th time.
 
@@ -138,6 +139,7 @@ def gan_update(
       optimizers: The generator's and the discriminator's.
       geometry: See `emdm_loss.generator_loss`.
       ema: Decay of the generator's average.
+      alone: First updates, of the generator without a discriminator (ours).
 
     Returns:
       `update(state, key, batch) -> (state, info)` of a `GanState`.
@@ -156,7 +158,22 @@ def gan_update(
         )
         return both(state, key, batch)
 
-    return update
+    def regress(state: Any, key: Key, batch: emdm_loss.Batch) -> tuple[Any, dict]:
+        loss = functools.partial(
+            emdm_loss.diffusion_loss, config=config, geometry=geometry
+        )
+        one = training.make_update(loss, optimizers[0], ema_decay=ema)
+        generator, info = one(state.generator, key, batch)
+        shapes = jax.eval_shape(update, state, key, batch)[1]
+        unused = {name: jnp.zeros(x.shape, x.dtype) for name, x in shapes.items()}
+        found = {f"generator/{name}": value for name, value in info.items()}
+        state = dataclasses.replace(state, generator=generator)
+        return state, {**unused, **found, "loss": info["loss"]}
+
+    def either(state: Any, key: Key, batch: emdm_loss.Batch) -> tuple[Any, dict]:
+        return jax.lax.cond(state.step < alone, regress, update, state, key, batch)
+
+    return either if alone else update
 
 
 def _stage(row: str) -> str:
@@ -171,11 +188,13 @@ def train_row(
     *,
     generator: Budget,
     discriminator: Budget,
+    alone: float = 0.0,
 ) -> None:
     """Trains a row, from its newest checkpoint if there is one.
 
     Of the discriminator's budget only the optimizer counts: its steps are the
-    generator's.
+    generator's, but for the part of them, `alone`, that the generator learns without
+    it.
 
     Raises:
       ValueError: if the row has a checkpoint of other sizes or data.
@@ -199,7 +218,10 @@ def train_row(
             params["generator"], task.run, stage, loss, sample, task.data, **common
         )
         return
-    optimizers = runs.make_optimizer(generator), runs.make_optimizer(discriminator)
+    first = round(alone * generator.steps)
+    # The discriminator's rate falls over the updates that it makes.
+    with_it = dataclasses.replace(discriminator, steps=generator.steps - first)
+    optimizers = runs.make_optimizer(generator), runs.make_optimizer(with_it)
     names = ("generator", "discriminator")
     players = {
         name: training.init_train_state(params[name], optimizer)
@@ -209,12 +231,19 @@ def train_row(
         task.run,
         stage,
         adversarial.GanState(**players),
-        gan_update(optimizers, config=config, geometry=geometry, ema=generator.ema),
+        gan_update(
+            optimizers,
+            config=config,
+            geometry=geometry,
+            ema=generator.ema,
+            alone=first,
+        ),
         sample,
         task.data,
         settings={
             "discriminator_rate": discriminator.learning_rate,
             "discriminator_constant": discriminator.constant,
+            **({"alone": first} if first else {}),
         },
         show=("loss", "discriminator/loss"),
         **common,
