@@ -5,13 +5,14 @@ import functools
 import json
 import shutil
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxmotion.diffusion import chain
-from jaxmotion.learning import checkpoint, runs, training
+from jaxmotion.learning import adversarial, checkpoint, runs, training
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import training as emdm_training
@@ -116,6 +117,7 @@ def test_rows_are_changes_of_the_base():
     expected = {
         "emdm": {},
         "emdm_5": dict(num_steps=5),
+        "emdm_3": dict(num_steps=3),
         "emdm_2": dict(num_steps=2),
         "emdm_1": dict(num_steps=1),
         "naive": dict(discriminator_condition=False, weight_recon=0.0, **flat),
@@ -126,6 +128,9 @@ def test_rows_are_changes_of_the_base():
         "no_gan": dict(weight_adversarial=0.0),
         "no_condition": dict(discriminator_condition=False),
     }
+    for steps in (1, 2, 3, 5):
+        alone = dict(weight_adversarial=0.0, num_steps=steps)
+        expected[f"no_gan_{steps}"] = alone
     for weight in (0, 1, 10, 100, 1000):
         expected[f"recon_{weight}"] = dict(weight_recon=float(weight), **flat)
     assert set(expected) == {*emdm_training.ROWS, *emdm_training.SAMPLERS}
@@ -291,7 +296,7 @@ def test_a_row_without_weights_of_joints_needs_no_geometry(tmp_path, monkeypatch
     """Its batches may be of features that have no joints."""
     given = []
 
-    def watched(optimizers, *, config, geometry, ema):
+    def watched(optimizers, *, config, geometry, **_):
         given.append((config, geometry))
         raise KeyboardInterrupt
 
@@ -301,6 +306,42 @@ def test_a_row_without_weights_of_joints_needs_no_geometry(tmp_path, monkeypatch
             fit(tmp_path, row)
     assert given[0][1] is None and given[1][1] is GEOMETRY
     assert given[0][0].weight_recon == 10.0
+
+
+def test_a_generator_alone_makes_the_updates_of_a_diffusion_model():
+    """And the discriminator, left as it is meanwhile, those of a GAN after them."""
+    rate = training.make_optimizer("adam", learning_rate=1e-2)
+    params = tiny.random_params(emdm_model.init, CONFIG)
+    start = adversarial.GanState(
+        generator=training.init_train_state(params["generator"], rate),
+        discriminator=training.init_train_state(params["discriminator"], rate),
+    )
+    make = functools.partial(
+        emdm_training.gan_update,
+        (rate, rate),
+        config=CONFIG,
+        geometry=GEOMETRY,
+        ema=0.5,
+    )
+    both, alone = jax.jit(make()), jax.jit(make(alone=2))
+    loss = functools.partial(emdm_loss.diffusion_loss, config=CONFIG, geometry=GEOMETRY)
+    plain = jax.jit(training.make_update(loss, rate, ema_decay=0.5))
+    state, model = start, start.generator
+    for i in range(2):
+        key, drawn = jax.random.key(i), batch(jax.random.key(9 + i), DATA, 4)
+        state, info = alone(state, key, drawn)
+        model, expected = plain(model, jax.random.clone(key), drawn)
+        assert float(info["loss"]) == pytest.approx(float(expected["loss"]), rel=1e-5)
+        assert float(info["discriminator/loss"]) == 0.0
+    chex.assert_trees_all_close(state.generator, model, rtol=1e-5, atol=1e-6)
+    chex.assert_trees_all_equal(state.discriminator, start.discriminator)
+    key, drawn = jax.random.key(5), batch(jax.random.key(6), DATA, 4)
+    chex.assert_trees_all_close(
+        alone(state, key, drawn),
+        both(state, jax.random.clone(key), drawn),
+        rtol=1e-5,
+        atol=1e-6,
+    )
 
 
 # --- sampling ----------------------------------------------------------------------
