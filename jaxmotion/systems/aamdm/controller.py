@@ -24,6 +24,7 @@ import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -314,9 +315,8 @@ def controller(
 def exports(controller: Controller) -> dict[str, Exported]:
     """What can leave Python: "step", a whole tick, since every tick makes a frame."""
 
-    def step(
-        key: Key, state: CharacterState, command: Command
-    ) -> tuple[CharacterState, Frame]:
+    # A controller that locks feet has more of a state.
+    def step(key: Key, state: Any, command: Command) -> tuple[Any, Frame]:
         state = controller.plans[0](key, state, command)
         return controller.advance(state, command)
 
@@ -337,7 +337,7 @@ class Method:
     config: aamdm_model.Config
     num_joints: int
     fps: float
-    scale: float = SCALE
+    scale: float | Float[Array, ""] = SCALE
     guided_steps: int | None = GUIDED_STEPS
     memory: Memory | None = None
     step: chain.StepFactory = chain.ancestral_step

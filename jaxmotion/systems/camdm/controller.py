@@ -80,7 +80,7 @@ class Control:
     replan_on_change: bool = True
     extend: bool = True
     reuse: int = 15
-    guidance_scale: float = 0.7
+    guidance_scale: float | Float[Array, ""] = 0.7
     guided_plans: int = 1
     guide_start: bool = False
     half_life: float = 0.27

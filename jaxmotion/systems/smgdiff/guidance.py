@@ -45,7 +45,7 @@ class Guidance:
 
     start: int = 0
     end: int = 2
-    rate: float = 0.5
+    rate: float | Float[Array, ""] = 0.5
     last_sigma: float | None = None
     min_acceleration: float = 2.0
     max_distance: float = 0.1
