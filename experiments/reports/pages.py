@@ -11,7 +11,8 @@ A page says between markers, which no reader sees, what stands there:
 
 `table` shows rows and columns of a stored table; `grid` cells, one by one, where a page
 needs other rows and columns than the file has ("{}" stands for each of `across`);
-`plot` draws a column of chosen rows beside the page; `claims` the papers' claims with
+`plot` draws a column of chosen rows beside the page, or, with `panels`, quality over
+time beside peers' times; `claims` the papers' claims with
 verdicts; `absent` what nobody here can measure; `headline` the rows of headline.toml. A
 figure within a sentence is <!-- = camdm/steering | row | column -->0.1<!-- / -->.
 """
@@ -361,19 +362,62 @@ def plots_of(page: Path, text: str) -> list[tuple[str, dict[str, Any]]]:
     return [_options(match[3]) for match in _BLOCK.finditer(text) if match[2] == "plot"]
 
 
+def _ends(one: Stored, row: str, column: str, times: float = 1.0) -> list[list[float]]:
+    """Value, lower and upper end of each training whose value is finite."""
+    return [
+        [float(f"{times * (cell.value if x is None else x):.6g}") for x in ends]
+        for cell in one.cells(row, column)
+        if math.isfinite(cell.value)
+        for ends in [(cell.value, cell.low, cell.high)]
+    ]
+
+
+def _costs(store: Store, name: str, options: dict[str, Any]) -> dict[str, Any]:
+    """What a plot of quality over time shows, as JSON; `name` is of the peers' times.
+
+    Each panel has its own table and columns, and points by sampler.
+    """
+    peers, panels = store.table(name), []
+    for panel in options["panels"]:
+        one, times = store.table(panel["table"]), panel.get("times", 1.0)
+        time, quality = (one.columns[panel[x]] for x in ("time", "quality"))
+        points = {
+            sampler: {
+                label: [
+                    _ends(one, row, time.id, times)[0],
+                    _ends(one, row, quality.id)[0],
+                ]
+                for row, label in rows.items()
+            }
+            for sampler, rows in panel["points"].items()
+        }
+        panels.append(
+            {
+                "title": panel["title"],
+                "xlabel": panel["label"],
+                "ylabel": header(quality),
+                "points": points,
+                "data": _ends(one, panel["data"], quality.id)[0],
+                "call": f"beside: {panel['peers']}, timed in turn",
+                "peers": {
+                    column.title: found[0][0]
+                    for column in peers.columns.values()
+                    if (found := _ends(peers, panel["peers"], column.id))
+                },
+            }
+        )
+    return {"title": options["title"], "panels": panels}
+
+
 def _series(store: Store, name: str, options: dict[str, Any]) -> dict[str, Any]:
     """What a plot shows, as JSON: titles and (value, low, high) of each row."""
+    if "panels" in options:
+        return _costs(store, name, options)
     one, id = store.table(name), options["column"]
     rows = _chosen(options.get("rows"), one.measured.rows)
-    shown = {}
-    for row, title in rows.items():
-        values = []
-        for cell in one.cells(row, id):
-            low = cell.value if cell.low is None else cell.low
-            high = cell.value if cell.high is None else cell.high
-            if math.isfinite(cell.value):
-                values.append([float(f"{x:.6g}") for x in (cell.value, low, high)])
-        shown[title or one.title(row)] = values
+    shown = {
+        title or one.title(row): _ends(one, row, id) for row, title in rows.items()
+    }
     return {
         "label": header(one.columns[id]),
         "title": options["title"],
@@ -387,11 +431,25 @@ def _stamp(series: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(series).encode()).hexdigest()[:16]
 
 
+def _panel(plots: Any, panel: dict[str, Any]) -> Any:
+    points = {
+        sampler: {label: np.array(ends) for label, ends in rows.items()}
+        for sampler, rows in panel["points"].items()
+    }
+    return plots.Costs(**panel | {"points": points, "data": np.array(panel["data"])})
+
+
 def drawn(series: dict[str, Any]) -> str:
     """A plot as SVG; its description is the stamp of what it shows."""
     # matplotlib is slow to import, and only those who draw need it.
     from jaxmotion.viz import plots
 
+    if "panels" in series:
+        return plots.costs_svg(
+            tuple(_panel(plots, panel) for panel in series["panels"]),
+            title=series["title"],
+            description=_stamp(series),
+        )
     return plots.dots_svg(
         {k: np.reshape(v, (-1, 3)) for k, v in series["rows"].items()},
         references=tuple(series["data"]),

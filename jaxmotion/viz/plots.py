@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from jaxmotion.viz import figure
@@ -223,8 +224,13 @@ def _draw_references(axes: Axes, references: dict[str, np.ndarray]) -> None:
 
 
 def _plain_ticks(axis: Axis) -> None:
-    """1, 2, 5, 10, 20, ... on a logarithmic axis, instead of powers."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    """1, 2, 5, 10, 20, ... on a logarithmic axis, instead of powers.
+
+    Every digit where the axis is narrow.
+    """
+    low, high = axis.get_view_interval()
+    every = np.arange(1.0, 10.0) if high < _WIDE_FROM * low else (1.0, 2.0, 5.0)
+    axis.set_major_locator(LogLocator(subs=every))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
 
@@ -384,6 +390,123 @@ def plot_sweep(
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize="small")
     drawing.savefig(path)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Costs:
+    """One panel of `costs_svg`: quality over time; lower left is best.
+
+    Attributes:
+      title: Above it.
+      xlabel: Quantity and unit of the times.
+      ylabel: Quantity of the quality.
+      points: By sampler and label, time and quality: value, lower and upper end.
+      data: The quality of held-out data, its lower and its upper end.
+      peers: Times of a call elsewhere, by name.
+      call: What call that is.
+    """
+
+    title: str
+    xlabel: str
+    ylabel: str
+    points: dict[str, dict[str, Float[np.ndarray, "2 3"]]]
+    data: Float[np.ndarray, "3"]
+    peers: dict[str, float]
+    call: str
+
+
+def _draw_costs(axes: Axes, panel: Costs, colors: dict[str, str]) -> None:
+    value, low, high = panel.data
+    axes.axhline(value, color=figure.COMMANDED, lw=1.2, ls="--")
+    axes.axhspan(low, high, color=figure.COMMANDED, alpha=0.12, lw=0)
+    every = np.stack([x for points in panel.points.values() for x in points.values()])
+    front = every[pareto_front(*every[:, :, 0].T), :, 0]
+    axes.plot(*front[np.argsort(front[:, 0])].T, color=figure.MIDDLE, lw=0.9)
+    for sampler, points in panel.points.items():
+        color = colors[sampler]
+        for place, (label, ends) in enumerate(points.items()):
+            (x, y), bars = ends[:, 0], np.abs(ends[:, 1:] - ends[:, :1])[:, :, None]
+            axes.errorbar(
+                x, y, xerr=bars[0], yerr=bars[1], fmt="o", markersize=4.5, color=color,
+                elinewidth=1.2, capsize=2.5,
+            )  # fmt: skip
+            # On both sides in turn, since neighbors can be near each other.
+            side, shift = (("left", (5, 6)), ("right", (-5, -12)))[place % 2]
+            axes.annotate(
+                label, (x, y), xytext=shift, textcoords="offset points", ha=side,
+                fontsize=8, color=color, fontweight="bold",
+            )  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.margins(0.14)
+    axes.set_title(panel.title, fontsize=9.5, parse_math=False)
+    axes.set_ylabel(panel.ylabel, fontsize=8.5)
+    axes.tick_params(labelbottom=False)
+
+
+def _draw_peers(axes: Axes, panel: Costs, marks: dict[str, str]) -> None:
+    for name, height in zip(
+        panel.peers, np.linspace(0.6, -0.6, len(panel.peers)), strict=True
+    ):
+        axes.plot(
+            [panel.peers[name]], [height], marks[name], markersize=5, mfc="none",
+            color=figure.MIDDLE, markeredgewidth=1.2,
+        )  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_ylim(-1.3, 1.3)
+    axes.set_yticks([])
+    axes.set_xlabel(panel.xlabel, fontsize=8.5)
+    axes.set_title(panel.call, fontsize=7.5, loc="left", color=figure.MIDDLE, pad=2)
+    axes.spines["left"].set_visible(False)
+
+
+def costs_svg(panels: tuple[Costs, ...], *, title: str, description: str = "") -> str:
+    """Draws quality over time, two panels across, as SVG that equal values repeat.
+
+    Strips below the panels, with the same axes of time, mark what peers take.
+
+    Args:
+      title: Above the picture.
+      description: In the file's metadata.
+    """
+    down = math.ceil(len(panels) / 2)
+    samplers = dict.fromkeys(name for panel in panels for name in panel.points)
+    colors = dict(zip(samplers, _CYCLE, strict=False))
+    peers = dict.fromkeys(name for panel in panels for name in panel.peers)
+    marks = dict(zip(peers, "o^sDX", strict=False))
+    with matplotlib.rc_context({"svg.hashsalt": "jaxmotion", "svg.fonttype": "path"}):
+        canvas = Figure(figsize=(9.0, 3.7 * down + 0.9), layout="constrained")
+        canvas.suptitle(title, fontsize=11, parse_math=False)
+        grid = canvas.subplots(2 * down, 2, squeeze=False, height_ratios=[5, 1] * down)
+        pairs = grid.reshape(down, 2, 2).swapaxes(1, 2).reshape(-1, 2)
+        for panel, pair in zip(panels, pairs, strict=False):
+            _draw_costs(pair[0], panel, colors)
+            _draw_peers(pair[1], panel, marks)
+            times = np.array([*panel.peers.values(), *pair[0].get_xlim()])
+            for axes in pair:
+                axes.set_xlim(times.min() / 1.1, times.max() * 1.1)
+                axes.grid(alpha=0.3)
+                axes.tick_params(labelsize=8)
+                axes.spines[["top", "right"]].set_visible(False)
+                for axis in (axes.xaxis, axes.yaxis)[: 1 + (axes is pair[0])]:
+                    _plain_ticks(axis)
+        for axes in pairs[len(panels) :].ravel():
+            axes.set_axis_off()
+        handles = [
+            *(Line2D([], [], color=colors[x], marker="o", lw=0) for x in samplers),
+            Line2D([], [], color=figure.MIDDLE, lw=0.9),
+            Line2D([], [], color=figure.COMMANDED, ls="--"),
+            *(
+                Line2D([], [], color=figure.MIDDLE, marker=marks[x], mfc="none", lw=0)
+                for x in peers
+            ),
+        ]
+        names = [*samplers, "none is better in both", "held-out data", *peers]
+        canvas.legend(handles, names, loc="outside lower center", ncols=4, fontsize=8)
+        text = io.StringIO()
+        about = {"Date": None, "Creator": None, "Description": description}
+        canvas.savefig(text, format="svg", metadata=about)
+    return re.sub(r"[ \t]+\n", "\n", text.getvalue())
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

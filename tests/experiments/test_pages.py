@@ -72,6 +72,32 @@ def test_a_changed_digit_is_noticed_wherever_it_is(pages, checkout):
     assert stale == {"aamdm.md", "locomotion_fast.md", "shipped.svg"}
 
 
+def test_a_picture_of_costs_joins_tables(pages, checkout):
+    page = checkout / "experiments/results/steps.md"
+    place = {
+        options["file"]: (n, options)
+        for n, options in pages.plots_of(page, page.read_text())
+    }
+    store = pages.Store(checkout / "experiments/results")
+    shown = pages._series(store, *place["steps.svg"])
+    camdm, _, emdm, _ = shown["panels"]
+    whole = json.loads(
+        (checkout / "experiments/results/camdm/sweep_camdm.json").read_text()
+    )
+    cells = whole["rows"]["T = 16"]
+    expected = [
+        [cells[k][x] for x in ("value", "low", "high")] for k in ("plan_time", "fid")
+    ]
+    assert camdm["points"]["ancestral"]["16"] == expected
+    # Milliseconds a frame, of 60 frames.
+    assert emdm["points"]["DDGAN"]["10"][0] == pytest.approx([5.058, 4.782, 6.12])
+    path = checkout / "experiments/results/timings/peers.json"
+    compiled = json.loads(path.read_text())["rows"]["CAMDM, a plan of 8 steps, batch 1"]
+    assert camdm["peers"]["torch.compile"] == compiled["compile"]["value"]
+    path.write_text(path.read_text().replace('"value": 48.8', '"value": 48.9'))
+    assert {x.name for x in pages.stale(checkout)} == {"steps.svg", "README.md"}
+
+
 def test_writing_is_idempotent_and_mends_what_was_edited(pages, checkout):
     page = checkout / "experiments/results/emdm.md"
     text = page.read_text()

@@ -89,3 +89,51 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         plots.write_dots(
             tmp_path / "file" / "a.png", ("A", "B", "C"), (panel,), **OPTIONS
         )
+
+
+# --- quality over time ----------------------------------------------------------------
+
+
+def costs(**more):
+    """Two points of one sampler and one of another, held-out data and two peers."""
+    ends = lambda x: np.array([[x, 0.9 * x, 1.1 * x], [20 / x, 18 / x, 22 / x]])  # noqa: E731
+    return plots.Costs(
+        title="a system",
+        xlabel="a plan, ms",
+        ylabel="FID",
+        points={
+            "ancestral": {"1": ends(2.0), "2": ends(4.0)},
+            "DDIM": {"2": ends(3.0)},
+        },
+        data=np.array([4.0, 3.0, 5.0]),
+        peers={"ours": 0.5, "theirs": 90.0},
+        call="a call",
+        **more,
+    )
+
+
+def test_costs_are_at_their_time_and_quality_beside_data_and_peers(monkeypatch):
+    kept, save = [], Figure.savefig
+    monkeypatch.setattr(
+        Figure,
+        "savefig",
+        lambda self, *a, **k: (kept.append(self), save(self, *a, **k)),
+    )
+    made = [plots.costs_svg((costs(), costs(), costs()), title="all") for _ in range(2)]
+    assert made[0] == made[1]
+    axes = kept[0].axes
+    top, strip = axes[0], axes[2]
+    dots = [container.lines[0].get_xydata()[0] for container in top.containers]
+    np.testing.assert_allclose(dots, [[2.0, 10.0], [4.0, 5.0], [3.0, 20 / 3]])
+    assert [text.get_text() for text in top.texts] == ["1", "2", "2"]
+    data, front = top.lines[:2]
+    np.testing.assert_allclose(data.get_ydata(), 4.0)
+    np.testing.assert_allclose(front.get_xdata(), [2.0, 3.0, 4.0])
+    np.testing.assert_allclose([x.get_xdata()[0] for x in strip.lines], [0.5, 90.0])
+    # One axis of time, wide enough for the peers.
+    assert top.get_xlim() == strip.get_xlim()
+    assert strip.get_xlim()[0] < 0.5 and strip.get_xlim()[1] > 90
+    # A place without a panel is empty.
+    assert [one.axison for one in axes] == [True] * 5 + [False, True, False]
+    words = [text.get_text() for text in kept[0].legends[0].texts]
+    assert words[:2] == ["ancestral", "DDIM"] and words[-2:] == ["ours", "theirs"]
