@@ -1,7 +1,8 @@
 """Opens a page on which characters are steered: keys, mouse, and all settings.
 
 W A S D or the arrows walk, Shift runs, Q and E turn on the spot, 1 to 9 choose a style;
-a click or a drag on the ground sends the character there.
+a click or a drag on the ground sends the character there, clicks with Shift along
+waypoints.
 
 Examples:
   python experiments/steer.py

@@ -1,7 +1,8 @@
 """Real-time motion diffusion in JAX: four published systems on one functional core.
 
 The face is a handful of functions: `load` a model, `start` characters, give them
-`commands`, `rollout`, or `sample` whole motions, and `save` or `show` what they do.
+`commands`, or a `path` or `place` to go to, `rollout`, or `sample` whole motions, and
+`save` or `show` what they do.
 Everything they are made of is public: `from jaxmotion.diffusion import chain`.
 """
 
@@ -16,7 +17,17 @@ from jaxmotion import (
     networks,
     systems,
 )
-from jaxmotion.face import commands, load, retarget, rollout, sample, save, show
+from jaxmotion.face import (
+    commands,
+    load,
+    path,
+    place,
+    retarget,
+    rollout,
+    sample,
+    save,
+    show,
+)
 
 __version__ = "0.1.0"
 
@@ -31,6 +42,8 @@ __all__ = [
     "load",
     "motion",
     "networks",
+    "path",
+    "place",
     "retarget",
     "rollout",
     "sample",

@@ -5,6 +5,8 @@
     commands = jm.commands("figure_eight", model, 256, seconds=10.0, speed=1.4)
     frames = jm.rollout(model, jax.random.key(0), states, commands)
     jm.save("walk.gif", model.skeleton, frames[0])
+    path = jm.path([(0, 0), (0, 4), (3, 4)], speed=1.4)
+    frames = jm.rollout(model, jax.random.key(0), states, goal=path)
 
     model = jm.load("actions")
     motions = jm.sample(model, jax.random.key(0), "jump", 256)
@@ -26,7 +28,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxmotion import files
-from jaxmotion.control import courses, sampling, steering
+from jaxmotion.control import courses, goals, sampling, steering
 from jaxmotion.control.foot_lock import FootLock, clean_sampler, lock_feet
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.sampling import Sampler
@@ -177,34 +179,148 @@ def _segments(
     return dataclasses.replace(many, label=given)
 
 
+def path(points: Any, *, speed: Any = 1.2) -> goals.Path:
+    """A path to walk along and to stand at the end of, for `rollout`.
+
+    Args:
+      points: (x, z) meters, [points, 2] for all characters or [characters, points, 2].
+      speed: m/s; for all points, or one for each.
+
+    Raises:
+      ValueError: if there are fewer than two points, two in a row are the same, or
+        speeds are not positive or of another number.
+    """
+    found, speeds = np.asarray(points, np.float32), np.asarray(speed, np.float32)
+    shape = found.shape
+    if len(shape) not in (2, 3) or shape[-1] != 2 or shape[-2] < 2:
+        raise ValueError(f"points of shape {shape}, expected two or more (x, z)")
+    if not (np.linalg.norm(np.diff(found, axis=-2), axis=-1) > 1e-3).all():
+        raise ValueError("two points in a row are the same, or one is not finite")
+    if speeds.shape not in ((), shape[-2:-1], shape[:-1]) or not (speeds > 0).all():
+        raise ValueError(f"speed is {speed!r}, expected one above 0, or one per point")
+    speeds = np.broadcast_to(speeds, shape[:-1])
+    return goals.Path(points=jnp.asarray(found), speed=jnp.asarray(speeds))
+
+
+def place(position: Any, *, facing: Any = 0.0, seconds: Any) -> goals.Place:
+    """A place to stand at from a time on, for `rollout`.
+
+    Args:
+      position: (x, z) meters, for all characters or [characters, 2].
+      facing: Degrees from +z toward +x; for all or for each.
+      seconds: When to be there, from the beginning; for all or for each.
+
+    Raises:
+      ValueError: if shapes do not agree, or a time is not positive.
+    """
+    found = np.asarray(position, np.float32)
+    angle, time = np.deg2rad(np.asarray(facing, np.float32)), np.asarray(seconds)
+    if found.ndim not in (1, 2) or found.shape[-1] != 2 or not np.isfinite(found).all():
+        raise ValueError(f"position is {position!r}, expected (x, z), or one for each")
+    for name, value in (("facing", angle), ("seconds", time)):
+        if value.shape not in ((), found.shape[:-1]):
+            raise ValueError(f"{name} of shape {value.shape} for {found.shape[:-1]}")
+    if not (time > 0).all():
+        raise ValueError(f"seconds is {seconds!r}, expected above 0")
+    ways = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+    return goals.Place(
+        position=jnp.asarray(found),
+        facing=jnp.asarray(np.broadcast_to(ways, found.shape)),
+        seconds=jnp.asarray(np.broadcast_to(time, found.shape[:-1]), jnp.float32),
+    )
+
+
 def rollout(
     model: Character | Sampler,
     key: Key,
     states: Any,
-    commands: Command,
+    commands: Command | None = None,
     *,
+    goal: goals.Goal | None = None,
     chunk: int | None = None,
     mesh: Mesh | None = None,
+    **options: Any,
 ) -> Frame:
     """Frames of steered characters: one program, compiled once per shape.
 
     Args:
       key: Consumed. Character c draws from `fold_in(key, c)`, however many there are.
+      commands: What they are told in each tick; with a goal, what leaders are told.
+      goal: What they go after instead, wherever that takes them: from `path` or
+        `place`, or a `control.goals.Follow`; one for all, or one for each.
       chunk: Characters to run at a time, at most; None for what suits the processor.
+        Those with goals, who may see each other, run all at once.
       mesh: Devices to split the characters over; None for one.
+      **options: With a goal, those of `control.goals.goal_rollouts`: `seconds` (None
+        for as long as it takes, and 2 s), `places` to start at (None for the first
+        points of paths, else the origin), `labels`, `avoiding`, `circles`.
 
     Returns:
       Frames [characters, ticks, ...]; `frames[0].motion` is the first one's motion.
 
     Raises:
-      ValueError: if the model is not steered, states and commands are of different
-        numbers of characters, or a label is none of the model's.
+      ValueError: if the model is not steered, there is neither a goal nor commands,
+        states and commands are of different numbers of characters, or a label is none
+        of the model's.
     """
     character = steering.steered(model)
+    if goal is not None:
+        if chunk is not None or mesh is not None:
+            raise ValueError("characters with goals run at once: no chunk and no mesh")
+        return _go(character, key, states, goal, commands, **options)
+    if commands is None or options:
+        given = f", found {', '.join(options)}" if options else ""
+        raise ValueError(f"expected commands, or a goal and its options{given}")
     if chunk is None and jax.default_backend() == "cpu":
         chunk = _CPU_CHUNK
     return steering.steered_rollouts(
         character, key, states, commands, chunk=chunk, mesh=mesh
+    )
+
+
+def _go(
+    character: Character,
+    key: Key,
+    states: Any,
+    goal: goals.Goal,
+    commands: Command | None,
+    *,
+    seconds: float | None = None,
+    places: Any = None,
+    labels: Any = None,
+    circles: Any = None,
+    **options: Any,
+) -> Frame:
+    """`rollout` with a goal."""
+    number = jax.tree.leaves(states)[0].shape[0]
+    starts = jnp.zeros(2)
+    if isinstance(goal, goals.Path):
+        steps = jnp.linalg.norm(jnp.diff(goal.points, axis=-2), axis=-1)
+        pace = 0.5 * (goal.speed[..., 1:] + goal.speed[..., :-1])
+        needs, starts = jnp.sum(steps / pace, axis=-1), goal.points[..., 0, :]
+    else:
+        needs = goal.seconds if isinstance(goal, goals.Place) else goal.distance
+    if not needs.ndim:
+        every = lambda x: jnp.broadcast_to(x, (number, *x.shape))  # noqa: E731
+        goal = jax.tree.map(every, goal)
+    starts = starts if places is None else jnp.asarray(places, jnp.float32)
+    if starts.ndim == 1:
+        starts = jnp.broadcast_to(starts, (number, 2))
+    if seconds is None and isinstance(goal, goals.Follow):
+        if commands is None:
+            raise ValueError("who follows needs seconds, or commands of a leader")
+        seconds = commands.label.shape[-1] / character.fps
+    return goals.goal_rollouts(
+        character,
+        key,
+        states,
+        goal,
+        seconds=float(jnp.max(needs)) + 2.0 if seconds is None else seconds,
+        places=starts,
+        labels=jnp.asarray(steering.label_indices(character.labels, labels, number)),
+        circles=None if circles is None else jnp.asarray(circles, jnp.float32),
+        commands=commands,
+        **options,
     )
 
 

@@ -13,6 +13,7 @@ from jaxmotion import files
 from jaxmotion.control import steering
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.diffusion import chain
+from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import joint_positions
 from tests import samples
 
@@ -154,6 +155,70 @@ def test_shipped_models_say_what_they_are(name):
     card = path.with_suffix(".md").read_text()
     assert card.startswith(f"# {path.name}") and "Apache-2.0" in card
     assert path.stat().st_size <= 6e6
+
+
+def test_goals_are_told_in_a_line():
+    """One path for all, which start at its first point; a path each elsewhere."""
+    model = jm.load("walker")
+    path = jm.path([(1, 2), (1, 5), (3, 5)], speed=(1.2, 1.2, 0.8))
+    roll = lambda number, **more: jm.rollout(  # noqa: E731
+        model, jax.random.key(0), model.start(number), **more
+    )
+    frames = roll(2, goal=path, seconds=0.2)
+    assert frames.root_position.shape[:2] == (2, 6)
+    np.testing.assert_allclose(frames.root_position[:, 0, ::2], [(1, 2)] * 2, atol=0.1)
+    place = jm.place([(2, 3), (0, 3)], facing=(90, 0), seconds=4.0)
+    np.testing.assert_allclose(place.facing, [(1, 0), (0, 1)], atol=1e-6)
+    frames = roll(2, goal=place, places=[(0, 0), (5, 5)], seconds=0.2, labels=0)
+    np.testing.assert_allclose(
+        frames.root_position[:, 0, ::2], [(0, 0), (5, 5)], atol=0.1
+    )
+    # A meter at 1 m/s, and two seconds.
+    near = jm.path([[(0, 0), (0, 1)], [(0, 0), (1, 0)]], speed=1.0)
+    assert roll(2, goal=near).root_position.shape[1] == 90
+    for wrong, message in (
+        ({}, "expected commands, or a goal"),
+        ({"seconds": 3.0}, "and its options, found seconds"),
+        ({"goal": near, "chunk": 2}, "no chunk"),
+        ({"goal": jm.place([(0, 1)] * 3, seconds=1.0)}, "3 goals for 2 characters"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            roll(2, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: jm.path([(0, 0)]), r"shape \(1, 2\), expected two or more"),
+        (lambda: jm.path([0, 1]), "expected two or more"),
+        (lambda: jm.path([(0, 0), (0, 0), (1, 0)]), "two points in a row"),
+        (lambda: jm.path([(0, 0), (0, float("nan"))]), "not finite"),
+        (lambda: jm.path([(0, 0), (0, 1)], speed=-1), "speed is -1"),
+        (lambda: jm.path([(0, 0), (0, 1)], speed=(1, 1, 1)), "one per point"),
+        (lambda: jm.place((0, 0, 1), seconds=2.0), r"expected \(x, z\)"),
+        (lambda: jm.place((0, 1), seconds=-2.0), "seconds is -2"),
+        (lambda: jm.place((0, 1), facing=(0, 1), seconds=2.0), "facing of shape"),
+    ],
+)
+def test_wrong_goals_are_told_in_one_line(make, message):
+    with pytest.raises(ValueError, match=message) as error:
+        make()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_paths_and_places_are_reached(model):
+    """By the ends of what a goal takes: three characters on a path, two at places."""
+    path = jm.path([(0, 0), (0, 3), (2, 4)], speed=1.3)
+    frames = jm.rollout(model, jax.random.key(0), model.start(3), goal=path)
+    end = np.asarray(frames.root_position)[:, -1, ::2]
+    assert np.linalg.norm(end - [2, 4], axis=1).max() < 0.3
+    place = jm.place([(2, 3), (-1, 2)], facing=(90, 0), seconds=4.5)
+    frames = jm.rollout(model, jax.random.key(0), model.start(2), goal=place)
+    end = np.asarray(frames.root_position)[:, -1, ::2]
+    assert np.linalg.norm(end - [(2, 3), (-1, 2)], axis=1).max() < 0.3
+    facing = trajectory.root_trajectory(model.skeleton, frames.motion).facing[:, -1]
+    assert np.min(np.sum(facing * np.array([(1, 0), (0, 1)]), axis=-1)) > 0.85
 
 
 def test_a_steered_model_is_not_sampled(model):

@@ -256,6 +256,12 @@ def avoid(
     return jnp.take_along_axis(choices, best[:, None, None], axis=1)[:, 0]
 
 
+def averaged(velocity: Any, moved: Any, fps: float) -> Any:
+    """The velocity of who moved so in a tick, m/s; hips sway, so over .2 s."""
+    keep = 0.5 ** (1.0 / (0.1 * fps))
+    return keep * velocity + (1.0 - keep) * moved
+
+
 def _wish(
     goal: Goal, walkers: Walker, memory: Array, seconds: Array, told: Command | None
 ) -> tuple[Array, Array, Array]:
@@ -388,8 +394,6 @@ def _rollouts(
     rest = jnp.zeros((number, 2))
     walkers = Walker(position=places, velocity=rest, facing=ahead)
     told = Command(velocity=rest, facing=ahead, label=labels)
-    # Hips sway: velocities are averaged over a fifth of a second.
-    keep = 0.5 ** (1.0 / (0.1 * fps))
 
     def body(carry: tuple, tick: Array) -> tuple[tuple, Frame]:
         states, walkers, told, memory = carry
@@ -407,7 +411,7 @@ def _rollouts(
         moved = (position - walkers.position) * fps
         walkers = Walker(
             position=position,
-            velocity=keep * walkers.velocity + (1.0 - keep) * moved,
+            velocity=averaged(walkers.velocity, moved, fps),
             facing=told.facing,
         )
         root = frame.root_position.at[:, ::2].set(position)

@@ -330,6 +330,7 @@ class Inputs:
       held: Of `MOVES`.
       azimuth: Where the camera looks, radians from +z toward +x.
       target: Point (x, z) on the ground to go to, meters; keys come first.
+      path: Points to go along, whatever else is held; see `waypoints`.
       stick: A stick's (right, ahead), at most 1 long: go so, seen by the camera, and as
         fast as it is pushed; keys come first.
       face: Another one's: face so, whatever the way.
@@ -338,6 +339,7 @@ class Inputs:
     held: frozenset[str] = frozenset()
     azimuth: float = 0.0
     target: tuple[float, float] | None = None
+    path: tuple[tuple[float, float], ...] = ()
     stick: tuple[float, float] | None = None
     face: tuple[float, float] | None = None
 

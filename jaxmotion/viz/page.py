@@ -11,8 +11,9 @@ frame a tick as little-endian float32:
     the plan's path (x, z), root (3) and rotations [joints, 6] at its end
 
 The browser sends JSON: {"held": [...], "azimuth": radians, "target": [x, z] or null},
-where "stick" and "face" may be [right, ahead] of somebody's sticks, {"set": {name:
-value}}, {"do": "reset" | "step" | "record"} or {"save": ".bvh"}.
+where "path" may be waypoints [[x, z], ...], "stick" and "face" [right, ahead] of
+somebody's sticks, {"set": {name: value}}, {"do": "reset" | "step" | "record"} or
+{"save": ".bvh"}.
 
 A browser that reads slowly gets fewer frames, the newest ones, and holds up nobody.
 Only pages from this very server may connect, so no other web site steers, and a name
@@ -32,6 +33,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
+from jaxmotion.control import waypoints
 from jaxmotion.control.steering import MOVES, Inputs
 from jaxmotion.viz import packed
 from jaxmotion.viz.viewer import Session, Shown
@@ -45,7 +47,7 @@ _WEB = Path(__file__).with_name("web")
 _FILES = (
     *("body.js", "camera.js", "figures.js", "gltf.js", "input.js", "linear.js"),
     *("page.js", "panel.js", "person.js", "rig.js", "save.js", "scene.js", "shape.js"),
-    *("socket.js", "transfer.js"),
+    *("socket.js", "steer.js", "transfer.js", "waypoints.js"),
 )
 
 # Writes a take: (path, skeleton, motion).
@@ -87,7 +89,7 @@ def frame_bytes(shown: Shown, fps: float) -> bytes:
 
 
 def read_message(text: str | bytes) -> dict[str, Any]:
-    """What a browser says, checked; `held`, `azimuth` and `target` become `inputs`.
+    """What a browser says, checked; `held` and what comes with it become `inputs`.
 
     Raises:
       ValueError: names what is wrong.
@@ -100,20 +102,31 @@ def read_message(text: str | bytes) -> dict[str, Any]:
         raise ValueError("message is no JSON object")
     if "held" not in value:
         return value
-    held, target = value["held"], value.get("target")
+    held, target, path = value["held"], value.get("target"), value.get("path", [])
     azimuth = value.get("azimuth", math.nan)
     if not isinstance(held, list) or not all(x in MOVES for x in held):
         raise ValueError(f"held is wrong, expected some of {', '.join(MOVES)}")
-    point = [0.0, 0.0] if target is None else target
-    if not isinstance(point, list) or len(point) != 2:
+    is_point = lambda x: isinstance(x, list) and len(x) == 2  # noqa: E731
+    if target is not None and not is_point(target):
         raise ValueError("target is wrong, expected [x, z] or null")
-    numbers = [azimuth, *point]
+    if not isinstance(path, list) or not all(map(is_point, path)):
+        raise ValueError("path is wrong, expected a list of [x, z]")
+    if len(path) > waypoints.MOST:
+        raise ValueError(
+            f"path has {len(path)} points, expected at most {waypoints.MOST}"
+        )
+    numbers = [azimuth, *(target or ()), *(x for point in path for x in point)]
     if not all(
         type(x) in (int, float) and math.isfinite(x) and abs(x) < 1e5 for x in numbers
     ):
-        raise ValueError("azimuth or target is no finite number")
-    place = None if target is None else (float(target[0]), float(target[1]))
-    inputs = Inputs(held=frozenset(held), azimuth=float(azimuth), target=place)
+        raise ValueError("azimuth, target or path is no finite number")
+    place = lambda x: (float(x[0]), float(x[1]))  # noqa: E731
+    inputs = Inputs(
+        held=frozenset(held),
+        azimuth=float(azimuth),
+        target=None if target is None else place(target),
+        path=tuple(map(place, path)),
+    )
     sticks = {name: _stick(name, value[name]) for name in _STICKS if name in value}
     return {"inputs": dataclasses.replace(inputs, **sticks)}
 

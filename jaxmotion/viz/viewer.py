@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion.control import rollout
+from jaxmotion.control import goals, rollout, waypoints
 from jaxmotion.control.steering import Character, Inputs, Wish, settled, wanted
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.motion.trajectory import Command
@@ -254,8 +254,7 @@ class Session:
         self._builder: threading.Thread | None = None
         self._crowd: rollout.Crowd | None = None
         self._home = np.zeros((1, 2), np.float32)
-        self._leader = (0.0, 0.0)
-        self._wish, self._told = Wish(), Wish()
+        self._stand()
         self._tick, self.engine_number = 0, 0
         self._take: list[tuple[np.ndarray, np.ndarray]] | None = None
         self.note = ""
@@ -285,7 +284,8 @@ class Session:
             before = self._inputs.get(client)
             if before is None:
                 return
-            touched = (before.held, before.target) != (inputs.held, inputs.target)
+            keys = lambda x: (x.held, x.target, x.path)  # noqa: E731
+            touched = keys(before) != keys(inputs)
             self._inputs[client] = inputs
             if touched or self._active is None:
                 self._active = client
@@ -428,13 +428,7 @@ class Session:
             self._steps = max(self._steps - 1, 0)
             if self._resets:
                 self._begin(engine, keep=False)
-        wish = wanted(
-            inputs,
-            self._wish,
-            position=self._leader,
-            speed=settings.speed,
-            seconds=1.0 / engine.character.fps,
-        )
+        wish = self._wanted(inputs, settings.speed, engine.character.fps)
         self._told = settled(self._told, wish, steady=wish == self._wish)
         self._wish = wish
         assert self._crowd is not None  # made with the engine
@@ -466,6 +460,14 @@ class Session:
             planned=int(more["planned"]),
             milliseconds=(time.perf_counter() - begin) * 1e3,
         )
+        moved = [
+            (float(x) - before) * engine.character.fps
+            for x, before in zip(leader[::2], self._leader, strict=True)
+        ]
+        self._velocity = tuple(
+            goals.averaged(v, x, engine.character.fps)
+            for v, x in zip(self._velocity, moved, strict=True)
+        )
         self._leader = (float(leader[0]), float(leader[2]))
         self._tick += 1
         with self._lock:
@@ -490,8 +492,24 @@ class Session:
             home[shared:] += np.array(self._leader, np.float32) - home[0]
             home[:shared] = self._home[:shared]
         else:
-            self._wish, self._told, self._leader = Wish(), Wish(), (0.0, 0.0)
+            self._stand()
         self._crowd, self._home = new, home
+
+    def _stand(self) -> None:
+        """The first character has been told nothing, at the origin."""
+        self._wish, self._told, self._route = Wish(), Wish(), waypoints.Route()
+        self._leader = self._velocity = (0.0, 0.0)
+
+    def _wanted(self, inputs: Inputs, speed: float, fps: float) -> Wish:
+        """What all are told: the first one goes along waypoints, the others beside."""
+        self._route = waypoints.routed(self._route, inputs.path, self._leader)
+        where: dict[str, Any] = dict(position=self._leader, speed=speed)
+        if not self._route.points:
+            return wanted(inputs, self._wish, seconds=1.0 / fps, **where)
+        wish, self._route = waypoints.along(
+            self._route, self._wish, velocity=self._velocity, **where
+        )
+        return wish
 
     def _wanted_engine(self) -> tuple:
         now = self.settings
@@ -549,6 +567,9 @@ class Session:
             done = made.step(crowd, Wish(), settings, seed=0, n=0)
             made.poses = np.asarray(done[1][1])
             made.step(done[0], Wish(), settings, seed=0, n=1)
+            ahead = waypoints.Route(points=((0.0, 0.0), (0.0, 1.0)))
+            here = dict(position=(0.0, 0.0), velocity=(0.0, 0.0), speed=1.0)
+            waypoints.along(ahead, Wish(), **here)
             if self._dress is not None:
                 made.dress = self._dressed(name, made)
             self._programs[key] = made

@@ -278,6 +278,23 @@ def test_a_click_on_the_ground_is_a_target(tab, served):
     shows(served, lambda x: far(x) < steering.FAR)
 
 
+def test_shift_clicks_are_waypoints(tab, served):
+    after_ticks(served, 15)
+    tab.keyboard.down("Shift")
+    tab.mouse.click(220, 420)
+    tab.mouse.click(520, 400)
+    tab.keyboard.up("Shift")
+    tab.wait_for_function("input.path.length === 2", timeout=PATIENCE)
+    path = tab.evaluate("input.path")
+    for place in path:
+        shows(served, lambda x, at=place: np.linalg.norm(x.roots[0, ::2] - at) < 0.4)
+    shows(served, walks_at(0))
+    assert np.linalg.norm(after_ticks(served, 30).roots[0, ::2] - path[-1]) < 0.3
+    tab.keyboard.press("a")
+    assert tab.evaluate("input.path.length") == 0
+    shows(served, walks_at(0))
+
+
 def test_a_take_is_saved_as_it_was_shown(tab, served):
     before = len(served.shown)
     after_ticks(served, 5)

@@ -40,6 +40,17 @@ navigator.getGamepads = () => [gamepad];
 """
 
 
+# Where the first character was in every frame, however few are drawn.
+TRAIL = """
+window.trail = [];
+let last;
+Object.defineProperty(window, "shown", {
+  get: () => last,
+  set: x => { last = x; trail.push([x.roots[0], x.roots[2]]); },
+});
+"""
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     pytest.importorskip("jax2onnx")
@@ -236,6 +247,28 @@ def test_a_click_is_a_target_and_the_view_orbits_and_zooms(browser, address):
         tab.mouse.wheel(0, 300)
         tab.wait_for_function(f"input.camera.distance > {1.2 * far}")
         assert tab.evaluate("input.camera.azimuth") == pytest.approx(azimuth - 0.6)
+
+
+def test_shift_clicks_are_waypoints(browser, address):
+    with opened(browser, address, script=TRAIL) as tab:
+        tab.keyboard.down("Shift")
+        tab.mouse.click(150, 250)
+        tab.mouse.click(400, 230)
+        tab.keyboard.up("Shift")
+        path = np.array(tab.evaluate("input.path"))
+        assert len(path) == 2 and tab.evaluate("input.target") is None
+        tab.wait_for_function(
+            f"Math.hypot(shown.roots[0] - {path[1][0]}, shown.roots[2] - {path[1][1]})"
+            " < 0.3 && Math.hypot(shown.told[0], shown.told[1]) < 1e-6",
+            timeout=PATIENCE,
+        )
+        # By way of the first one, whose corner he cuts a little; and there he stays.
+        trail = np.array(tab.evaluate("trail"))
+        assert np.linalg.norm(trail - path[0], axis=1).min() < 0.5
+        tab.wait_for_timeout(1000)
+        assert np.linalg.norm(root(tab) - path[1]) < 0.3
+        tab.mouse.click(150, 250)
+        assert tab.evaluate("input.path.length") == 0 and tab.evaluate("input.target")
 
 
 def test_settings_and_a_link_that_holds_them(browser, address):

@@ -1,6 +1,7 @@
 """What held keys ask for, the session's ticks, and what it records."""
 
 import dataclasses
+import json
 import math
 import threading
 import time
@@ -142,6 +143,12 @@ def test_settings_in_range():
         ('{"held": [], "azimuth": 0, "target": [1]}', "target is wrong"),
         ('{"held": [], "azimuth": 0, "target": [1, true]}', "no finite number"),
         ('{"held": [], "target": null}', "no finite number"),
+        ('{"held": [], "azimuth": 0, "path": [1, 2]}', "path is wrong"),
+        ('{"held": [], "azimuth": 0, "path": [[1, NaN]]}', "no finite number"),
+        (
+            json.dumps({"held": [], "azimuth": 0, "path": [[1, 2]] * 33}),
+            "path has 33 points, expected at most 32",
+        ),
         ('{"held": [], "azimuth": 0, "stick": [2, 0]}', "stick is wrong"),
         ('{"held": [], "azimuth": 0, "face": [NaN, 0]}', "face is wrong"),
     ],
@@ -159,7 +166,10 @@ def test_inputs_are_read():
         '{"held": [], "azimuth": 0, "target": null, "stick": [0, 0.5], "face": [1, 0]}'
     )
     found = page.read_message(text)["inputs"]
+    assert found.path == ()
     assert (found.stick, found.face) == ((0.0, 0.5), (1.0, 0.0))
+    text = '{"held": [], "azimuth": 0, "path": [[0, 1], [2.5, 3]]}'
+    assert page.read_message(text)["inputs"].path == ((0.0, 1.0), (2.5, 3.0))
     assert page.read_message('{"do": "reset"}') == {"do": "reset"}
 
 
@@ -233,6 +243,31 @@ def test_a_session_walks_and_compiles_once():
     assert it.shown[-1].told.speed == 0
     assert np.abs(it.shown[-1].roots[0] - it.shown[-2].roots[0]).max() < 1e-3
     assert not np.allclose(here, it.shown[-1].roots[0])
+
+
+@pytest.mark.slow
+def test_waypoints_are_walked_by_all_side_by_side():
+    it = Ticking()
+    it.session.change("characters", 3)
+    it.load()
+    start = it.tick(times=2).roots
+    went = it.tick(path=((0.0, 2.0),), times=20).roots[0]
+    it.tick(path=((0.0, 2.0), (2.0, 2.0)), times=150)
+    roots = np.stack([x.roots[0, ::2] for x in it.shown])
+    assert went[2] > 0.2 and np.linalg.norm(roots - [0.0, 2.0], axis=1).min() < 0.3
+    end = it.shown[-1]
+    assert np.linalg.norm(end.roots[0, ::2] - [2.0, 2.0]) < 0.2 and end.told.speed == 0
+    # One of them plans a tick: the others are told a little later.
+    np.testing.assert_allclose(end.roots - end.roots[:1], start - start[:1], atol=0.3)
+    # Another path begins where he is; who drops it stands; a reset drops it, too.
+    it.tick(path=((2.0, 5.0),), times=30)
+    assert it.shown[-1].told.velocity[1] > 1.0
+    assert it.tick().told.speed == 0
+    it.tick(path=((2.0, 5.0),), times=9)
+    it.session.reset()
+    it.tick(times=9)
+    assert it.shown[-1].told.speed == 0
+    assert np.abs(it.shown[-1].roots[0, ::2]).max() < 0.1
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxmotion.control import steering
+from jaxmotion.control import goals, steering, waypoints
 from jaxmotion.control.steering import Inputs, Wish
 from jaxmotion.data import bvh as bvh_motion
 from jaxmotion.data import bvh_text, walker
@@ -103,6 +103,70 @@ def test_a_stick_walks_as_far_as_it_is_pushed_and_another_one_faces():
     stands = steering.wanted(Inputs(face=(0.0, -1.0)), Wish(), **more)
     np.testing.assert_allclose(stands.facing, (0, -1), atol=1e-9)
     assert stands.speed == 0
+
+
+def test_the_page_goes_along_waypoints_as_the_library_does():
+    """Of somebody who obeys late and sways: the same wish in each tick."""
+    random, fps, calls, wants = np.random.default_rng(0), 30.0, [], []
+    points = np.cumsum(random.normal(0, 1.5, (6, 2)), axis=0).tolist()
+    points = tuple(map(tuple, points))
+    for number in (1, 3, 6):
+        route = waypoints.routed(waypoints.Route(), points[:number], (0.3, -0.2))
+        last, place, velocity = Wish(), np.array([0.3, -0.2]), np.zeros(2)
+        own = velocity
+        for _ in range(round(30 * 4.0 * number)):
+            where = dict(
+                position=tuple(place.tolist()),
+                velocity=tuple(velocity.tolist()),
+                speed=1.4,
+            )
+            given = {"points": route.points, "way": route.way}
+            calls.append((given, wish_json(last), where))
+            last, route = waypoints.along(route, last, **where)
+            wants.append((last, route))
+            own = 0.85 * own + 0.15 * np.array(last.velocity)
+            moved = own + random.normal(0, 0.1, 2)
+            place = place + moved / fps
+            velocity = goals.averaged(velocity, moved, fps)
+        assert np.linalg.norm(place - points[number - 1]) < 0.2 and last.speed == 0
+    away = []
+    for (wish, route), (want, further) in zip(
+        run("waypoints.js", "along", *calls), wants, strict=True
+    ):
+        # A nearest point may be its neighbor where both are as near.
+        assert abs(route["way"] - further.way) < 0.026
+        away += [
+            np.abs(np.subtract(wish[x], getattr(want, x))).max()
+            for x in ("velocity", "facing")
+        ]
+    assert np.mean(np.array(away) < 1e-4) > 0.98 and np.max(away) < 0.1
+    (found,) = run("waypoints.js", "averaged", ([1.0, 2.0], [3.0, -1.0], fps))
+    want = goals.averaged(np.array([1.0, 2.0]), np.array([3.0, -1.0]), fps)
+    np.testing.assert_allclose(found, want)
+
+
+def test_waypoints_lengthen_a_route_or_begin_another_one():
+    a, b, c, here = (0.0, 1.0), (1.0, 1.0), (5.0, 5.0), (0.5, 0.5)
+    went = waypoints.Route(points=((0.0, 0.0), a), way=0.4)
+    calls = [(went, (a,)), (went, (a, b)), (went, (c, b)), (went, ()), (None, (a,))]
+    wants = [
+        went,
+        waypoints.Route(points=((0.0, 0.0), a, b), way=0.4),
+        waypoints.Route(points=(here, c, b)),
+        waypoints.Route(),
+        waypoints.Route(points=(here, a)),
+    ]
+    given = []
+    for (route, points), want in zip(calls, wants, strict=True):
+        found = waypoints.routed(route or waypoints.Route(), points, here)
+        assert found == want
+        own = None if route is None else {"points": route.points, "way": route.way}
+        given.append((own, points, here))
+    for found, want in zip(run("waypoints.js", "routed", *given), wants, strict=True):
+        expected = {"points": [list(x) for x in want.points], "way": want.way}
+        assert found == (expected if want.points else None)
+    assert waypoints.routed(went, (c,), here).points == (here, c)
+    assert waypoints.MOST == 32
 
 
 def test_formations_are_the_same():

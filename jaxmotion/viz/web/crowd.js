@@ -3,6 +3,7 @@
 
 import { Group } from "./group.js";
 import { same, settled, still, wanted } from "./steer.js";
+import { along, averaged, routed } from "./waypoints.js";
 
 const SPACING = 1.6;
 
@@ -29,7 +30,8 @@ export class Crowd {
   // Nobody is there yet; groups stay.
   restart() {
     this.tick = 0; this.owners = []; this.homes = [];
-    this.wish = still(); this.told = still(); this.leader = [0, 0];
+    this.wish = still(); this.told = still(); this.route = null;
+    this.leader = [0, 0]; this.velocity = [0, 0];
     for (const group of this.groups) group.resize(0);
   }
 
@@ -76,13 +78,23 @@ export class Crowd {
     groups.forEach((group, g) => group.resize(size(g), this.settings.label));
   }
 
+  // What all are told: the first one goes along waypoints, the others beside.
+  wanted(inputs) {
+    const { settings, model, leader: position } = this, { speed } = settings;
+    this.route = routed(this.route, inputs.path || [], position);
+    if (!this.route)
+      return wanted(inputs, this.wish, { position, speed, seconds: 1 / model.about.fps });
+    const { velocity } = this;
+    const [wish, route] = along(this.route, this.wish, { position, velocity, speed });
+    this.route = route;
+    return wish;
+  }
+
   // One tick of all. `slack`: milliseconds that plans may take before frames run out.
   async next(inputs, slack) {
     const began = performance.now(), { model, settings, homes, owners } = this;
     const { label, scale, foot_lock, num_steps: steps } = settings;
-    const wish = wanted(inputs, this.wish, {
-      position: this.leader, speed: settings.speed, seconds: 1 / model.about.fps,
-    });
+    const wish = this.wanted(inputs);
     this.told = settled(this.told, wish, same(wish, this.wish));
     this.wish = wish;
     const told = { ...this.told, label, scale, locks: foot_lock };
@@ -93,7 +105,10 @@ export class Crowd {
     const found = await Promise.all(made), at = found.map(() => 0);
     const shown = owners.map(g => found[g].shown[at[g]++]);
     const planned = found.reduce((sum, one) => sum + one.planned, 0);
-    this.leader = [shown[0].root[0] + homes[0][0], shown[0].root[2] + homes[0][1]];
+    const at0 = [shown[0].root[0] + homes[0][0], shown[0].root[2] + homes[0][1]];
+    const { fps } = model.about, moved = at0.map((x, i) => (x - this.leader[i]) * fps);
+    this.velocity = averaged(this.velocity, moved, fps);
+    this.leader = at0;
     return this.pack(shown, planned, performance.now() - began, found[0].rest);
   }
 

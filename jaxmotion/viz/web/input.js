@@ -1,6 +1,7 @@
 // Keys, mouse, thumbs and gamepads: what somebody asks for now, the same for all of them.
 
 import { clamp } from "./camera.js";
+import { MOST } from "./waypoints.js";
 
 export const KEYS = {
   KeyW: "forward", ArrowUp: "forward", KeyS: "back", ArrowDown: "back",
@@ -12,10 +13,11 @@ const MOVES = ["forward", "back", "left", "right"], REACH = 56, TAP = 10;
 export class Input {
   // view: the canvas; camera; stick: the element that shows the thumb's stick;
   // on: `change()` when something else is asked for, `key(code)` for other keys,
-  // `news()` when a picture is to be drawn.
+  // `news()` when a picture is to be drawn, `fail(text)`; `here()` is where the first
+  // character is.
   constructor(view, camera, stick, on) {
     Object.assign(this, { view, camera, stickElement: stick, on });
-    this.pressed = new Set(); this.pads = new Set(); this.target = null;
+    this.pressed = new Set(); this.pads = new Set(); this.forget();
     this.thumb = null; this.pad = {}; this.fingers = new Map(); this.buttons = [];
     window.addEventListener("keydown", e => this.keydown(e));
     window.addEventListener("keyup", e => {
@@ -32,6 +34,9 @@ export class Input {
     }, { passive: false });
   }
 
+  // No target and no waypoints; these are a path from where the first one was set.
+  forget() { this.target = null; this.path = []; this.from = null; }
+
   get held() { return new Set([...this.pressed, ...this.pads]); }
 
   // What is sent: sticks are (right, ahead), at most 1 long.
@@ -43,6 +48,7 @@ export class Input {
       held: held.filter(x => !((moves || stick) && x.startsWith("turn"))),
       azimuth: +this.camera.azimuth.toFixed(3),
       target: moves || stick || face ? null : this.target,
+      ...(this.path.length && !(moves || stick || face) ? { path: this.path } : {}),
       ...(stick ? { stick } : {}), ...(face ? { face } : {}),
     };
   }
@@ -60,7 +66,7 @@ export class Input {
     const action = KEYS[e.code];
     if (action) {
       e.preventDefault();
-      if (action !== "run") this.target = null;
+      if (action !== "run") this.forget();
       if (!e.repeat) { this.pressed.add(action); this.on.change(); }
     } else if (!e.repeat) {
       if (e.code === "Space") e.preventDefault();
@@ -74,9 +80,11 @@ export class Input {
     const { clientX: x, clientY: y } = e, touch = e.pointerType === "touch";
     const low = y > 0.35 * this.view.clientHeight;
     let does = e.button === 0 && !e.altKey ? "target" : "turn";
+    if (does === "target" && e.shiftKey) does = "waypoint";
     if (touch) does = x < 0.45 * this.view.clientWidth && low ? "stick" : "turn";
     this.fingers.set(e.pointerId, { does, x, y, from: [x, y], far: 0 });
     if (does === "target") this.point(x, y);
+    if (does === "waypoint") this.lengthen(x, y);
     if (does === "stick") this.showStick(x, y, 0, 0);
     this.on.news();
   }
@@ -103,7 +111,7 @@ export class Input {
       const far = Math.max(Math.hypot(dx, dy) / REACH, 1);
       this.thumb = [dx / REACH / far, -dy / REACH / far].map(v => +v.toFixed(2));
       this.showStick(...finger.from, dx / far, dy / far);
-      this.target = null; this.on.change();
+      this.forget(); this.on.change();
     }
     this.on.news();
   }
@@ -125,9 +133,25 @@ export class Input {
     knob.style.transform = `translate(${dx}px, ${dy}px)`;
   }
 
-  point(x, y) {
+  onGround(x, y) {
     const found = this.camera.onGround(this.view, x, y);
-    if (found) { this.target = found.map(v => +v.toFixed(2)); this.on.change(); }
+    return found && found.map(v => +v.toFixed(2));
+  }
+
+  point(x, y) {
+    const found = this.onGround(x, y);
+    if (found) { this.forget(); this.target = found; this.on.change(); }
+  }
+
+  // One more waypoint.
+  lengthen(x, y) {
+    const found = this.onGround(x, y), path = this.path.slice();
+    if (!found) return;
+    if (path.length === MOST) { this.on.fail(`a path has at most ${MOST} waypoints`); return; }
+    const from = this.from || this.on.here();
+    this.forget();
+    Object.assign(this, { from, path: [...path, found] });
+    this.on.change();
   }
 
   // Reads the first gamepad of the standard mapping; call once a picture. Left stick: go,
@@ -152,7 +176,7 @@ export class Input {
     this.pad = { stick: stick(0), face: stick(2) };
     this.pads = new Set(down(7) ? ["run"] : []);
     if (before !== JSON.stringify([this.pad, [...this.pads]])) {
-      if (this.pad.stick) this.target = null;
+      if (this.pad.stick || this.pad.face) this.forget();
       this.on.change();
     }
     this.pad.orbit = (down(4) || down(14)) - (down(5) || down(15));

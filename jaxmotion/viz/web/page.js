@@ -59,7 +59,7 @@ export function start(source) {
   const spent = window.spent = [];
   const say = message => source.say(message);
   const panel = new Panel(say, {
-    reset() { input.target = null; trail = []; tell(); },
+    reset() { input.forget(); trail = []; tell(); },
     save(suffix) { download(suffix); },
     link() { copyLink(); },
     wear,
@@ -68,7 +68,8 @@ export function start(source) {
   let lastNews = 0;
   const news = () => { lastNews = performance.now(); };
   const input = window.input = new Input(view, camera, $("stick"), {
-    change: () => tell(), news,
+    change: () => tell(), news, fail: text => panel.fail(text),
+    here: () => (frame ? [frame.to.roots[0], frame.to.roots[2]] : [0, 0]),
     key(code) {
       const digit = /^(?:Digit|Numpad)([1-9])$/.exec(code), { state } = panel;
       if (digit && state && +digit[1] <= state.labels.length) panel.choose(+digit[1] - 1);
@@ -294,6 +295,11 @@ export function start(source) {
       made.ribbon(points.reverse(), 0.06, VIOLET);
     }
     made.arrow(x, z, still ? 1e-6 * fx : vx, still ? 1e-6 * fz : vz, GREEN);
+    [input.from, ...input.path].forEach((point, i, all) => {
+      if (!i) return;
+      made.ribbon([all[i - 1], all[i - 1], point], 0.05, GREEN);
+      made.ring(...point, 0, 0.07, GREEN);
+    });
     if (input.target) {
       made.ring(...input.target, 0.16, 0.05, GREEN);
       made.ring(...input.target, 0, 0.05, GREEN);

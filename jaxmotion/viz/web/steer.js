@@ -2,11 +2,12 @@
 // says for the live page, which has the same numbers.
 
 export const RUN = 2.0, TURN = 150 * Math.PI / 180;
-const ARRIVE = 0.7, NEAR = 0.2, FAR = 0.45;
+export const ARRIVE = 0.7, NEAR = 0.2;
+const FAR = 0.45;
 const HEADING_STEP = 8 * Math.PI / 180, SPEED_STEP = 0.15, STICK = 0.12;
 
 export const still = () => ({ velocity: [0, 0], facing: [0, 1] });
-const speedOf = wish => Math.hypot(...wish.velocity);
+export const speedOf = wish => Math.hypot(...wish.velocity);
 const to = angle => [Math.sin(angle), Math.cos(angle)];
 
 function go(angle, speed, facing = to(angle)) {
