@@ -64,8 +64,81 @@ def _adam(rate: optax.ScalarOrSchedule) -> Optimizer:
     return optax.adam(rate, b1=0.5, b2=0.9)
 
 
+# Each of five steps: singular values of 0.0015 to 1 become 0.68 to 1.2.
+_NEWTON_SCHULZ = (3.4445, -4.7750, 2.0315)
+
+
+def orthogonalize(
+    matrix: Float[Array, "rows columns"], coefficients: Float[Array, "steps 3"]
+) -> Float[Array, "rows columns"]:
+    """About the nearest matrix with orthonormal rows, or columns if it has fewer.
+
+    Steps X <- a X + b A X + c A^2 X, with A = X X^T, of X with a Frobenius norm of 1.
+    All P = a + b A + c A^2 commute with A: so A <- P A P on the shorter side, and only
+    the product of all P meets X.
+
+    Args:
+      coefficients: a, b, c of each step.
+
+    Source: Jordan et al. 2024, "Muon".
+    """
+    x = matrix / (jnp.linalg.norm(matrix) + 1e-8)
+    wide = matrix.shape[0] <= matrix.shape[1]
+    gram = x @ x.T if wide else x.T @ x
+    one = product = jnp.eye(gram.shape[0], dtype=gram.dtype)
+    for step, (a, b, c) in enumerate(coefficients):
+        factor = a * one + b * gram + c * (gram @ gram)
+        product = factor @ product if step else factor
+        gram = factor @ (gram @ factor)
+    return product @ x if wide else x @ product
+
+
+def _scale_by_muon(decay: float = 0.95) -> Optimizer:
+    """Nesterov momentum of matrices, orthogonal and of the size of Adam's changes."""
+
+    def init(params: Params) -> optax.contrib.MuonState:
+        return optax.contrib.MuonState(
+            count=jnp.zeros([], jnp.int32),
+            mu=jax.tree.map(jnp.zeros_like, params),
+            ns_coeffs=jnp.asarray(_NEWTON_SCHULZ),
+        )
+
+    def update(
+        grads: Params, state: optax.contrib.MuonState, params: Params | None = None
+    ) -> tuple[Params, optax.contrib.MuonState]:
+        mu = jax.tree.map(lambda m, g: decay * m + (1 - decay) * g, state.mu, grads)
+        # Both as means over all gradients so far.
+        count = state.count + 1
+        past, now = (
+            weight / (1 - decay ** power.astype(jnp.float32))
+            for weight, power in ((decay, count + 1), (1 - decay, count))
+        )
+
+        coefficients = jnp.tile(state.ns_coeffs, (5, 1))
+
+        def move(m: Array, g: Array) -> Array:
+            found = orthogonalize(past * m + now * g, coefficients)
+            return 0.2 * max(m.shape) ** 0.5 * found
+
+        return jax.tree.map(move, mu, grads), state._replace(count=count, mu=mu)
+
+    return optax.GradientTransformation(init, update)
+
+
 def _muon(rate: optax.ScalarOrSchedule) -> Optimizer:
-    return optax.contrib.muon(rate, consistent_rms=0.2)
+    # optax.contrib.muon with consistent_rms=0.2, and its states, in half the time.
+    none = optax.identity()
+    return optax.partition(
+        {
+            "muon": optax.chain(
+                _scale_by_muon(), none, none, optax.scale_by_learning_rate(rate)
+            ),
+            "adam": optax.adamw(rate, weight_decay=0.0, nesterov=True),
+        },
+        lambda params: jax.tree.map(
+            lambda x: "muon" if x.ndim == 2 else "adam", params
+        ),
+    )
 
 
 OptimizerName = Literal["muon", "adamw", "radam", "adam"]

@@ -1,5 +1,7 @@
 """State, update and chunks on a model small enough to be done by hand."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -108,6 +110,70 @@ def test_gradient_is_clipped_and_weights_decay():
     params = {"a": jnp.array([2.0, -2.0])}
     change, _ = decaying.update({"a": jnp.zeros(2)}, decaying.init(params), params)
     np.testing.assert_allclose(change["a"], [-0.1, 0.1], rtol=1e-6)
+
+
+def matrix(rows, columns, sizes):
+    """A matrix with given singular values, and its left and right vectors."""
+    generator = np.random.default_rng(rows)
+    left, _ = np.linalg.qr(generator.normal(size=(rows, len(sizes))))
+    right, _ = np.linalg.qr(generator.normal(size=(columns, len(sizes))))
+    return left * sizes @ right.T, left, right
+
+
+COEFFICIENTS = np.tile([3.4445, -4.7750, 2.0315], (5, 1))
+
+
+@pytest.mark.parametrize("shape", [(40, 24), (24, 40), (24, 24)])
+def test_orthogonalized_matrices_are_near_those_of_the_svd_in_float64(shape):
+    """As steep as gradients are: most singular values are below a tenth."""
+    sizes = np.geomspace(1.0, 1e-3, 24)
+    given, left, right = matrix(*shape, sizes)
+    found = np.float64(
+        training.orthogonalize(jnp.float32(given), jnp.float32(COEFFICIENTS))
+    )
+    expected = sizes / np.linalg.norm(sizes)
+    for a, b, c in COEFFICIENTS:
+        expected = a * expected + b * expected**3 + c * expected**5
+    np.testing.assert_allclose(found, left * expected @ right.T, atol=1e-3)
+    # The nearest matrix with orthonormal rows or columns has ones in their place.
+    large = expected[sizes > 0.0015 * np.linalg.norm(sizes)]
+    assert len(large) > 18 and large.min() > 0.67 and large.max() < 1.21
+
+
+def test_orthogonalizing_many_is_orthogonalizing_each():
+    each = functools.partial(
+        training.orthogonalize, coefficients=jnp.float32(COEFFICIENTS)
+    )
+    many = jnp.float32(np.random.default_rng(0).normal(size=(3, 5, 8)))
+    for one, alone in zip(jax.vmap(each)(many), many, strict=True):
+        np.testing.assert_allclose(one, each(alone), atol=1e-5)
+    assert not np.any(each(jnp.zeros((2, 3))))
+
+
+def moves(optimizer, gradients, params):
+    """Changes of each update, and the last state."""
+    state, made = optimizer.init(params), []
+    for gradient in gradients:
+        change, state = optimizer.update(gradient, state, params)
+        made.append(change)
+    return made, state
+
+
+def test_muon_is_optax_s_and_goes_on_from_its_states():
+    params = {"w": jnp.zeros((6, 4)), "b": jnp.zeros(3)}
+    generator = np.random.default_rng(0)
+    gradients = [
+        {k: jnp.float32(generator.normal(size=x.shape)) for k, x in params.items()}
+        for _ in range(5)
+    ]
+    theirs = optax.chain(optax.contrib.muon(0.01, consistent_rms=0.2))
+    expected, state = moves(theirs, gradients, params)
+    ours = training.make_optimizer("muon", learning_rate=0.01)
+    found, own = moves(ours, gradients, params)
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6)
+    jax.tree.map(close, (found, own), (expected, state))
+    again, other = (x.update(gradients[0], state, params)[0] for x in (ours, theirs))
+    jax.tree.map(close, again, other)
 
 
 def test_muon_moves_matrices_orthogonally_and_vectors_as_nadam_does():

@@ -135,7 +135,9 @@ def seam_terms(
         joined = (jnp.concatenate([past, x], axis=-2) for x in (prediction, target))
         return loss_terms(skeleton, *joined, config=config, mask=mask)
 
-    return jax.vmap(terms)(predictions, jnp.broadcast_to(x_0, predictions.shape))
+    # Targets that all levels share are posed once.
+    own = 0 if x_0.ndim == predictions.ndim else None
+    return jax.vmap(terms, (0, own))(predictions, x_0)
 
 
 def examples(
