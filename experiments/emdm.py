@@ -30,6 +30,7 @@ from jaxmotion.systems.emdm import sampler as emdm_sampler
 from jaxmotion.systems.emdm import scoring as emdm_scoring
 from jaxmotion.systems.emdm import text as emdm_text
 from jaxmotion.systems.emdm import training as emdm_training
+from jaxmotion.typing import Params
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +77,8 @@ class Train:
       ddpm_rate: Of rows without a discriminator (Muon).
       discriminator_rate: Of the discriminator (Adam), which falls as the generator's
         does (published: constant, 6 times the generator's).
+      init: Run folder or exported model to start from (actions); a folder's row of the
+        same name.
       alone: Part of a GAN's updates that its generator makes first, without the
         discriminator (ours).
       distributed: One of several processes: "auto", or address, number, index.
@@ -124,6 +127,7 @@ class Train:
     learning_rate: float = 2e-3
     ddpm_rate: float = 2e-3
     discriminator_rate: float = 5e-4
+    init: cli.Optional[Path] = None
     alone: float = 0.0
     distributed: cli.Distributed = ()
     seed: int = 0
@@ -253,6 +257,18 @@ def prepare(args: Train) -> emdm_training.Task:
     return emdm_data.make_task(run, base_config(args, 1.0), conditional=conditional)
 
 
+def _start(args: Train, task: emdm_training.Task, row: str) -> Params:
+    """Parameters that a row of actions begins with."""
+    run = emdm_data.load_run(args.out)
+    model = emdm_sampler.Model(
+        config=emdm_training.row_config(task.base, row),
+        representation=run.representation,
+        labels=run.actions,
+        source=run.clips.source,
+    )
+    return emdm_sampler.start_of(args.init, model, row=row)
+
+
 def train(args: Train) -> None:
     """Trains row by row."""
     cli.join_processes(args.distributed)
@@ -263,8 +279,11 @@ def train(args: Train) -> None:
             raise ValueError(
                 f"row {row!r} samples {emdm_training.SAMPLERS[row][0]!r}: train that"
             )
+    if args.init and args.task != "action":
+        raise ValueError(f"init is {args.init}, but task {args.task!r}: expected none")
     loop.check_writable(args.out)
     task = prepare(args)
+    starts = {row: _start(args, task, row) for row in rows if args.init}
     for row in rows:
         begun = time.perf_counter()
         config = emdm_training.row_config(task.base, row)
@@ -285,6 +304,7 @@ def train(args: Train) -> None:
             generator=budget,
             discriminator=discriminator,
             alone=args.alone,
+            start=starts.get(row),
         )
         print(f"{row}: {time.perf_counter() - begun:.0f} s", flush=True)
 

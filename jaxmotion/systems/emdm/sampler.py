@@ -125,6 +125,41 @@ def load(path: Path, *, row: str = "emdm") -> tuple[Model, Params]:
     return model, params
 
 
+# What of a configuration its parameters do not depend on.
+_FREE = (
+    "num_steps",
+    "schedule",
+    "dropout",
+    "drop_condition",
+    "geometry",
+    "mask_frames",
+)
+
+
+def start_of(path: Path, model: Model, *, row: str = "emdm") -> Params:
+    """Averaged parameters of a folder's row or an exported file, to train on from.
+
+    Raises:
+      ValueError: if sizes, skeleton, labels or units of features differ from the
+        model's to train; names which.
+    """
+    first, params = load(path, row=row)
+
+    def part(model: Model) -> dict[str, Any]:
+        value = to_json(dataclasses.replace(model, source=""))
+        value["config"] = {
+            name: found
+            for name, found in value["config"].items()
+            if not name.startswith(("weight_", "discriminator_")) and name not in _FREE
+        }
+        return value
+
+    differ = model_json.differences(part(first), part(model))
+    if differ:
+        raise ValueError(f"{path}: expected a model like the one to train: {differ}")
+    return params
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Method:
     """What makes motions of `(generator's parameters, representation)`; hashable."""

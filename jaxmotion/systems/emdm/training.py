@@ -189,12 +189,13 @@ def train_row(
     generator: Budget,
     discriminator: Budget,
     alone: float = 0.0,
+    start: Params | None = None,
 ) -> None:
     """Trains a row, from its newest checkpoint if there is one.
 
     Of the discriminator's budget only the optimizer counts: its steps are the
     generator's, but for the part of them, `alone`, that the generator learns without
-    it.
+    it. The generator starts from `start`, if given.
 
     Raises:
       ValueError: if the row has a checkpoint of other sizes or data.
@@ -204,6 +205,8 @@ def train_row(
     flat = not (config.weight_position or config.weight_velocity or config.weight_foot)
     geometry = None if flat else task.geometry
     params = emdm_model.init(jax.random.key(generator.seed), config)
+    if start is not None:
+        params |= {"generator": start}
     common: dict[str, Any] = dict(budget=generator, model=dataclasses.asdict(config))
     stage = _stage(row)
 
