@@ -1,8 +1,10 @@
 """A model of actions as one file, and its motions."""
 
 import copy
+import dataclasses
 import json
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -102,6 +104,30 @@ def test_wrong_words_end_in_one_line(file):
     with pytest.raises(ValueError, match="expected hip, knee and ankle"):
         jm.load(file, foot_lock=True)
     assert model.license is None and model.frames == 8
+
+
+def test_a_training_starts_from_a_model_of_its_sizes(model, params, file):
+    """Losses and noise may differ; what features mean may not."""
+    other = dataclasses.replace(
+        model.config, num_steps=5, weight_foot=300.0, discriminator_width=128
+    )
+    got = emdm_sampler.start_of(file, dataclasses.replace(model, config=other))
+    chex.assert_trees_all_close(got, params, rtol=1e-3, atol=1e-3)
+    wider = dataclasses.replace(model.config, width=64)
+    scaled = dataclasses.replace(
+        model.representation,
+        normalizer=dataclasses.replace(
+            model.representation.normalizer,
+            std=2.0 * model.representation.normalizer.std,
+        ),
+    )
+    for changes, message in (
+        (dict(config=wider), "config.width is 32, given 64"),
+        (dict(labels=ACTIONS[::-1]), "labels is .*walk.*, given .*stand"),
+        (dict(representation=scaled), "representation.std is .*given"),
+    ):
+        with pytest.raises(ValueError, match=f"{file}: expected .*{message}"):
+            emdm_sampler.start_of(file, dataclasses.replace(model, **changes))
 
 
 @pytest.mark.slow
