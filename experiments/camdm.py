@@ -5,7 +5,6 @@ Examples:
   python experiments/camdm.py train --data data/bandai2.npz --out runs/camdm
   python experiments/camdm.py evaluate --run runs/camdm
   python experiments/camdm.py rollout --run runs/camdm --style elderly --seconds 20
-  python experiments/camdm.py steering --run runs/camdm --style elderly
   python experiments/camdm.py distill --run runs/camdm --out runs/camdm_student
   python experiments/camdm.py import --weights best.pt --skeleton ybot.bvh --out runs/camdm_released
 """  # noqa: E501
@@ -18,18 +17,14 @@ import tyro
 
 from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
-from jaxmotion.control.foot_lock import FootLock
 from jaxmotion.data.clips import Clips
-from jaxmotion.evaluation import by_frame
 from jaxmotion.evaluators import frozen
 from jaxmotion.learning import checkpoint, loop, runs
 from jaxmotion.learning.training import OptimizerName
-from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import distillation as camdm_distillation
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import model as camdm_model
 from jaxmotion.systems.camdm import published as camdm_published
-from jaxmotion.systems.camdm import steering as camdm_steering
 from jaxmotion.systems.camdm import training as camdm_training
 
 
@@ -264,55 +259,6 @@ class Evaluate:
 
 
 @dataclasses.dataclass(frozen=True)
-class Steering:
-    """Steer characters straight on at several speeds and along courses; measure each.
-
-    Example: python experiments/camdm.py steering --run locomotion --data data/o3de.npz
-    --held-out-clips WalkStopTurn1 RunPivotTurn1 --out runs/steering
-
-    Attributes:
-      run: Run folder of `train`; or a shipped model or an exported file, with `data`.
-      data: Clips; None for those that the run was trained on.
-      held_out_clips: Clips of `data` that a shipped or exported model never saw.
-      out: Folder for metrics.json and table.md; None for <run>/steering.
-      style: Style of all characters; None for the first.
-      speeds: What characters are told that go straight on, meters per second; 0 to
-        stand.
-      courses: Courses that they follow besides.
-      speed: What they are told there, meters per second.
-      rollouts: Characters per speed and per course.
-      seconds: Length of each rollout, seconds; 13 or more to measure who stands.
-      follow: Half-life in which a character that left its course returns, seconds; 0
-        to steer by velocity alone; None for what the model ships with.
-      foot_lock: Measure what is displayed with locked feet, too.
-      visit: Steps of the schedule that a plan visits; none: the model's own.
-      chunk: Characters to run at a time, at most.
-      seed: Seeds poses and noise.
-    """
-
-    run: Path = Path("runs/camdm")
-    data: Path | None = None
-    held_out_clips: tuple[str, ...] = ()
-    out: Path | None = None
-    style: str | None = None
-    speeds: tuple[float, ...] = (0.0, 0.8, 1.4, 2.5, 3.5)
-    courses: tuple[Course, ...] = (
-        "figure_eight",
-        "stop_and_go",
-        "turn_on_the_spot",
-        "turn_around",
-    )
-    speed: float = 1.4
-    rollouts: int = 16
-    seconds: float = 20.0
-    follow: float | None = None
-    foot_lock: bool = True
-    visit: tuple[int, ...] = ()
-    chunk: int = 4
-    seed: int = 0
-
-
-@dataclasses.dataclass(frozen=True)
 class Rollout:
     """Steer one character in one style; writes BVH, GIF and HTML.
 
@@ -364,41 +310,6 @@ def evaluate(args: Evaluate) -> None:
     notes = (frozen.note(report["evaluator"]),)
     reporting.write_table(out, rows, report, notes)
     print(report)
-
-
-def steering(args: Steering) -> None:
-    """Writes the table; below it what is told by frame of the plan and by time."""
-    if args.run.is_dir():
-        run = camdm_training.load_run(args.run, args.data)
-    else:
-        run = camdm_training.exported_run(args.run, args.data, args.held_out_clips)
-    model = camdm_model.with_steps(run.model, args.visit)
-    run, control = dataclasses.replace(run, model=model), None
-    out = cli.out_folder(args, "steering")
-    if args.follow is not None:
-        control = camdm_controller.Control(follow=args.follow)
-    cli.announce("compiling the rollouts", 40)
-    found = camdm_steering.steering_table(
-        camdm_controller.character(run.params, model, control=control),
-        run.held_out,
-        run.train,
-        field=run.field,
-        label=args.style or model.labels[0],
-        speeds=args.speeds,
-        names=args.courses,
-        course_speed=args.speed,
-        rollouts=args.rollouts,
-        seconds=args.seconds,
-        foot_lock=FootLock() if args.foot_lock else None,
-        chunk=args.chunk,
-        seed=args.seed,
-    )
-    report = found.report | reporting.provenance(args)
-    notes = [by_frame.to_markdown(found.by_plan, places="by frame of the plan")]
-    if found.by_time:
-        title = "by 0.2 s since a command"
-        notes.append(by_frame.to_markdown(found.by_time, places=title))
-    reporting.write_table(out, found.rows, report, tuple(notes))
 
 
 def rollout(args: Rollout) -> None:
@@ -512,7 +423,6 @@ Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Distill, tyro.conf.subcommand("distill")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Steering, tyro.conf.subcommand("steering")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]
@@ -526,7 +436,6 @@ def main() -> None:
         Train: train,
         Distill: distill,
         Evaluate: evaluate,
-        Steering: steering,
         Rollout: rollout,
         Export: export,
         Import: import_weights,

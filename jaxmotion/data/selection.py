@@ -40,6 +40,18 @@ def select(clips: Clips, field: str, names: Sequence[str]) -> Clips:
     return take_clips(clips, keep)
 
 
+def label_field(clips: Clips, labels: Sequence[str]) -> str | None:
+    """Field of the clips that has all these labels; None if none has.
+
+    One with these labels alone comes before one that has others as well.
+    """
+    fields = dict(clips.label_names)
+    for field in sorted(fields, key=lambda field: fields[field] != tuple(labels)):
+        if labels and {*labels} <= {*fields[field]}:
+            return field
+    return None
+
+
 def relabel(clips: Clips, field: str) -> Clips:
     """Renumbers a label field to the labels that occur, in the old order.
 

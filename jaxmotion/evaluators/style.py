@@ -259,6 +259,19 @@ def in_batches(function: Callable[[Any], Any], x: Any, *, size: int = 256) -> An
     return jax.tree.map(lambda *p: np.concatenate(p), *parts)
 
 
+def contact_height(skeleton: Skeleton, real: EvalWindows) -> float:
+    """Height below which toes should not move, meters.
+
+    One centimeter above where toes rest (their first percentile), as the paper's
+    "below, e.g., 1 cm".
+    """
+    feet = jnp.array(skeleton.feet)
+    toes = in_batches(
+        jax.jit(lambda m: joint_positions(skeleton, m)[..., feet, :]), real.motion
+    )
+    return float(np.percentile(toes[..., 1], 1)) + 0.01
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StyleEvaluator:
     """A style evaluator and its size.

@@ -444,17 +444,16 @@ def fitting_clips(model: Model, clips: Clips) -> tuple[Clips, str]:
       ValueError: if no field has them all, or the clips are of another skeleton or
         rate.
     """
-    fields = dict(clips.label_names)
-    # A field with these styles alone before one that has others as well.
-    for field in sorted(fields, key=lambda field: fields[field] != model.labels):
-        if {*model.labels} <= {*fields[field]}:
-            if fields[field] != model.labels:
-                clips = selection.select(clips, field, model.labels)
-                clips = selection.relabel(clips, field)
-            check_clips(model, clips, field)
-            return clips, field
+    field = selection.label_field(clips, model.labels)
+    if field is not None:
+        if clips.names(field) != model.labels:
+            clips = selection.select(clips, field, model.labels)
+            clips = selection.relabel(clips, field)
+        check_clips(model, clips, field)
+        return clips, field
     raise ValueError(
-        f"the clips do not fit the model: no label field (of {', '.join(fields)}) has "
+        f"the clips do not fit the model: no label field (of "
+        f"{', '.join(name for name, _ in clips.label_names)}) has "
         f"the styles {', '.join(model.labels)}"
     )
 

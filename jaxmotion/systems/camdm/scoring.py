@@ -20,7 +20,12 @@ from jaxmotion.evaluation import (
 )
 from jaxmotion.evaluation.table import Row
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.evaluators.style import StyleEvaluator, features_and_hits, in_batches
+from jaxmotion.evaluators.style import (
+    StyleEvaluator,
+    contact_height,
+    features_and_hits,
+    in_batches,
+)
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.systems.camdm import release as camdm_release
 
@@ -203,19 +208,6 @@ def repeat_diversity(
     shape = (characters // repeats, repeats, -1, skeleton.num_joints, 3)
     local = jnp.asarray(local).reshape(shape)
     return table.cell(jax.vmap(diversity.intra_style_variance)(local))
-
-
-def contact_height(skeleton: Skeleton, real: windows.EvalWindows) -> float:
-    """Height below which toes should not move, meters.
-
-    One centimeter above where toes rest (their first percentile), as the paper's
-    "below, e.g., 1 cm".
-    """
-    feet = jnp.array(skeleton.feet)
-    toes = in_batches(
-        jax.jit(lambda m: joint_positions(skeleton, m)[..., feet, :]), real.motion
-    )
-    return float(np.percentile(toes[..., 1], 1)) + 0.01
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

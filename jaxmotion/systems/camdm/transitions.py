@@ -23,7 +23,7 @@ from jaxmotion.data import windows
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.transitions import transition
 from jaxmotion.evaluators import style as style_evaluator
-from jaxmotion.evaluators.style import StyleEvaluator
+from jaxmotion.evaluators.style import StyleEvaluator, contact_height
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.camdm import controller as camdm_controller
@@ -226,7 +226,7 @@ def evaluate_transitions(
     real = windows.eval_windows(
         run.held_out, stride=windows.EVAL_WINDOW, field=run.field
     )
-    height = camdm_scoring.contact_height(run.model.skeleton, real)
+    height = contact_height(run.model.skeleton, real)
 
     def row(own: Changes, control: camdm_controller.Control) -> dict[str, table.Cell]:
         frames = steering.steered_rollouts(

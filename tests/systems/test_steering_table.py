@@ -11,7 +11,7 @@ import pytest
 from jaxmotion.control import courses, rollout, steering
 from jaxmotion.control.frame import Frame
 from jaxmotion.motion import spring
-from jaxmotion.systems.camdm import steering as camdm_steering
+from jaxmotion.systems import steering_table
 from tests import tiny
 
 FPS, SECONDS = 30.0, 14.0
@@ -109,11 +109,10 @@ def table(*names, speeds=(), rollouts=2, speed=1.0, chunk=2, **faults):
         starts=functools.partial(starts, None),
         clip_starts=starts,
     )
-    return camdm_steering.steering_table(
+    return steering_table.steering_table(
         character,
         clips(),
         clips(),
-        field="style",
         label="calm",
         speeds=speeds,
         names=names,
@@ -242,18 +241,18 @@ def test_changes_are_stops_starts_and_turns():
     commands = courses.course_commands(
         "stop_and_go", seconds=9.0, fps=FPS, speed=1.0, label=0
     )
-    assert camdm_steering.changes(commands) == [
+    assert steering_table.changes(commands) == [
         ("stop", 90, 150),
         ("start", 150, 240),
         ("stop", 240, 270),
     ]
-    since = camdm_steering.since_changes(camdm_steering.changes(commands), 270, FPS)
+    since = steering_table.since_changes(steering_table.changes(commands), 270, FPS)
     assert (since[:, :90] == -1).all() and (since[2] == -1).all()
     np.testing.assert_array_equal(since[0, 90:102], [0] * 6 + [1] * 6)
     assert since[0, 149] == 9 and since[0, 150] == -1 and since[1, 150] == 0
 
 
 def test_rollouts_too_short_to_measure_are_named(monkeypatch):
-    monkeypatch.setattr("tests.systems.camdm.test_steering_table.SECONDS", 4.0)
+    monkeypatch.setattr("tests.systems.test_steering_table.SECONDS", 4.0)
     with pytest.raises(ValueError, match="4 s are too short to measure"):
         table(speeds=(1.0,))

@@ -25,7 +25,7 @@ from jaxmotion.control import courses, steering
 from jaxmotion.control.foot_lock import FootLock, lock_feet
 from jaxmotion.control.frame import Frame
 from jaxmotion.control.steering import Character
-from jaxmotion.data import windows
+from jaxmotion.data import selection, windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import (
     alignment,
@@ -38,12 +38,11 @@ from jaxmotion.evaluation import (
 )
 from jaxmotion.evaluation.by_frame import ByFrame, Sums
 from jaxmotion.evaluation.table import Cell, Row, Rows
-from jaxmotion.evaluators.style import in_batches
+from jaxmotion.evaluators.style import contact_height, in_batches
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.motion.spring import Scalar
 from jaxmotion.motion.trajectory import Command
-from jaxmotion.systems.camdm import scoring as camdm_scoring
 
 # Seconds to leave out at the start: characters begin with other speeds.
 SKIP = 3.0
@@ -312,29 +311,37 @@ def _join(parts: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 class _Real:
-    """Windows of real clips with a label, and where the ground is by the first clips.
+    """Windows of real clips, and where the ground is by the first clips.
+
+    Those with the label, if their clips know it.
 
     Attributes:
       values: Metrics of the windows and their clips, by name of the clips.
     """
 
-    def __init__(self, clips: dict[str, Clips], *, field: str, label: int):
+    def __init__(self, clips: dict[str, Clips], *, label: str):
+        first = next(iter(clips))
+        field = selection.label_field(clips[first], [label])
+        any_field = field or clips[first].label_names[0][0]
         found = {
             name: windows.eval_windows(
-                some, stride=windows.EVAL_WINDOW // 2, field=field
+                some, stride=windows.EVAL_WINDOW // 2, field=any_field
             )
             for name, some in clips.items()
         }
-        first = next(iter(clips))
         skeleton = clips[first].skeleton
-        height = camdm_scoring.contact_height(skeleton, found[first])
+        height = contact_height(skeleton, found[first])
         root = np.asarray(found[first].motion.root_position)[..., 1]
         self.ground = Ground(rest=height - 0.01, root=float(np.median(root)))
         measure = functools.partial(_window_metrics, skeleton, self.ground)
         self.values = {}
         for name, some in found.items():
-            values, is_own = in_batches(measure, some), np.asarray(some.label) == label
-            groups = np.asarray(some.group)[is_own]
+            values, groups = in_batches(measure, some), np.asarray(some.group)
+            is_own = np.ones(groups.size, bool)
+            if field is not None:
+                wanted = clips[name].names(field).index(label)
+                is_own = np.asarray(some.label) == wanted
+            groups = groups[is_own]
             self.values[name] = {k: v[is_own] for k, v in values.items()}, groups
 
     def rows(self, speed: float) -> Rows:
@@ -390,7 +397,6 @@ def steering_table(
     held_out: Clips,
     train: Clips,
     *,
-    field: str,
     label: str,
     speeds: Sequence[float],
     names: Sequence[str] = (),
@@ -405,10 +411,10 @@ def steering_table(
     """Steers characters straight on and along courses, and measures them.
 
     Args:
-      held_out: Clips that it never saw: rows of real motion, poses to start from, and
-        where the ground is.
+      held_out: Clips that it never saw: rows of real motion, where the ground is, and
+        poses to start from if it starts from clips.
       train: Clips that it was trained on: rows of real motion.
-      label: Label of all characters and of the real windows.
+      label: Label of all characters, and of the real windows if the clips know it.
       speeds: What characters are told that go straight on, m/s; 0 to stand.
       names: Courses that they follow besides.
       course_speed: What they are told there, m/s.
@@ -424,7 +430,8 @@ def steering_table(
       ValueError: if rollouts are too short to measure, there is no such label or
         course, or the skeleton has no feet to lock.
     """
-    fps, index = character.fps, character.label(label)
+    fps = character.fps
+    index = character.label(label) if character.labels else 0
     skip, ticks = round(SKIP * fps), round(seconds * fps)
     windows.check_ticks(ticks, fps=fps, skip=skip)
     courses_ = [("straight", speed) for speed in speeds]
@@ -438,9 +445,14 @@ def steering_table(
     characters = {"": character}
     if foot_lock is not None:
         characters[", locked feet"] = lock_feet(character, foot_lock)
-    real = _Real({"held-out": held_out, "training": train}, field=field, label=index)
+    real = _Real({"held-out": held_out, "training": train}, label=label)
     starts = {
-        feet: one.start(rollouts, labels=index, clips=held_out, seed=seed)
+        feet: one.start(
+            rollouts,
+            labels=index,
+            clips=None if one.clip_starts is None else held_out,
+            seed=seed,
+        )
         for feet, one in characters.items()
     }
     chunk = max(size for size in range(1, chunk + 1) if rollouts % size == 0)
