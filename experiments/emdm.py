@@ -158,6 +158,8 @@ class Evaluate:
       padding: What the text-motion evaluator sees beyond the end of generated motions:
         "zeros" (ours), as beyond that of real ones, or "kept", what the model put there
         (as released).
+      foot_lock: Score motions whose planted feet stand, as `jaxmotion.load` gives them
+        (actions).
       seed: Seeds noise and pairs.
     """
 
@@ -173,6 +175,7 @@ class Evaluate:
     matcher: Path | None = None
     glove: Path | None = None
     padding: Padding = "zeros"
+    foot_lock: bool = False
     seed: int = 0
 
 

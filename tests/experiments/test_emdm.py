@@ -203,6 +203,7 @@ BAD = {
     "evaluate --run {texts} --matcher finest.tar": (
         "matcher is finest.tar and glove is None.*our_vab_data.npy, our_vab_words.pkl"
     ),
+    "evaluate --run {texts} --foot-lock": "foot_lock is on, but .*expected off",
     "evaluate --run {texts} --glove glove": "matcher is None and glove is glove",
     "evaluate --run {texts} --matcher {new}/finest.tar --glove glove": (
         "expected mean.npy and std.npy of the evaluator's meta folder"

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from jaxmotion.control import foot_lock
 from jaxmotion.evaluation import (
     by_frame,
     contact,
@@ -267,9 +268,16 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
         mask=jnp.ones((*wanted.shape, run.train.frames), bool),
     )
 
+    def cleaned(motion: Motion) -> Motion:
+        return foot_lock.clean_motion(
+            run.clips.skeleton, motion, lock=foot_lock.FootLock()
+        )
+
     @jax.jit
     def positions_of(x: Array) -> Array:
         motion = emdm_features.to_motion(x, run.representation)
+        if settings.foot_lock:
+            motion = jax.vmap(cleaned)(motion)
         return joint_positions(run.clips.skeleton, motion)
 
     def score_row(key: Key, many: Many) -> Scores:

@@ -35,6 +35,7 @@ class Settings:
       matcher: Published weights of the text-motion evaluator; None to train one.
       glove: Folder of the word vectors that they read.
       padding: What the text-motion evaluator sees beyond the end of generated motions.
+      foot_lock: Generated motions are cleaned (`control.foot_lock.clean_motion`).
       seed: Seeds noise and pairs.
     """
 
@@ -46,6 +47,7 @@ class Settings:
     matcher: Path | None = None
     glove: Path | None = None
     padding: Padding = "zeros"
+    foot_lock: bool = False
     seed: int = 0
 
 

@@ -373,6 +373,11 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
             f"evaluator is {settings.evaluator.path}, but {folder} makes motions "
             "from texts: expected none, or --matcher"
         )
+    if settings.foot_lock:
+        raise ValueError(
+            f"foot_lock is on, but {folder} makes motions from texts, which are scored "
+            "as features: expected off"
+        )
     if (settings.matcher is None) != (settings.glove is None):
         raise ValueError(
             f"matcher is {settings.matcher} and glove is {settings.glove}: "
