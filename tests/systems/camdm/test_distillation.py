@@ -64,6 +64,7 @@ def test_the_teacher_teaches_itself_nothing_at_the_last_step(walker, target):
     assert terms["data"] > 1e-4 and terms["position"] > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["chain", "consistency"])
 def test_a_short_training_comes_closer_to_the_teacher(walker, target):
     loss = loss_of(walker, steps=(2, T), target=target)
@@ -123,6 +124,7 @@ def student(taught):
     return folder
 
 
+@pytest.mark.slow
 def test_a_student_is_a_run_like_others_and_visits_its_own_steps(student, taught):
     run = camdm_training.load_run(student)
     assert run.model.steps == (2, T)
@@ -190,6 +192,7 @@ def test_a_plan_of_one_step_is_one_prediction(student):
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_training_that_was_stopped_goes_on_as_if_it_had_not_been(
     student, taught, tmp_path
 ):

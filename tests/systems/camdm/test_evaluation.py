@@ -139,6 +139,7 @@ def test_health_counts_who_stands_although_told_to_walk():
     assert found == dict(diverged=1, frozen=0, rollouts=1)
 
 
+@pytest.mark.slow
 def test_planted_feet_score_as_planted_in_both_rows():
     rows, _ = evaluated("walking")
     for name in (TRUTH, "rollouts"):
