@@ -231,7 +231,8 @@ def main() -> None:
                 stage = make_stage(model.skeleton, frames.motion, apart=0.0)
                 animation.save_gif(args.gif, stage)
                 print(f"wrote {args.gif}")
-    reporting.write_table(args.out, rows, reporting.provenance(args))
+        # Of all models up to here: the others may take long.
+        reporting.write_table(args.out, rows, reporting.provenance(args))
 
 
 if __name__ == "__main__":

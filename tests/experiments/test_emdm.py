@@ -80,7 +80,9 @@ def test_actions_are_scored_beside_real_motions(call, actions):
         "ddpm_50",
     }
     for name, row in rows.items():
-        assert {"fid", "accuracy", "diversity", "multimodality"} <= set(row), name
+        expected = {"fid", "accuracy", "diversity", "multimodality", "deviation"}
+        assert expected <= set(row), name
+        assert 0 < row["deviation"]["value"] < 100, name  # cm
         assert 0 <= row["accuracy"]["value"] <= 1 and row["fid"]["value"] >= 0
         assert row["fid"]["samples"] == 2 and row["fid"]["low"] is not None
     assert rows["emdm"]["network_calls"]["value"] == 10
