@@ -60,8 +60,9 @@ def along(
     """
     # Of one length, so that waypoints compile nothing.
     points = route.points + route.points[-1:] * (MOST + 1 - len(route.points))
-    arrays = map(np.float32, (points, speed, position, velocity, last.facing))
-    found, way = map(np.asarray, _pursue(*arrays, np.float32(route.way)))
+    given = (points, speed, position, velocity, last.facing, route.way)
+    arrays = [np.asarray(x, np.float32) for x in given]
+    found, way = map(np.asarray, _pursue(*arrays))
     route = dataclasses.replace(route, way=float(way))
     length = sum(itertools.starmap(math.dist, itertools.pairwise(route.points)))
     ends = length - route.way < NEAR and math.dist(position, route.points[-1]) < NEAR

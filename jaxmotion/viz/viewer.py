@@ -568,8 +568,8 @@ class Session:
             made.poses = np.asarray(done[1][1])
             made.step(done[0], Wish(), settings, seed=0, n=1)
             ahead = waypoints.Route(points=((0.0, 0.0), (0.0, 1.0)))
-            here = dict(position=(0.0, 0.0), velocity=(0.0, 0.0), speed=1.0)
-            waypoints.along(ahead, Wish(), **here)
+            here = (0.0, 0.0)
+            waypoints.along(ahead, Wish(), position=here, velocity=here, speed=1.0)
             if self._dress is not None:
                 made.dress = self._dressed(name, made)
             self._programs[key] = made

@@ -499,8 +499,8 @@ def load_character(
             method=lambda num_steps, scale: dataclasses.replace(method, scale=scale),
             num_steps=(model.config.num_steps,),
             own_steps=model.config.num_steps,
-            scale=method.scale,
-            scales=(0.0, 4 * method.scale),
+            scale=float(method.scale),
+            scales=(0.0, 4 * float(method.scale)),
             patience=0,
         ),
         starts=lambda labels, seed: starts(

@@ -462,7 +462,7 @@ def _tuning(method: Method, *, all_steps: bool) -> Tuning:
         method=tuned,
         num_steps=tuple(range(1, len(offered) + 1)),
         own_steps=len(own),
-        scale=control.guidance_scale,
+        scale=float(control.guidance_scale),
         scales=(0.0, 2.0),
         patience=method.config.future - control.apply,
     )

@@ -366,7 +366,7 @@ def _tuning(method: Method) -> Tuning:
         method=tuned,
         num_steps=tuple(range(max(guided.start + guided.end, 1), total + 1)),
         own_steps=total,
-        scale=guided.rate,
+        scale=float(guided.rate),
         scales=(0.0, 1.0),
         patience=method.config.future - control.apply,
     )
