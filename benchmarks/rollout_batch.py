@@ -4,6 +4,7 @@ Examples:
   python benchmarks/rollout_batch.py --system camdm --characters 1 16 256
   python benchmarks/rollout_batch.py --characters 64 --chunks 1 4 16 0 --staggered
   python benchmarks/rollout_batch.py --system aamdm --characters 1 64 4096
+  python benchmarks/rollout_batch.py --run dribble --characters 1 64 4096 --seconds 0.1
   python benchmarks/rollout_batch.py --characters 1 16 256 4096 65536 --seconds 0.5
       --width 128 --frames-per-token 5
 """
@@ -20,7 +21,7 @@ import numpy as np
 import suite
 import workload
 
-from jaxmotion import cli
+from jaxmotion import cli, files
 from jaxmotion.control import rollout
 from jaxmotion.evaluation import timing
 from jaxmotion.networks import work
@@ -63,9 +64,9 @@ class Config(suite.Settings):
         its jitted networks.
       characters: Characters that are rolled out together.
       seconds: Length of a rollout.
-      run: Trained model: for CAMDM a run folder or exported file of the procedural
-        walker, for AAMDM a run folder; None for random parameters, which take the same
-        time as trained ones.
+      run: Name of a shipped model of any system, to be steered; or a trained model:
+        for CAMDM a run folder or exported file of the procedural walker, for AAMDM a
+        run folder; None for random parameters, which take the same time.
       chunks: Characters at a time, in batches of 16 and more; 0 for all at once.
         Several compare.
       staggered: CAMDM: change commands at other ticks for each character; without it
@@ -275,18 +276,22 @@ def main() -> None:
     """Measures and writes the report."""
     args = suite.parse(Config, __doc__)
     suite.at_least(args, characters=1, runs=1)
-    make = workload.of(args.system, "rollouts")
-    sizes = workload.Sizes(width=args.width, frames_per_token=args.frames_per_token)
-    load = make(sizes, args.run, args.seconds, args.staggered)
+    shipped = str(args.run) in files.SHIPPED
+    if shipped:
+        load = workload.shipped_rollouts(str(args.run), args.seconds, args.staggered)
+    else:
+        make = workload.of(args.system, "rollouts")
+        sizes = workload.Sizes(width=args.width, frames_per_token=args.frames_per_token)
+        load = make(sizes, args.run, args.seconds, args.staggered)
     chunks = (load.chunk,) if args.chunks is None else args.chunks
     cases = [(n, chunk) for n in args.characters for chunk in chunks_of(n, chunks)]
     floor = timing.matmul_rate(), plan_flops(load)
     print(f"matmul: {floor[0] / 1e9:.4g} GFLOP/s; a plan: {floor[1] / 1e9:.4g} GFLOP")
-    rows, metrics = [], []
+    rows, metrics, what = [], [], args.run.name if shipped else args.system
     for number, chunk in cases:
         row = case(args, load, number, chunk, floor)
         rows.append(row)
-        name = f"{args.system} characters={number} chunk={row['chunk']}"
+        name = f"{what} characters={number} chunk={row['chunk']}"
         metrics += suite.time_metrics(name, row)
         metrics.append(
             suite.Metric(f"{name} traces", row["traces"], "traces", tolerance=0.0)
@@ -300,7 +305,7 @@ def main() -> None:
         table = np.array([(row["characters"], row["p50_ms"]) for row in rows])
         plots.plot_sweep(
             args.out / "rollout_batch.png",
-            {args.system: (*table.T, None)},
+            {what: (*table.T, None)},
             xlabel="characters",
             ylabel=f"{args.seconds:g} s of motion, ms (p50)",
         )

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxmotion.control import courses, rollout
+from jaxmotion import face
+from jaxmotion.control import courses, rollout, steering
 from jaxmotion.data import procedural, windows
 from jaxmotion.data.builders import smpl
 from jaxmotion.data.clips import Clips
@@ -354,6 +355,44 @@ def walker_model(
     return model, params
 
 
+def _straight_on(
+    labels: np.ndarray, seconds: float, fps: float, staggered: bool
+) -> trajectory.Command:
+    """The course "forward" at 1 m/s; staggered: from another place of it for each."""
+    ticks, extra = round(seconds * fps), 30.0 if staggered else 0.0
+    commands = courses.course_batch(
+        "forward", labels, np.ones(len(labels)), seconds=seconds + extra, fps=fps
+    )
+    last = round(extra * fps)
+    places = np.random.default_rng(0).integers(0, last + 1, len(labels))
+    rows = jnp.asarray(places[:, None] + np.arange(ticks))
+    return jax.tree.map(lambda x: jax.vmap(lambda y, i: y[i])(x, rows), commands)
+
+
+def shipped_rollouts(name: str, seconds: float, staggered: bool) -> Rollouts:
+    """A shipped model, steered straight on, without the foot lock.
+
+    Raises:
+      ValueError: if it makes whole motions.
+    """
+    model = steering.steered(face.load(name, foot_lock=False), what=name)
+
+    def start(characters: int) -> tuple[Any, trajectory.Command]:
+        labels = np.zeros(characters, np.int32)
+        return model.start(characters), _straight_on(
+            labels, seconds, model.fps, staggered
+        )
+
+    return Rollouts(
+        params=model.params,
+        controller=model.method,
+        start=start,
+        plans=lambda frames: float(frames.planned.sum()),
+        fps=model.fps,
+        chunk=4,
+    )
+
+
 def _camdm_rollouts(
     sizes: Sizes, run: Path | None, seconds: float, staggered: bool
 ) -> Rollouts:
@@ -366,15 +405,7 @@ def _camdm_rollouts(
         states = camdm_controller.start_states(
             make_clips(), model, labels, field="style", seed=0
         )
-        ticks, extra = round(seconds * fps), 30.0 if staggered else 0.0
-        commands = courses.course_batch(
-            "forward", labels, np.ones(characters), seconds=seconds + extra, fps=fps
-        )
-        last = round(extra * fps)
-        places = np.random.default_rng(0).integers(0, last + 1, characters)
-        rows = jnp.asarray(places[:, None] + np.arange(ticks))
-        pick = lambda x: jax.vmap(lambda y, i: y[i])(x, rows)  # noqa: E731
-        return states, jax.tree.map(pick, commands)
+        return states, _straight_on(labels, seconds, fps, staggered)
 
     return Rollouts(
         params=params,

@@ -530,3 +530,15 @@ def test_retarget(tmp_path):
     for row in rows:
         assert row["slide"] < 1.1 * row["slide_source"] + 1e-4
         assert row["under"] < 1e-3 and row["trip"] < 0.01
+
+
+def test_shipped_models_are_rolled_out_straight_on(load):
+    workload = load("workload")
+    made = workload.shipped_rollouts("locomotion_fast", 0.1, True)
+    states, commands = made.start(3)
+    assert commands.label.shape == (3, round(0.1 * made.fps))
+    assert jax.tree.leaves(states)[0].shape[0] == 3
+    speed = np.linalg.norm(commands.velocity, axis=-1)
+    np.testing.assert_allclose(speed, 1.0, atol=1e-5)
+    with pytest.raises(ValueError, match="actions makes whole motions"):
+        workload.shipped_rollouts("actions", 0.1, False)
