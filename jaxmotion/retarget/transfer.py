@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 
 from jaxmotion.motion import anatomy, rotation
 from jaxmotion.motion.anatomy import LEFT, RIGHT, Anatomy, Limb
-from jaxmotion.motion.skeleton import Motion, Skeleton, global_transforms
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.retarget import roles as names
 
 # An adult's ankle over the sole and thigh with shank, meters; how far behind the ankle
@@ -206,46 +206,88 @@ def _sources(source: Rest, target: Rest) -> tuple[np.ndarray, list[int]]:
 _settled = jax.lax.optimization_barrier
 
 
-# Written out: products of 3 x 3 matrices then compile into the loops around them.
+# Vectors are [n, 3, batch] and matrices [n, rows, columns, batch], and products are
+# written out: they compile into few loops, which run over the batch.
 def _times(a: Array, b: Array) -> Array:
-    parts = [a[..., :, k, None] * b[..., None, k, :] for k in range(3)]
+    parts = [a[:, :, k, None] * b[:, None, k] for k in range(3)]
     return functools.reduce(operator.add, parts)
 
 
-def _turned(a: Array, v: np.ndarray | Array) -> Array:
-    return functools.reduce(operator.add, (a[..., :, k] * v[k] for k in range(3)))
+def _turned(a: Array, v: Array) -> Array:
+    parts = [a[:, :, k] * v[:, k, None] for k in range(3)]
+    return functools.reduce(operator.add, parts)
 
 
-def _orthonormal(matrices: Array) -> Array:
-    columns = jnp.concatenate([matrices[..., 0], matrices[..., 1]], axis=-1)
-    return rotation.matrix_from_rot6d(columns)
-
-
-def _swing(start: Array, end: Array) -> Array:
-    """The smallest rotation between unit vectors that are not opposed."""
-    v = jnp.cross(start, end)
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    o = jnp.zeros_like(x)
-    cross = jnp.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(*x.shape, 3, 3)
-    far = 1.0 / jnp.maximum(1.0 + jnp.sum(start * end, axis=-1), 1e-4)
-    return jnp.eye(3) + cross + far[..., None, None] * _times(cross, cross)
+def _dot(a: Array, b: Array) -> Array:
+    parts = [a[:, k, None] * b[:, k, None] for k in range(3)]
+    return functools.reduce(operator.add, parts)
 
 
 def _unit(v: Array) -> Array:
-    return v / jnp.maximum(jnp.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
+    return v / jnp.maximum(jnp.sqrt(_dot(v, v)), 1e-9)
+
+
+def _swung(turns: Array, start: Array, end: Array) -> Array:
+    """Turns after the smallest rotation between unit vectors that are not opposed.
+
+    That is two half turns, about the first and about the middle of both.
+    """
+    middle = _unit(start + end)
+    for axis in (start, middle):
+        along = sum(axis[:, k, None, None] * turns[:, k, None] for k in range(3))
+        turns = 2.0 * axis[:, :, None] * along - turns
+    return turns
+
+
+def _smallest(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """That rotation itself, [3, 3]."""
+    middle = anatomy.unit(start + end)
+    first, second = (2.0 * np.outer(x, x) - np.eye(3) for x in (start, middle))
+    return second @ first
+
+
+def _constant(vectors: Any) -> Array:
+    """[n, 3] or [n, 3, 3] for the same in all of a batch."""
+    return jnp.asarray(np.asarray(vectors, np.float32)[..., None])
+
+
+def _world(
+    skeleton: Skeleton, root_position: Array, joint_rotation: Array
+) -> tuple[Array, Array]:
+    """`global_transforms`, by generations of joints: few steps for few characters."""
+    parents, offsets = skeleton.parents, np.asarray(skeleton.offsets)
+    local = rotation.columns_from_rot6d(
+        jnp.moveaxis(joint_rotation, 0, -1).swapaxes(0, 1)
+    )
+    local = jnp.moveaxis(local, 2, 0)
+    depth = np.array([len(anatomy.chain(parents, j)) for j in range(len(parents))])
+    places, turns, before = [root_position.T[None]], [local[:1]], np.array([0])
+    order = [0]
+    for number in range(2, depth.max() + 1):
+        joints = np.flatnonzero(depth == number)
+        up = np.searchsorted(before, [parents[j] for j in joints])
+        parent = turns[-1][up]
+        place = places[-1][up] + _turned(parent, _constant(offsets[joints]))
+        place, turn = _settled((place, _times(parent, local[joints])))
+        places.append(place)
+        turns.append(turn)
+        before = joints
+        order += joints.tolist()
+    back = np.argsort(order)
+    return jnp.concatenate(places)[back], jnp.concatenate(turns)[back]
 
 
 def two_bones(
-    start: Float[Array, "*batch 3"],
-    goal: Float[Array, "*batch 3"],
-    pole: Float[Array, "*batch 3"],
-    a: float,
-    b: float,
-) -> Float[Array, "*batch 3"]:
-    """Where the middle joint of a limb is whose end reaches for a goal.
+    start: Float[Array, "limbs 3 batch"],
+    goal: Float[Array, "limbs 3 batch"],
+    pole: Float[Array, "limbs 3 batch"],
+    a: Float[Array, "limbs 1 1"],
+    b: Float[Array, "limbs 1 1"],
+) -> Float[Array, "limbs 3 batch"]:
+    """Where the middle joints of limbs are whose ends reach for goals.
 
     Args:
-      start: Of the limb.
+      start: Of each limb.
       goal: Of its end; beyond its reach, it points there.
       pole: A direction, to the side of which the middle joint is.
       a, b: Lengths of the two bones.
@@ -253,12 +295,12 @@ def two_bones(
     Source: the law of cosines.
     """
     way = goal - start
-    far = jnp.linalg.norm(way, axis=-1, keepdims=True)
+    far = jnp.sqrt(_dot(way, way))
     along = way / jnp.maximum(far, 1e-9)
-    far = jnp.clip(far, abs(a - b) * 1.001 + 1e-9, _REACH * (a + b))
+    far = jnp.clip(far, jnp.abs(a - b) * 1.001 + 1e-9, _REACH * (a + b))
     cosine = jnp.clip((a * a + far * far - b * b) / (2 * a * far), -1.0, 1.0)
     sine = jnp.sqrt(jnp.maximum(1.0 - cosine * cosine, 0.0))
-    aside = pole - along * jnp.sum(along * pole, axis=-1, keepdims=True)
+    aside = pole - along * _dot(along, pole)
     return start + a * (cosine * along + sine * _unit(aside))
 
 
@@ -305,12 +347,10 @@ class Retarget:
 
     @functools.cached_property
     def _program(self) -> Callable[[Array, Array], tuple[Array, Array]]:
-        many = jax.vmap(self._one)
-
         # Reshapes inside: outside, each would cost as much as the rest.
         def pose(root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
             batch = root_position.shape[:-1]
-            root, turns = many(
+            root, turns = self._many(
                 root_position.reshape(-1, 3),
                 joint_rotation.reshape(-1, *joint_rotation.shape[-2:]),
             )
@@ -318,44 +358,52 @@ class Retarget:
 
         return jax.jit(pose)
 
-    def _one(self, root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
-        """Of one character in one frame."""
-        places, turns = global_transforms(
-            self.source.skeleton, root_position, joint_rotation
-        )
+    def _many(self, root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
+        """Of many characters, one frame each."""
+        given = _settled((root_position, joint_rotation))
+        places, turns = _world(self.source.skeleton, *given)
         rows, leader = self._rows
         leaders = sorted({*leader} - {-1})
-        back = jnp.asarray(np.swapaxes(self.source.turns, -1, -2), turns.dtype)
-        mixed = jnp.einsum(
-            "ts,sij->tij",
-            jnp.asarray(rows[leaders], turns.dtype),
-            _times(turns, back),
-            precision="highest",
-        )
-        mixed, places = _settled((_orthonormal(mixed), places))
-        # By joint of the target: those that have a role.
-        turned = {joint: mixed[i] for i, joint in enumerate(leaders)}
-        turned = self._spine(places, turned)
-        middle, goals = _settled(self._goals(places, turned))
-        turned = self._legs(places, turned, middle, goals)
-        turned = self._arms(places, turned)
-        turned[-1] = jnp.eye(3, dtype=turns.dtype)  # above the hips
-        twists = self._twists(turned)
-        turned = [twists.get(j, turned[up]) for j, up in enumerate(leader)]
-        hips = turned[self.target.joint("hips")]  # pyright: ignore
-        turned = _settled(jnp.stack(turned))
-        world = _times(turned, jnp.asarray(self.target.turns, turns.dtype))
+        back = _constant(np.swapaxes(self.source.turns, -1, -2))
+        turned = _times(turns, back)
+        parts = rows[leaders]
+        # Where one joint leads, its turn; means are turned into rotations again.
+        alone = parts.max(axis=1) > 1.0 - 1e-6
+        if alone.all():
+            turned = turned[parts.argmax(axis=1)]
+        else:
+            turned = jnp.tensordot(
+                jnp.asarray(parts, turns.dtype), turned, 1, precision="highest"
+            )
+            columns = jnp.concatenate([turned[:, :, 0], turned[:, :, 1]], axis=1)
+            turned = rotation.columns_from_rot6d(jnp.moveaxis(columns, 1, 0))
+            turned = jnp.moveaxis(turned, 2, 0)
+        turned, places = _settled((turned, places))
+        # Row of each joint of the target that has a role.
+        at = {joint: row for row, joint in enumerate(leaders)}
+        turned = self._spine(places, turned, at)
+        middle, goals = _settled(self._goals(places, turned, at))
+        turned = self._limbs(places, turned, at, middle, goals)
+        at[-1] = len(turned)  # above the hips
+        still = jnp.broadcast_to(_constant([np.eye(3)]), (1, *turned.shape[1:]))
+        turned = _settled(jnp.concatenate([turned, still]))
+        turned = self._twists(turned, at)
+        every = np.array([at.get(j, at[up]) for j, up in enumerate(leader)])
+        world = _settled(_times(turned[every], _constant(self.target.turns)))
         parents = np.maximum(self.target.skeleton.parents, 0)
-        local = _times(jnp.swapaxes(world[parents], -1, -2), world)
+        local = _times(jnp.swapaxes(world[parents], 1, 2), world)
         local = jnp.concatenate([world[:1], local[1:]])
         number = self.target.joint("hips")
+        assert number is not None  # of every person
         offset = self._hip_middle - self.target.places[number]
-        root = middle - _turned(hips, offset.astype(np.float32))
+        hips = turned[at[number], None]
         # What is above the hips does not turn.
-        root = root - self.target.places[number].astype(np.float32)
-        return root, rotation.rot6d_from_matrix(local)
+        root = middle - _turned(hips, _constant([offset]))
+        root = root - _constant([self.target.places[number]])
+        local = jnp.concatenate([local[:, :, 0], local[:, :, 1]], axis=1)
+        return root[0].T, jnp.moveaxis(local, -1, 0)
 
-    def _spine(self, places: Array, turned: dict[int, Array]) -> dict[int, Array]:
+    def _spine(self, places: Array, turned: Array, at: dict[int, int]) -> Array:
         """All turns after the chest was brought to where the source's is from the hips.
 
         Means over spines of other numbers of joints bend a little less or more.
@@ -363,25 +411,31 @@ class Retarget:
         yours, mine = _trunk(self.source)[0], _trunk(self.target)[0]
         if len(mine) < 3 or len(yours) < 2:
             return turned
-        hips, at = turned[mine[0]], self.target.places[mine]
         rest = np.diff(self.source.places[[yours[0], yours[-1]]], axis=0)[0]
-        own = at[-1] - at[0]
+        joints = self.target.places[mine]
+        own = joints[-1] - joints[0]
         size = np.linalg.norm(own) / max(np.linalg.norm(rest), 1e-9)
         if not 1e-6 < size < 1e6:
             return turned
-        # From its direction in one T-pose to that in the other.
-        between = _swing(
-            jnp.asarray(anatomy.unit(rest)), jnp.asarray(anatomy.unit(own))
-        )
-        way = _times(hips, _times(between.astype(hips.dtype), hips.T))
-        goal = size * jnp.einsum("ij,j->i", way, places[yours[-1]] - places[yours[0]])
-        bones = np.diff(at, axis=0).astype(np.float32)
-        goal = goal - _turned(hips, bones[0])
-        now = jnp.zeros(3)
-        for joint, bone in zip(mine[1:-1], bones[1:], strict=True):
-            now = now + _turned(turned[joint], bone)
-        swing = _swing(_unit(now), _unit(goal))
-        return turned | {j: _settled(_times(swing, turned[j])) for j in mine[1:-1]}
+        hips = turned[at[mine[0]], None]
+        # From its direction in one T-pose to that in the other, in axes of the hips.
+        between = _smallest(anatomy.unit(rest), anatomy.unit(own))
+        way = places[yours[-1], None] - places[yours[0], None]
+        way = _turned(jnp.swapaxes(hips, 1, 2), way)
+        way = _turned(_times(hips, _constant([between])), way)
+        bones = np.diff(joints, axis=0)
+        goal = size * way - _turned(hips, _constant(bones[:1]))
+        middle = np.array([at[j] for j in mine[1:-1]])
+        now = jnp.sum(_turned(turned[middle], _constant(bones[1:])), axis=0)[None]
+        bent = _swung(turned[middle], _unit(now), _unit(goal))
+        return self._replaced(turned, at, mine[1:-1], bent)
+
+    def _replaced(
+        self, turned: Array, at: dict[int, int], joints: list[int], new: Array
+    ) -> Array:
+        """All turns, and new ones of some joints, whose rows `at` then has."""
+        at |= {joint: len(turned) + i for i, joint in enumerate(joints)}
+        return _settled(jnp.concatenate([turned, new]))
 
     @functools.cached_property
     def _hip_middle(self) -> np.ndarray:
@@ -389,11 +443,6 @@ class Retarget:
         return np.mean(
             [self.target.places[leg.upper] for leg in self.target.anatomy.legs], axis=0
         )
-
-    def _scaled(self, points: Array, source: float, target: float) -> Array:
-        """The source's points for the target; both have a height that is the same."""
-        lift = jnp.array([0.0, target - self.scale * source, 0.0], points.dtype)
-        return self.scale * points + lift
 
     def _pairs(self, limbs: str) -> list[tuple[Limb, Limb]]:
         """Limbs of source and target, by side."""
@@ -407,111 +456,118 @@ class Retarget:
         return both
 
     def _goals(
-        self, places: Array, turned: dict[int, Array]
-    ) -> tuple[Array, list[Array]]:
-        """Where the middle of the hips and the ankles go."""
-        source, target = self.source, self.target
+        self, places: Array, turned: Array, at: dict[int, int]
+    ) -> tuple[Array, Array]:
+        """Where the middle of the hips [1, 3, batch] and the ankles go."""
+        source, target, scale = self.source, self.target, self.scale
         pairs = self._pairs("legs")
-        heights = []
-        for one, limbs in (
-            (source, [p[0] for p in pairs]),
-            (target, [p[1] for p in pairs]),
-        ):
-            heights.append(
-                float(np.mean([one.places[leg.end, 1] for leg in limbs])) - one.sole
+        ankles = [
+            float(np.mean([one.places[leg.end, 1] for leg in limbs])) - one.sole
+            for one, limbs in zip(
+                (source, target), zip(*pairs, strict=True), strict=True
             )
-        middle = 0.5 * sum(places[leg.upper] for leg, _ in pairs)
-        middle = self._scaled(jnp.asarray(middle), *heights)
-        goals, drops = [], []
+        ]
+        # The source's point that leads each foot, from the target's ankle and as high
+        # over the ground; heel and the sole under the ball, from the ankle.
+        leads, points, heights, lows, reaches = [], [], [], [], []
         for yours, mine in pairs:
-            foot = turned[mine.end]
             ankle = target.places[mine.end]
-            # Heel and the sole under the ball, from the ankle.
-            low = [np.array([0.0, target.sole - ankle[1], -_HEEL * target.leg / _LEG])]
+            lows.append([[0.0, target.sole - ankle[1], -_HEEL * target.leg / _LEG]] * 2)
             if yours.after and mine.after:
                 ball = target.places[mine.after[0]] - ankle
                 own = float(ankle[1] + ball[1] - target.sole)
                 other = float(source.places[yours.after[0], 1] - source.sole)
-                goal = self._scaled(places[yours.after[0]], other, own)
-                goal = goal - _turned(foot, ball.astype(np.float32))
-                low.append(ball - [0.0, own, 0.0])
+                leads.append(yours.after[0])
+                points.append(ball)
+                lows[-1][1] = ball - [0.0, own, 0.0]
             else:
-                goal = self._scaled(places[yours.end], *heights)
-            # Neither heel nor ball below the ground, or below the source's own.
-            reach = np.array([0.0, source.sole - source.places[yours.end, 1], 0.0])
-            heel = reach - [0.0, 0.0, _HEEL * source.leg / _LEG]
-            floor = _turned(foot, heel.astype(np.float32))[..., 1]
-            floor = jnp.minimum(self.scale * (places[yours.end, 1] + floor), 0.0)
-            under = [
-                floor - goal[..., 1] - _turned(foot, p.astype(np.float32))[..., 1]
-                for p in low
-            ]
-            lift = jnp.maximum(jnp.max(jnp.stack(under), axis=0), 0.0)
-            goal = goal.at[..., 1].add(lift)
-            goals.append(goal)
-            # Where the leg is too short for its goal, the hips sink.
-            hip = self._hip(turned, middle, mine)
-            long = _REACH * sum(target.lengths(mine))
-            aside = jnp.sum((hip - goal)[..., [0, 2]] ** 2, axis=-1)
-            most = goal[..., 1] + jnp.sqrt(jnp.maximum(long * long - aside, 0.0))
-            drops.append(jnp.clip(hip[..., 1] - most, 0.0, 0.15 * long))
-        middle = middle.at[..., 1].add(-jnp.maximum(*drops))
-        return middle, goals
+                leads.append(yours.end)
+                points.append(np.zeros(3))
+                other, own = ankles
+            heights.append([0.0, own - scale * other, 0.0])
+            heel = source.sole - source.places[yours.end, 1]
+            reaches.append([0.0, heel, -_HEEL * source.leg / _LEG])
+        lift = _constant([[0.0, ankles[1] - scale * ankles[0], 0.0]])
+        hips = [places[leg.upper, None] for leg, _ in pairs]
+        middle = scale * 0.5 * (hips[0] + hips[1]) + lift
+        feet = turned[np.array([at[mine.end] for _, mine in pairs])]
+        goals = scale * places[np.array(leads)] + _constant(heights)
+        goals = goals - _turned(feet, _constant(points))
+        # Neither heel nor ball below the ground, or below the source's own.
+        up = feet[:, 1]
+        ends = places[np.array([yours.end for yours, _ in pairs]), 1, None]
+        floor = jnp.minimum(scale * (ends + _dot(up, _constant(reaches))), 0.0)
+        low = jnp.minimum(*(_dot(up, _constant(p)) for p in np.swapaxes(lows, 0, 1)))
+        lift = jnp.maximum(floor - goals[:, 1, None] - low, 0.0)
+        goals = goals + lift * _constant([[0.0, 1.0, 0.0]])
+        # Where the leg is too short for its goal, the hips sink.
+        gap = self._hips(turned, at, middle) - goals
+        long = np.array([_REACH * sum(target.lengths(mine)) for _, mine in pairs])
+        long = long.astype(np.float32)[:, None]
+        aside = gap[:, 0] ** 2 + gap[:, 2] ** 2
+        most = jnp.sqrt(jnp.maximum(long * long - aside, 0.0))
+        drop = jnp.max(jnp.clip(gap[:, 1] - most, 0.0, 0.15 * long), axis=0)
+        return middle - drop[None, None] * _constant([[0.0, 1.0, 0.0]]), goals
 
-    def _hip(self, turned: dict[int, Array], middle: Array, leg: Limb) -> Array:
-        """The target's hip joint."""
-        hips = self.target.joint("hips")
-        offset = self.target.places[leg.upper] - self._hip_middle
-        turn = turned[hips]  # pyright: ignore[reportArgumentType]
-        return middle + _turned(turn, offset.astype(np.float32))
+    def _hips(self, turned: Array, at: dict[int, int], middle: Array) -> Array:
+        """The target's hip joints."""
+        legs = [mine.upper for _, mine in self._pairs("legs")]
+        offsets = self.target.places[legs] - self._hip_middle
+        number = self.target.joint("hips")
+        assert number is not None  # of every person
+        return middle + _turned(turned[at[number], None], _constant(offsets))
 
-    def _aimed(
-        self, turned: dict[int, Array], joint: int, child: int, direction: Array
-    ) -> dict[int, Array]:
-        """All turns after a joint's bone was swung to a direction."""
-        bone = anatomy.unit(self.target.places[child] - self.target.places[joint])
-        now = _turned(turned[joint], bone.astype(np.float32))
-        swing = _swing(now, _unit(direction))
-        return turned | {joint: _settled(_times(swing, turned[joint]))}
-
-    def _limb(
+    def _limbs(
         self,
-        turned: dict[int, Array],
         places: Array,
-        yours: Limb,
-        mine: Limb,
-        start: Array,
-        goal: Array,
-        ahead: float,
-    ) -> dict[int, Array]:
-        """All turns after a limb of two bones has reached for a goal."""
-        a, b = self.target.lengths(mine)
-        upper, middle, end = (places[j] for j in (yours.upper, yours.middle, yours.end))
-        way = _unit(end - upper)
-        bent = middle - upper
-        bent = bent - way * jnp.sum(bent * way, axis=-1, keepdims=True)
-        straight = _PULL * sum(self.source.lengths(yours)) * ahead
-        pole = bent + straight * turned[mine.upper][:, 2]
-        joint = two_bones(start, goal, pole, a, b)
-        turned = self._aimed(turned, mine.upper, mine.middle, joint - start)
+        turned: Array,
+        at: dict[int, int],
+        middle: Array,
+        goals: Array,
+    ) -> Array:
+        """All turns after the legs have reached for goals, and the arms for theirs."""
+        pairs = [*self._pairs("legs"), *self._pairs("arms")]
+        yours, mine = zip(*pairs, strict=True)
+        lengths = np.array([self.target.lengths(limb) for limb in mine])
+        whole = np.array([sum(self.source.lengths(limb)) for limb in yours])
+        upper, bend, end = (
+            places[np.array([getattr(limb, name) for limb in yours])]
+            for name in ("upper", "middle", "end")
+        )
+        hips = self._hips(turned, at, middle)
+        part = _constant((lengths.sum(axis=1) / whole)[2:, None])
+        start = jnp.concatenate([hips, jnp.zeros_like(hips)])
+        goals = jnp.concatenate([goals, part * (end - upper)[2:]])
+        rows = [
+            np.array([at[getattr(limb, name)] for limb in mine])
+            for name in ("upper", "middle")
+        ]
+        way, bent = _unit(end - upper), bend - upper
+        bent = bent - way * _dot(bent, way)
+        # Knees ahead and elbows back where a limb is straight.
+        pull = _PULL * whole * np.array([1.0, 1.0, -1.0, -1.0])
+        tops, lowers = (turned[row] for row in rows)
+        pole = bent + _constant(pull[:, None]) * tops[:, :, 2]
+        a, b = (_constant(x[:, None]) for x in lengths.T)
+        joint = _settled(two_bones(start, goals, pole, a, b))
         # From where the middle joint is to the goal, or to as far as it can be.
-        return self._aimed(turned, mine.middle, mine.end, goal - joint)
-
-    def _legs(
-        self, places: Array, turned: dict[int, Array], middle: Array, goals: list[Array]
-    ) -> dict[int, Array]:
-        for (yours, mine), goal in zip(self._pairs("legs"), goals, strict=True):
-            hip = self._hip(turned, middle, mine)
-            turned = self._limb(turned, places, yours, mine, hip, goal, 1.0)
-        return turned
-
-    def _arms(self, places: Array, turned: dict[int, Array]) -> dict[int, Array]:
-        for yours, mine in self._pairs("arms"):
-            part = sum(self.target.lengths(mine)) / sum(self.source.lengths(yours))
-            goal = part * (places[yours.end] - places[yours.upper])
-            start = jnp.zeros_like(goal)
-            turned = self._limb(turned, places, yours, mine, start, goal, -1.0)
-        return turned
+        ways = (joint - start, goals - joint)
+        made = []
+        for turns, way, name, child in (
+            (tops, ways[0], "upper", "middle"),
+            (lowers, ways[1], "middle", "end"),
+        ):
+            bones = [
+                anatomy.unit(
+                    self.target.places[getattr(limb, child)]
+                    - self.target.places[getattr(limb, name)]
+                )
+                for limb in mine
+            ]
+            now = _turned(turns, _constant(bones))
+            made.append(_swung(turns, now, _unit(way)))
+        joints = [limb.upper for limb in mine] + [limb.middle for limb in mine]
+        return self._replaced(turned, at, joints, jnp.concatenate(made))
 
     @functools.cached_property
     def _twist_bones(self) -> list[tuple[int, int, int, int, float]]:
@@ -537,28 +593,41 @@ class Retarget:
                         found.append((int(twist), joint, a, b, min(part, 1.0) + shift))
         return found
 
-    def _twists(self, turned: dict[int, Array]) -> dict[int, Array]:
-        """Turns of the twist bones."""
-        found = {}
-        for twist, joint, a, b, part in self._twist_bones:
+    def _twists(self, turned: Array, at: dict[int, int]) -> Array:
+        """All turns with those of the twist bones."""
+        if not self._twist_bones:
+            return turned
+        twists, joints, above, below, parts = zip(*self._twist_bones, strict=True)
+        bones = []
+        for joint in joints:
             child = next(
                 limb.middle if limb.upper == joint else limb.end
                 for limb in (*self.target.anatomy.arms, *self.target.anatomy.legs)
                 if joint in (limb.upper, limb.middle)
             )
-            bone = anatomy.unit(self.target.places[child] - self.target.places[joint])
-            x, y, z = bone.astype(np.float32)
-            above = turned[self._rows[1][a]]  # a joint between may have no role
-            between = _times(above.T, turned[b])
-            skew = between - between.T
-            about = skew[2, 1] * x + skew[0, 2] * y + skew[1, 0] * z
-            trace = jnp.maximum(1.0 + jnp.trace(between), 1e-6)
-            angle = part * 2.0 * jnp.arctan2(about, trace)
-            cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            turn = jnp.cos(angle) * jnp.eye(3) + jnp.sin(angle) * cross
-            turn = turn + (1 - jnp.cos(angle)) * np.outer(bone, bone).astype("f4")
-            found[twist] = _times(turned[joint], turn)
-        return found
+            away = self.target.places[child] - self.target.places[joint]
+            bones.append(anatomy.unit(away))
+        bone = np.array(bones)
+        # A joint between may have no role.
+        a = turned[np.array([at[self._rows[1][j]] for j in above])]
+        b = turned[np.array([at[self._rows[1][j]] for j in below])]
+        between = _times(jnp.swapaxes(a, 1, 2), b)
+        x, y, z = (_constant(bone[:, k]) for k in range(3))
+        about = (
+            (between[:, 2, 1] - between[:, 1, 2]) * x
+            + (between[:, 0, 2] - between[:, 2, 0]) * y
+            + (between[:, 1, 0] - between[:, 0, 1]) * z
+        )
+        trace = 1.0 + between[:, 0, 0] + between[:, 1, 1] + between[:, 2, 2]
+        angle = 2.0 * jnp.arctan2(about, jnp.maximum(trace, 1e-6))
+        angle = (_constant(parts) * angle)[:, None, None]
+        cross = np.cross(np.eye(3), bone[:, None])
+        outer = bone[:, :, None] * bone[:, None]
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        turn = cos * _constant([np.eye(3)]) + sin * _constant(cross)
+        turn = turn + (1 - cos) * _constant(outer)
+        own = turned[np.array([at[joint] for joint in joints])]
+        return self._replaced(turned, at, list(twists), _times(own, turn))
 
 
 def page_json(source: Rest) -> dict[str, Any]:

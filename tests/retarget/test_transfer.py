@@ -139,8 +139,9 @@ def test_two_bones_reach_as_an_optimizer_does():
         a, b = draw.uniform(0.2, 0.5, 2)
         start, pole = draw.normal(size=(2, 3))
         goal = start + draw.normal(size=3) * 0.3
-        points = (jnp.asarray(x, jnp.float32) for x in (start, goal, pole))
-        middle = np.asarray(transfer.two_bones(*points, float(a), float(b)), float)
+        points = jnp.float32([start, goal, pole])[:, None, :, None]
+        lengths = (jnp.full((1, 1, 1), x, jnp.float32) for x in (a, b))
+        middle = np.asarray(transfer.two_bones(*points, *lengths), float)[0, :, 0]
         far = np.linalg.norm(goal - start)
         assert abs(np.linalg.norm(middle - start) - a) < 1e-4
         if abs(a - b) * 1.01 < far < 0.99 * (a + b):
