@@ -104,9 +104,9 @@ def _scale_by_muon(decay: float = 0.95) -> Optimizer:
         )
 
     def update(
-        grads: Params, state: optax.contrib.MuonState, params: Params | None = None
-    ) -> tuple[Params, optax.contrib.MuonState]:
-        mu = jax.tree.map(lambda m, g: decay * m + (1 - decay) * g, state.mu, grads)
+        updates: Params, state: Any, params: Params | None = None
+    ) -> tuple[Params, Any]:
+        mu = jax.tree.map(lambda m, g: decay * m + (1 - decay) * g, state.mu, updates)
         # Both as means over all gradients so far.
         count = state.count + 1
         past, now = (
@@ -120,7 +120,7 @@ def _scale_by_muon(decay: float = 0.95) -> Optimizer:
             found = orthogonalize(past * m + now * g, coefficients)
             return 0.2 * max(m.shape) ** 0.5 * found
 
-        return jax.tree.map(move, mu, grads), state._replace(count=count, mu=mu)
+        return jax.tree.map(move, mu, updates), state._replace(count=count, mu=mu)
 
     return optax.GradientTransformation(init, update)
 

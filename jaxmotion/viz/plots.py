@@ -8,6 +8,7 @@ import dataclasses
 import io
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib
@@ -229,7 +230,7 @@ def _plain_ticks(axis: Axis) -> None:
     Every digit where the axis is narrow.
     """
     low, high = axis.get_view_interval()
-    every = np.arange(1.0, 10.0) if high < _WIDE_FROM * low else (1.0, 2.0, 5.0)
+    every = [*range(1, 10)] if high < _WIDE_FROM * low else [1, 2, 5]
     axis.set_major_locator(LogLocator(subs=every))
     axis.set_major_formatter("{x:g}")
     axis.set_minor_formatter(NullFormatter())
@@ -415,7 +416,7 @@ class Costs:
     call: str
 
 
-def _draw_costs(axes: Axes, panel: Costs, colors: dict[str, str]) -> None:
+def _draw_costs(axes: Axes, panel: Costs, colors: Mapping[str, str]) -> None:
     value, low, high = panel.data
     axes.axhline(value, color=figure.COMMANDED, lw=1.2, ls="--")
     axes.axhspan(low, high, color=figure.COMMANDED, alpha=0.12, lw=0)
