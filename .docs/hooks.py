@@ -23,7 +23,8 @@ import figures  # noqa: E402
 PAGES = (
     *("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "CITATION.cff", "LICENSE"),
     *("experiments/*.md", "experiments/results/*.md", "experiments/guides/*.md"),
-    *("experiments/results/*/*.json", "experiments/results/*/*.svg"),
+    *("experiments/results/*.svg", "experiments/results/*/*.json"),
+    "experiments/results/*/*.svg",
     *("experiments/*.gif", "experiments/*.jpg", "benchmarks/*.md"),
     *("jaxmotion/assets/*.md", "jaxmotion/data/*.md", "notebooks/*.ipynb"),
 )
