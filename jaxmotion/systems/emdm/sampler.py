@@ -133,6 +133,9 @@ _FREE = (
     "drop_condition",
     "geometry",
     "mask_frames",
+    "fade_geometry",
+    "weigh_levels",
+    "r1_every",
 )
 
 

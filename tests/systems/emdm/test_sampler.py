@@ -109,7 +109,13 @@ def test_wrong_words_end_in_one_line(file):
 def test_a_training_starts_from_a_model_of_its_sizes(model, params, file):
     """Losses and noise may differ; what features mean may not."""
     other = dataclasses.replace(
-        model.config, num_steps=5, weight_foot=300.0, discriminator_width=128
+        model.config,
+        num_steps=5,
+        weight_foot=300.0,
+        discriminator_width=128,
+        fade_geometry=True,
+        weigh_levels="posterior",
+        r1_every=4,
     )
     got = emdm_sampler.start_of(file, dataclasses.replace(model, config=other))
     chex.assert_trees_all_close(got, params, rtol=1e-3, atol=1e-3)
