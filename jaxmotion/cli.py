@@ -79,7 +79,7 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("weight_position", "weight_velocity"), Range(0, 10**6)),
     **dict.fromkeys(("weight_foot", "weight_pose"), Range(0, 10**6)),
     **dict.fromkeys(("speed", "speeds"), Range(0, 100)),
-    **dict.fromkeys(("follow", "noise_half_life"), Range(0, 86400)),
+    "noise_half_life": Range(0, 86400),
     "min_acceleration": Range(0, 10**4),
     "before": Range(1, 86400),
     "long_minutes": Range(0, 86400),
