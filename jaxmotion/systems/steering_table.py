@@ -380,7 +380,7 @@ def _title(name: str, speed: float) -> str:
     """What a row is called; whoever turns on the spot has no speed."""
     stands = name in ("stand", "turn_on_the_spot")
     title = name.replace("_", " ")
-    return title if stands else f"{title}, told {speed:g} m/s"
+    return title if stands else f"{title} at {speed:g} m/s"
 
 
 class Steered(NamedTuple):

@@ -206,11 +206,11 @@ def test_steering_is_measured_beside_data_and_by_frame_of_the_plan(
     )
     found = json.loads((tmp_path / "metrics.json").read_text())
     rows = found["rows"]
-    title = "turn around, told 1.4 m/s"
-    made = ["straight, told 0 m/s", "straight, told 1 m/s", title]
+    title = "turn around at 1.4 m/s"
+    made = ["straight at 0 m/s", "straight at 1 m/s", title]
     locked = [f"{name}, locked feet" for name in made]
     assert {*made, *locked, f"{title}, the springs themselves"} < {*rows}
-    assert rows["straight, told 0 m/s"]["creep"]["samples"] == 2
+    assert rows["straight at 0 m/s"]["creep"]["samples"] == 2
     data = rows["training, about 1 m/s"]
     assert data["windows"]["value"] > 0
     assert 0.8 < data["speed"]["value"] < 1.2
@@ -219,7 +219,7 @@ def test_steering_is_measured_beside_data_and_by_frame_of_the_plan(
     assert len(found["by_frame_of_the_plan"][made[1]]["jerk"]) == 15
     assert f"{title}, turn" in found["by_time_since_a_command"]
     text = (tmp_path / "table.md").read_text()
-    assert "| straight, told 1 m/s, jerk, m/s³ |" in text
+    assert "| straight at 1 m/s, jerk, m/s³ |" in text
 
 
 @pytest.mark.slow

@@ -130,8 +130,8 @@ def value(found, row, column):
 @pytest.mark.slow
 def test_who_does_as_told_has_no_errors():
     found = table("figure_eight", speeds=(0.0, 1.0))
-    stands, goes = "straight, told 0 m/s", "straight, told 1 m/s"
-    for row in (stands, goes, "figure eight, told 1 m/s"):
+    stands, goes = "straight at 0 m/s", "straight at 1 m/s"
+    for row in (stands, goes, "figure eight at 1 m/s"):
         assert value(found, row, "path_error") < 0.1
         assert value(found, row, "frozen") == value(found, row, "diverged") == 0
         assert value(found, row, "minutes") == pytest.approx(2 * SECONDS / 60)
@@ -144,13 +144,13 @@ def test_who_does_as_told_has_no_errors():
     # Real windows: the calm walker goes at 0.7 m/s and never at 1.
     assert value(found, "held-out, about 1 m/s", "windows") == 0
     assert found.report["character_minutes"] == pytest.approx(6 * SECONDS / 60)
-    assert set(found.by_plan) == {stands, goes, "figure eight, told 1 m/s"}
+    assert set(found.by_plan) == {stands, goes, "figure eight at 1 m/s"}
     assert len(found.by_plan[goes]["jerk"]) == 15
 
 
 def test_a_circle_beside_the_path_is_as_far_off_as_it_is():
     found = table("figure_eight", aside=0.1)
-    row = "figure eight, told 1 m/s"
+    row = "figure eight at 1 m/s"
     # Averaged over half a second of a turn, a little less.
     assert value(found, row, "path_error") == pytest.approx(10.0, rel=0.03)
     assert value(found, row, "path_error_max") == pytest.approx(10.0, rel=0.03)
@@ -158,12 +158,12 @@ def test_a_circle_beside_the_path_is_as_far_off_as_it_is():
 
 def test_creep_is_centimeters_in_ten_seconds():
     found = table(speeds=(0.0,), creep=0.003)
-    assert value(found, "straight, told 0 m/s", "creep") == pytest.approx(3.0, rel=0.01)
+    assert value(found, "straight at 0 m/s", "creep") == pytest.approx(3.0, rel=0.01)
 
 
 def test_who_is_slow_has_an_error_of_speed_and_falls_behind():
     found = table(speeds=(1.0,), gain=0.9)
-    row = "straight, told 1 m/s"
+    row = "straight at 1 m/s"
     assert value(found, row, "speed_error") == pytest.approx(10.0, abs=0.1)
     assert value(found, row, "speed") == pytest.approx(0.9, abs=1e-3)
     # A tenth of the way of 14 m, less what the spring's start took.
@@ -173,7 +173,7 @@ def test_who_is_slow_has_an_error_of_speed_and_falls_behind():
 def test_who_is_slow_lags_behind_by_the_part_that_is_missing():
     """At the ends of two stops after 3 m ahead, and 3 m more at 60 degrees."""
     found = table("stop_and_go", gain=0.9)
-    lead = found.by_time["stop and go, told 1 m/s, stop"]["path_lead"]
+    lead = found.by_time["stop and go at 1 m/s, stop"]["path_lead"]
     assert lead[9] == pytest.approx(-(30.0 + 30.0 * (1 + 0.5)) / 2, abs=0.5)
 
 
@@ -195,7 +195,7 @@ def test_who_turns_late_takes_that_long(late):
 
 def test_who_never_turns_disobeys():
     found = table("turn_around", late=100.0)
-    row = "turn around, told 1 m/s"
+    row = "turn around at 1 m/s"
     # It faces ahead all along, which is what the second of three turns asks for; the
     # last one has two seconds left.
     assert value(found, row, "disobeyed") == pytest.approx(2 / 3)
@@ -205,7 +205,7 @@ def test_who_never_turns_disobeys():
 
 def test_stops_and_starts_take_the_springs_time():
     found = table("stop_and_go")
-    row, springs = "stop and go, told 1 m/s", "stop and go, told 1 m/s, the springs"
+    row, springs = "stop and go at 1 m/s", "stop and go at 1 m/s, the springs"
     rate = 2 * np.log(2) / 0.27
     seconds = np.arange(0.0, 2.0, 1e-3)
     left = (1 + rate * seconds) * np.exp(-rate * seconds)
@@ -218,15 +218,15 @@ def test_stops_and_starts_take_the_springs_time():
 
 def test_frozen_and_diverged_rollouts_are_counted():
     found = table(speeds=(1.0,), swing=0.0, rollouts=4, chunk=3)
-    assert value(found, "straight, told 1 m/s", "frozen") == 4
+    assert value(found, "straight at 1 m/s", "frozen") == 4
     found = table(speeds=(0.0,), swing=0.0)
-    assert value(found, "straight, told 0 m/s", "frozen") == 0
+    assert value(found, "straight at 0 m/s", "frozen") == 0
     found = table(speeds=(1.0,), jump=2.0)
-    assert value(found, "straight, told 1 m/s", "diverged") == 2
+    assert value(found, "straight at 1 m/s", "diverged") == 2
 
 
 def test_sunk_toes_are_that_deep():
-    row = "straight, told 0 m/s"
+    row = "straight at 0 m/s"
     plain, sunk = (
         table(speeds=(0.0,), swing=0.0, sink=x).rows[row] for x in (0.0, 0.05)
     )
