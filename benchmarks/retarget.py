@@ -2,15 +2,17 @@
 
 The shipped model stands, walks, runs, crouches and turns; each second is brought onto
 other bodies and, for the round trip, back. Bodies are the model's own skeleton with
-legs, arms and trunk of other lengths, or a rig's file.
+legs, arms and trunk of other lengths, one of them as a file with Mixamo's names, or
+rigs' files. `experiments/report.py --keep` stores the reports.
 
 Example:
   python benchmarks/retarget.py
-  python benchmarks/retarget.py --rig hero.glb
+  python benchmarks/retarget.py --rig hero.glb avatar.vrm
   python benchmarks/retarget.py --robot g1.xml
 """
 
 import dataclasses
+import tempfile
 import time
 from pathlib import Path
 
@@ -44,35 +46,30 @@ BODIES = {
     "long arms": (0.9, 1.5, 1.05),
 }
 LOW = 0.01  # over its lowest in standing: a toe that is planted, meters
+# Titles and units, by column.
 COLUMNS = {
-    "body": "body",
-    "course": "course",
-    "slide_source": "source's slide, scaled",
-    "slide": "slide m/s",
-    "under": "toes under m",
-    "angle": "angles degrees",
-    "path": "root path m",
-    "jerk": "jerk ratio",
-    "trip": "round trip m",
-    "trip_95": "95 % below m",
+    "source_slide": ("source's slide, scaled", "m/s"),
+    "slide": ("slide", "m/s"),
+    "penetration": ("toes under", "mm"),
+    "angle": ("angles", "degrees"),
+    "root": ("root's path", "mm"),
+    "jerk_ratio": ("jerk", "ratio"),
+    "round": ("round trip", "mm"),
+    "round_95": ("95 % below", "mm"),
 }
 ROBOT = {
-    "course": "course",
-    "at_limit": "frames at a limit",
-    "fastest": "fastest joint",
-    "fastest_velocity": "rad/s",
-    "slide": "slide m/s",
-    "under": "soles under m",
-    "miss": "planted feet off m",
-    "seconds": "s to solve",
+    "at_limit": ("frames at a limit", "%"),
+    "velocity": ("fastest joint", "rad/s"),
+    "slide": ("slide", "mm/s"),
+    "under": ("soles under", "mm"),
+    "miss": ("planted feet off", "mm"),
 }
 COST = {
-    "characters": "characters",
-    "milliseconds": "ms alone",
-    "rate": "frames/s",
-    "tick": "a tick, ms",
-    "with_rig": "with the rig, ms",
-    "share": "rig's part of a tick",
+    "alone": ("alone", "ms"),
+    "rate": ("alone", "frames/s"),
+    "tick": ("a tick", "ms"),
+    "with_rig": ("with the rig", "ms"),
+    "share": ("rig's part of a tick", "%"),
 }
 
 
@@ -81,14 +78,14 @@ class Config(suite.Settings):
     """Slide, penetration, angles, paths, jerk and round trips; costs per tick.
 
     Attributes:
-      rig: A rig's file to be measured instead of the bodies.
+      rig: Files of rigs to be measured instead of the bodies.
       robot: MJCF or URDF of a humanoid to be measured instead.
       seconds: Length of each course.
       characters: Numbers of characters to time.
       repeats: Calls to time; the median counts.
     """
 
-    rig: Path | None = None
+    rig: tuple[Path, ...] = ()
     robot: Path | None = None
     seconds: float = 6.0
     characters: tuple[int, ...] = (1, 64, 1024)
@@ -163,20 +160,23 @@ def measure(function: transfer.Retarget, motion: Motion) -> dict[str, float]:
         p[:, one.joint("hips"), ::2] for p, one in ((before, source), (after, target))
     ]
     return {
-        "slide_source": function.scale * slide(before, toes[0], planted, motion.fps),
+        "source_slide": function.scale * slide(before, toes[0], planted, motion.fps),
         "slide": slide(after, toes[1], planted, motion.fps),
-        "under": float(np.maximum(height[1] - after[:, toes[1], 1], 0.0).max()),
+        "penetration": 1e3
+        * float(np.maximum(height[1] - after[:, toes[1], 1], 0).max()),
         "angle": float(angle.mean()),
-        "path": float(np.abs(hips[1] - function.scale * hips[0]).max()),
-        "jerk": jerk(after) / (function.scale * jerk(before)),
-        "trip": float(away.mean()),
-        "trip_95": float(np.percentile(away, 95)),
+        "root": 1e3 * float(np.abs(hips[1] - function.scale * hips[0]).max()),
+        "jerk_ratio": jerk(after) / (function.scale * jerk(before)),
+        "round": 1e3 * float(away.mean()),
+        "round_95": 1e3 * float(np.percentile(away, 95)),
     }
 
 
-def cost(function: transfer.Retarget, motion: Motion, args: Config) -> list[dict]:
+def cost(
+    function: transfer.Retarget, model: Character, motion: Motion, args: Config
+) -> dict[str, dict[str, float]]:
     """Milliseconds of a tick of many characters, compiled."""
-    rows = []
+    rows = {}
     for number in args.characters:
         poses = [
             jnp.resize(x, (number, *x.shape[1:]))
@@ -189,13 +189,9 @@ def cost(function: transfer.Retarget, motion: Motion, args: Config) -> list[dict
             jax.block_until_ready(function.pose(*poses))
             times.append(time.perf_counter() - start)
         seconds = float(np.median(times))
-        rows.append(
-            {
-                "characters": number,
-                "milliseconds": 1e3 * seconds,
-                "rate": number / seconds,
-            }
-        )
+        name = f"{number:,} character" + "s" * (number > 1)
+        rows[name] = {"alone": 1e3 * seconds, "rate": number / seconds}
+        rows[name] |= share(function, model, number, args.repeats)
     return rows
 
 
@@ -241,25 +237,65 @@ def share(
     return {
         "tick": 1e3 * float(np.median(ticks[:, 0])),
         "with_rig": 1e3 * float(np.median(ticks[:, 1])),
-        "share": float(np.median(ticks[:, 1] / ticks[:, 0])) - 1.0,
+        "share": 100.0 * (float(np.median(ticks[:, 1] / ticks[:, 0])) - 1.0),
     }
 
 
 def measure_robot(args: Config, model: Character, motions: dict[str, Motion]) -> None:
     """What a robot cannot do of each course, in a report."""
     robot = robots.read_robot(args.robot)
-    rows = []
+    rows = {}
     for course, motion in motions.items():
-        start = time.perf_counter()
         found = robot_motion.follow(robot, model.skeleton, motion).report()
-        seconds = time.perf_counter() - start
-        rows.append({"course": course, **found, "seconds": seconds})
-    suite.print_table(rows, ROBOT)
+        rows[course] = {
+            "at_limit": 100.0 * found["at_limit"],
+            "velocity": found["fastest_velocity"],
+            **{name: 1e3 * found[name] for name in ("slide", "under", "miss")},
+        }
+        print(f"{course}: fastest is {found['fastest']}")
+    report("robot", rows, ROBOT, args)
+
+
+def report(
+    name: str,
+    rows: dict[str, dict[str, float]],
+    columns: dict[str, tuple[str, str]],
+    args: Config,
+) -> None:
+    """Prints a table and writes its report."""
+    titles = {"row": ""} | {key: f"{a} {b}" for key, (a, b) in columns.items()}
+    suite.print_table([{"row": row, **rows[row]} for row in rows], titles)
     metrics = [
-        suite.Metric(f"{row['course']}: at a limit", row["at_limit"], "of frames")
+        suite.Metric(
+            f"{row} {key}",
+            rows[row][key],
+            unit,
+            "higher" if key == "rate" else "lower",
+            0.6 if columns is COST else 0.3,
+        )
         for row in rows
+        for key, (_, unit) in columns.items()
     ]
-    suite.report("robot", metrics, args, rows=rows)
+    suite.report(name, metrics, args, rows=rows)
+
+
+def functions(args: Config, model: Character) -> dict[str, transfer.Retarget]:
+    """Onto each body: the rigs that are asked for, or the bodies."""
+    rigs: dict[str, Path | Skeleton] = {path.name: path for path in args.rig}
+    if rigs:
+        return {name: jm.retarget(model.skeleton, rig) for name, rig in rigs.items()}
+    rigs = {name: proportioned(model.skeleton, *size) for name, size in BODIES.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "child.glb"
+        child = rigs["child"]
+        assert isinstance(child, Skeleton)
+        columns = jnp.tile(jnp.eye(3)[:2].reshape(6), (1, child.num_joints, 1))
+        still = Motion(
+            root_position=jnp.zeros((1, 3)), joint_rotation=columns, fps=model.fps
+        )
+        jm.save(path, child, still, mixamo=True)
+        rigs["Mixamo's names, a file"] = path
+        return {name: jm.retarget(model.skeleton, rig) for name, rig in rigs.items()}
 
 
 def moving(model: Character, args: Config) -> dict[str, Motion]:
@@ -281,34 +317,17 @@ def main() -> None:
     motions = moving(model, args)
     if args.robot is not None:
         return measure_robot(args, model, motions)
-    bodies = {
-        name: proportioned(model.skeleton, *sizes) for name, sizes in BODIES.items()
+    found = functions(args, model)
+    rows = {
+        f"{name}, {course}": measure(function, motion)
+        for name, function in found.items()
+        for course, motion in motions.items()
     }
-    if args.rig is not None:
-        bodies = {args.rig.name: args.rig}
-    functions = {
-        name: jm.retarget(model.skeleton, body) for name, body in bodies.items()
-    }
-    rows = []
-    for course, motion in motions.items():
-        for name, function in functions.items():
-            rows.append({"body": name, "course": course, **measure(function, motion)})
-    rows.sort(key=lambda row: list(bodies).index(row["body"]))
-    suite.print_table(rows, COLUMNS)
-    first = next(iter(functions.values()))
-    costs = cost(first, motion, args)
-    for row in costs:
-        row |= share(first, model, row["characters"], args.repeats)
-    suite.print_table(costs, COST)
-    metrics = [
-        suite.Metric(f"{row['body']}, {row['course']}: slide", row["slide"], "m/s")
-        for row in rows
-    ]
-    for row in costs:
-        name = f"{row['characters']} characters"
-        metrics.append(suite.Metric(f"{name}: share", row["share"], "of a tick"))
-        metrics.append(suite.Metric(name, row["milliseconds"], "ms", tolerance=0.6))
-    suite.report("retarget", metrics, args, rows=rows, costs=costs)
+    report("rigs" if args.rig else "retarget", rows, COLUMNS, args)
+    if args.characters:
+        first = next(iter(found.values()))
+        costs = cost(first, model, motions["turn"], args)
+        report("retarget_cost", costs, COST, args)
 
 
 if __name__ == "__main__":

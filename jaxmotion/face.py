@@ -469,8 +469,11 @@ def _read_rest(path: str | Path, roles: Any) -> transfer.Rest:
         )
     from jaxmotion.data import fbx, own
 
-    read = own.read_bvh if kind == ".bvh" else fbx.read_fbx
-    recording = read(str(path), files.read_bytes(path))
+    given = (str(path), files.read_bytes(path))
+    if kind == ".bvh":
+        recording = own.read_bvh(*given)
+    else:
+        recording = fbx.read_fbx(*given, rest=True)
     skeleton, motion = own.as_recorded(recording)
     rotations = anatomy.kinematics(skeleton, motion)[1]
     try:

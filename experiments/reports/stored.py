@@ -282,6 +282,8 @@ def keep(folder: Path, path: Path, name: str, title: str) -> Path:
     for field in ("interval", "names", "notes"):
         if field in before:
             whole[field] = before[field]
+    told = before.get("columns", {})
+    whole["columns"] = {id: told.get(id, x) for id, x in whole["columns"].items()}
     if "names" in whole:
         whole["names"] = {k: v for k, v in whole["names"].items() if k in found.rows}
     files.write_text(place, to_text(whole))

@@ -25,11 +25,14 @@ def _matrix(transform) -> np.ndarray:
     return found
 
 
-def read_fbx(name: str, data: bytes, *, fps: float = 30.0) -> Recording:
+def read_fbx(
+    name: str, data: bytes, *, fps: float = 30.0, rest: bool = False
+) -> Recording:
     """The animation of an FBX file's bones; of several takes the longest.
 
     Args:
       fps: Frames per second to sample it at.
+      rest: A file without animation is one frame, as its bones are.
 
     Raises:
       ModuleNotFoundError: without the extra [fbx].
@@ -52,10 +55,19 @@ def read_fbx(name: str, data: bytes, *, fps: float = 30.0) -> Recording:
     if not bones:
         raise ValueError(f"{name}: the FBX has no bones")
     takes = [take for take in stacks if take.time_end > take.time_begin]
-    if not takes:
+    if not takes and not rest:
         raise ValueError(f"{name}: the FBX has no animation")
-    take = max(takes, key=lambda take: take.time_end - take.time_begin)
-    animation = take.anim
+    times = np.zeros(1)
+    if takes:
+        take = max(takes, key=lambda take: take.time_end - take.time_begin)
+        count = int((take.time_end - take.time_begin) * fps + 1e-6) + 1
+        times = take.time_begin + np.arange(count) / fps
+
+    def local(node, time: float) -> np.ndarray:
+        if not takes:
+            return _matrix(node.local_transform)
+        return _matrix(ufbx.evaluate_transform(take.anim, node, time))
+
     # Bones of one tree, parents first; what is above (an armature) moves its root.
     index = {node.element_id: i for i, node in enumerate(bones)}
     upper = [node.parent for node in bones]
@@ -74,17 +86,14 @@ def read_fbx(name: str, data: bytes, *, fps: float = 30.0) -> Recording:
     while node is not None:
         above.insert(0, node)
         node = node.parent
-    count = int((take.time_end - take.time_begin) * fps + 1e-6) + 1
-    world = np.zeros((count, len(order), 4, 4))
-    for frame in range(count):
-        time = take.time_begin + frame / fps
+    world = np.zeros((len(times), len(order), 4, 4))
+    for frame, time in enumerate(times):
         base = np.eye(4)
         for node in above:
-            base = base @ _matrix(ufbx.evaluate_transform(animation, node, time))
+            base = base @ local(node, time)
         for at, j in enumerate(order):
-            local = _matrix(ufbx.evaluate_transform(animation, bones[j], time))
             start = base if at == 0 else world[frame, places[at]]
-            world[frame, at] = start @ local
+            world[frame, at] = start @ local(bones[j], time)
     turns = world[..., :3, :3]
     turns = turns / np.linalg.norm(turns, axis=-2, keepdims=True)
     if (np.linalg.det(turns) < 0.9).any():

@@ -254,6 +254,15 @@ def parents_of(name: str, nodes: list[dict]) -> list[int]:
     return parents
 
 
+def _path(parents: list[int], node: int) -> list[int]:
+    """From a node up to its root."""
+    found = []
+    while node >= 0:
+        found.append(node)
+        node = parents[node]
+    return found
+
+
 def world_of(name: str, nodes: list[dict], parents: list[int]) -> dict[int, np.ndarray]:
     """World matrix [4, 4] of each node at rest."""
     local = [_local(name, number, node) for number, node in enumerate(nodes)]
@@ -270,25 +279,27 @@ def world_of(name: str, nodes: list[dict], parents: list[int]) -> dict[int, np.n
 
 
 def _joints(name: str, content: dict, parents: list[int]) -> list[int]:
-    """Nodes of the skeleton, parents first: the skins' joints and what joins them."""
+    """Nodes of the skeleton, parents first: the skins' joints and what joins them.
+
+    A VRM without a skin, whose meshes hang on its bones, says itself what they are.
+    """
     skins = objects(name, content, "skins")
-    if not skins:
+    bones = [*_vrm_roles(content).values()]
+    if not skins and not bones:
         raise ValueError(f"{name}: no skin: expected a character with a skeleton")
     paths: dict[int, list[int]] = {}
-    for number, skin in enumerate(skins):
+    for number, skin in enumerate(skins or [{"joints": bones}]):
+        what = f"skin {number}" if skins else "the VRM"
         joints = skin.get("joints")
         if not isinstance(joints, list) or not joints:
-            raise ValueError(f"{name}: skin {number} has no joints")
+            raise ValueError(f"{name}: {what} has no joints")
         for joint in joints:
-            path = [index(name, joint, len(parents), f"a joint of skin {number}")]
-            while parents[path[-1]] >= 0:
-                path.append(parents[path[-1]])
-            paths[path[0]] = path[::-1]
+            joint = index(name, joint, len(parents), f"a joint of {what}")
+            paths[joint] = _path(parents, joint)[::-1]
     roots = {path[0] for path in paths.values()}
     if len(roots) > 1:
-        raise ValueError(
-            f"{name}: {len(skins)} skins of {len(roots)} skeletons, expected one"
-        )
+        said = f"{len(skins)} skins" if skins else "bones"
+        raise ValueError(f"{name}: {said} of {len(roots)} skeletons, expected one")
     common = set.intersection(*({*path} for path in paths.values()))
     top = max(common, key=lambda node: paths[next(iter(paths))].index(node))
     found = {n for path in paths.values() for n in path[path.index(top) :]}
@@ -368,7 +379,7 @@ def read_rig(path: str | Path) -> Rig:
         roles=told,
         sole=None,
     )
-    lowest = _lowest(rig, world)
+    lowest = _lowest(rig, world, upper)
     if lowest is None:
         return rig
     try:
@@ -384,28 +395,37 @@ def read_rig(path: str | Path) -> Rig:
     return dataclasses.replace(rig, sole=sole if fits else None)
 
 
-def _lowest(rig: Rig, world: dict[int, np.ndarray]) -> float | None:
-    """Height of the lowest skinned vertex at rest; None where meshes are packed."""
+def _lowest(rig: Rig, world: dict[int, np.ndarray], parents: list[int]) -> float | None:
+    """Height of the lowest vertex at rest; None where meshes are packed.
+
+    Of skinned meshes, or of those that hang on joints where there is no skin.
+    """
     found = []
-    skins, meshes = rig.content["skins"], objects(rig.name, rig.content, "meshes")
-    for node in rig.content["nodes"]:
-        if "skin" not in node or "mesh" not in node:
+    get = (rig.name, rig.content, rig.data)
+    skins, meshes = (objects(rig.name, rig.content, x) for x in ("skins", "meshes"))
+    for number, node in enumerate(rig.content["nodes"]):
+        skinned = "skin" in node
+        hangs = not skins and {*rig.nodes} & {*_path(parents, number)}
+        if "mesh" not in node or not (skinned or hangs):
             continue
         try:
-            skin = skins[index(rig.name, node["skin"], len(skins), "a skin")]
             mesh = meshes[index(rig.name, node["mesh"], len(meshes), "a mesh")]
-            moves = np.stack([world[joint] for joint in skin["joints"]])
-            if "inverseBindMatrices" in skin:
-                get = (rig.name, rig.content, rig.data)
-                bind = array(*get, skin["inverseBindMatrices"]).reshape(-1, 4, 4)
-                with np.errstate(all="ignore"):
-                    moves = moves @ np.swapaxes(bind, 1, 2)[: len(moves)]
+            moves = world[number][None]
+            if skinned:
+                skin = skins[index(rig.name, node["skin"], len(skins), "a skin")]
+                moves = np.stack([world[joint] for joint in skin["joints"]])
+                if "inverseBindMatrices" in skin:
+                    bind = array(*get, skin["inverseBindMatrices"]).reshape(-1, 4, 4)
+                    with np.errstate(all="ignore"):
+                        moves = moves @ np.swapaxes(bind, 1, 2)[: len(moves)]
             for part in objects(rig.name, mesh, "primitives"):
                 have = part.get("attributes", {})
-                get = (rig.name, rig.content, rig.data)
                 points = array(*get, have["POSITION"])
-                which = array(*get, have["JOINTS_0"])
-                weights = array(*get, have["WEIGHTS_0"]).astype(float)
+                which = np.zeros((len(points), 1), int)
+                weights = np.ones((len(points), 1))
+                if skinned:
+                    which = array(*get, have["JOINTS_0"])
+                    weights = array(*get, have["WEIGHTS_0"]).astype(float)
                 rows = moves[which, 1]  # what becomes y
                 four = np.concatenate([points, np.ones((len(points), 1))], axis=1)
                 with np.errstate(all="ignore"):

@@ -19,6 +19,7 @@ from jaxmotion.networks import work
 from jaxmotion.systems import registry
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
+from tests.retarget import rigs
 
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 SMALL = ["--width", "16", "--runs", "2", "--limit", "1"]
@@ -526,10 +527,21 @@ def test_retarget(tmp_path):
     arguments = ["--seconds", "1", "--characters", "1", "--repeats", "2"]
     run_script("retarget", *arguments, "--out", tmp_path)
     rows = json.loads((tmp_path / "retarget.json").read_text())["rows"]
-    assert len(rows) == 20 and {row["body"] for row in rows} >= {"child", "giant"}
-    for row in rows:
-        assert row["slide"] < 1.1 * row["slide_source"] + 1e-4
-        assert row["under"] < 1e-3 and row["trip"] < 0.01
+    assert len(rows) == 25
+    assert {row.rpartition(", ")[0] for row in rows} >= {"child", "giant"}
+    for row in rows.values():
+        assert row["slide"] < 1.1 * row["source_slide"] + 1e-4
+        assert row["penetration"] < 1.0 and row["round"] < 10.0
+    costs = json.loads((tmp_path / "retarget_cost.json").read_text())["rows"]
+    assert costs["1 character"]["with_rig"] > 0.0
+    walker = tmp_path / "walker.glb"
+    walker.write_bytes(rigs.glb(rigs.person("long arms", "Unreal")))
+    run_script(
+        "retarget",
+        *("--rig", walker, "--seconds", "1", "--characters", "--out", tmp_path),
+    )
+    rows = json.loads((tmp_path / "rigs.json").read_text())["rows"]
+    assert len(rows) == 5 and "walker.glb, crouch" in rows
 
 
 def test_shipped_models_are_rolled_out_straight_on(load):

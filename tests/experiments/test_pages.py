@@ -166,6 +166,7 @@ def test_what_is_kept_of_an_evaluation(stored, tmp_path):
     cell = made["rows"]["rollouts"]["foot_slide"]
     assert cell == {"value": 0.123457, "samples": 3}
     # Again, with other numbers: the title and what people wrote stay.
+    made["columns"]["foot_slide"]["title"] = "slide of feet"
     path.write_text(
         stored.to_text(made | {"names": {"rollouts": "walks"}, "interval": "none"})
     )
@@ -173,6 +174,7 @@ def test_what_is_kept_of_an_evaluation(stored, tmp_path):
     again = json.loads(stored.keep(tmp_path, source, "camdm/it", "").read_text())
     assert again["title"] == "A title" and again["names"] == {"rollouts": "walks"}
     assert again["interval"] == "none" and list(again["columns"]) == ["foot_slide"]
+    assert again["columns"]["foot_slide"]["title"] == "slide of feet"
 
 
 def test_what_is_kept_of_a_benchmark(stored, tmp_path):

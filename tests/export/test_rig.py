@@ -127,23 +127,43 @@ def test_a_gltf_with_a_buffer_beside_it_and_a_vrm_are_rigs(hero, tmp_path):
     plain = rigging.read_rig(hero)
     found = rigging.read_rig(tmp_path / "hero.gltf")
     np.testing.assert_array_equal(found.skeleton.offsets, plain.skeleton.offsets)
-    # A VRM says itself which joint is which, whatever they are called.
-    content, data = rigs.split(hero.read_bytes())
-    index = {node["name"]: n for n, node in enumerate(content["nodes"])}
-    roles = plain.rest().roles
-    for node in content["nodes"]:
-        node["name"] = f"n{index[node['name']]}"
-    roles = {r: n for r, n in roles.items() if r not in ("neck", "chest")}
-    bones = {role: {"node": index[name]} for role, name in roles.items()}
-    for extension, human in (
-        ("VRMC_vrm", bones),
-        ("VRM", [{"bone": b, **v} for b, v in bones.items()]),
-    ):
-        content["extensions"] = {extension: {"humanoid": {"humanBones": human}}}
-        (tmp_path / "a.vrm").write_bytes(rigs.joined(content, data))
-        told = rigging.read_rig(tmp_path / "a.vrm").rest().roles
-        for role, name in roles.items():
-            assert int(told[role][1:]) == index[name], role
+
+
+@pytest.mark.parametrize("version", ["VRMC_vrm", "VRM"])
+@pytest.mark.parametrize("skin", [True, False])
+def test_a_vrm_says_which_joint_is_which(version, skin, hero, tmp_path):
+    plain = rigging.read_rig(hero)
+    index = {node["name"]: n for n, node in enumerate(plain.content["nodes"])}
+    (tmp_path / "a.vrm").write_bytes(rigs.vrm(hero.read_bytes(), version, skin=skin))
+    found = rigging.read_rig(tmp_path / "a.vrm")
+    told = found.rest().roles
+    for role, name in plain.rest().roles.items():
+        if role == "neck":
+            continue  # between chest and head anyway
+        assert int(told[role][1:]) == index[name], role
+    assert found.rest().leg == pytest.approx(plain.rest().leg, rel=1e-5)
+    # Where nothing is skinned, what hangs on the bones says where the ground is.
+    assert found.sole == pytest.approx(plain.sole, rel=1e-4)
+    skeleton, motion = samples.person(seconds=0.3)
+    jm.save(tmp_path / "walk.vrm.glb", skeleton, motion, onto=tmp_path / "a.vrm")
+    content = pygltflib.GLTF2().load(str(tmp_path / "walk.vrm.glb"))
+    expected = jm.retarget(skeleton, tmp_path / "a.vrm", motion=motion)(motion)
+    world = worlds(content, 5)
+    places = np.stack([world[node][:3, 3] for node in found.nodes])
+    wanted = np.asarray(joint_positions(found.skeleton, expected))[5]
+    np.testing.assert_allclose(places, wanted, atol=2e-4)
+
+
+def test_an_fbx_of_bones_alone_is_a_rig(tmp_path):
+    pytest.importorskip("ufbx")
+    child = rigs.person("child")
+    (tmp_path / "a.fbx").write_bytes(rigs.fbx(child))
+    target = jm.retarget(rigs.walker(), tmp_path / "a.fbx").target
+    assert sorted(target.skeleton.names) == sorted(child.names)
+    order = [target.skeleton.names.index(name) for name in child.names]
+    expected = anatomy.zero_pose(child)
+    found = anatomy.zero_pose(target.skeleton)[order]
+    np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-4)
 
 
 def changed(hero, tmp_path, change):

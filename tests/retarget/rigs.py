@@ -12,6 +12,7 @@ from jaxmotion.data.walker import walker_skeleton
 from jaxmotion.export import gltf
 from jaxmotion.motion import anatomy
 from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.retarget import roles as names
 
 # Lengths of legs, arms and trunk beside the walker's.
 BODIES = {
@@ -252,3 +253,89 @@ def plain(offsets, parents, words):
     return Skeleton(
         offsets=jnp.asarray(offsets, jnp.float32), parents=tuple(parents), names=words
     )
+
+
+def vrm(raw, version="VRMC_vrm", *, skin=True):
+    """A .glb as a VRM whose joints' names say nothing: its extension says all.
+
+    Without a skin, the body as it stands hangs on the hips.
+    """
+    content, data = split(raw)
+    index = {node["name"]: n for n, node in enumerate(content["nodes"])}
+    joints = content["skins"][0]["joints"]
+    tree = plain(
+        np.zeros((len(joints), 3)),
+        _parents(content["nodes"], joints),
+        tuple(content["nodes"][j]["name"] for j in joints),
+    )
+    told = names.find_roles(tree)
+    bones = {role: {"node": index[name]} for role, name in told.items()}
+    if not skin:
+        mesh = next(n for n in content["nodes"] if "mesh" in n).pop("mesh")
+        hips, at = bones["hips"]["node"], np.eye(4)
+        for node in _up(content["nodes"], hips):
+            at = _matrix(content["nodes"][node]) @ at
+        content["nodes"][hips]["children"].append(len(content["nodes"]))
+        back = np.linalg.inv(at).T.ravel().tolist()
+        content["nodes"].append({"name": "body", "mesh": mesh, "matrix": back})
+        del content["skins"]
+        for node in content["nodes"]:
+            node.pop("skin", None)
+    for number, node in enumerate(content["nodes"]):
+        node["name"] = f"n{number}"
+    listed = [{"bone": bone, **about} for bone, about in bones.items()]
+    human = bones if version == "VRMC_vrm" else listed
+    content["extensions"] = {version: {"humanoid": {"humanBones": human}}}
+    return joined(content, data)
+
+
+def _up(nodes, node):
+    """From a node to the root."""
+    above = {c: n for n, have in enumerate(nodes) for c in have.get("children", ())}
+    found = [node]
+    while found[-1] in above:
+        found.append(above[found[-1]])
+    return found
+
+
+def _parents(nodes, joints):
+    return [
+        next((joints.index(n) for n in _up(nodes, joint)[1:] if n in joints), -1)
+        for joint in joints
+    ]
+
+
+def _matrix(node):
+    found = np.eye(4)
+    turn = Rotation.from_quat(node.get("rotation", [0, 0, 0, 1])).as_matrix()
+    found[:3, :3] = turn * node.get("scale", [1, 1, 1])
+    found[:3, 3] = node.get("translation", [0, 0, 0])
+    return found
+
+
+def fbx(skeleton):
+    """An FBX (text, centimeters) of bones in their zero pose, without animation."""
+    objects, links = [], []
+    for j, (name, parent) in enumerate(
+        zip(skeleton.names, skeleton.parents, strict=True)
+    ):
+        x, y, z = 100.0 * np.asarray(skeleton.offsets, float)[j]
+        objects.append(
+            f'NodeAttribute: {1000 + j}, "NodeAttribute::", "LimbNode" '
+            '{\n TypeFlags: "Skeleton"\n}\n'
+            f'Model: {j + 1}, "Model::{name}", "LimbNode" {{\n Version: 232\n'
+            ' Properties70: {\n  P: "Lcl Translation", "Lcl Translation", "", "A",'
+            f"{x},{y},{z}\n }}\n}}"
+        )
+        links.append(f'C: "OO",{1000 + j},{j + 1}\nC: "OO",{j + 1},{parent + 1}')
+    return "\n".join(
+        [
+            "; FBX 7.4.0 project file",
+            "FBXHeaderExtension: {\n FBXVersion: 7400\n}",
+            'GlobalSettings: {\n Version: 1000\n Properties70: {\n  P: "UpAxis",'
+            ' "int", "Integer", "",1\n  P: "UnitScaleFactor", "double", "Number",'
+            ' "",1\n }\n}',
+            "Objects: {\n" + "\n".join(objects) + "\n}",
+            "Connections: {\n" + "\n".join(links) + "\n}\n",
+        ]
+    ).encode()

@@ -21,20 +21,6 @@ from tests.viz.test_web import data, floats, run
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
 
 
-def unnamed(version):
-    """A VRM whose joints' names say nothing."""
-    content, rest = rigs.split(rigs.glb(rigs.person("child")))
-    names = rigging.names.find_roles(rigs.person("child"))
-    index = {node["name"]: n for n, node in enumerate(content["nodes"])}
-    bones = {role: {"node": index[name]} for role, name in names.items()}
-    for number, node in enumerate(content["nodes"]):
-        node["name"] = f"n{number}"
-    listed = [{"bone": bone, **about} for bone, about in bones.items()]
-    human = bones if version == "VRMC_vrm" else listed
-    content["extensions"] = {version: {"humanoid": {"humanBones": human}}}
-    return rigs.joined(content, rest)
-
-
 def with_twists():
     """Twist bones, a finger, and a joint without a role above an upper arm."""
     base = rigs.proportioned(1.1, 0.9, 1.0)
@@ -74,8 +60,11 @@ RIGS = {
     "an Unreal giant": lambda: rigs.glb(
         rigs.person("giant", "Unreal"), unit=1.0, seed=3
     ),
-    "VRM 1": lambda: unnamed("VRMC_vrm"),
-    "VRM 0": lambda: unnamed("VRM"),
+    "VRM 1": lambda: rigs.vrm(rigs.glb(rigs.person("child"))),
+    "VRM 0": lambda: rigs.vrm(rigs.glb(rigs.person("child")), "VRM"),
+    "a VRM without a skin": lambda: rigs.vrm(
+        rigs.glb(rigs.person("long arms", "Unreal")), skin=False
+    ),
     "twist bones": with_twists,
     "names that say nothing": by_shape,
 }
@@ -85,6 +74,7 @@ SLOW = {
     "an Unreal giant",
     "VRM 0",
     "VRM 1",
+    "a VRM without a skin",
     "names that say nothing",
 }  # each compiles its own
 
@@ -206,7 +196,7 @@ def test_what_cannot_be_worn_is_refused_in_one_line(hero):
 @pytest.mark.slow
 def test_malformed_rigs_are_refused_in_one_line(hero):
     """Mutated files are worn or refused; what else is thrown fails in `run`."""
-    whole, lines = [hero, unnamed("VRM")], []
+    whole, lines = [hero, rigs.vrm(hero, "VRM")], []
     for start in range(0, 1000, 50):
         files = []
         for seed in range(start, start + 50):

@@ -156,14 +156,16 @@ function check(m, number) {
     refuse(`node ${number} is mirrored, sheared or uneven`);
 }
 
-// Nodes of the skeleton, parents first: the skins' joints and what joins them.
+// Nodes of the skeleton, parents first: the skins' joints and what joins them. A VRM
+// without a skin, whose meshes hang on its bones, says itself what they are.
 function jointsOf(file, parents) {
-  const { skins } = file, paths = new Map();
-  if (!skins.length) refuse("no skin: expected a character with a skeleton");
-  skins.forEach(({ joints }, number) => {
-    if (!Array.isArray(joints) || !joints.length) refuse(`damaged: skin ${number} has no joints`);
+  const { skins } = file, paths = new Map(), bones = Object.values(vrmRoles(file));
+  if (!skins.length && !bones.length) refuse("no skin: expected a character with a skeleton");
+  (skins.length ? skins : [{ joints: bones }]).forEach(({ joints }, number) => {
+    const what = skins.length ? `skin ${number}` : "the VRM";
+    if (!Array.isArray(joints) || !joints.length) refuse(`damaged: ${what} has no joints`);
     for (const joint of joints) {
-      file.item("nodes", joint, `a joint of skin ${number}`);
+      file.item("nodes", joint, `a joint of ${what}`);
       const path = [joint];
       while (parents[path[0]] >= 0) path.unshift(parents[path[0]]);
       paths.set(joint, path);
@@ -171,7 +173,7 @@ function jointsOf(file, parents) {
   });
   const all = [...paths.values()], roots = new Set(all.map(path => path[0]));
   if (roots.size > 1)
-    refuse(`${skins.length} skins of ${roots.size} skeletons, expected one`);
+    refuse(`${skins.length ? `${skins.length} skins` : "bones"} of ${roots.size} skeletons, expected one`);
   const top = all[0].filter(node => all.every(path => path.includes(node))).pop();
   const depth = new Map();
   for (const path of all) path.forEach((node, i) => { if (i >= path.indexOf(top)) depth.set(node, i); });
@@ -372,7 +374,7 @@ function readFile(file) {
   arrays.faces = joined(starts[starts.length - 1] < 2 ** 16 ? Uint16Array : Uint32Array,
     found.map((part, i) => part.faces.map(x => x + starts[i])));
   let lowest = Infinity;
-  for (const { positions, skinned } of found) if (skinned)
+  for (const { positions, skinned } of found) if (skinned || !file.skins.length)
     for (let i = 1; i < positions.length; i += 3) lowest = Math.min(lowest, positions[i]);
   return { skeleton: { names, parents: above, offsets }, places, told, lowest, arrays, parts };
 }
