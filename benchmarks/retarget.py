@@ -107,14 +107,34 @@ def proportioned(
     return dataclasses.replace(skeleton, offsets=jnp.asarray(offsets, jnp.float32))
 
 
-def slide(positions: np.ndarray, feet: list[int], planted: np.ndarray, fps: float):
+SIDES = ("left", "right")
+
+
+def balls(
+    one: transfer.Rest, places: np.ndarray, turned: np.ndarray, like: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the balls of the feet are [F, 2, 3], and heights over the ground at rest.
+
+    Args:
+      turned: Turns of the joints from rest.
+      like: [2, 3] from the ankles, of feet that have no toes.
+    """
+    feet = [one.joint(side + "Foot") for side in SIDES]
+    toes = [one.joint(side + "Toes") for side in SIDES]
+    if None not in toes:
+        return places[:, toes], one.places[toes, 1] - one.sole
+    there = places[:, feet] + np.einsum("fsij,sj->fsi", turned[:, feet], like)
+    return there, one.places[feet, 1] + like[:, 1] - one.sole
+
+
+def slide(feet: np.ndarray, planted: np.ndarray, fps: float) -> float:
     """Mean speed of planted feet over the ground, m/s."""
-    moved = np.linalg.norm(np.diff(positions[:, feet][..., ::2], axis=0), axis=-1)
+    moved = np.linalg.norm(np.diff(feet[..., ::2], axis=0), axis=-1)
     return float((moved * planted).sum() / max(planted.sum(), 1) * fps)
 
 
 def jerk(positions: np.ndarray) -> float:
-    """Mean third difference of all joints."""
+    """Mean third difference."""
     return float(np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1).mean())
 
 
@@ -128,45 +148,36 @@ def measure(function: transfer.Retarget, motion: Motion) -> dict[str, float]:
     """What is lost on the way there, and back."""
     source, target = function.source, function.target
     made = function(motion)
-    before = np.asarray(joint_positions(source.skeleton, motion))
-    after = np.asarray(joint_positions(target.skeleton, made))
+    both = [role for role in source.roles if role in target.roles]
+    places, turned, roles, hips = [], [], [], []
+    for one, moved in ((source, motion), (target, made)):
+        there, turns = anatomy.kinematics(one.skeleton, moved)
+        places.append(np.asarray(there))
+        turned.append(np.asarray(turns) @ np.swapaxes(one.turns, -1, -2))
+        roles.append([one.joint(role) for role in both])
+        legs = [one.joint(side + "UpperLeg") for side in SIDES]
+        hips.append(places[-1][:, legs].mean(axis=1)[:, ::2])
     back = transfer.Retarget(target, source)(made)
-    away = np.asarray(joint_positions(source.skeleton, back)) - before
+    away = np.asarray(joint_positions(source.skeleton, back)) - places[0]
     away = np.linalg.norm(away, axis=-1)
-    toes = [
-        [
-            one.joint(side + "Toes") or one.joint(side + "Foot")
-            for side in ("left", "right")
-        ]
-        for one in (source, target)
-    ]
-    height = [
-        one.places[feet, 1] - one.sole
-        for one, feet in zip((source, target), toes, strict=True)
-    ]
-    planted = before[1:, toes[0], 1] < height[0] + LOW
-    worlds = [
-        anatomy.kinematics(one.skeleton, moved)[1] @ np.swapaxes(one.turns, -1, -2)
-        for one, moved in ((source, motion), (target, made))
-    ]
-    both = [r for r in source.roles if r in target.roles]
-    angle = degrees(
-        *(
-            world[:, [one.joint(role) for role in both]]
-            for world, one in zip(worlds, (source, target), strict=True)
-        )
+    toes, ankles = (
+        [source.joint(side + part) for side in SIDES] for part in ("Toes", "Foot")
     )
-    hips = [
-        p[:, one.joint("hips"), ::2] for p, one in ((before, source), (after, target))
-    ]
+    like = function.scale * (source.places[toes] - source.places[ankles])
+    (before, low), (after, height) = (
+        balls(one, there, turns, like)
+        for one, there, turns in zip((source, target), places, turned, strict=True)
+    )
+    planted = before[1:, :, 1] < low + LOW
+    angle = degrees(*(x[:, j] for x, j in zip(turned, roles, strict=True)))
+    jerks = [jerk(x[:, j]) for x, j in zip(places, roles, strict=True)]
     return {
-        "source_slide": function.scale * slide(before, toes[0], planted, motion.fps),
-        "slide": slide(after, toes[1], planted, motion.fps),
-        "penetration": 1e3
-        * float(np.maximum(height[1] - after[:, toes[1], 1], 0).max()),
+        "source_slide": function.scale * slide(before, planted, motion.fps),
+        "slide": slide(after, planted, motion.fps),
+        "penetration": 1e3 * float(np.maximum(height - after[..., 1], 0.0).max()),
         "angle": float(angle.mean()),
         "root": 1e3 * float(np.abs(hips[1] - function.scale * hips[0]).max()),
-        "jerk_ratio": jerk(after) / (function.scale * jerk(before)),
+        "jerk_ratio": jerks[1] / (function.scale * jerks[0]),
         "round": 1e3 * float(away.mean()),
         "round_95": 1e3 * float(np.percentile(away, 95)),
     }

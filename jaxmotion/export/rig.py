@@ -30,6 +30,7 @@ from jaxmotion.retarget.transfer import Rest
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _FLOAT = 5126
+MESHOPT = "EXT_meshopt_compression"
 _MAX_NODES = 20_000
 
 
@@ -336,6 +337,9 @@ def read_rig(path: str | Path) -> Rig:
     path = Path(path)
     name = str(path)
     content, data = _chunks(name, files.read_bytes(path))
+    needed = content.get("extensionsRequired")
+    if isinstance(needed, list) and MESHOPT in needed:  # packs bind matrices, too
+        raise ValueError(f"{name}: {MESHOPT}: expected a file that is not packed")
     data = _one_buffer(path, content, data)
     nodes = objects(name, content, "nodes")
     objects(name, content, "accessors")

@@ -22,7 +22,7 @@ from jaxmotion.export.rig import Rig, array, index, numbers, objects
 from jaxmotion.viz import packed
 
 _TRIANGLES = 4
-_PACKED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
+_DRACO = "KHR_draco_mesh_compression"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -219,9 +219,9 @@ def rig_mesh(rig: Rig) -> RigMesh:
       ValueError: if meshes are compressed, damaged, or there are none; names the file.
     """
     content = rig.content
-    packed = [x for x in content.get("extensionsRequired", ()) if x in _PACKED]
-    if packed:
-        raise ValueError(f"{rig.name}: {packed[0]}: expected meshes as they are")
+    needed = content.get("extensionsRequired")
+    if isinstance(needed, list) and _DRACO in needed:
+        raise ValueError(f"{rig.name}: {_DRACO}: expected meshes as they are")
     nodes = objects(rig.name, content, "nodes")
     meshes = objects(rig.name, content, "meshes")
     skins = objects(rig.name, content, "skins")

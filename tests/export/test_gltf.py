@@ -162,24 +162,23 @@ validateBytes(data).then(r => console.log(JSON.stringify(r)));
 """
 
 
-@pytest.fixture(scope="module")
-def validator(tmp_path_factory):
-    """Where npm has put the validator of Khronos."""
+def installed(folder, package):
+    """The folder, into which npm puts a package."""
     npm = shutil.which("npm")
     if npm is None or shutil.which("node") is None:
         pytest.skip("node and npm are not installed")
-    folder = tmp_path_factory.mktemp("validator")
-    command = [
-        npm,
-        "install",
-        "--no-audit",
-        "--no-fund",
-        "gltf-validator@2.0.0-dev.3.10",
-    ]
+    command = [npm, "install", "--no-audit", "--no-fund", package]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     if done.returncode:
-        pytest.skip(f"npm cannot install gltf-validator: {done.stderr[-200:]}")
+        pytest.skip(f"npm cannot install {package}: {done.stderr[-200:]}")
     return folder
+
+
+@pytest.fixture(scope="module")
+def validator(tmp_path_factory):
+    """Where npm has put the validator of Khronos."""
+    folder = tmp_path_factory.mktemp("validator")
+    return installed(folder, "gltf-validator@2.0.0-dev.3.10")
 
 
 @pytest.mark.slow

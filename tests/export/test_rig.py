@@ -189,8 +189,16 @@ def set_node(**values):
     return lambda content: content["nodes"][2].update(values)
 
 
+BONE = {"bone": "hips", "node": 99}
 BAD = {
     "no skin: expected a character": lambda c: c.pop("skins"),
+    "EXT_meshopt_compression: expected a file that is not packed": lambda c: c.update(
+        extensionsRequired=["EXT_meshopt_compression"]
+    ),
+    "a joint of the VRM is 99, expected in": lambda c: (
+        c.pop("skins"),
+        c.update(extensions={"VRM": {"humanoid": {"humanBones": [BONE]}}}),
+    ),
     "2 skins of 2 skeletons, expected one": two_skins,
     "node 0 is above itself": cycle,
     "node 2 has the scale zero": set_node(scale=[0, 0, 0]),
