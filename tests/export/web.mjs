@@ -6,7 +6,6 @@
 import { readFileSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import { pathToFileURL } from "node:url";
-import { gunzipSync } from "node:zlib";
 
 const [, , modules, packages, folder] = process.argv;
 const load = createRequire(`${packages}/package.json`);
@@ -18,10 +17,8 @@ ort.env.wasm.numThreads = 1;
 let at = 0;
 const noise = asked.noise && new Float32Array(readFileSync(asked.noise).buffer.slice(0));
 const draw = count => (noise ? noise.slice(at, at += count) : new Float32Array(count));
-const read = async file => {
-  const bytes = new Uint8Array(gunzipSync(readFileSync(`${folder}/${file}.gz`)));
-  return bytes.slice();
-};
+const { unpacked } = await import(pathToFileURL(`${modules}/packing.js`));
+const read = file => unpacked(new Uint8Array(readFileSync(`${folder}/${file}.packed`)));
 try {
   const model = await new Model(ort, read, draw).open("character");
   for (const steps of model.about.steps) await model.prepare(steps);

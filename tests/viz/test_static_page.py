@@ -65,7 +65,7 @@ def site(tmp_path_factory):
     command = jax.tree.map(lambda x: x[0, 0], commands)
     web.write_character(folder / "strider", "strider", character, command, steps=(2,))
     shutil.copytree(folder / "strider", folder / "broken")
-    damaged = folder / "broken" / "advance.onnx.gz"
+    damaged = folder / "broken" / "advance.onnx.packed"
     damaged.write_bytes(damaged.read_bytes()[:-300])
     return folder
 
@@ -296,7 +296,7 @@ def test_where_one_model_does_not_load_another_one_does(browser, address):
     with opened(browser, address) as tab:
         tab.select_option("#model", "broken")
         tab.wait_for_selector("#note.bad", state="visible", timeout=PATIENCE)
-        assert "broken/advance.onnx.gz is damaged" in tab.inner_text("#note")
+        assert "broken/advance.onnx.packed is damaged" in tab.inner_text("#note")
         tab.select_option("#model", "strider")
         tab.wait_for_selector("#note", state="hidden", timeout=PATIENCE)
         tab.keyboard.down("w")
@@ -406,8 +406,8 @@ def test_a_rig_that_is_dropped_walks(browser, address, tmp_path):
     ("link", "prepare", "line"),
     [
         ("#model=nobody", "", "unknown model nobody, expected one of strider, broken"),
-        ("#model=broken", "", "broken/advance.onnx.gz is damaged"),
-        ("", "missing", "strider/advance.onnx.gz is missing (404)"),
+        ("#model=broken", "", "broken/advance.onnx.packed is damaged"),
+        ("", "missing", "strider/advance.onnx.packed is missing (404)"),
         ("", "simd", "this browser has no WebAssembly SIMD"),
         ("", "gl", "this browser has no WebGL 2"),
     ],
@@ -419,7 +419,7 @@ def test_what_is_wrong_is_one_line_on_the_page(browser, address, link, prepare, 
     if prepare == "gl":
         tab.add_init_script(script)
     if prepare == "missing":
-        tab.route("**/advance.onnx.gz", lambda route: route.fulfill(status=404))
+        tab.route("**/advance.onnx.packed", lambda route: route.fulfill(status=404))
     if prepare == "simd":
 
         def refuse(route):

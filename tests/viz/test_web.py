@@ -14,7 +14,7 @@ from jaxmotion.control import goals, steering, waypoints
 from jaxmotion.control.steering import Inputs, Wish
 from jaxmotion.data import bvh as bvh_motion
 from jaxmotion.data import bvh_text, walker
-from jaxmotion.export import slim
+from jaxmotion.export import slim, web
 from jaxmotion.motion.skeleton import global_transforms, joint_positions
 from jaxmotion.viz import packed, page, viewer
 from tests import tiny
@@ -322,6 +322,28 @@ def test_the_pages_glb_is_what_was_shown(tmp_path):
     values = np.frombuffer(content[start : start + view["byteLength"]], "<f4")
     roots = np.asarray(motion.root_position).ravel()
     np.testing.assert_allclose(values, roots, atol=1e-5)
+
+
+def test_packed_files_are_unpacked():
+    """Programs as LZMA, noise as gzip; a damaged file is refused."""
+    draw = np.random.default_rng(0)
+    noise = draw.bytes(3000)
+    lines = [f"line {i} {draw.integers(9)} of {i % 7}\n" for i in range(4000)]
+    text = "".join(lines).encode() + noise[:400] + bytes(900) + noise[:400]
+    files = [web.pack(text), web.pack(noise), b"plain", web.pack(2 * text)]
+    assert [x[0] for x in files] == [0x5D, 0x1F, ord("p"), 0x5D]
+    some = lambda x: ({"bytes": data(x)["base64"]},)  # noqa: E731
+    found = run("packing.js", "unpacked", *map(some, files))
+    wanted = [text, noise, b"plain", 2 * text]
+    for one, content in zip(found, wanted, strict=True):
+        assert base64.b64decode(one["base64"]) == content
+    cut = [files[0][:-300], files[0][:12]]
+    for _ in range(20):
+        at, other = draw.integers(13, len(files[0]) - 1), bytearray(files[0])
+        other[at] ^= 1 << int(draw.integers(8))
+        cut.append(bytes(other))
+    said = run("packing.js", "unpacked", *map(some, cut))
+    assert said == [{"error": "damaged"}] * len(cut)
 
 
 def test_half_precision_constants_are_widened():

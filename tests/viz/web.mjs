@@ -21,15 +21,15 @@ const outward = (_, x) => {
   return ArrayBuffer.isView(x) ? [...x] : x;
 };
 const [first, method] = name.split(".");
-const results = calls.map(call => {
+const results = await Promise.all(calls.map(async call => {
   const args = JSON.parse(JSON.stringify(call), inward);
   try {
-    if (!method) return found[first](...args);
+    if (!method) return await found[first](...args);
     const made = found[first](...args[0]);
     return args.slice(1).map(each => made[method](...each));
   } catch (error) {
     if (error.constructor !== Error) throw error;
     return { error: error.message };  // one that is meant for whoever looks
   }
-});
+}));
 process.stdout.write(JSON.stringify(results, outward));

@@ -5,6 +5,7 @@
 import * as ort from "onnxruntime-web/wasm";
 import { Crowd } from "./crowd.js";
 import { Helper, help } from "./group.js";
+import { unpacked } from "./packing.js";
 import { Model } from "./player.js";
 
 // Ticks to be ahead: at least so many, and never more.
@@ -38,11 +39,8 @@ async function fetched(path) {
     throw new Error(`${path} cannot be fetched`);
   }
   if (!answer.ok) throw new Error(`${path} is missing (${answer.status})`);
-  const bytes = new Uint8Array(await answer.arrayBuffer());
-  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) return bytes;
   try {
-    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-    return new Uint8Array(await new Response(stream).arrayBuffer());
+    return await unpacked(new Uint8Array(await answer.arrayBuffer()));
   } catch {
     throw new Error(`${path} is damaged`);
   }
@@ -58,7 +56,7 @@ async function open(message) {
     throw new Error("this browser has no WebAssembly SIMD: plans cannot be made here");
   note("loading");
   // Both at once; who fails first is told.
-  const runtime = fetched("ort.wasm.gz").then(binary => {
+  const runtime = fetched("ort.wasm.packed").then(binary => {
     ort.env.wasm.numThreads = 1;
     ort.env.wasm.wasmBinary = binary;
   });
@@ -76,7 +74,7 @@ async function choose(name, wish = {}, runtime = null) {
     throw new Error(`unknown model ${name}, expected one of ${state.models.join(", ")}`);
   note(`loading ${name}`);
   if (!opened.has(name)) {
-    const read = kept(file => fetched(`${name}/${file}.gz`));
+    const read = kept(file => fetched(`${name}/${file}.packed`));
     opened.set(name, await new Model(ort, read).open(name));
   }
   const next = opened.get(name), { about } = next;
