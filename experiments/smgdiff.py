@@ -53,12 +53,16 @@ class Train:
       own_levels: Probability of noise on own predictions at lower levels.
       seam_half_life: Half-life, frames, of the offset with which plans go on from the
         past; 0: none.
+      weight_foot: Weight of planted feet; None for the preset's.
+      init: Run folder or exported model to start from; without a draft then.
       held_out: Part of the recordings kept for evaluation.
       steps: Updates of a motion model.
       draft_steps: Updates before these in which displacements hardly count.
       path_steps: Updates of a trajectory generator.
       batch: Windows per update.
       learning_rate: Peak of Muon's rate; cosine to a twentieth.
+      warmup: Updates of its linear rise; None for a tenth, 100 at most.
+      ema: Decay per update of the average that is kept.
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with these settings where a stage began with others.
     """  # noqa: E501
@@ -74,12 +78,16 @@ class Train:
     noise_levels: int | None = None
     own_levels: float | None = None
     seam_half_life: float | None = None
+    weight_foot: float | None = None
+    init: cli.Optional[Path] = None
     held_out: float = 0.1
     steps: int = 3000
     draft_steps: int = 3500
     path_steps: int = 2000
     batch: int = 48
     learning_rate: float = 2e-3
+    warmup: int | None = None
+    ema: float = 0.999
     distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False
@@ -184,6 +192,7 @@ def train(args: Train) -> None:
         held_out=args.held_out,
         sizes=sizes_of(args),
         paths=smgdiff_training.PATHS[args.preset],
+        init=args.init,
     )
     clips = run.train.clips
     print(
@@ -195,7 +204,11 @@ def train(args: Train) -> None:
         number = args.steps if stage.startswith("motion") else args.path_steps
         budget = runs.Budget(**cli.given(runs.Budget, args) | {"steps": number})
         smgdiff_training.train_stage(
-            run, stage, budget=budget, draft_steps=args.draft_steps
+            run,
+            stage,
+            budget=budget,
+            draft_steps=args.draft_steps,
+            init=args.init,
         )
         print(f"{stage}: {time.perf_counter() - begun:.0f} s", flush=True)
 

@@ -427,11 +427,7 @@ def load_run(path: Path) -> tuple[smgdiff_training.Run, Model, dict[str, Params]
       CheckpointError: if a stage was not trained.
       ValueError: if it is no run folder of SMGDiff.
     """
-    run = smgdiff_training.load_run(path)
-    model, motion = smgdiff_training.load_stage(run, "motion_8")
-    paths, path_params = smgdiff_training.load_stage(run, "paths_1")
-    model = dataclasses.replace(model, paths=paths.paths)
-    return run, model, {"motion": motion, "paths": path_params}
+    return smgdiff_training.load_run(path), *smgdiff_training.load(path)
 
 
 def own_starts(path: Path, *, number: int, seed: int = 0) -> Scene:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 from jaxmotion.data.ball_clips import BallClips, load_ball_clips, save_ball_clips
-from jaxmotion.learning import runs
+from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
 from jaxmotion.systems.smgdiff import model as smgdiff_model
@@ -101,6 +101,39 @@ def with_steps(model: Model, stage: str) -> Model:
     return dataclasses.replace(model, **{field: changed})
 
 
+# Fields of `smgdiff.Config` that change no parameter's shape.
+_FREE = ("attention", "noise_levels", "own_levels", "seam_half_life", "seam_features")
+
+
+def continued(model: Model, path: Path) -> tuple[Model, dict[str, Params]]:
+    """A run's or exported model's parameters, to be trained on as this model.
+
+    The units of features go with them; weights of the losses, attention, noise levels
+    and seam are this model's.
+
+    Raises:
+      ValueError: if skeleton, skills or sizes differ; names which.
+    """
+    first, params = load(path)
+
+    def part(model: Model) -> dict[str, Any]:
+        value = smgdiff_model.to_json(model)
+        for name in ("config", "paths"):
+            value[name] = {
+                field: found
+                for field, found in value[name].items()
+                if not field.startswith("weight_") and field not in _FREE
+            }
+        features = ("skeleton", "joints", "fps")
+        value["representation"] = {k: value["representation"][k] for k in features}
+        return {k: value[k] for k in ("config", "paths", "representation", "labels")}
+
+    differ = model_json.differences(part(first), part(model))
+    if differ:
+        raise ValueError(f"{path}: expected a model like the one to train: {differ}")
+    return dataclasses.replace(model, representation=first.representation), params
+
+
 def prepare(
     folder: Path,
     data: Path,
@@ -108,11 +141,12 @@ def prepare(
     held_out: float,
     sizes: dict[str, Any],
     paths: dict[str, Any] | None = None,
+    init: Path | None = None,
 ) -> Run:
     """Makes model and clips of a run folder, or loads those it has.
 
     Sizes and paths are as `make_model` takes them; `held_out` is the part of the
-    recordings to hold out.
+    recordings to hold out; `init` is a model to start from.
 
     Raises:
       OSError: if the clips cannot be read.
@@ -122,6 +156,8 @@ def prepare(
     def make() -> runs.Content:
         parts = smgdiff_data.split(load_ball_clips(data), fraction=held_out)
         model = make_model(parts[0], sizes=sizes, paths=paths)
+        if init is not None:
+            model = continued(model, init)[0]
         return runs.Content(
             model=smgdiff_model.to_json(model),
             source=model.source,
@@ -139,7 +175,12 @@ def prepare(
         folder,
         system=SYSTEM,
         data=[data],
-        settings={"held_out": held_out, "sizes": sizes, "paths": paths or {}},
+        settings={
+            "held_out": held_out,
+            "sizes": sizes,
+            "paths": paths or {},
+            "init": init and str(init),
+        },
         make=make,
     )
     return _decode(record)
@@ -190,6 +231,22 @@ def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
     return model, runs.load_params(run.record, stage, init)
 
 
+def load(path: Path) -> tuple[Model, dict[str, Params]]:
+    """Model and parameters of a file, or of a folder's "motion_8" and "paths_1".
+
+    Raises:
+      CheckpointError: if a stage was not trained, or the file is damaged.
+      ValueError: if it is of another system.
+    """
+    if path.is_file():
+        return smgdiff_model.import_file(path)
+    run = load_run(path)
+    model, motion = load_stage(run, "motion_8")
+    paths, path_params = load_stage(run, "paths_1")
+    model = dataclasses.replace(model, paths=paths.paths)
+    return model, {"motion": motion, "paths": path_params}
+
+
 # Sizes and weights of `smgdiff.Config`, by name.
 PRESETS = {
     # CAMDM's network, which the paper's missing supplement is taken to have.
@@ -223,14 +280,22 @@ DRAFT = dict(
 
 
 def train_stage(
-    run: Run, stage: str, *, budget: runs.Budget, draft_steps: int = 0
+    run: Run,
+    stage: str,
+    *,
+    budget: runs.Budget,
+    draft_steps: int = 0,
+    init: Path | None = None,
 ) -> None:
     """Trains a stage such as "motion_8", from its newest checkpoint if there is one.
 
-    A motion model first gets `draft_steps` updates with the weights `DRAFT`.
+    A motion model first gets `draft_steps` updates with the weights `DRAFT`. A new
+    stage starts with the parameters of `init`, and then has no draft; None for random
+    ones.
 
     Raises:
-      ValueError: if there is no such stage, or its checkpoint has other settings.
+      ValueError: if there is no such stage, its checkpoint has other settings, or the
+        model of `init` does not fit.
       TrainingDiverged: if a loss is not finite.
     """
     model = with_steps(run.model, stage)
@@ -238,9 +303,14 @@ def train_stage(
     params = jax.jit(lambda key: init_stage(key, model, stage))(
         jax.random.key(budget.seed)
     )
-    settings = None
-    if stage.startswith("motion"):
-        settings = {"draft_steps": draft_steps}
+    kind, _ = check_stage_name(stage)
+    settings: dict[str, Any] | None = None
+    if init is not None:
+        settings, draft_steps = {"init": str(init)}, 0
+        if checkpoint.latest_step(run.record.checkpoints(stage)) is None:
+            params = continued(model, init)[1][kind]
+    if kind == "motion":
+        settings = (settings or {}) | {"draft_steps": draft_steps}
         if draft_steps:
             draft = dataclasses.replace(model.config, **DRAFT)
             params = _fit(

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 
 from jaxmotion.data.ball_clips import save_ball_clips
-from jaxmotion.learning import runs
+from jaxmotion.learning import checkpoint, runs
 from jaxmotion.learning.checkpoint import CheckpointError, latest_step, load_config
 from jaxmotion.motion import trajectory
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
+from jaxmotion.systems.smgdiff import model as smgdiff_model
 from jaxmotion.systems.smgdiff import players as smgdiff_players
 from jaxmotion.systems.smgdiff import scoring as smgdiff_scoring
 from jaxmotion.systems.smgdiff import training as smgdiff_training
+from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from jaxmotion.systems.smgdiff.guidance import UNGUIDED
 from tests import ball_walker, tiny
 
@@ -139,6 +141,47 @@ def test_another_model_does_not_go_into_the_same_folder(run):
         given = dict(held_out=0.3, sizes=SIZES, paths=PATHS) | change
         with pytest.raises(ValueError, match=f"made otherwise: {message}"):
             smgdiff_training.prepare(run.record.folder, data, **given)
+
+
+def test_training_goes_on_from_an_exported_model(run, tmp_path):
+    """With the file's units and parameters, and a seam of its own."""
+    file, folder = tmp_path / "first.npz", tmp_path / "run"
+    shifted = run.model.representation.normalizer
+    shifted = dataclasses.replace(shifted, mean=shifted.mean + 1.0)
+    first = dataclasses.replace(
+        run.model,
+        representation=dataclasses.replace(
+            run.model.representation, normalizer=shifted
+        ),
+        starts=None,
+    )
+    params = {
+        "motion": tiny.random_params(smgdiff_model.init, first.config),
+        "paths": tiny.random_params(smgdiff_trajectory.init, first.paths),
+    }
+    checkpoint.export_params(file, params, smgdiff_model.to_json(first))
+    sizes = SIZES | dict(seam_half_life=5.0, weight_foot=9.0)
+    data = run.record.folder.parent / "clips.npz"
+    common = dict(held_out=0.3, paths=PATHS)
+    made = smgdiff_training.prepare(folder, data, sizes=sizes, init=file, **common)
+    found = made.model.representation.normalizer
+    np.testing.assert_allclose(found.mean, shifted.mean, rtol=1e-6)
+    assert made.model.config.seam_half_life == 5.0
+    still = dataclasses.replace(BUDGET, steps=1, learning_rate=1e-12, ema=0.5)
+    smgdiff_training.train_stage(
+        made, "motion_2", budget=still, draft_steps=2, init=file
+    )
+    assert latest_step(made.record.checkpoints("motion_2/draft")) is None
+    _, trained = smgdiff_training.load_stage(made, "motion_2")
+    jax.tree.map(
+        lambda x, y: np.testing.assert_allclose(x, np.float16(y), atol=1e-3),
+        trained,
+        params["motion"],
+    )
+    with pytest.raises(ValueError, match="config.width is 16, given 32"):
+        smgdiff_training.prepare(
+            tmp_path / "other", data, sizes=sizes | dict(width=32), init=file, **common
+        )
 
 
 def test_stages_are_named_by_kind_and_steps(run):
