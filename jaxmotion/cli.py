@@ -31,13 +31,7 @@ Distributed = Annotated[tuple[str, ...], tyro.conf.arg(metavar="...")]
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Numbers that an option may have.
-
-    Attributes:
-      low: The least.
-      high: The largest.
-      without: Which of them are not allowed themselves.
-    """
+    """Numbers from `low` to `high` that an option may have, but for those `without`."""
 
     low: float | int
     high: float | int
@@ -208,10 +202,7 @@ def part_processes() -> bool:
 
 
 def announce(what: str, seconds: int) -> None:
-    """Says what a silence is for, such as "compiling the rollout".
-
-    It takes so many seconds on two CPU cores.
-    """
+    """Says what a silence of so many seconds on two CPU cores is for: "compiling"."""
     print(f"{what}, about {seconds} s", file=sys.stderr, flush=True)
 
 

@@ -628,7 +628,6 @@ def show(
     Args:
       frames: Frames of one character, such as `frames[0]`, or of many, which are set
         apart where they would start within each other.
-      title: Above the picture.
       caption: Below it, such as the data's source and license.
       height: Height of the view, pixels.
 

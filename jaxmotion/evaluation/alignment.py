@@ -82,9 +82,7 @@ def trajectory_error(
 def orientation_error(
     wanted: Float[Array, "*batch frames 2"], actual: Float[Array, "*batch frames 2"]
 ) -> Float[Array, "*batch"]:
-    """Mean absolute angle between the wanted and the actual facing (x, z).
-
-    In [0, pi] radians.
+    """Mean angle between the wanted and the actual facing (x, z), in [0, pi] radians.
 
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 6; wrapped.
     """

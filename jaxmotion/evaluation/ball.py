@@ -56,7 +56,6 @@ def touch_events(
     flight and the kicks at its two ends are a single event. A bounce is one as well.
 
     Args:
-      ball: Positions, meters.
       threshold: Meters per second squared, exclusive. The paper's 2 is a second
         difference of 2.2 mm at 30 fps, which noise in a recording exceeds.
 
@@ -90,7 +89,6 @@ def foot_ball_distance(
     events. A touch by the surface of a foot leaves the ball's radius and half a foot.
 
     Args:
-      ball: Positions, meters.
       joints: World positions of the joints that may touch it (feet, or hands), meters.
       threshold: Acceleration of an event, meters per second squared, exclusive.
 
@@ -119,7 +117,6 @@ def touch_count(
     above `max_distance`. Divide by the minutes for touches a minute.
 
     Args:
-      ball: Positions, meters.
       joints: World positions of the joints that may touch it, meters.
       threshold: Acceleration of an event, meters per second squared, exclusive.
       max_distance: From a joint to the ball's center, meters, inclusive: the ball's
@@ -157,7 +154,6 @@ def untouched_acceleration(
     squared, a flying one falls with 9.8: compare with real motions.
 
     Args:
-      ball: Positions, meters.
       joints: World positions of the joints that may touch it, meters.
       max_distance: From a joint to the ball's center, meters, inclusive.
 

@@ -157,7 +157,6 @@ class Amount:
     Attributes:
       quick: For half an hour of two cores, training of five models included.
       full: As long as the figures of the README, or longer.
-      meaning: What it is.
       training: Whether trained models depend on it; otherwise only their evaluation.
     """
 
@@ -214,11 +213,8 @@ class Job:
     """One sweep of one system.
 
     Attributes:
-      points: Step counts.
       data: Files of clips.
       models: Folder of the trained models.
-      budget: Numbers, from `resolve`.
-      replications: Replications of the evaluation.
       seed: Seeds everything random.
       evaluator: A frozen evaluator; None to train one.
     """

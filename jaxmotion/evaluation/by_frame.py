@@ -99,7 +99,6 @@ def by_frame(
 
     Args:
       positions: World, meters.
-      feet: Joints whose sliding counts.
       place: Place of each frame, in 0..num_places-1; others are left out.
       contact_height: A foot joint below this height should not move, meters.
     """

@@ -18,8 +18,6 @@ class Column:
     """One metric.
 
     Attributes:
-      id: In rows and files.
-      title: In tables and plots.
       unit: "" for what has none.
       better: Where good values lie; "real" is near those of recorded motion, ""
         nowhere.

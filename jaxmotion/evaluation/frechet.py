@@ -22,9 +22,7 @@ class Moments:
     Leading axes come from `jax.vmap` over sets; the functions here take one set.
 
     Attributes:
-      mean: Mean of each feature.
       covariance: Unbiased (divided by count - 1).
-      count: Number of samples.
     """
 
     mean: Float[Array, "*batch features"]

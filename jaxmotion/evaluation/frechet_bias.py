@@ -81,8 +81,6 @@ def frechet_bias(
       features: Features of all samples of a model, one row each.
       reference: Moments of what they are compared with, of as many samples as there
         are.
-      sizes: Sizes of the subsets, see `subset_sizes`.
-      repeats: Subsets of each size.
 
     Raises:
       ValueError: if there are fewer than two different sizes or one is not in

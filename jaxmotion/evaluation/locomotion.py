@@ -29,7 +29,6 @@ def locomotion_metrics(
       skeleton: The skeleton; its feet are the joints whose sliding counts.
       motion: Windows [windows, frames, ...], world.
       wanted_velocity: Velocity asked for in each frame, meters per second.
-      wanted_facing: Facing asked for in each frame.
       contact_height: A foot joint below this height should not move, meters.
 
     Returns:

@@ -40,8 +40,6 @@ def r_precision(
     same pools, or of many.
 
     Args:
-      text: Embeddings of sentences.
-      motion: Embeddings of their motions.
       top: The largest k, at most pool.
 
     Returns:

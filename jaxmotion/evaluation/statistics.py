@@ -42,8 +42,6 @@ class Spread(NamedTuple):
     """What is kept of samples that are gone; in float64.
 
     Attributes:
-      count: Samples seen.
-      mean: Their mean.
       squares: Sum of their squared deviations from it.
     """
 

@@ -23,7 +23,6 @@ class Cell:
     """One number of a table.
 
     Attributes:
-      value: The estimate.
       low: Lower end of its interval; None where none is given.
       high: Upper end.
       samples: Clips, rollouts or resamples that it came from.

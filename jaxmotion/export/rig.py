@@ -61,10 +61,7 @@ class Rig:
     sole: float | None
 
     def rest(self, roles: Any = None) -> Rest:
-        """For `transfer.retarget`.
-
-        Args:
-          roles: Joints of some roles; see `roles.find_roles`.
+        """For `transfer.retarget`; for the roles see `roles.find_roles`.
 
         Raises:
           OSError, ValueError: see `transfer.rest`; names the file.

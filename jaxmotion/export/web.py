@@ -98,7 +98,6 @@ def write_character(
     """Writes a character's files.
 
     Args:
-      folder: Of this character.
       name: What the page calls it.
       character: A `control.steering.Character` with tuning.
       command: Of one tick; only its shapes matter.
@@ -213,10 +212,7 @@ def _write(path: Path, content: bytes) -> str:
 
 
 def packages(cache: Path) -> Path:
-    """The folder with the page's packages of npm, which is filled if need be.
-
-    Args:
-      cache: It lies there, one for each lock file.
+    """The page's packages of npm in `cache`, one for each lock file; made if need be.
 
     Raises:
       ValueError: if Node is missing, or npm fails.
@@ -242,7 +238,6 @@ def write_page(
     """Bundles the page's sources and writes them, the runtime and the list of models.
 
     Args:
-      folder: To write to.
       models: Names, each of a character's folder there; the first is shown first.
       cache: Folder for the packages of npm; those there are used again.
 

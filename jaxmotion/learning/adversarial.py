@@ -18,12 +18,7 @@ from jaxmotion.typing import Key, Params
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class GanState:
-    """All that an adversarial run needs to go on.
-
-    Attributes:
-      generator: Its parameters, their average, its optimizer.
-      discriminator: The same; the average is not used.
-    """
+    """What an adversarial run needs to go on; the discriminator's average is unused."""
 
     generator: training.TrainState
     discriminator: training.TrainState
@@ -58,7 +53,6 @@ def make_gan_update(
       discriminator_loss: Loss of the discriminator's parameters, then the generator's.
       generator_loss: Loss of the generator's parameters, then the discriminator's.
       optimizers: The generator's and the discriminator's.
-      ema_decay: Decay of the generator's average.
 
     Returns:
       `update(state, key, batch) -> (state, info)`. Names in info begin with

@@ -66,14 +66,11 @@ class Content:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run folder.
+    """A run folder; its model, source and split are those of its `Content`.
 
     Attributes:
       system: Whose run it is.
-      model: JSON of what rebuilds the model.
       settings: JSON of how model and data were made.
-      source: The data, and their license.
-      split: Names of the clips of each part.
       files: Fingerprint of each file in `data`, by file name.
     """
 
@@ -528,7 +525,6 @@ def minimize(
 
     Args:
       loss: `(params, key, batch) -> (loss, info)`.
-      sample_batch: `(key, data) -> batch`.
       **more: As `fit` takes them.
     """
     optimizer = make_optimizer(budget)

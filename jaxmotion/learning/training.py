@@ -28,11 +28,7 @@ Optimizer = optax.GradientTransformation
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class TrainState:
-    """All that a run needs to go on.
-
-    Attributes:
-      ema_params: Their exponential moving average: what evaluation uses.
-    """
+    """What a run needs to go on; `ema_params`, a moving average, is for evaluation."""
 
     step: Int[Array, ""]
     params: Params
@@ -170,7 +166,6 @@ def make_optimizer(
     """An optimizer with linear warm-up and cosine decay, or at a constant rate.
 
     Args:
-      name: One of `OPTIMIZERS`.
       learning_rate: Peak rate.
       num_steps: Steps of the whole run; the rate stays at its end value after them.
         None for a constant rate.

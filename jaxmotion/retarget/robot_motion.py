@@ -62,8 +62,6 @@ class RobotMotion:
     """A robot over time, and how well it follows.
 
     Attributes:
-      robot: The robot.
-      fps: Frames per second.
       qpos: [F, nq] MuJoCo's state.
       planted: [F, 2] whether the left and the right foot stand.
       goals: What it followed, on its skeleton as a person.
@@ -403,7 +401,6 @@ def follow(
     """A motion on a robot.
 
     Args:
-      source: Whose motion it is.
       motion: [frames, ...] of one character.
       fps: Frames per second that are wanted; mjlab's policies act at 50.
 

@@ -287,7 +287,6 @@ def two_bones(
     """Where the middle joints of limbs are whose ends reach for goals.
 
     Args:
-      start: Of each limb.
       goal: Of its end; beyond its reach, it points there.
       pole: A direction, to the side of which the middle joint is.
       a, b: Lengths of the two bones.
@@ -329,11 +328,7 @@ class Retarget:
         return np.array([j for j, up in enumerate(leader) if up == joint])
 
     def __call__(self, motion: Motion) -> Motion:
-        """The motion of the target.
-
-        Args:
-          motion: Of the source, with whatever axes lead.
-        """
+        """The motion of the target of one of the source's, with whatever axes lead."""
         root, turns = self.pose(motion.root_position, motion.joint_rotation)
         return Motion(root_position=root, joint_rotation=turns, fps=motion.fps)
 

@@ -42,15 +42,12 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 
 def fit_text(text: str, width: int, *, size: int, least: int) -> tuple[str, int]:
-    """One line that is at most so wide: shrunk, and if that is not enough elided.
+    """A line at most so wide, and its font's size: shrunk, and if need be elided.
 
     Args:
       width: Pixels.
       size: Size of the font, pixels, where there is room.
       least: The smallest size.
-
-    Returns:
-      What to write, and its size.
     """
     text = " ".join(text.split())
     for smaller in range(size, least - 1, -1):
@@ -347,8 +344,6 @@ def save_gif(
     still, so that sliding feet show.
 
     Args:
-      path: File to write.
-      stage: From `stage.make_stage`.
       title: Above the picture, in one line: shrunk, then elided.
       caption: Below it, small: the source of the data and its license.
       every: Draw every so many frames; the speed stays true. None for at most 20

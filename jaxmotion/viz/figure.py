@@ -11,13 +11,7 @@ COMMANDED, WALKED = "#2ca02c", "#ff7f0e"
 
 
 def check_writable(path: str | Path) -> Path:
-    """Raises if a file cannot be written; called before anything is drawn.
-
-    Args:
-      path: The file.
-
-    Returns:
-      The path.
+    """The path of a file that can be written, asked before anything is drawn.
 
     Raises:
       OSError: names the file.

@@ -310,7 +310,6 @@ def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
     """The page as text.
 
     Args:
-      stage: From `stage.make_stage`.
       title: Above the picture, in one line; escaped, like the caption.
       caption: Below it, small: the source of the data and its license.
     """

@@ -1,8 +1,4 @@
-"""Plots: tables as dots with intervals, quality against time, curves, clouds, sweeps.
-
-Figures are made without pyplot, so that neither a display is needed nor the backend of
-a notebook changed.
-"""
+"""Plots: tables as dots with intervals, quality over time, curves, clouds, sweeps."""
 
 import dataclasses
 import io
@@ -39,7 +35,6 @@ class Panel:
     """One metric of several methods, by two sources that need not compare.
 
     Attributes:
-      title: The metric.
       left: Value, lower and upper end of each method; nan for none.
       right: The same by the second source.
       target: Method whose value is drawn as a line; None for no line.
@@ -106,12 +101,9 @@ def write_dots(
     """Draws two axes a metric, with one line a method and a scale of their own.
 
     Args:
-      path: The picture.
       methods: Names, from above.
-      panels: Metrics.
       sources: Names of the left and the right source of every panel.
       absent: What stands where the left or the right source has no value.
-      title: Above the picture.
 
     Raises:
       OSError: if the file cannot be written.
@@ -162,9 +154,6 @@ def dots_svg(
     Args:
       rows: Value, lower and upper end by row, one per training.
       references: Rows of data, with a dashed line through their first value.
-      title: Above the picture.
-      xlabel: Below it.
-      logarithmic: Axis of the values.
       description: In the file's metadata.
     """
     with matplotlib.rc_context({"svg.hashsalt": "jaxmotion", "svg.fonttype": "path"}):
@@ -198,15 +187,7 @@ def dots_svg(
 def pareto_front(
     x: Float[np.ndarray, " points"], y: Float[np.ndarray, " points"]
 ) -> Bool[np.ndarray, " points"]:
-    """Which points no other beats: none is as low in both, and lower in one.
-
-    Args:
-      x: First cost.
-      y: Second cost.
-
-    Returns:
-      True for those of the front.
-    """
+    """Which points no other beats: none is as low in both costs, and lower in one."""
     no_worse = (x[:, None] <= x) & (y[:, None] <= y)
     lower = (x[:, None] < x) | (y[:, None] < y)
     return ~np.any(no_worse & lower, axis=0)
@@ -251,14 +232,9 @@ def write_pareto(
     """Draws named points with error bars in both directions, lower left is best.
 
     Args:
-      path: The picture.
-      names: Names of the points; written beside them.
       x: Value, lower and upper end of each point's first cost.
       y: The same of its second.
       references: Value, lower and upper end of second costs that are lines.
-      xlabel: Quantity and unit.
-      ylabel: Quantity and unit.
-      title: Above the picture.
       broken: Names of points that fail in other ways: hollow, and beaten by all.
 
     Raises:
@@ -322,10 +298,7 @@ def write_scatter(
     in the panel's title, not drawn.
 
     Args:
-      path: The PNG.
-      clouds: Points by name.
       marks: Points drawn as crosses in every panel.
-      title: Over all panels.
       shown: Points drawn of a cloud, at most.
       seed: Seeds the choice of these.
 
@@ -366,11 +339,7 @@ def plot_sweep(
     """Lines with upper whiskers, such as latency over the number of steps.
 
     Args:
-      path: File to write.
       lines: Label to (x, y, upper end of the whisker or None).
-      xlabel: Quantity and unit.
-      ylabel: Quantity and unit.
-      log: Logarithmic axes.
       ticks: What stands below x = 0, 1, 2, ...; none for numbers.
 
     Raises:
@@ -398,9 +367,6 @@ class Costs:
     """One panel of `costs_svg`: quality over time; lower left is best.
 
     Attributes:
-      title: Above it.
-      xlabel: Quantity and unit of the times.
-      ylabel: Quantity of the quality.
       points: By sampler and label, time and quality: value, lower and upper end.
       data: The quality of held-out data, its lower and its upper end.
       peers: Times of a call elsewhere, by name.
@@ -467,7 +433,6 @@ def costs_svg(panels: tuple[Costs, ...], *, title: str, description: str = "") -
     Strips below the panels, with the same axes of time, mark what peers take.
 
     Args:
-      title: Above the picture.
       description: In the file's metadata.
     """
     down = math.ceil(len(panels) / 2)
@@ -515,9 +480,6 @@ class Curves:
     """One pair of axes of `write_curves`.
 
     Attributes:
-      title: Above them.
-      xlabel: Quantity and unit.
-      ylabel: Quantity and unit.
       lines: Label to x, and value, lower and upper end at each x; nan for no interval.
       references: Label to the value of a line across, its lower and its upper end.
       noisy: The lines are smoothed, with the values thin behind; else each point is a
@@ -588,9 +550,7 @@ def write_curves(path: str | Path, panels: tuple[Curves, ...], *, title: str) ->
     across all of them where some lines are much longer than others.
 
     Args:
-      path: The picture.
       panels: What to draw, each with a finite value.
-      title: Above the picture.
 
     Raises:
       OSError: if the file cannot be written.

@@ -191,7 +191,6 @@ def codes(
     """Which shade of which color each pixel shows.
 
     Args:
-      seen: From `triangles`.
       normals: [V, 3] right, up and toward the viewer.
       colors: [V] number of the color.
       faces: [T, 3].

@@ -46,8 +46,6 @@ class Stage:
     """Characters of one skeleton over time.
 
     Attributes:
-      skeleton: Theirs.
-      body: Its body.
       motion: [characters, frames, ...].
       positions, rotations: Of the joints in the world.
       ghost: A pose per frame that is drawn pale, such as where a plan ends; None for

@@ -38,8 +38,6 @@ class Settings:
     """What the panel shows.
 
     Attributes:
-      model: One of the session's.
-      label: Index.
       speed: Without Shift, m/s.
       num_steps: Diffusion steps of a plan.
       scale: Guidance scale.
@@ -225,7 +223,6 @@ class Session:
 
         Args:
           models: What loads each model that can be chosen, the first one first.
-          characters: To begin with.
           foot_locks: Whether a model begins with locked feet; True where not given.
           dress: Makes another body for a model that has walked for a second.
           seed: Seeds starts and noise.
