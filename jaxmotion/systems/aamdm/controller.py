@@ -201,7 +201,6 @@ def guided(
     """AAMDM as a stepper steered by the objective's gradient, unless the goal is None.
 
     Args:
-      sample: From `aamdm_model.sampler`.
       scale: Strength of the guidance, epsilon of eq. 13.
       guided_steps: How many at the chain's end are guided; None for all (paper).
       memory: How the noise of its posteriors is remembered; None draws it anew in every
@@ -271,7 +270,6 @@ def controller(
     """The run-time as the three functions that `rollout.rollout` composes.
 
     Args:
-      step: Makes the next frame.
       steered: Whether commands matter; if not, none of the steering is compiled in.
       bounded: Whether frames are kept within the bounds of the data; ours.
       half_life: Of the springs that turn a command into a path, seconds.
@@ -328,10 +326,8 @@ class Method:
     """What makes a controller of `(networks' parameters, space)`; hashable.
 
     Attributes:
-      scale: Strength of the guidance.
       guided_steps: How many at the chain's end are guided; None for all.
       memory: How the noise of the posteriors is remembered.
-      step: Makes the chain's step from the schedule and a denoiser.
     """
 
     config: aamdm_model.Config

@@ -443,10 +443,6 @@ def load_networks(
 ) -> tuple[Params, aamdm_model.Config]:
     """Parameters of a trained chain's stages that take steps, and their configuration.
 
-    Args:
-      polishes: Steps of the diffusion model.
-      predict: What the networks predict.
-
     Raises:
       CheckpointError: if a stage that it needs is missing, or of another kind.
       ValueError: if a stage was trained for another space.

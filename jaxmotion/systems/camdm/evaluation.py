@@ -339,10 +339,6 @@ def load_evaluator(
 ) -> style_evaluator.StyleEvaluator:
     """The frozen evaluator if there is one, else one trained on the run's clips.
 
-    Args:
-      evaluator: A frozen evaluator of styles; None to train one.
-      num_steps: Updates of a training.
-
     Raises:
       ValueError: if the evaluator does not fit the run; names the field.
     """
@@ -401,7 +397,6 @@ def train_style(
     Args:
       held_out: Clips for its accuracy.
       field: Label field that it recognizes.
-      num_steps: Updates.
 
     Raises:
       ValueError: if a part has no clip as long as a window, or there is no such field.

@@ -24,9 +24,7 @@ class Representation:
     """What turns motions of one skeleton into features and back.
 
     Attributes:
-      skeleton: The skeleton.
       normalizer: Mean and deviation of the features.
-      fps: Frames per second.
     """
 
     skeleton: Skeleton

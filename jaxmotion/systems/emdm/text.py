@@ -44,7 +44,6 @@ class TextRun:
 
     Attributes:
       motions: Clips with captions.
-      encoder: Encoder of sentences.
       vectors: Vectors of the captions' distinct sentences, as the networks take them.
       index: Vector of each caption.
       scale: What the encoder's vectors were multiplied with; 1 as released.

@@ -288,10 +288,7 @@ def schedule_table(
     guided: Guidance,
     chunk: int,
 ) -> tuple[Rows, Places]:
-    """Table 4: where in the chain guidance acts, by names of `SCHEDULES`.
-
-    Args:
-      steps: T of the motion model.
+    """Table 4: where in a chain of `steps` guidance acts, by names of `SCHEDULES`.
 
     Returns:
       The rows, and jerk and slide by place in a token.
