@@ -275,16 +275,23 @@ def _absent(store: Store, name: str, options: dict[str, Any], page: Path) -> lis
 
 
 def _counts(store: Store) -> list[str]:
-    decided = []
+    """How many claims have each verdict: in all, then by system."""
+    decided = {}
     for paper in writing.PAPERS:
         found = found_of(store, paper.system.name)
-        decided += [
+        decided[paper.system] = [
             (table, claim, verdicts.decide(table, claim, found))
             for table in paper.tables
             for claim in table.claims
         ]
-    counts = ", ".join(markdown.counts(decided).values())
-    return [f"{len(decided)} claims: {counts}."]
+
+    def counted(some: markdown.Decided) -> str:
+        return f"{len(some)} claims: {', '.join(markdown.counts(some).values())}."
+
+    return [counted(sum(decided.values(), [])), ""] + [
+        f"* [{system.title}](#{system.name}): {counted(some)}"
+        for system, some in decided.items()
+    ]
 
 
 def _headline(
