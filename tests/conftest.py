@@ -31,7 +31,11 @@ DRAWS = ("control", "diffusion", "evaluators", "learning", "networks", "systems"
 # the other's last module.
 FIRST = ("systems", "contracts", "learning", "test_face.py", "evaluators")
 # Compiled programs of so many modules are kept: they take memory, and time to forget.
-MODULES_REMEMBERED = 3
+MODULES_REMEMBERED = 8
+# Programs that compile faster than this, seconds, are not stored: it takes as long.
+LEAST_STORED = 0.05
+# Objects made before garbage is looked for: traces make many, and hardly any cycles.
+GARBAGE = (20_000, 20, 20)
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -61,7 +65,7 @@ def pytest_configure(config):
     if cache and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         for name, value in (
             ("JAX_COMPILATION_CACHE_DIR", str(cache.mkdir("jax"))),
-            ("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", 0.0),
+            ("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_STORED),
         ):
             os.environ[name] = str(value)
             jax.config.update(name.lower(), value)
@@ -81,6 +85,7 @@ def pytest_collection_finish():
     """What is loaded by now stays: garbage is not looked for in it."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(*GARBAGE)
 
 
 def _known(flags, cache):

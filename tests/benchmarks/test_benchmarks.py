@@ -208,12 +208,12 @@ def sizes(load, system):
     workload = load("workload")
     return {
         "camdm": workload.camdm_model.Config(**CAMDM),
-        "aamdm": workload.aamdm_model.Config(features=20, width=32),
+        "aamdm": workload.aamdm_model.Config(features=20, width=32, depth=2),
         "emdm": workload.emdm_model.Config(
-            features=30, frames=20, condition_size=5, width=32, heads=2
+            features=30, frames=20, condition_size=5, width=32, heads=2, depth=3
         ),
         "smgdiff": workload.smgdiff_model.Config(
-            num_features=60, num_labels=3, width=32, heads=2
+            num_features=60, num_labels=3, width=32, heads=2, depth=3
         ),
     }[system]
 

@@ -304,6 +304,7 @@ def test_training_on_a_few_poses_lowers_the_loss():
 # --- slow toes ---------------------------------------------------------------------
 
 
+@jax.jit
 def error_of_feet(found, poses):
     return aamdm_embedding.foot_error(
         found, poses, parents=person.PARENTS, feet=person.FEET, config=CONFIG
@@ -363,7 +364,7 @@ def test_toes_that_stand_as_recorded_cost_nothing_and_fast_ones_never_do():
 
 def test_gradients_of_slow_toes_are_finite():
     poses = person.float32(near_poses(7))
-    slope = jax.grad(error_of_feet)
+    slope = jax.jit(jax.grad(error_of_feet))
     assert np.isfinite(slope(poses, poses)).all()
     found = slope(person.float32(near_poses(8)), poses)
     assert np.isfinite(found).all() and np.abs(found).sum() > 0

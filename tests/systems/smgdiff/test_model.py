@@ -244,36 +244,57 @@ def test_the_truth_costs_nothing_but_its_own_slide(scenes, representation):
         assert float(terms[name]) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_ball_that_trembles_costs_its_second_differences(scenes, representation):
+@pytest.fixture(scope="module")
+def loss_terms(representation):
+    """One program of a prediction and its target."""
+    terms = functools.partial(smgdiff_loss.loss_terms, representation=representation)
+    return jax.jit(terms)
+
+
+@pytest.fixture(scope="module")
+def to_features(representation):
+    """One program of scenes."""
+    return jax.jit(
+        functools.partial(smgdiff_scene.to_features, representation=representation)
+    )
+
+
+def test_a_ball_that_trembles_costs_its_second_differences(
+    scenes, loss_terms, to_features
+):
     """Every other frame a centimeter higher: differences of 2 cm in each triple."""
     near = dataclasses.replace(
         scenes, ball=scenes.motion.root_position + jnp.array([[[0.3, -0.7, 0.4]]])
     )
     up = jnp.zeros_like(near.ball).at[:, 1::2, 1].set(0.01)
     trembling = dataclasses.replace(near, ball=near.ball + up)
-    x, y = (smgdiff_scene.to_features(s, representation) for s in (near, trembling))
-    terms = smgdiff_loss.loss_terms(y, x, representation=representation)
+    x, y = map(to_features, (near, trembling))
+    terms = loss_terms(y, x)
     frames = near.ball.shape[-2]
     part_up = (frames // 2) / frames
     assert float(terms["ball"]) == pytest.approx(part_up * 1e-4 / 3, rel=1e-2)
     assert float(terms["ball_acceleration"]) == pytest.approx(4e-4 / 3, rel=1e-2)
 
 
-def test_a_ball_that_is_far_away_costs_nothing_of_its_own(scenes, representation):
+def test_a_ball_that_is_far_away_costs_nothing_of_its_own(
+    scenes, loss_terms, to_features
+):
     far = dataclasses.replace(
         scenes, ball=scenes.motion.root_position + jnp.array([[[1.7, 0.0, 0.0]]])
     )
-    x = smgdiff_scene.to_features(far, representation)
-    terms = smgdiff_loss.loss_terms(1.1 * x, x, representation=representation)
+    x = to_features(far)
+    terms = loss_terms(1.1 * x, x)
     assert float(terms["ball"]) == float(terms["ball_acceleration"]) == 0.0
 
 
-def test_a_shifted_person_costs_its_shift(scenes, representation):
+def test_a_shifted_person_costs_its_shift(
+    scenes, representation, loss_terms, to_features
+):
     """Ten centimeters along x: a third of 0.01 square meters in every joint."""
-    x = smgdiff_scene.to_features(scenes, representation)
+    x = to_features(scenes)
     std = representation.normalizer.std[0]
     shifted = x.at[..., 0].add(0.1 / std)
-    terms = smgdiff_loss.loss_terms(shifted, x, representation=representation)
+    terms = loss_terms(shifted, x)
     assert float(terms["position"]) == pytest.approx(0.01 / 3, rel=1e-3)
     assert float(terms["data"]) == pytest.approx(
         (0.1 / float(std)) ** 2 / x.shape[-1], rel=1e-3
@@ -291,24 +312,25 @@ def test_losses_reach_over_the_seam(scenes, representation, config, monkeypatch)
     monkeypatch.setattr(smgdiff_loss, "network", lambda config: Zeros())
     config = dataclasses.replace(config, seam_half_life=3.0)
     labels = jnp.array([0, 1, 0])
-    _, found = smgdiff_loss.loss(
-        {},
-        jax.random.key(0),
-        (scenes, labels),
-        representation=representation,
-        config=config,
+    loss = functools.partial(
+        smgdiff_loss.loss, {}, representation=representation, config=config
     )
-    frame = jax.vmap(
-        lambda scene: smgdiff_scene.plan_frame(
-            representation.skeleton, jax.tree.map(lambda x: x[:4], scene.motion)
+    _, found = jax.jit(loss)(jax.random.key(0), (scenes, labels))
+
+    @jax.jit
+    def beside_zeros(scenes):
+        frame = jax.vmap(
+            lambda scene: smgdiff_scene.plan_frame(
+                representation.skeleton, jax.tree.map(lambda x: x[:4], scene.motion)
+            )
+        )(scenes)
+        seen = jax.vmap(smgdiff_scene.to_frame)(scenes, frame)
+        x = smgdiff_scene.to_features(seen, representation)[:, 2:]
+        return smgdiff_loss.loss_terms(
+            x.at[:, 2:].set(0.0), x, representation=representation
         )
-    )(scenes)
-    seen = jax.vmap(smgdiff_scene.to_frame)(scenes, frame)
-    x = smgdiff_scene.to_features(seen, representation)[:, 2:]
-    expected = smgdiff_loss.loss_terms(
-        x.at[:, 2:].set(0.0), x, representation=representation
-    )
-    for name, value in expected.items():
+
+    for name, value in beside_zeros(scenes).items():
         np.testing.assert_allclose(found[name], value, rtol=1e-3, err_msg=name)
 
 
