@@ -220,10 +220,18 @@ def test_motion_to_bvh_and_back_keeps_rotations_also_at_a_locked_gimbal():
     np.testing.assert_allclose(found.root_position, motion.root_position, atol=1e-6)
 
 
+def test_only_leaves_have_end_sites_and_the_root_is_at_its_positions():
+    content = bvh.bvh_from_motion(samples.skeleton(), samples.motion(2, 4))
+    leaves = [j not in content.parents for j in range(content.num_joints)]
+    assert [bool(sites) for sites in content.end_sites] == leaves
+    np.testing.assert_array_equal(content.offsets[0], 0.0)
+
+
 def test_motion_with_nan_or_other_joints_is_not_written():
     motion = samples.motion(4, 5)
-    with pytest.raises(ValueError, match="6 joints"):
-        bvh.bvh_from_motion(samples.skeleton(), samples.motion(4, 5, num_joints=4))
+    for other in (samples.motion(4, 5, num_joints=4), samples.motion(0, 5)):
+        with pytest.raises(ValueError, match="expected frames, 6 joints"):
+            bvh.bvh_from_motion(samples.skeleton(), other)
     broken = Motion(
         root_position=motion.root_position.at[2, 1].set(jnp.nan),
         joint_rotation=motion.joint_rotation,

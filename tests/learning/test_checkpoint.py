@@ -236,6 +236,16 @@ def test_a_step_without_checksums_is_read_with_a_warning(tmp_path):
         assert checkpoint.load_config(folder) == {"a": 1}
 
 
+@pytest.mark.parametrize("field", ["config", "state"])
+def test_checksums_that_lack_one_are_none(tmp_path, field):
+    folder = tmp_path / "checkpoints"
+    checkpoint.save(folder, 7, state_of(7), {})
+    path = folder / "7" / "checksums" / "metadata"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {field: None}))
+    with pytest.raises(checkpoint.CheckpointError, match="no readable checksums"):
+        checkpoint.load_config(folder)
+
+
 def test_a_config_that_is_no_object(tmp_path):
     folder = tmp_path / "checkpoints"
     checkpoint.save(folder, 7, state_of(7), {})
@@ -323,6 +333,9 @@ def test_export_and_import(tmp_path):
     assert half["bias"].dtype == jnp.float32
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), half, params)
     assert [p.name for p in path.parent.iterdir()] == ["model.npz"]
+    deep = {"a": {"b": {"c": jnp.ones(2)}, "d": jnp.zeros(1)}}
+    checkpoint.export_params(path, deep, {})
+    checkpoint.check_params(path, checkpoint.import_params(path)[0], deep)
 
 
 def test_a_flipped_bit_of_an_export_is_noticed_or_changes_nothing(tmp_path):
