@@ -44,7 +44,6 @@ def write_rollout(
       motion: Frames of one character, world.
       desired_velocity: What was commanded, meters per second; its integral is drawn as
         the commanded path. None if nothing was.
-      title: Title of the pictures.
       caption: Below them: the source of the data and its license.
       name: Name of the files, without their ends.
       ball: What the person plays with; None for nothing.

@@ -61,8 +61,6 @@ def ball_clips(
       position: World position of the ball's center in every frame, meters; its shape,
         [frames, 3], is checked here, since it may come from a file.
       touch: Which of the joints touch the ball in every frame, [frames, touching].
-      joints: Joints that may touch the ball.
-      radius: Radius of the ball, meters.
 
     Raises:
       ValueError: if the frames differ in number, a position is not finite, a joint does

@@ -112,7 +112,6 @@ class Touches:
     """Possible touches of one clip, in the order of their frames.
 
     Attributes:
-      frame: Frame of each touch.
       foot: Which of the feet touches.
       place: Place of the ball's center on the ground plane, meters.
       direction: Direction of the toe's velocity on the ground plane.

@@ -96,9 +96,6 @@ def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> 
       gait: The manner. Speeds above its max_speed look rushed; far above, legs are too
         short for the steps.
 
-    Returns:
-      The motion, and which toes stand.
-
     Raises:
       ValueError: if a command is not finite or its facing not of length one (names the
         frame), the rate is not positive, or the legs do not reach the steps.

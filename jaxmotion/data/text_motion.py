@@ -420,7 +420,6 @@ def text_arrays(
     Args:
       split: "train", "val" or "test".
       max_frames: Frames of a sample; 196 in the published experiments.
-      unit_length: Lengths of samples are multiples of it, frames.
 
     Raises:
       ValueError: if the split has no clips, a clip is shorter than a unit (names it),

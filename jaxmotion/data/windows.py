@@ -25,8 +25,6 @@ class WindowIndex:
 
     Attributes:
       starts: First frame of each window, counted over all clips.
-      clips: The clip of each window.
-      length: Frames per window.
     """
 
     starts: Int[Array, "windows"]
@@ -43,7 +41,6 @@ def window_starts(
 
     Args:
       offsets: First frame of each clip, and the number of frames at the end.
-      length: Frames per window.
       stride: Frames between the starts of windows of one clip.
     """
     starts = [
@@ -64,7 +61,6 @@ def window_index(
     """Lists all windows of a length that lie within one clip.
 
     Args:
-      length: Frames per window.
       stride: Frames between the starts of windows of one clip.
       short: What to do with clips shorter than a window.
 

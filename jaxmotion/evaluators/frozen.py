@@ -51,7 +51,6 @@ class Evaluator:
       kind: "style" (CAMDM's evaluator, of windows of a label), "action" (EMDM's GRU),
         "ball" (SMGDiff's, of skills with a ball), or "style_release" (the classifier
         released with CAMDM).
-      params: Parameters of the evaluator.
       field: Label field of the clips that the classes are from.
       labels: Names of the classes, in their order.
       joints: Names of the skeleton's joints, in their order.

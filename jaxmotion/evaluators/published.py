@@ -28,9 +28,6 @@ def load_matcher(
         as "text_encoder.gru.weight_ih_l0" and so on.
       config: Its size; None for HumanML3D's.
 
-    Returns:
-      Parameters for `learning.matching`.
-
     Raises:
       FileNotFoundError: if there is no such file.
       ValueError: if the file is damaged or foreign, or arrays are missing, unknown or

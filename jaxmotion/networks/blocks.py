@@ -288,7 +288,6 @@ class EncoderLayer(nn.Module):
         """The rest of the layer for the tokens that the queries came from.
 
         Args:
-          x: Tokens of the queries.
           projections: Queries of those tokens, keys and values of all tokens.
           mask: Tokens of `projections` that may be attended to; None for all.
           prefix: More tokens to attend to. They stay apart, so that `vmap` shares one

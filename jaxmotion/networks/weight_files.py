@@ -63,7 +63,6 @@ class Stored:
     """An array of a file.
 
     Attributes:
-      shape: Its shape.
       read: Reads it; raises ValueError if the file is damaged.
     """
 
