@@ -75,6 +75,11 @@ COLUMNS: dict[str, Column] = {
         _evaluated("diversity", "diversity of features", "real"),
         _evaluated("multimodality", "multimodality", "higher"),
         Column(id="deviation", title="deviation of poses", unit="cm", better="real"),
+        Column(
+            id="kept", title="deviation of samples over what is open", better="real"
+        ),
+        _share("told_apart", "accuracy of a classifier of samples and data"),
+        Column(id="discriminator", title="loss of the discriminator", better=""),
         Column(id="div", title="diversity of poses", better="real"),
         Column(id="pose_variance", title="diversity", unit="m²", better="higher"),
         # Following commands.
@@ -116,6 +121,7 @@ COLUMNS: dict[str, Column] = {
         Column(id="touches", title="touches", unit="per minute", better=""),
         Column(id="missed", title="missed", unit="per minute"),
         _share("missed_part", "missed part"),
+        Column(id="ball_away", title="ball away", unit="m", better="real"),
         Column(id="touch_distance", title="touch distance", unit="cm"),
         Column(id="ball_in_ground", title="ball in ground", unit="mm"),
         Column(id="foot_in_ball", title="foot in ball", unit="mm"),

@@ -29,6 +29,7 @@ from jaxmotion.data import selection, windows
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import (
     alignment,
+    ball,
     by_frame,
     columns,
     contact,
@@ -53,6 +54,9 @@ _NEAR, _STILL = 0.15, 0.1
 _STOPPED, _STARTED, _TURNED = 0.1, 0.9, 10.0
 _LEAST_SECONDS = 1.5
 _CREEP_SECONDS = 10.0
+# A ball that accelerates by more, m/s^2, is being touched: by a toe or an ankle within
+# this distance of its center, meters, or by nothing (the values of SMGDiff's tables).
+_PUSHED, _TOUCHING = 12.0, 0.18
 # Time since a command, in steps of 0.2 s up to 3 s.
 _STEP_SECONDS, _STEPS = 0.2, 15
 
@@ -138,6 +142,29 @@ def _window_metrics(
     }
 
 
+def _ball_metrics(
+    skeleton: Skeleton, frames: Frame, positions: Array, *, skip: int
+) -> dict[str, Array]:
+    """Touches, missed ones, and how far the ball is; nothing if there is no ball."""
+    if "ball" not in frames.extra:
+        return {}
+    place, positions = frames.extra["ball"][:, skip:], positions[:, skip:]
+    touching = sorted({*skeleton.feet, *(skeleton.parents[i] for i in skeleton.feet)})
+    count = ball.touch_count(
+        place,
+        positions[..., jnp.array(touching), :],
+        frames.fps,
+        threshold=_PUSHED,
+        max_distance=_TOUCHING,
+    )
+    away = jnp.linalg.norm((place - positions[..., 0, :])[..., ::2], axis=-1)
+    return {
+        "touches": count.touches / count.minutes,
+        "missed": count.missed / count.minutes,
+        "ball_away": jnp.mean(away, axis=-1),
+    }
+
+
 @functools.partial(jax.jit, static_argnames=("skip", "places"))
 def _measure(
     skeleton: Skeleton,
@@ -196,6 +223,7 @@ def _measure(
         positions, fps=fps, min_root=0.5 * ground.root, max_root=1.5 * ground.root
     )
     return {
+        "ball": _ball_metrics(skeleton, frames, positions, skip=skip),
         "windows": _window_metrics(skeleton, ground, cut),
         "by_plan": rough(
             by_frame.frames_since(frames.planned)[:, skip:], num_places=places
@@ -291,6 +319,7 @@ def _rollout_row(
     if not (told or np.any(np.asarray(commands.velocity))) and ticks - skip >= length:
         away = alignment.creep(jnp.asarray(kept["path"][:, skip:]), length=length)
         row["creep"] = table.cell(away, scale=100.0)
+    row |= {name: table.cell(jnp.asarray(x)) for name, x in kept["ball"].items()}
     row |= _reaction_cells(kept, told, commands, fps)
     row["diverged"] = _count(kept["diverged"].sum(), number)
     row["frozen"] = _count(kept["frozen"].sum(), number)

@@ -16,6 +16,8 @@ from tests import tiny
 
 FPS, SECONDS = 30.0, 14.0
 HONEST = dict(gain=1.0, aside=0.0, creep=0.0, late=0.0, swing=0.5, sink=0.0, jump=0.0)
+HONEST |= dict(ball=0.0)
+KICKS = 30  # ticks from one to the next
 
 
 def yaw_columns(direction):
@@ -51,12 +53,16 @@ def advance(faults, state, command):
     swing = faults["swing"] * jnp.sin(2 * jnp.pi * tick / FPS)
     still = pitch_columns(jnp.zeros(()))
     legs = [pitch_columns(swing), still, pitch_columns(-swing), still]
+    # Pushed aside by 5 cm, and back.
+    kicked = 0.05 * (tick // KICKS % 2)
+    root = jnp.array([place[0], 0.9 - faults["sink"], place[1]])
     frame = Frame(
-        root_position=jnp.array([place[0], 0.9 - faults["sink"], place[1]]),
+        root_position=root,
         joint_rotation=jnp.stack([yaw_columns(hips), *legs]),
         desired_velocity=velocity,
         desired_facing=facing,
         planned=tick % 15 == 1,
+        extra={"ball": root + jnp.array([kicked + faults["ball"], -0.8, 0.0])},
         fps=FPS,
     )
     return {
@@ -235,6 +241,14 @@ def test_sunk_toes_are_that_deep():
     # Who stands still is as deep on the mean; above the ground there is no depth.
     assert sunk["toe_depth"].value == pytest.approx(5.0 + rest, abs=0.01)
     assert plain["toe_depth"].value == pytest.approx(max(rest, 0.0), abs=0.01)
+
+
+@pytest.mark.parametrize("away", [0.0, 3.0])
+def test_touches_are_counted_and_missed_where_no_foot_is(away):
+    row = table(speeds=(0.0,), swing=0.0, ball=away).rows["straight at 0 m/s"]
+    assert row["touches"].value == pytest.approx(60.0, rel=0.1)
+    assert row["missed"].value == (row["touches"].value if away else 0.0)
+    assert row["ball_away"].value == pytest.approx(away + 0.025, abs=0.01)
 
 
 def test_changes_are_stops_starts_and_turns():
