@@ -106,8 +106,9 @@ def test_prefix_attention_is_less_work_from_the_second_step_on(load, system):
     workload = load("workload")
 
     def flops(attention, steps):
-        sizes = workload.Sizes(steps=steps, width=16, attention=attention)
-        run, given = workload.of(system, "samples")(sizes).program(1)
+        config = dataclasses.replace(sizes(load, system), attention=attention, depth=3)
+        given = workload.Sizes(steps=steps, config=config)
+        run, given = workload.of(system, "samples")(given).program(1)
         return work.count(run, *given).flops
 
     full, prefix = ([flops(x, 1), flops(x, 5)] for x in ("full", "prefix"))
