@@ -31,7 +31,7 @@ MODULES = {
         "learning/test_checkpoint.py learning/test_loop.py learning/test_runs.py",
     ),
     "chain": ("diffusion/chain.py", "diffusion/test_chain.py diffusion"),
-    "schedule": ("diffusion/schedule.py", "diffusion/test_schedule.py diffusion"),
+    "schedule": ("diffusion/schedule.py", "diffusion/test_schedule.py"),
     "foot_lock": ("control/foot_lock.py", "control/test_foot_lock.py"),
 }
 SECONDS = 240  # a fault with which tests never end counts as found
