@@ -63,7 +63,11 @@ ROBOT = {
     "slide": ("slide", "mm/s"),
     "under": ("soles under", "mm"),
     "miss": ("planted feet off", "mm"),
+    "replayed": ("replayed, off", "μm"),
+    "sinks": ("touches the ground under", "mm"),
+    "touches": ("touches itself under", "mm"),
 }
+LONG = "figure eight, 60 s"
 COST = {
     "alone": ("alone", "ms"),
     "rate": ("alone", "frames/s"),
@@ -257,14 +261,44 @@ def measure_robot(args: Config, model: Character, motions: dict[str, Motion]) ->
     robot = robots.read_robot(args.robot)
     rows = {}
     for course, motion in motions.items():
-        found = robot_motion.follow(robot, model.skeleton, motion).report()
+        moved = robot_motion.follow(robot, model.skeleton, motion)
+        found = moved.report()
         rows[course] = {
             "at_limit": 100.0 * found["at_limit"],
             "velocity": found["fastest_velocity"],
             **{name: 1e3 * found[name] for name in ("slide", "under", "miss")},
+            **replay(args.robot, moved.to_arrays()),
         }
         print(f"{course}: fastest is {found['fastest']}")
     report("robot", rows, ROBOT, args)
+
+
+def replay(path: Path, content: dict[str, np.ndarray]) -> dict[str, float]:
+    """What MuJoCo says of a motion's file: where bodies are, and what touches how deep."""
+    mujoco, _ = robots.packages()
+    spec = mujoco.MjSpec.from_file(str(path))
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(name="the ground", type=plane, size=[0, 0, 1])
+    model = spec.compile()
+    data, ground = mujoco.MjData(model), model.geom("the ground").id
+    away, deepest = 0.0, {True: 0.0, False: 0.0}
+    for frame, root in enumerate(content["body_pos_w"][:, 0]):
+        data.qpos[:7] = [*root, *content["body_quat_w"][frame, 0]]
+        for name, value in zip(
+            content["joint_names"], content["joint_pos"][frame], strict=True
+        ):
+            data.joint(str(name)).qpos = value
+        mujoco.mj_forward(model, data)
+        places = [data.body(str(name)).xpos for name in content["body_names"]]
+        away = max(away, float(np.abs(places - content["body_pos_w"][frame]).max()))
+        for contact in data.contact:
+            on_ground = ground in (contact.geom1, contact.geom2)
+            deepest[on_ground] = max(deepest[on_ground], -contact.dist)
+    return {
+        "replayed": 1e6 * away,
+        "sinks": 1e3 * deepest[True],
+        "touches": 1e3 * deepest[False],
+    }
 
 
 def report(
@@ -327,7 +361,9 @@ def main() -> None:
     model = jm.load("locomotion")
     motions = moving(model, args)
     if args.robot is not None:
-        return measure_robot(args, model, motions)
+        long = jm.commands("figure_eight", model, 1, seconds=60.0, speed=1.2)
+        frames = jm.rollout(model, jax.random.key(0), model.start(1), long)
+        return measure_robot(args, model, motions | {LONG: frames[0].motion})
     found = functions(args, model)
     rows = {
         f"{name}, {course}": measure(function, motion)
