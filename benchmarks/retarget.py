@@ -274,7 +274,7 @@ def measure_robot(args: Config, model: Character, motions: dict[str, Motion]) ->
 
 
 def replay(path: Path, content: dict[str, np.ndarray]) -> dict[str, float]:
-    """What MuJoCo says of a motion's file: where bodies are, and what touches how deep."""
+    """Where MuJoCo has the bodies of a motion's file, and how deep what touches is."""
     mujoco, _ = robots.packages()
     spec = mujoco.MjSpec.from_file(str(path))
     plane = mujoco.mjtGeom.mjGEOM_PLANE

@@ -506,10 +506,12 @@ def _solve(
             least = np.maximum(low, before[columns] - reach)
             most = np.minimum(high, before[columns] + reach)
             change.set_target(before)
+        # From afar, a long step could end within what it should stay out of.
+        step = _STEP if frame else 0.25 * _STEP
         for _ in range(_ROUNDS if frame else _FIRST):
             now = configuration.q[columns]
-            limit.lower[columns] = np.maximum(least, now - _STEP)
-            limit.upper[columns] = np.minimum(most, now + _STEP)
+            limit.lower[columns] = np.maximum(least, now - step)
+            limit.upper[columns] = np.minimum(most, now + step)
             velocity = mink.solve_ik(
                 configuration,
                 [*all_tasks, change] if frame else all_tasks,
