@@ -396,7 +396,7 @@ def test_unrolled_sampler_is_the_scanned_one(load):
 
 
 SCRIPT_NAMES = ["step_counts", "rollout_batch", "compile_times", "train_together"]
-SCRIPT_NAMES += ["peers"]
+SCRIPT_NAMES += ["peers", "page"]
 
 
 @pytest.mark.parametrize("name", SCRIPT_NAMES)

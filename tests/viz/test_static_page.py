@@ -7,6 +7,8 @@ import http.server
 import json
 import math
 import shutil
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -97,6 +99,24 @@ def browser():
         chromium = run.chromium.launch(executable_path=path, args=OPTIONS)
         yield chromium
         chromium.close()
+
+
+def test_the_page_is_measured(site, tmp_path):
+    pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    folder = tmp_path / "site"
+    shutil.copytree(site, folder)
+    (folder / "models.json").write_text('{"models": ["strider"]}')
+    script = Path(__file__).parents[2] / "benchmarks" / "page.py"
+    command = [sys.executable, script, "--site", folder, "--out", tmp_path]
+    command += ["--seconds", "2", "--characters", "2"]
+    subprocess.run([str(x) for x in command], check=True, capture_output=True)
+    report = json.loads((tmp_path / "page.json").read_text())
+    (row,) = report["rows"]
+    assert row["row"] == "strider, 2 characters"
+    assert row["real_time"] > 0 and row["memory"] > 1 and row["own_99"] >= row["own"]
+    sent = sum(x.stat().st_size for x in (folder / "strider").iterdir()) / 1e6
+    (found,) = [x["value"] for x in report["metrics"] if x["name"] == "strider size"]
+    assert found == pytest.approx(sent)
 
 
 @contextlib.contextmanager
