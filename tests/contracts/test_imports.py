@@ -83,6 +83,7 @@ DOORS = {
     "tyro": ("jaxmotion/cli.py", "experiments/", "benchmarks/"),
     "torch": ("benchmarks/",),
     **dict.fromkeys(("jax2onnx", "onnx", "onnxruntime"), ("jaxmotion/export/",)),
+    "playwright": ("benchmarks/page.py",),
     "tokenizers": ("jaxmotion/text/",),
     "websockets": ("jaxmotion/viz/page.py",),
     "wordllama": ("jaxmotion/text/",),
