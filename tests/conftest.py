@@ -31,7 +31,7 @@ DRAWS = ("control", "diffusion", "evaluators", "learning", "networks", "systems"
 # the other's last module.
 FIRST = ("systems", "contracts", "learning", "test_face.py", "evaluators")
 # Compiled programs of so many modules are kept: they take memory, and time to forget.
-MODULES_REMEMBERED = 8
+MODULES_REMEMBERED = 5
 # Programs that compile faster than this, seconds, are not stored: it takes as long.
 LEAST_STORED = 0.05
 # Objects made before garbage is looked for: traces make many, and hardly any cycles.
