@@ -21,6 +21,7 @@ WRONG = {
     "evaluator": ("show {gone}", "gone"),
     "export": ("--model locomotion --format fbx --out {out}", "onnx, stablehlo"),
     "goals": ("--model {gone} --out {out}", "gone"),
+    "few_steps": ("--run {gone} --out {out}", "gone"),
     "next_frame": ("--run {gone} --out {out}", "gone"),
     "prepare_data": ("lafan1 --manual-dir {gone} --out {out}.npz", "gone"),
     "quickstart": ("--out {file}/below", "file/below"),
