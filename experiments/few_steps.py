@@ -13,6 +13,7 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
+import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -193,8 +194,8 @@ def gan_model(key: Key, pairs: Pairs, num_steps: int, args: Config) -> Trained:
     return denoiser, made.generator.ema_params, report
 
 
-def sample(key: Key, made: Trained, state: Array, num_steps: int, channels: int):
-    """One sample of a chain for each state."""
+def sampler(made: Trained, num_steps: int, channels: int) -> Callable[..., Array]:
+    """`(key, state) -> x_0`: one sample of a chain for each state; compiled once."""
     denoiser, params, _ = made
     table = schedule.cosine_schedule(num_steps)
 
@@ -204,7 +205,7 @@ def sample(key: Key, made: Trained, state: Array, num_steps: int, channels: int)
         shape = (len(state), channels)
         return chain.sample(step, key, shape, num_steps=num_steps)
 
-    return run(params, key, state)
+    return functools.partial(run, params)
 
 
 def told_apart(key: Key, real: Pairs, made: Pairs, args: Config) -> float:
@@ -269,14 +270,15 @@ def main() -> None:
     keys = jax.random.split(key_sample, 2)
     mean = diffusion_model(key_train, pairs, 1, args)
     size = real.shape[1]
-    unexplained = rms(sample(keys[0], mean, state, 1, size) - real)
+    unexplained = rms(sampler(mean, 1, size)(keys[0], state) - real)
     print(f"left by a regression: {unexplained:.3f} of a deviation", flush=True)
     kinds = {"diffusion": diffusion_model, "GAN": gan_model}
     for num_steps in args.diffusion_steps:
         for name, make in kinds.items():
             own = jax.random.fold_in(key_train, num_steps)
             made = make(own, pairs, num_steps, args)
-            drawn = [sample(k, made, state, num_steps, size) for k in keys]
+            draws = sampler(made, num_steps, size)
+            drawn = [draws(k, state) for k in keys]
             row = score(key_score, pairs, (state, drawn[0]), args)
             spread = rms(drawn[0] - drawn[1]) / np.sqrt(2.0)
             row["kept"] = Cell(value=spread / unexplained)

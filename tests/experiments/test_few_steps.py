@@ -44,14 +44,11 @@ def test_one_step_is_a_mean_and_an_adversary_draws(script, args):
     pairs = toy(KEY)
     zeros = jnp.zeros((2000, 1))
 
-    def drawn(make):
-        made = make(jax.random.key(1), pairs, 1, args)
-        return script.sample(jax.random.key(2), made, zeros, 1, 1)
+    def drawn(make, budget):
+        made = make(jax.random.key(1), pairs, 1, budget)
+        return script.sampler(made, 1, 1)(jax.random.key(2), zeros)
 
-    mean = drawn(script.diffusion_model)
-    assert script.rms(mean) < 0.25
-    quick = dataclasses.replace(args, seconds=8.0)
-    made = script.gan_model(jax.random.key(1), pairs, 1, quick)
-    found = script.sample(jax.random.key(2), made, zeros, 1, 1)
+    assert script.rms(drawn(script.diffusion_model, args)) < 0.25
+    found = drawn(script.gan_model, dataclasses.replace(args, seconds=8.0))
     assert 0.5 < script.rms(found) < 1.2
     assert 0.3 < jnp.mean(found > 0) < 0.7

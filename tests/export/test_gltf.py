@@ -169,7 +169,7 @@ def installed(folder, package):
         pytest.skip("node and npm are not installed")
     command = [npm, "install", "--no-audit", "--no-fund", package]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    if done.returncode:
+    if done.returncode:  # no network, say: nothing of ours is wrong
         pytest.skip(f"npm cannot install {package}: {done.stderr[-200:]}")
     return folder
 

@@ -427,7 +427,8 @@ def load_run(path: Path) -> tuple[smgdiff_training.Run, Model, dict[str, Params]
       CheckpointError: if a stage was not trained.
       ValueError: if it is no run folder of SMGDiff.
     """
-    return smgdiff_training.load_run(path), *smgdiff_training.load(path)
+    run = smgdiff_training.load_run(path)
+    return run, *smgdiff_training.load_networks(run)
 
 
 def own_starts(path: Path, *, number: int, seed: int = 0) -> Scene:

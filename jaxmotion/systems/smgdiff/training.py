@@ -240,7 +240,15 @@ def load(path: Path) -> tuple[Model, dict[str, Params]]:
     """
     if path.is_file():
         return smgdiff_model.import_file(path)
-    run = load_run(path)
+    return load_networks(load_run(path))
+
+
+def load_networks(run: Run) -> tuple[Model, dict[str, Params]]:
+    """The model of 8 steps of motion and 1 of paths, and its parameters.
+
+    Raises:
+      CheckpointError: if a stage was not trained.
+    """
     model, motion = load_stage(run, "motion_8")
     paths, path_params = load_stage(run, "paths_1")
     model = dataclasses.replace(model, paths=paths.paths)
