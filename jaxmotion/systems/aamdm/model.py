@@ -203,6 +203,27 @@ def polish(
     return denoise
 
 
+def _denoiser(
+    weights: mlp.MlpWeights,
+    previous: Float[Array, "*batch features"],
+    config: Config,
+    change: Float[Array, " features"] | None,
+    latent: int,
+) -> Denoiser:
+    """`draft` or, without channels of a latent, `polish`, of weights laid out."""
+    net = network(config)
+    context = net.encode(weights, previous)
+
+    def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
+        given: tuple[Array, ...] = ()
+        if latent:
+            given = (jax.random.normal(key, (*x_t.shape[:-1], latent), x_t.dtype),)
+        found = net.denoise(weights, context, x_t, t, *given)
+        return to_frame(found, previous, change)
+
+    return denoise
+
+
 Sample = Callable[..., Float[Array, "*batch features"]]
 
 
@@ -232,7 +253,14 @@ def sampler(
       ValueError: if `change` does not fit what is predicted.
     """
     check_change(config, change)
-    table = config.table()
+    table, net = config.table(), network(config)
+    number = {"generator": config.drafts, "polisher": config.polishes}
+    # Here, so that a rollout does it once.
+    weights = {
+        name: net.layout(params[name], config.features)
+        for name, steps in number.items()
+        if steps
+    }
 
     def sample(
         key: Key,
@@ -266,12 +294,12 @@ def sampler(
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, previous.shape, previous.dtype)
         if config.drafts:
-            drafter = draft(params["generator"], previous, config=config, change=change)
+            drafter = _denoiser(
+                weights["generator"], previous, config, change, config.latent
+            )
             x = part(drafter, x, config.num_steps, config.polishes)
         if config.polishes:
-            polisher = polish(
-                params["polisher"], previous, config=config, change=change
-            )
+            polisher = _denoiser(weights["polisher"], previous, config, change, 0)
             x = part(polisher, x, config.polishes, 0)
         return x
 
