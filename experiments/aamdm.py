@@ -206,9 +206,10 @@ def train(args: Train) -> None:
                 )
                 autoencoder = aamdm_training.train_autoencoder(run, steps)
             spaces[where] = aamdm_training.make_space(run, autoencoder)
-        steps = args.full_pose_steps if name == "full_pose" else args.polisher_steps
-        # Windows of that row are longer: as many frames, about.
-        windows = args.batch if name == "frame" else args.polisher_batch
+        full = rows.is_chain(name) and where == "full_pose"
+        steps = args.full_pose_steps if full else args.polisher_steps
+        # Windows of these rows are longer: as many frames, about.
+        windows = args.batch if rows.is_published(name) else args.polisher_batch
         rows.train_row(
             name,
             run,

@@ -82,16 +82,13 @@ def folders_of(args: Config) -> dict[Source, tuple[Path, ...]]:
     return {source: found[source.run] for source in writing.SOURCES}
 
 
-def commands_of(source: Source, folders: tuple[Path, ...]) -> tuple[str, ...]:
-    """What leaves a source's file behind: for each training, with its seed."""
-    lines = {}
-    for seed, folder in enumerate(folders):
-        for command in source.commands:
-            line = command.format(run=folder)
-            if seed and "--out {run}" in command:
-                line += f" --seed {seed}"
-            lines[line] = None
-    return tuple(lines)
+def commands_of(source: Source, folder: Path, seed: int) -> tuple[str, ...]:
+    """What leaves a source's file behind in a training's folder."""
+    return tuple(
+        command.format(run=folder)
+        + (f" --seed {seed}" if seed and "--out {run}" in command else "")
+        for command in source.commands
+    )
 
 
 def report(args: Config) -> None:
@@ -102,7 +99,16 @@ def report(args: Config) -> None:
         for source, own in folders.items()
     }
     loop.check_writable(args.out)
-    commands = {source: commands_of(source, folders[source]) for source in folders}
+    commands = {
+        source: tuple(
+            dict.fromkeys(
+                line
+                for seed, folder in enumerate(own)
+                for line in commands_of(source, folder, seed)
+            )
+        )
+        for source, own in folders.items()
+    }
     for source, there in found.items():
         trained = there.trainings if there else ()
         for folder, one in zip(folders[source], trained, strict=False):

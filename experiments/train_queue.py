@@ -1,12 +1,13 @@
 """Trains and evaluates what the papers' claims still need, a process per core.
 
 Takes the runs of experiments/papers and their commands, with seeds 0, 1, ...: each run
-until all claims of its tables are decided, or MAX trainings are made. What is there is
-not made again. Ctrl-C and `kill -9` lose nothing but the updates since the last
-checkpoint: the same command goes on, and leaves alone what still runs.
+until all claims of its tables are decided, or MAX trainings are made. What is there, or
+stored in experiments/results, is not made again. Ctrl-C and `kill -9` lose nothing but
+the updates since the last checkpoint: the same command goes on, and leaves alone what
+still runs.
 
 Examples:
-  python experiments/train_queue.py --only emdm_ablation --minutes 240
+  python experiments/train_queue.py --only emdm_ablation --minutes 240 --keep
   nohup python experiments/train_queue.py --cores 1 > queue.log &
 
 Beside each run folder's files are queue.log (all output) and queue.json (the commands
@@ -28,7 +29,7 @@ from typing import NamedTuple
 import report
 import tqdm
 import tyro
-from reports import results, verdicts, writing
+from reports import results, stored, verdicts, writing
 from reports.claims import Source
 
 from jaxmotion import cli, files
@@ -48,6 +49,8 @@ class Config:
       most: Trainings at most; claims that are open then stay so.
       cores: Trainings at a time, each on a core of its own; None for all cores.
       minutes: Start nothing after so many; None to go on until all is done.
+      keep: Store what a training measured in experiments/results (then
+        `report.py --write-docs`).
     """
 
     runs: Path = Path("runs")
@@ -56,6 +59,7 @@ class Config:
     most: int = verdicts.MAX_TRAININGS
     cores: cli.Optional[int] = None
     minutes: cli.Optional[float] = None
+    keep: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,18 +70,23 @@ class Job:
       run: Name of the run, of all its seeds.
       folder: The run folder.
       commands: What makes it, in turn.
-      files: What it leaves behind when it is done.
+      files: What it leaves behind when it is done, by the name it is stored under.
     """
 
     run: str
     folder: Path
     commands: tuple[str, ...]
-    files: tuple[Path, ...]
+    files: dict[str, Path]
+
+    def measured(self, name: str) -> Path:
+        """Where a file is: in the run folder, or as it was stored."""
+        path, kept = self.files[name], stored.FOLDER / f"{name}.json"
+        return path if path.is_file() or not stored.is_measured(kept) else kept
 
     @property
     def done(self) -> bool:
         """Whether nothing is missing."""
-        return all(path.is_file() for path in self.files)
+        return all(self.measured(name).is_file() for name in self.files)
 
 
 def sources_of(args: Config) -> dict[str, list[Source]]:
@@ -101,11 +110,10 @@ def job_of(args: Config, sources: list[Source], seed: int) -> Job:
     """The training of a seed."""
     run = sources[0].run
     folder = args.runs / (f"{run}_seed{seed}" if seed else run)
-    # The seed's place among the folders says which seed a command gets.
-    folders = (*(Path("-"),) * seed, folder)
-    lines = [line for x in sources for line in report.commands_of(x, folders)]
-    own = dict.fromkeys(line for line in lines if str(folder) in shlex.split(line))
-    return Job(run, folder, tuple(own), tuple(folder / x.file for x in sources))
+    lines = [line for x in sources for line in report.commands_of(x, folder, seed)]
+    end = f"_seed{seed}" if seed else ""
+    found = {f"{x.name}{end}": folder / x.file for x in sources}
+    return Job(run, folder, tuple(dict.fromkeys(lines)), found)
 
 
 def needed(args: Config, sources: list[Source]) -> int:
@@ -119,10 +127,10 @@ def needed(args: Config, sources: list[Source]) -> int:
         there += 1
     if there < args.least:
         return args.least
-    folders = [job_of(args, sources, seed).folder for seed in range(there)]
+    jobs = [job_of(args, sources, seed) for seed in range(there)]
     found = {
-        x: results.read_trainings([folder / x.file for folder in folders])
-        for x in sources
+        x: results.read_trainings([job.measured(list(job.files)[i]) for job in jobs])
+        for i, x in enumerate(sources)
     }
     made = [verdicts.decide(table, claim, found).verdict for table, claim in claims]
     return min(there + ("not decided" in made), args.most)
@@ -151,6 +159,11 @@ class Running(NamedTuple):
         files.write_text(path, json.dumps(value, indent=1))
 
 
+def output_of(words: list[str]) -> Path:
+    """What a command that serves several runs leaves behind, as an evaluator's file."""
+    return Path(words[words.index("--out") + 1])
+
+
 def start(job: Job, core: int) -> Running | None:
     """Starts a training on a core; None if it is running already.
 
@@ -167,7 +180,9 @@ def start(job: Job, core: int) -> Running | None:
     if path.is_file():
         minutes = float(json.loads(path.read_text())["minutes"])
     lines = [
-        shlex.join([sys.executable, *shlex.split(line)[1:]]) for line in job.commands
+        shlex.join([sys.executable, *words[1:]])
+        for words in map(shlex.split, job.commands)
+        if str(job.folder) in words or not output_of(words).exists()
     ]
     with (job.folder / "queue.log").open("a") as log, lock:
         process = subprocess.Popen(
@@ -245,6 +260,9 @@ def work(args: Config, show: Callable[[str], None] = print) -> list[Job]:
                 job = running.pop(core).job
                 if code == 0 and job.done:
                     show(f"{job.folder}: done")
+                    if args.keep:
+                        for name, path in job.files.items():
+                            show(f"wrote {stored.keep(stored.FOLDER, path, name)}")
                     wanted[job.run] = needed(args, sources[job.run])
                 else:
                     left[job.folder] = job

@@ -1,10 +1,11 @@
 """The rows of AAMDM's tables: how each is trained, and its stepper.
 
 aamdm               2 polishes after 3 drafts, in the embedded space
-polish1_draft3 ...  other numbers of steps (its table 2)
+polish1_draft3 ...  other numbers of steps (its table 2); polish5_draft0 has no GAN
 full_pose           2 and 3 without the embedding
-frame               2 and 3 by networks that predict the frame instead of its change,
-                    with windows of ten and no errors of poses (paper)
+frame               2 and 3 as published: networks predict the frame instead of its
+                    change, on windows of ten, without errors of poses, toes, or noise
+                    on given frames; likewise full_pose_frame, polish1_draft3_frame ...
 amdm5, amdm200      AMDM in the full pose space
 amdm5_embedded ...  the same in the embedded space
 mvae                Motion VAE in the full pose space
@@ -38,8 +39,8 @@ TABLE_2 = tuple(
 # The most expensive last.
 ALL = (*TABLE_1, *TABLE_2, "full_pose", "amdm200")
 # Rows that the paper does not have.
-MORE = ("frame", "amdm5_embedded", "amdm200_embedded")
-_CHAIN = re.compile(r"polish(\d+)_draft(\d+)$")
+MORE = ("frame", "full_pose_frame", "amdm5_embedded", "amdm200_embedded")
+_CHAIN = re.compile(r"polish(\d+)_draft(\d+)(_frame)?$")
 _AMDM = ("amdm5", "amdm200", "amdm5_embedded", "amdm200_embedded")
 _BASELINES = dict.fromkeys(_AMDM, amdm) | {"lmm": lmm, "mvae": mvae}
 # Frames of the windows that each baseline is trained on, and which is the first given.
@@ -57,8 +58,9 @@ class Sizes:
       weight_pose: Weight of the poses' errors in their loss.
       weight_foot: Weight of slow toes' errors beside these.
       gan_window: Frames of the windows of AAMDM's GANs.
-      levels: Steps that each of AAMDM's networks learns; the row "frame" all (paper).
-      previous_noise: Noise on given previous frames in training, for all rows alike.
+      levels: Steps that each of AAMDM's networks learns.
+      previous_noise: Noise on given previous frames in training, for all rows but those
+        as published alike.
     """
 
     width: int = 256
@@ -73,13 +75,19 @@ class Sizes:
 
 def space_of(name: str) -> SpaceName:
     """In which space a row works."""
-    full = ("full_pose", "amdm5", "amdm200", "mvae")
+    full = ("full_pose", "full_pose_frame", "amdm5", "amdm200", "mvae")
     return "full_pose" if name in full else "embedded"
 
 
 def is_chain(name: str) -> bool:
     """Whether a row is AAMDM with some numbers of steps."""
-    return name in ("aamdm", "full_pose", "frame") or bool(_CHAIN.match(name))
+    named = ("aamdm", "full_pose", "frame", "full_pose_frame")
+    return name in named or bool(_CHAIN.match(name))
+
+
+def is_published(name: str) -> bool:
+    """Whether a row is AAMDM by the paper's recipe."""
+    return is_chain(name) and name.endswith("frame")
 
 
 def check(names: tuple[str, ...]) -> None:
@@ -87,8 +95,8 @@ def check(names: tuple[str, ...]) -> None:
     for name in names:
         if name not in _BASELINES and not is_chain(name):
             raise ValueError(
-                f"unknown row {name!r}: there are {', '.join((*ALL, *MORE))}, and "
-                "polish<n>_draft<m>"
+                f"unknown row {name!r}: there are {', '.join((*ALL, *MORE))}, "
+                "polish<n>_draft<m> and polish<n>_draft<m>_frame"
             )
 
 
@@ -99,7 +107,7 @@ def _steps(name: str) -> tuple[int, int]:
 
 
 def _predict(name: str) -> Literal["frame", "change"]:
-    return "frame" if name == "frame" else "change"
+    return "frame" if is_published(name) else "change"
 
 
 def _config(name: str, space: Space, sizes: Sizes) -> Any:
@@ -107,23 +115,23 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
     common = dict(features=space.num_features, width=sizes.width)
     if is_chain(name):
         polishes, drafts = _steps(name)
-        predict, ours = _predict(name), {}
-        if predict == "change":
-            ours = dict(
-                window=sizes.window,
-                weight_pose=sizes.weight_pose,
-                weight_foot=sizes.weight_foot,
-                levels=sizes.levels,
-            )
+        recipe: dict[str, Any] = dict(
+            window=sizes.window,
+            gan_window=sizes.gan_window,
+            weight_pose=sizes.weight_pose,
+            weight_foot=sizes.weight_foot,
+            levels=sizes.levels,
+            previous_noise=sizes.previous_noise,
+        )
+        if is_published(name):
+            recipe = dict(window=10, gan_window=10)
         return aamdm_model.Config(
             **common,
-            **ours,
+            **recipe,
             polishes=polishes,
             drafts=drafts,
             schedule=sizes.schedule,
-            gan_window=sizes.gan_window,
-            previous_noise=sizes.previous_noise,
-            predict=predict,
+            predict=_predict(name),
         )
     if name == "lmm":
         return lmm.Config(**common | {"width": 512}, queries=12)
@@ -215,7 +223,8 @@ def load_row(
       run: The run.
       space: The row's space.
       scale: Strength of the guidance, for those that are guided.
-      guided_steps: How many steps at a chain's end are guided; None for all.
+      guided_steps: How many steps at a chain's end are guided; None for all, as rows
+        that are as published have it.
       half_life: In which noise of a chain's posteriors is forgotten, seconds; 0 to draw
         it anew in every frame.
 
@@ -226,6 +235,8 @@ def load_row(
       CheckpointError: if the row was not trained, or its folder holds another.
     """
     if is_chain(name):
+        if is_published(name):
+            guided_steps = None
         polishes, drafts = _steps(name)
         transition = aamdm_training.load_chain(
             run,

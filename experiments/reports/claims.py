@@ -25,7 +25,8 @@ class Source:
       run: Name of the run folder, and of the option that moves it.
       file: Path below that folder.
       commands: "{run}" stands for the folder.
-      name: In its file of experiments/papers, and of its file in experiments/results.
+      name: "system/table": its part of experiments/papers, and its file in
+        experiments/results.
     """
 
     run: str
@@ -73,6 +74,7 @@ class Row:
       paper: One value a column.
       source: Where it is measured; None for the table's source.
       reason: Why it cannot be run here.
+      ours: The same by our recipe, as metrics.json names it; None where there is none.
     """
 
     name: str
@@ -80,6 +82,7 @@ class Row:
     paper: tuple[Stated, ...]
     source: Source | None = None
     reason: str = ""
+    ours: str | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -139,6 +142,12 @@ class Table:
     def name(self) -> str:
         """For headings and messages."""
         return f"{self.paper}, table {self.number}"
+
+    @property
+    def ours(self) -> "Table":
+        """The table with the rows of our recipes in place of the published ones."""
+        rows = [dataclasses.replace(x, here=x.ours or x.here) for x in self.rows]
+        return dataclasses.replace(self, rows=tuple(rows))
 
     def column(self, name: str) -> Column:
         """The column of a name."""
@@ -232,7 +241,10 @@ def read_paper(system: registry.System) -> Paper:
     whole = tomllib.loads(path.read_text())
     try:
         sources = {
-            name: Source(name=name, **value | {"commands": tuple(value["commands"])})
+            name: Source(
+                name=f"{system.name}/{name}",
+                **value | {"commands": tuple(value["commands"])},
+            )
             for name, value in whole.pop("source").items()
         }
         known = {k: _column(value) for k, value in whole.pop("column").items()}

@@ -219,9 +219,11 @@ def _claims(store: Store, name: str, options: dict[str, Any], page: Path) -> lis
     lines = []
     for one in paper.tables:
         for claim in one.claims:
-            decision = verdicts.decide(one, claim, found)
-            lines.append(_claim(one, claim, decision, found))
-    titles = ("table", "claim", "paper", "here", "verdict")
+            own = "–"
+            if any(one.row(name).ours for name in claim.rows):
+                own = _verdict(one.ours, claim, found)
+            lines.append([*_claim(one, claim, found), own])
+    titles = ("table", "claim", "paper", "here", "verdict", "by our recipe")
     return markdown.table_lines(titles, lines)
 
 
@@ -231,12 +233,23 @@ def found_of(store: Store, system: str) -> stored.Found:
     sources = dict.fromkeys(
         table.source_of(row) for table in paper.tables for row in table.rows
     )
-    return stored.found_for(store.folder, system, tuple(sources))
+    return stored.found_for(store.folder, tuple(sources))
 
 
-def _claim(
-    one: Table, claim: Claim, decision: verdicts.Decision, found: stored.Found
-) -> list[str]:
+def _verdict(one: Table, claim: Claim, found: stored.Found) -> str:
+    """A verdict, and of how many trainings it is."""
+    decision = verdicts.decide(one, claim, found)
+    if not decision.trainings or decision.verdict == "not run":
+        return decision.verdict
+    sources = {one.source_of(one.row(name)) for name in claim.rows}
+    files_ = [x for source in sources if (x := found.get(source))]
+    if any(len(x.seeds) > 1 for x in files_):
+        return f"{decision.verdict}: single trainings were not kept"
+    several = "s" * (decision.trainings > 1)
+    return f"{decision.verdict}, {decision.trainings} training{several}"
+
+
+def _claim(one: Table, claim: Claim, found: stored.Found) -> list[str]:
     column, paper, here = one.column(claim.column), [], []
     for name in claim.rows:
         row = one.row(name)
@@ -250,19 +263,12 @@ def _claim(
             here.append(f"{short} {text_of([mean], _plain(column))}")
         elif cells:
             here.append(f"{short} {text_of(cells[:1], _plain(column))}")
-    verdict = decision.verdict
-    if decision.trainings and verdict != "not run":
-        verdict += f", {decision.trainings} training" + "s" * (decision.trainings > 1)
-        sources = {one.source_of(one.row(name)) for name in claim.rows}
-        files_ = [x for source in sources if (x := found.get(source))]
-        if any(len(x.seeds) > 1 for x in files_):
-            verdict = f"{decision.verdict}: single trainings were not kept"
     return [
         f"{one.number}, {claim.column}",
         claim.words,
         "; ".join(paper),
         "; ".join(here) or _NOTHING,
-        verdict,
+        _verdict(one, claim, found),
     ]
 
 

@@ -146,14 +146,14 @@ def read(folder: Path, name: str) -> Stored:
     return Stored(name=name, columns=declared, measured=measured)
 
 
-def found_for(folder: Path, system: str, sources: tuple[Source, ...]) -> Found:
+def found_for(folder: Path, sources: tuple[Source, ...]) -> Found:
     """What is stored of the tables that a paper's claims speak of; None for nothing."""
-    found: Found = {}
-    for source in sources:
-        name = f"{system}/{source.name}"
-        there = (folder / f"{name}.json").exists()
-        found[source] = read(folder, name).measured if there else None
-    return found
+    return {
+        source: read(folder, source.name).measured
+        if (folder / f"{source.name}.json").exists()
+        else None
+        for source in sources
+    }
 
 
 def _declared(id: str) -> dict[str, Any]:
@@ -251,14 +251,20 @@ def _benchmark(path: Path) -> Measured | None:
     return Measured(path=path, rows=rows, about=about)
 
 
-def keep(folder: Path, path: Path, name: str, title: str) -> Path:
+def is_measured(path: Path) -> bool:
+    """Whether a stored file is there that a command made, and not a text."""
+    return path.is_file() and "measured" in json.loads(path.read_text())
+
+
+def keep(folder: Path, path: Path, name: str, title: str = "") -> Path:
     """Trims an evaluation's file and stores it.
 
     Args:
       folder: Of all stored results.
       path: The metrics.json, a sweep's table.json, or a benchmark's report.
       name: "system/table", or "system/table_seed1" for a further training.
-      title: What it answers; "" for that of the file it replaces.
+      title: What it answers; "" for that of the file it replaces, or of the first
+        training.
 
     Returns:
       The file that was written.
@@ -273,17 +279,19 @@ def keep(folder: Path, path: Path, name: str, title: str) -> Path:
     if found is None:
         raise FileNotFoundError(f"{path}: no such file")
     place = folder / f"{name}.json"
-    before = json.loads(place.read_text()) if place.exists() else {}
+    first = folder / f"{re.sub(r'_seed[0-9]+$', '', name)}.json"
+    told = place if place.exists() else first
+    before = json.loads(told.read_text()) if told.exists() else {}
     title = title or before.get("title", "")
     if not title:
         raise ValueError("title: expected one for a table that is new")
     whole = trimmed(found, title)
     # What people wrote into the file that it replaces stays.
     for field in ("interval", "names", "notes"):
-        if field in before:
+        if field in before and (field == "names" or "measured" in before):
             whole[field] = before[field]
-    told = before.get("columns", {})
-    whole["columns"] = {id: told.get(id, x) for id, x in whole["columns"].items()}
+    said = before.get("columns", {})
+    whole["columns"] = {id: said.get(id, x) for id, x in whole["columns"].items()}
     if "names" in whole:
         whole["names"] = {k: v for k, v in whole["names"].items() if k in found.rows}
     files.write_text(place, to_text(whole))

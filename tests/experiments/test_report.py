@@ -524,7 +524,10 @@ def test_trainings_have_folders_of_their_own(load, runs):
     ]
     source = next(x for x in folders if x == "sweep_camdm")
     source = next(x for x in load("reports.writing").SOURCES if x.run == source)
-    shown = report.commands_of(source, folders["sweep_camdm"])
+    own = folders["sweep_camdm"]
+    (shown,) = zip(
+        *(report.commands_of(source, x, i) for i, x in enumerate(own)), strict=True
+    )
     assert [line.partition("--out ")[2] for line in shown] == [
         f"{runs}/sweep_camdm",
         f"{runs}/sweep_camdm_seed1 --seed 1",

@@ -17,6 +17,7 @@ FOLDER = Path(__file__).parents[2] / "experiments"
 TRAIN = """
 import json, pathlib, sys, time
 out, steps, pause, gap = pathlib.Path(sys.argv[2]), *map(float, sys.argv[3:6])
+out.mkdir(exist_ok=True)
 seed = int(sys.argv[7]) if "--seed" in sys.argv else 0
 log = out / "steps.txt"
 done = len(log.read_text().split()) if log.exists() else 0
@@ -30,7 +31,7 @@ total = sum(map(int, log.read_text().split()))
 # The gap between rows wiggles a little from seed to seed.
 rows = {"a": total, "b": total + gap * (1 + 0.05 * (-1) ** seed)}
 cells = {k: {"fid": dict(value=v, low=None, high=None, samples=1)} for k, v in rows.items()}
-about = {"seeds": {"training": [seed]}}
+about = {"seeds": {"training": [seed]}, "command": "train", "git_commit": ""}
 (out / "metrics.json").write_text(json.dumps(about | {"rows": cells}))
 """  # noqa: E501
 
@@ -39,11 +40,20 @@ import sys
 sys.path.insert(0, sys.argv[1])
 import train_queue
 from jaxmotion import cli
-from reports import claims, writing
+from pathlib import Path
+from reports import claims, stored, writing
+stored.FOLDER = Path(sys.argv[2]).parent / "results"
+(stored.FOLDER / "x").mkdir(parents=True, exist_ok=True)
+old = stored.FOLDER / "x/clear.json"
+if not old.exists():
+    old.write_text('{"title": "t", "transcribed": "", "rows": {}}')
 def make(name, gap, pause):
     source = claims.Source(
-        run=name, file="metrics.json",
-        commands=(f"python {sys.argv[2]} --out {{run}} 6 {pause} {gap}",),
+        run=name, file="metrics.json", name=f"x/{name}",
+        commands=(
+            f"python {sys.argv[2]} --out {stored.FOLDER}/shared 1 0 0",
+            f"python {sys.argv[2]} --out {{run}} 6 {pause} {gap}",
+        ),
     )
     row = lambda x: claims.Row(name=x, here=x.lower(), paper=(1.0,))
     claim = claims.Claim(words=name, column="FID", pairs=(("A", "B"),), where="here")
@@ -107,7 +117,7 @@ def test_trainings_are_added_until_a_claim_is_decided(queue, tmp_path):
         ]  # fmt: skip
     assert sum(x.startswith("none") for x in made) == 5
     note = json.loads((runs / "clear_seed1" / "queue.json").read_text())
-    assert note["minutes"] >= 0 and "--seed 1" in note["commands"][0]
+    assert note["minutes"] >= 0 and "--seed 1" in note["commands"][-1]
     # All is there: nothing is made again.
     before = {path: path.stat().st_mtime for path in runs.glob("*/metrics.json")}
     assert finish(queue(f"--runs {runs} --most 5", "clear,9,0"))[0] == 0
@@ -162,5 +172,33 @@ def test_a_job_has_the_commands_of_its_run_with_its_seed(load, tmp_path):
     assert all(str(folder) in line for line in job.commands)
     assert all(("--seed 2" in x) == (" train " in x) for x in job.commands)
     assert len(set(job.commands)) == len(job.commands)
-    assert {x.parents[2] for x in job.files} == {folder} and not job.done
-    assert dataclasses.replace(job, files=()).done
+    assert {x.parents[2] for x in job.files.values()} == {folder} and not job.done
+    assert set(job.files) == {
+        "smgdiff/smgdiff_schedules_seed2",
+        "smgdiff/smgdiff_paths_seed2",
+        "smgdiff/smgdiff_steps_seed2",
+    }
+    assert dataclasses.replace(job, files={}).done
+
+
+@pytest.mark.slow
+def test_what_is_stored_is_not_made_again_and_what_runs_share_is_made_once(
+    queue, tmp_path
+):
+    results = tmp_path / "results"
+    options = "--only clear --keep"
+    code, shown = finish(queue(f"{options} --runs {tmp_path}/runs", "clear,9,0"))
+    assert code == 0, shown
+    # Three trainings are stored, the first in place of a text without numbers.
+    kept = [results / f"x/clear{end}.json" for end in ("", "_seed1", "_seed2")]
+    assert all(path.is_file() and f"wrote {path}" in shown for path in kept)
+    assert len((results / "shared/steps.txt").read_text().split()) == 1
+    before = kept[0].read_text()
+    code, shown = finish(queue(f"{options} --runs {tmp_path}/others", "clear,9,0"))
+    assert code == 0 and "started" not in shown, shown
+    # One more is wanted: only that one is made.
+    line = f"{options} --least 4 --runs {tmp_path}/others"
+    code, shown = finish(queue(line, "clear,9,0"))
+    assert code == 0 and shown.count("started") == 1, shown
+    assert sorted(x.name for x in (tmp_path / "others").iterdir()) == ["clear_seed3"]
+    assert kept[0].read_text() == before
