@@ -9,11 +9,12 @@ A page says between markers, which no reader sees, what stands there:
     ... written here ...
     <!-- end -->
 
-`table` shows rows and columns of a stored table; `grid` cells, one by one, where a page
-needs other rows and columns than the file has ("{}" stands for each of `across`);
+`table` shows rows and columns of a stored table, and as `less` the mean difference of
+two rows within each training, with its 95 % interval; `grid` cells, one by one, where a
+page needs other rows and columns than the file has ("{}" stands for each of `across`);
 `plot` draws a column of chosen rows beside the page, or, with `panels`, quality over
-time beside peers' times; `claims` the papers' claims with
-verdicts; `absent` what nobody here can measure; `headline` the rows of headline.toml. A
+time beside peers' times; `claims` the papers' claims with verdicts; `absent` what
+nobody here can measure; `headline` the rows of headline.toml. A
 figure within a sentence is <!-- = camdm/steering | row | column -->0.1<!-- / -->.
 """
 
@@ -31,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from jaxmotion import files
-from jaxmotion.evaluation import columns
+from jaxmotion.evaluation import columns, statistics
 from jaxmotion.evaluation.table import Cell
 from reports import markdown, stored, verdicts, writing
 from reports.claims import Claim, Table
@@ -176,10 +177,29 @@ def _table(store: Store, name: str, options: dict[str, Any], page: Path) -> list
             for id in shown
         ]
         lines.append([f"**{title}**" if row in bold else title, *cells])
+    for title, pair in options.get("less", {}).items():
+        cells = [_difference(one, *pair, one.columns[id]) for id in shown]
+        lines.append([title, *cells])
     made = markdown.table_lines(["", *titles], lines)
     if options.get("source", True):
         made += _where_from(one, page, store.folder)
     return made
+
+
+def _difference(one: Stored, row: str, other: str, column: columns.Column) -> str:
+    """The mean difference of two rows over trainings that have both."""
+    trainings = [x.rows for x in one.measured.trainings if x is not None]
+    pairs = [
+        [rows.get(name, {}).get(column.id) for name in (row, other)]
+        for rows in trainings
+    ]
+    own = np.array([a.value - b.value for a, b in pairs if a and b])
+    if own.size < 2 or not np.isfinite(own).all():
+        return _NOTHING
+    spread = statistics.spread(own)
+    low, high = verdicts.interval(spread)
+    plain = dataclasses.replace(column, kind="mean")
+    return text_of([Cell(value=float(spread.mean), low=low, high=high)], plain)
 
 
 def _grid(store: Store, name: str, options: dict[str, Any], page: Path) -> list[str]:

@@ -309,6 +309,21 @@ def test_digits_follow_the_interval(load, pages, value, low, high, text):
     assert pages.text_of([cell], columns.COLUMNS["fid"]) == text
 
 
+def test_differences_are_taken_within_trainings(pages, store, tmp_path):
+    """By SciPy: 1, 2 and 4 less .5; a row beside itself differs by nothing."""
+    marker = (
+        "<!-- table emdm/three\nrows = []\nsource = false\n"
+        'less = {"more" = ["a", "data"], "none" = ["a", "a"]}\n-->\n<!-- end -->'
+    )
+    own = np.array([0.5, 1.5, 3.5])
+    ends = scipy.stats.t.interval(0.95, 2, own.mean(), scipy.stats.sem(own))
+    lines = pages.written(tmp_path / "page.md", marker, store).splitlines()
+    text = next(x for x in lines if x.startswith("| more"))
+    mean, low, high = map(float, re.findall(r"-?\d+\.\d+", text))
+    np.testing.assert_allclose([mean, low, high], [own.mean(), *ends], atol=0.05)
+    assert any(x.startswith("| none | 0 ") for x in lines)
+
+
 def test_claims_are_decided_from_stored_trainings(pages, checkout):
     """The mean over trainings and its interval, by SciPy, and the verdict's word."""
     folder = checkout / "experiments/results"

@@ -507,7 +507,7 @@ def test_a_run_folder_can_be_elsewhere(load, runs, tmp_path):
     args = report.Config(runs=runs, elsewhere=(f"aamdm={tmp_path / 'mine'}",))
     folders = {source.run: path for source, path in report.folders_of(args).items()}
     assert folders["aamdm"] == (tmp_path / "mine",)
-    assert folders["camdm"] == (runs / "camdm",)
+    assert folders["camdm_small"] == (runs / "camdm_small",)
 
 
 def test_trainings_have_folders_of_their_own(load, runs):
