@@ -21,6 +21,7 @@ from jaxmotion.data.clips import Clips
 from jaxmotion.evaluators import frozen
 from jaxmotion.learning import checkpoint, loop, runs
 from jaxmotion.learning.training import OptimizerName
+from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import distillation as camdm_distillation
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import model as camdm_model
@@ -240,6 +241,8 @@ class Evaluate:
       evaluator: File of a frozen evaluator of styles, from evaluator.py; None trains
         one here.
       visit: Steps of the schedule that a plan visits; none: the model's own.
+      extend: Plans see the last plan's own path, extended (HFTE); else the wanted path
+        alone (one of table 3).
       seed: Seeds poses, noise, evaluator and subsets.
     """
 
@@ -255,6 +258,7 @@ class Evaluate:
     evaluator_steps: int = 1500
     evaluator: Path | None = None
     visit: tuple[int, ...] = ()
+    extend: bool = True
     seed: int = 0
 
 
@@ -305,6 +309,7 @@ def evaluate(args: Evaluate) -> None:
         evaluator_steps=args.evaluator_steps,
         seed=args.seed,
         evaluator=evaluator,
+        control=None if args.extend else camdm_controller.Control(extend=False),
     )
     report |= reporting.provenance(args)
     notes = (frozen.note(report["evaluator"]),)

@@ -86,7 +86,7 @@ def commands_of(source: Source, folder: Path, seed: int) -> tuple[str, ...]:
     """What leaves a source's file behind in a training's folder."""
     return tuple(
         command.format(run=folder)
-        + (f" --seed {seed}" if seed and "--out {run}" in command else "")
+        + (f" --seed {seed}" if seed and "--out {run} " in f"{command} " else "")
         for command in source.commands
     )
 

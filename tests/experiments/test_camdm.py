@@ -177,6 +177,17 @@ def test_an_evaluation_writes_its_table(call, trained):
         "--chunk 2"
     )
     check_evaluation(trained / "evaluation", 2)
+    # Without the last plan's own path the same characters walk another way.
+    call(
+        f"evaluate --run {trained} --rollouts 2 --seconds 4 --evaluator-steps 2 "
+        f"--chunk 2 --no-extend --out {trained / 'no_hfte'}"
+    )
+    check_evaluation(trained / "no_hfte", 2)
+    with_, without = (
+        json.loads((trained / name / "metrics.json").read_text())["rows"]["rollouts"]
+        for name in ("evaluation", "no_hfte")
+    )
+    assert with_["jerk"] != without["jerk"]
 
 
 @pytest.mark.slow

@@ -450,6 +450,7 @@ def test_a_report_has_values_verdicts_and_what_is_missing(call, runs, tmp_path, 
         "up to 8 steps FID falls": "not decided",
         "8 steps have a lower FID than 16 and 32": "not run",
         "up to 8 steps feet slide less": "not decided",
+        "feet slide least with 16 steps": "not run",
     }
     others = [v for k, v in verdicts.items() if k[0] != "CAMDM, table 5"]
     assert len(others) > 50 and set(others) == {"not run"}

@@ -240,6 +240,7 @@ def score_run(
     chunk: int | None,
     seed: int,
     replicated: bool = False,
+    control: camdm_controller.Control | None = None,
 ) -> tuple[Row, dict[str, int]]:
     """Steers the characters of a trial from held-out poses, and measures them.
 
@@ -252,7 +253,7 @@ def score_run(
     """
     model, fps = run.model, run.model.config.fps
     _, key = jax.random.split(jax.random.key(seed))
-    frames = _timed_rollouts(run, key, trial.states, trial.commands, chunk)
+    frames = _timed_rollouts(run, key, trial.states, trial.commands, chunk, control)
     made = windows.rollout_windows(frames, jnp.asarray(trial.labels), skip=SKIP)
     row = camdm_scoring.made_row(
         reference,
@@ -282,6 +283,7 @@ def evaluate_run(
     evaluator_steps: int = 1500,
     seed: int = 0,
     evaluator: evaluators.Evaluator | None = None,
+    control: camdm_controller.Control | None = None,
 ) -> tuple[Rows, dict[str, Any]]:
     """Steers characters in every style, and measures them beside held-out clips.
 
@@ -292,6 +294,7 @@ def evaluate_run(
       chunk: Characters to run at a time, at most.
       evaluator_steps: Updates of the evaluator of styles, if it is trained here.
       evaluator: A frozen evaluator of styles; None to train one.
+      control: Constants of the run-time; None for the model's.
 
     Returns:
       The table, and what belongs beside it: speeds, health, counts, versions.
@@ -310,7 +313,9 @@ def evaluate_run(
     reference = reference_of_run(run, chosen, seed=seed)
     windows_made = trial.windows * trial.labels.size
     count = reference.count(windows_made)
-    row, found = score_run(run, reference, trial, count=count, chunk=chunk, seed=seed)
+    row, found = score_run(
+        run, reference, trial, count=count, chunk=chunk, seed=seed, control=control
+    )
     truth, floor = truth_rows(run, reference, count=count, seed=seed)
     return {TRUTH: truth, FLOOR: floor, ROLLOUTS: row}, {
         "contact_height_m": reference.height,
@@ -370,14 +375,19 @@ def load_evaluator(
 
 
 def _timed_rollouts(
-    run: Run, key: Key, states: Any, commands: trajectory.Command, chunk: int | None
+    run: Run,
+    key: Key,
+    states: Any,
+    commands: trajectory.Command,
+    chunk: int | None,
+    control: camdm_controller.Control | None = None,
 ) -> Any:
     """Frames of the characters; says how many, and how long they took in all."""
     number, ticks = commands.label.shape
     print(f"{number} rollouts of {ticks} ticks, in one program", flush=True)
     begun = time.perf_counter()
     frames = steering.steered_rollouts(
-        camdm_controller.character(run.params, run.model),
+        camdm_controller.character(run.params, run.model, control=control),
         key,
         states,
         commands,
