@@ -155,6 +155,11 @@ def _where_from(one: Stored, page: Path, folder: Path) -> list[str]:
     count = sum(x is not None for x in one.measured.trainings)
     told += [f"{count} trainings, values by seed"] if count > 1 else []
     told += [about["interval"]] if "interval" in about else []
+    trainings = [x.about.get("minutes", {}) for x in one.measured.trainings if x]
+    if "measured" in about and all(trainings):
+        taken = {k: [x.get(k, math.nan) for x in trainings] for k in trainings[0]}
+        each = (f"{k} {np.mean(x):.3g}" for k, x in taken.items())
+        told += [f"minutes of training: {', '.join(each)}"]
     return ["", f"<sub>{'; '.join(told)}</sub>"]
 
 
