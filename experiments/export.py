@@ -114,6 +114,7 @@ def export_page(args: Config) -> None:
     """Writes the folder of the page, for shipped models or a run."""
     web.check()
     loop.check_writable(args.out)
+    web.earlier(args.out)
     sources = {name: name for name in args.model}
     if args.run is not None:
         sources = {args.run.stem: args.run}
@@ -125,14 +126,15 @@ def export_page(args: Config) -> None:
             character = lock_feet(character)
         web.step_choices(character, args.steps)
         loaded[name] = character
-    web.write_page(args.out, list(loaded), cache=args.cache, say=say)
+    written = web.write_page(args.out, cache=args.cache, say=say)
     for name, character in loaded.items():
         tick = jax.tree.map(
             lambda x: x[0, 0], jm.commands("stand", character, 1, seconds=1.0)
         )
-        web.write_character(
+        written += web.write_character(
             args.out / name, name, character, tick, steps=args.steps, say=say
         )
+    web.finish(args.out, list(loaded), written)
     print(f"python -m http.server -d {args.out}")
 
 

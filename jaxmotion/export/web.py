@@ -6,7 +6,9 @@
     <model>/<graph>.onnx.packed
 
 Any web server serves it: files are packed already, and the page unpacks them itself.
-The page is bundled from the sources in `viz/web` by npm and esbuild.
+The page is bundled from the sources in `viz/web` by npm and esbuild. models.json lists
+all files that an export wrote, so that the next one can take away what it does not
+write again, and nothing else.
 """
 
 import gzip
@@ -34,6 +36,7 @@ from jaxmotion.viz import packed
 SOURCES = Path(packed.__file__).with_name("web")
 WEIGHTS = "weights.bin"
 PACKED = ".packed"
+LIST = "models.json"
 # What a graph takes besides noise, state and command.
 SETTINGS = {"scale": jnp.float32(1.0), "locks": jnp.bool_(True)}
 
@@ -94,8 +97,8 @@ def write_character(
     *,
     steps: tuple[int, ...] = (),
     say: Callable[[str], None] = lambda line: None,
-) -> None:
-    """Writes a character's files.
+) -> list[Path]:
+    """Writes a character's files; returns their paths.
 
     Args:
       name: What the page calls it.
@@ -118,7 +121,7 @@ def write_character(
     }
     names = [port.name for port in graph.ports({"state": states})]
     starts = dict(zip(names, map(np.asarray, jax.tree.leaves(states)), strict=True))
-    weights, graphs, runs = slim.Weights(WEIGHTS), {}, {}
+    weights, graphs, runs, written = slim.Weights(WEIGHTS), {}, {}, []
     for number in step_choices(character, steps):
         runs[number] = []
         for which, function in functions(character, number).items():
@@ -136,7 +139,7 @@ def write_character(
                 "inputs": _ports(made.inputs),
                 "outputs": _ports(made.outputs),
             }
-            say(_write(folder / file, content))
+            written.append(_write(folder / file, content, say))
     about = {
         "format": 1,
         "model": name,
@@ -162,8 +165,9 @@ def write_character(
         poses = poses.reshape(-1, *poses.shape[-2:])
     about["wear"] = _wear(character.skeleton, poses)
     arrays = starts | packed.body_arrays(character.skeleton, poses)
-    say(_write(folder / WEIGHTS, weights.packed()))
-    say(_write(folder / "character.bin", packed.pack(about, arrays)))
+    written.append(_write(folder / WEIGHTS, weights.packed(), say))
+    content = packed.pack(about, arrays)
+    return [*written, _write(folder / "character.bin", content, say)]
 
 
 def _wear(skeleton: Skeleton, poses: np.ndarray | None) -> dict[str, Any] | None:
@@ -202,13 +206,14 @@ def pack(content: bytes) -> bytes:
     return small if len(small) < 0.9 * len(plain) else plain
 
 
-def _write(path: Path, content: bytes) -> str:
-    """Writes a packed file; a line about it."""
+def _write(path: Path, content: bytes, say: Callable[[str], None]) -> Path:
+    """Writes a packed file; its path."""
     path = path.with_name(path.name + PACKED)
     small = pack(content)
     with files.replacing(path) as file:
         file.write(small)
-    return f"{path}: {len(small) / 1e6:.2f} MB ({len(content) / 1e6:.2f} unpacked)"
+    say(f"{path}: {len(small) / 1e6:.2f} MB ({len(content) / 1e6:.2f} unpacked)")
+    return path
 
 
 def packages(cache: Path) -> Path:
@@ -230,15 +235,13 @@ def packages(cache: Path) -> Path:
 
 def write_page(
     folder: Path,
-    models: list[str],
     *,
     cache: Path,
     say: Callable[[str], None] = lambda line: None,
-) -> None:
-    """Bundles the page's sources and writes them, the runtime and the list of models.
+) -> list[Path]:
+    """Bundles the page's sources and writes them and the runtime; returns their paths.
 
     Args:
-      models: Names, each of a character's folder there; the first is shown first.
       cache: Folder for the packages of npm; those there are used again.
 
     Raises:
@@ -258,11 +261,52 @@ def write_page(
             _run([bundler, source, *options, *out], Path(build))
             shutil.copyfile(Path(build) / f"{made}.out", folder / made)
         shutil.copyfile(Path(build) / "index.html", folder / "index.html")
-    for made in ("index.html", "page.js", "worker.js"):
-        say(f"{folder / made}: {(folder / made).stat().st_size / 1e6:.2f} MB")
+    written = [folder / made for made in ("index.html", "page.js", "worker.js")]
+    for path in written:
+        say(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
     runtime = place / "node_modules/onnxruntime-web/dist/ort-wasm-simd-threaded.wasm"
-    say(_write(folder / "ort.wasm", runtime.read_bytes()))
-    files.write_text(folder / "models.json", json.dumps({"models": models}) + "\n")
+    return [*written, _write(folder / "ort.wasm", runtime.read_bytes(), say)]
+
+
+def earlier(folder: Path) -> list[Path]:
+    """The files that an earlier export wrote to a folder.
+
+    Raises:
+      ValueError: if the folder has an export that does not say what it wrote.
+    """
+    path = folder / LIST
+    if not path.exists():
+        return []
+    try:
+        found = [folder / name for name in json.loads(path.read_bytes())["files"]]
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(
+            f"{path} does not list the files of the export that wrote it, so they "
+            "cannot be replaced: take another folder, or delete that one"
+        ) from None
+    inside = folder.resolve()
+    return [x for x in found if x.is_file() and inside in x.resolve().parents]
+
+
+def finish(folder: Path, models: list[str], written: list[Path]) -> None:
+    """Lists models and files, and deletes what only the export before wrote.
+
+    Args:
+      models: Names, each of a character's folder there; the first is shown first.
+      written: Paths of all files of this export.
+
+    Raises:
+      OSError: if the list cannot be written or a file not be deleted.
+      ValueError: as `earlier` does.
+    """
+    old = {path for path in earlier(folder) if path not in written}
+    for path in old:
+        path.unlink()
+        if path.parent != folder and not any(path.parent.iterdir()):
+            path.parent.rmdir()
+    names = sorted(path.relative_to(folder).as_posix() for path in written)
+    listed = {"models": models, "files": names}
+    files.write_text(folder / LIST, json.dumps(listed, indent=1) + "\n")
 
 
 def _run(command: list[str], folder: Path) -> None:

@@ -1,5 +1,6 @@
 """experiments/export.py: what the page is made of, and what ends it in one line."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from tests.viz.strider import strider
 
 @pytest.fixture
 def script(load, monkeypatch):
-    """The script, which finds two models and writes nothing."""
+    """The script, which finds three models and writes little."""
     script, written = load("export"), []
     known = {name: strider()[0] for name in ("one", "two", Path("runs/own.npz"))}
 
@@ -21,27 +22,53 @@ def script(load, monkeypatch):
 
     monkeypatch.setattr(script.jm, "load", found)
     monkeypatch.setattr(web, "check", lambda: None)
-    monkeypatch.setattr(
-        web, "write_page", lambda folder, names, **more: written.append(names)
-    )
-    monkeypatch.setattr(
-        web,
-        "write_character",
-        lambda folder, name, *args, **more: written.append((folder, name)),
-    )
+
+    def write(folder, *args, **more):
+        """A page or a character, of one file."""
+        written.append(path := folder / "some.bin")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"of the export")
+        return [path]
+
+    monkeypatch.setattr(web, "write_page", write)
+    monkeypatch.setattr(web, "write_character", write)
     script.written = written
     return script
 
 
 def test_the_page_has_a_folder_for_each_model(script, tmp_path, capsys):
     script.export(script.Config(format="web", model=("two", "one"), out=tmp_path))
-    want = [["two", "one"], (tmp_path / "two", "two"), (tmp_path / "one", "one")]
-    assert script.written == want
+    places = ("some.bin", "two/some.bin", "one/some.bin")
+    assert script.written == [tmp_path / x for x in places]
     assert f"python -m http.server -d {tmp_path}" in capsys.readouterr().out
-    script.written.clear()
-    run = Path("runs/own.npz")
-    script.export(script.Config(format="web", run=run, out=tmp_path))
-    assert script.written == [["own"], (tmp_path / "own", "own")]
+    listed = json.loads((tmp_path / "models.json").read_text())
+    assert listed == {"models": ["two", "one"], "files": sorted(places)}
+
+
+def test_an_export_replaces_its_own_earlier_one_and_nothing_else(script, tmp_path):
+    site, run = tmp_path / "site", Path("runs/own.npz")
+    script.export(script.Config(format="web", model=("two", "one"), out=site))
+    own = ["CNAME", "one/notes.txt", ".git/config", "../outside"]
+    for name in own:
+        (site / name).parent.mkdir(exist_ok=True)
+        (site / name).write_text("not of the export")
+    # A list that somebody changed reaches nothing outside the folder.
+    listed = json.loads((site / "models.json").read_text())
+    listed["files"] += ["../outside", str(tmp_path / "outside"), "gone.bin"]
+    (site / "models.json").write_text(json.dumps(listed))
+    script.export(script.Config(format="web", run=run, out=site))
+    left = {x.relative_to(site).as_posix() for x in site.rglob("*") if x.is_file()}
+    assert left == {*own[:3], "models.json", "some.bin", "own/some.bin"}
+    assert all((site / name).read_text() == "not of the export" for name in own)
+    assert not (site / "two").exists()
+
+
+@pytest.mark.parametrize("content", ['{"models": ["one"]}', "[]", "no JSON"])
+def test_an_export_that_lists_no_files_is_left_alone(script, tmp_path, content):
+    (tmp_path / "models.json").write_text(content)
+    with pytest.raises(ValueError, match=r"models.json does not list the files of the"):
+        script.export(script.Config(format="web", model=("one",), out=tmp_path))
+    assert not script.written and (tmp_path / "models.json").read_text() == content
 
 
 @pytest.mark.parametrize(

@@ -59,13 +59,16 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     cache = Path.home() / ".cache" / "jaxmotion" / "web"
     try:
-        web.write_page(folder, ["strider", "broken"], cache=cache)
+        written = web.write_page(folder, cache=cache)
     except ValueError as error:
         pytest.skip(f"needs packages of npm: {error}")
     character = strider(ball=True)[0]
     commands = jm.commands("stand", character, 1, seconds=1.0)
     command = jax.tree.map(lambda x: x[0, 0], commands)
-    web.write_character(folder / "strider", "strider", character, command, steps=(2,))
+    written += web.write_character(
+        folder / "strider", "strider", character, command, steps=(2,)
+    )
+    web.finish(folder, ["strider", "broken"], written)
     shutil.copytree(folder / "strider", folder / "broken")
     damaged = folder / "broken" / "advance.onnx.packed"
     damaged.write_bytes(damaged.read_bytes()[:-300])
