@@ -54,14 +54,14 @@ def modules(package: str) -> list[str]:
 
 def api_page(package: str) -> str:
     """A package's page: one section per module."""
-    title = f"# jaxmotion.{package}\n"
+    whole = f"jaxmotion.{package.replace('/', '.')}"
     blocks = [
         f"::: {name}\n    options: {{members: {'false' if i == 0 else 'null'}}}\n"
-        if name == f"jaxmotion.{package}"
+        if name == whole
         else f"::: {name}\n"
         for i, name in enumerate(modules(package))
     ]
-    return "\n".join([title, *blocks])
+    return "\n".join([f"# {whole}\n", *blocks])
 
 
 def on_config(config):
