@@ -80,6 +80,7 @@ LIMITS: dict[str, Range] = {
     "warmup": Range(0, 10**9),
     "draft_steps": Range(0, 10**9),
     "token_margin": Range(0, 1000),
+    "channels": _SIZE,
     "frame_kernel": Range(0, 255),
     "seam_half_life": Range(0, 10**6),
     **dict.fromkeys(("noise_levels", "guided_steps"), Range(1, 1000)),

@@ -32,6 +32,7 @@ WRONG = {
     "steering": ("--data {gone} --held-out-clips a --out {out}", "gone"),
     "smgdiff": ("evaluate --run {gone}", "gone"),
     "squ9": ("--out {file}/below", "file/below"),
+    "token_span": ("--data {gone} --out {out}", "gone"),
     "train_queue": ("--runs {file}/below --only aamdm", "file/below"),
     "step_sweep": ("--system mdm --out {out}", "system: unknown"),
 }
