@@ -7,11 +7,14 @@ released code does, every token in every step; onnxruntime runs our own sampler 
 `experiments/export.py` writes it, several characters one after the other. Needs torch
 (`pip install -e ".[parity]"`), and for onnxruntime `".[export]"`.
 
+`experiments/report.py --keep runs/benchmarks/peers.json --name timings/peers` stores
+what was measured.
+
 Examples:
   python benchmarks/peers.py
   python benchmarks/peers.py --threads 1
-  python benchmarks/peers.py --system aamdm emdm --batch 1 64 256 --limit 9
-"""
+  python benchmarks/peers.py --system aamdm emdm camdm smgdiff --batch 1 16 64 256 1024 --rounds 9 --limit 600
+"""  # noqa: E501
 
 import dataclasses
 import os
@@ -61,6 +64,22 @@ COLUMNS = {
 }
 # Cores of other processes up to which wall clock times of several threads count.
 IDLE = 0.15
+# Columns and rows of the stored table.
+STORED = {
+    OURS: "ours",
+    PREFIX: "prefix",
+    EAGER: "eager",
+    COMPILED: "compile",
+    ONNX: "onnx",
+}
+TITLES = {
+    "aamdm": "AAMDM, a frame",
+    "emdm": "EMDM, a motion of {} steps",
+    "camdm": "CAMDM, a plan of {} steps",
+    "smgdiff": "SMGDiff, a plan of {} steps",
+}
+# Rounds after which a row may sit out.
+FEW = 3
 # Whose encoder PyTorch can fuse, if the batch comes first, and ours can divide.
 FUSED = ("camdm", "smgdiff")
 
@@ -93,8 +112,12 @@ class Config(suite.Settings):
       threads: Threads (and cores) of all.
       rounds: Timed rounds; each runs every row once.
       limit: Seconds of rounds of a system and a batch, at most, but one round.
+      sit_out: After three rounds rows of more than so many times our time sit out the
+        rest; 0 for none.
       row_limit: Seconds of one call; a row that would take longer, judged by the batch
         before, is left out. 0 for no limit.
+      round_limit: Seconds of one round; a batch whose round would take longer, judged
+        by the one before, is left out. 0 for no limit.
       compile_limit: Seconds that torch.compile may take; 0 to leave it out.
       target: Greatest ratio of "ours, constants" that passes for one plan of CAMDM;
         exit status 1 beyond it, and 2 where the machine was too busy to tell. 0 for no
@@ -109,7 +132,9 @@ class Config(suite.Settings):
     threads: int = 2
     rounds: int = 100
     limit: float = 120.0
+    sit_out: float = 1.5
     row_limit: float = 60.0
+    round_limit: float = 60.0
     compile_limit: int = 60
     target: float = 0.65
 
@@ -263,19 +288,46 @@ def largest_differences(
     return {name: difference(value) for name, value in found.items()}
 
 
+def time_rows(
+    calls: dict[str, Callable], args: Config, *, warmup: int
+) -> dict[str, np.ndarray]:
+    """Times in turn; far slower rows sit out after some rounds, as `sit_out` says."""
+    begun = time.perf_counter()
+    few = min(FEW, args.rounds) if args.sit_out else args.rounds
+    times = timing.time_in_turn(
+        calls, rounds=few, warmup=warmup, limit_s=args.limit, least=1
+    )
+    most = args.sit_out * np.median(times[OURS], axis=0)
+    stay = {
+        name: call
+        for name, call in calls.items()
+        if not np.all(np.median(times[name], axis=0) > most)
+    }
+    left = args.limit - (time.perf_counter() - begun)
+    if len(times[OURS]) < few or few == args.rounds or left <= 0:
+        return times
+    more = timing.time_in_turn(
+        stay, rounds=args.rounds - few, warmup=0, limit_s=left, least=1
+    )
+    return times | {name: np.concatenate([times[name], more[name]]) for name in more}
+
+
 def rows_of(times: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """Percentiles and ratios to eager PyTorch, by wall clock and by processor time."""
     rows = []
     for name, values in times.items():
-        ratio = values / times[EAGER]
+        rounds = min(len(values), len(times[EAGER]))
+        ratio = values[:rounds] / times[EAGER][:rounds]
         low, middle, high = np.percentile(ratio, [25, 50, 75], axis=0)
         p50, p95 = np.percentile(values, [50, 95], axis=0)
+        p25, p75 = np.percentile(values[:, 0], [25, 75])
         rows.append(
             {
                 "name": name,
                 "rounds": len(values),
                 "p50_ms": float(p50[0]),
                 "p95_ms": float(p95[0]),
+                "middle_half": [float(p25), float(p75)],
                 "ratio": float(middle[0]),
                 "ratio_spread": f"{low[0]:.2f}-{high[0]:.2f}",
                 "cpu_ms": float(p50[1]),
@@ -338,12 +390,13 @@ def calls_of(
     conditions = samples.conditions(batch)
     given = torch_peers.given_of(system, samples.config, conditions)
     calls, note = {}, "torch.compile: left out"
-    for name, arguments in (("ours, arguments", True), (OURS, False)):
-        calls[name] = our_call(samples, batch, arguments=arguments)
+    calls[OURS] = our_call(samples, batch, arguments=False)
+    if batch == 1:
+        calls["ours, arguments"] = our_call(samples, batch, arguments=True)
     if prefix is not None:
         calls[PREFIX] = our_call(prefix, batch, arguments=False)
     for name, peer in peers.items():
-        if name not in skip:
+        if name not in skip and (name == EAGER or batch == 1):
             calls[name] = torch_call(peer, batch, given)
     if compile_limit and COMPILED not in skip:
         call, note = compiled_call(peers[EAGER], batch, given, compile_limit)
@@ -391,6 +444,11 @@ def measure(
             if args.row_limit and value > 1000 * args.row_limit
             if name != EAGER and not name.startswith("ours")
         )
+        seconds = sum(expected.values()) / 1000
+        if args.round_limit and seconds > args.round_limit:
+            text = f"a round of {seconds:.0f} s, --round-limit {args.round_limit:g} s"
+            print(f"{system}, batch {batch}: left out: {text}")
+            break
         if skip:
             text = f"more than --row-limit {args.row_limit:g} s a call"
             print(f"{system}, batch {batch}: {', '.join(skip)} left out: {text}")
@@ -405,26 +463,34 @@ def measure(
             compile_limit=args.compile_limit,
         )
         notes.append(f"batch {batch}: {note}")
-        total = sum(expected.get(name, 0.0) for name in calls)
         since = suite.busy()
-        times = timing.time_in_turn(
-            calls,
-            rounds=args.rounds,
-            # No call is the first of its network any more.
-            warmup=0 if total > 250 * args.limit else 3,
-            limit_s=args.limit,
-            least=1,
-        )
+        # After the first batch no call is the first of its network any more.
+        times = time_rows(calls, args, warmup=1 if seconds > 1 else 3)
         load = suite.other_load(since)
         found = rows_of(times)
         before = {row["name"]: row["p50_ms"] for row in found}
-        found = [dict(system=system, batch=batch, load=load) | row for row in found]
+        title = TITLES[system].format(samples.config.num_steps)
+        own = dict(system=system, title=title, batch=batch, load=load)
+        found = [own | row for row in found]
         rows += found
         print(f"{system}, batch {batch}: {threads} threads; {note}", flush=True)
         suite.print_table(found, COLUMNS)
         if faster(found):
             print(f"faster than ours: {', '.join(faster(found))}")
     return rows, {"largest_differences": differences, "notes": notes}
+
+
+def metric_of(row: dict[str, Any]) -> suite.Metric:
+    """A row's cell of the stored table, with the middle half of its rounds."""
+    low, high = row["middle_half"]
+    return suite.Metric(
+        f"{row['title']}, batch {row['batch']} {STORED[row['name']]}",
+        row["p50_ms"],
+        "ms",
+        low=low,
+        high=high,
+        samples=row["rounds"],
+    )
 
 
 def main() -> None:
@@ -439,14 +505,7 @@ def main() -> None:
     for system in dict.fromkeys(args.system):
         found, about[system] = measure(system, args, threads=threads)
         rows += found
-    metrics = []
-    for row in rows:
-        name = f"{row['system']} batch {row['batch']} {row['name']}"
-        metrics += [
-            suite.Metric(f"{name} p50", row["p50_ms"], "ms"),
-            suite.Metric(f"{name} ratio", row["ratio"], "of eager"),
-            suite.Metric(f"{name} cpu ratio", row["cpu_ratio"], "of eager"),
-        ]
+    metrics = [metric_of(row) for row in rows if row["name"] in STORED]
     suite.write_table(args.out / "peers", rows, COLUMNS)
     suite.report(
         "peers",

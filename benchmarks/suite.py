@@ -37,6 +37,9 @@ class Metric:
       unit: Unit of the value.
       direction: Whether a lower or a higher value is better.
       tolerance: Relative change for the worse that the gate still lets pass.
+      low: Lower end of its interval; None for none.
+      high: Upper end.
+      samples: Measurements that it came from.
     """
 
     name: str
@@ -44,6 +47,9 @@ class Metric:
     unit: str
     direction: Literal["lower", "higher"] = "lower"
     tolerance: float = 0.3
+    low: float | None = None
+    high: float | None = None
+    samples: int = 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -82,6 +82,16 @@ STEPS: dict[str, chain.StepFactory] = {
 }
 
 
+def options() -> dict[str, Any]:
+    """Options of XLA for programs of samples.
+
+    On a CPU vectors as wide as it has them: XLA's default stops at 256 bits.
+    """
+    if jax.default_backend() != "cpu":
+        return {}
+    return {"xla_cpu_prefer_vector_width": 512}
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Samples:
     """Samples to time.
@@ -141,9 +151,10 @@ class Samples:
                 check_vma=False,
             )
         given = jax.random.split(jax.random.key(1), batch), self.conditions(batch)
+        jit = functools.partial(jax.jit, compiler_options=options())
         if arguments:
-            return jax.jit(samples), (self.params, *given)
-        return jax.jit(functools.partial(samples, self.params)), given
+            return jit(samples), (self.params, *given)
+        return jit(functools.partial(samples, self.params)), given
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -294,6 +305,11 @@ def camdm_config(sizes: Sizes, **more: Any) -> camdm_model.Config:
     )
 
 
+def _plan_chunk(attention: str) -> int:
+    """Plans at a time: steps of a third of the tokens take four times as many."""
+    return 16 if attention == "prefix" else 4
+
+
 def camdm_conditions(config: camdm_model.Config, batch: int) -> camdm_model.Condition:
     """Conditions of plausible size."""
     rng = np.random.default_rng(0)
@@ -321,6 +337,7 @@ def _camdm_samples(sizes: Sizes) -> Samples:
         frames=config.future,
         fps=config.fps,
         config=config,
+        chunk=_plan_chunk(config.attention),
     )
 
 
@@ -694,6 +711,7 @@ def _emdm_samples(sizes: Sizes) -> Samples:
         frames=config.frames,
         fps=15.0,
         config=config,
+        chunk=16,
     )
 
 
@@ -764,4 +782,5 @@ def _smgdiff_samples(sizes: Sizes) -> Samples:
         frames=config.future,
         fps=representation.fps,
         config=config,
+        chunk=_plan_chunk(config.attention),
     )

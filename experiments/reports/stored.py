@@ -246,7 +246,8 @@ def _benchmark(path: Path) -> Measured | None:
     rows: dict[str, dict[str, Cell]] = {}
     for metric in whole["metrics"]:
         row, _, column = metric["name"].rpartition(" ")
-        rows.setdefault(row, {})[column] = Cell(value=metric["value"])
+        interval = {x: metric[x] for x in ("low", "high", "samples") if x in metric}
+        rows.setdefault(row, {})[column] = Cell(value=metric["value"], **interval)
     about = whole["environment"] | {"arguments": whole["settings"]}
     return Measured(path=path, rows=rows, about=about)
 

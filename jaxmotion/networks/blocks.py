@@ -178,10 +178,21 @@ class Projections(NamedTuple):
 
 
 class Prefix(NamedTuple):
-    """Keys and values of tokens that do not see those that attend to them."""
+    """Keys and values of tokens that do not see those that attend to them.
 
-    key: Float[Array, "*batch tokens heads channels"]
-    value: Float[Array, "*batch tokens heads channels"]
+    Laid out as the products read them, so that a sampler's steps need not.
+    """
+
+    key: Float[Array, "*batch heads channels tokens"]
+    value: Float[Array, "*batch heads tokens channels"]
+
+
+def prefix_of(projections: Projections) -> Prefix:
+    """The keys and values of tokens, for others that attend to them."""
+    return Prefix(
+        key=jnp.moveaxis(projections.key, -3, -1),
+        value=jnp.swapaxes(projections.value, -2, -3),
+    )
 
 
 def row_of(
@@ -304,12 +315,11 @@ class EncoderLayer(nn.Module):
         if prefix is None:
             mixed = drop(jax.nn.softmax(logits, axis=-1)) @ value
         else:
-            before, given = (jnp.swapaxes(y, -2, -3) for y in prefix)
-            ahead = query @ jnp.swapaxes(before, -1, -2) / np.sqrt(query.shape[-1])
+            ahead = query @ prefix.key / np.sqrt(query.shape[-1])
             logits = jnp.concatenate([ahead, logits], axis=-1)
             weights = drop(jax.nn.softmax(logits, axis=-1))
-            number = given.shape[-2]
-            mixed = weights[..., :number] @ given + weights[..., number:] @ value
+            number = prefix.value.shape[-2]
+            mixed = weights[..., :number] @ prefix.value + weights[..., number:] @ value
         mixed = jnp.swapaxes(mixed, -2, -3)
         x = x + drop(self.out(mixed.reshape(x.shape)))
         act = _ACTIVATIONS[self.activation]

@@ -220,7 +220,7 @@ class CamdmTransformer(nn.Module):
         for before, layer in zip(self.layers[:-1], self.layers[1:], strict=True):
             tokens = before.attend(tokens, layers[-1], train=train)
             layers.append(layer.project(tokens))
-        kept = tuple(blocks.Prefix(x.key, x.value) for x in layers)
+        kept = tuple(blocks.prefix_of(x) for x in layers)
         return PrefixContext(layers=kept, steps=steps, last=last)
 
     def denoise(

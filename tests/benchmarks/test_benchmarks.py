@@ -1,5 +1,6 @@
 """The scripts at sizes that take seconds, and the arithmetic of their reports."""
 
+import collections
 import csv
 import dataclasses
 import importlib
@@ -7,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -485,17 +487,48 @@ def test_peers_compute_the_same(tmp_path):
     printed = run_script("peers", *options, "--out", tmp_path)
     report = json.loads((tmp_path / "peers.json").read_text())
     found = {(row["batch"], row["name"]) for row in report["rows"]}
-    names = {"ours, arguments", "ours, constants", "torch eager"}
+    names = {"ours, constants", "torch eager"}
     different = report["systems"]["aamdm"]["largest_differences"]
     if "onnxruntime" in different:
         names.add("onnxruntime")
     else:
         assert printed.count("onnxruntime: left out") == 1
-    assert found == {(batch, name) for batch in (1, 3) for name in names}
+    every = {(batch, name) for batch in (1, 3) for name in names}
+    assert found == {(1, "ours, arguments"), *every}
+    cells = {metric["name"] for metric in report["metrics"]}
+    assert "AAMDM, a frame, batch 3 eager" in cells and len(cells) == len(every)
     # Of whole chains, which enlarge what their networks differ by: that is at most 1e-5
     # (tests/networks/test_parity.py), and noise in another order would give 1.
     assert max(different.values()) < 1e-3
     assert (tmp_path / "peers.md").exists()
+
+
+def test_what_is_far_slower_sits_out(load):
+    """Ours and another in all rounds, one that takes longer in the first ones alone."""
+    pytest.importorskip("torch")
+    peers, calls = load("peers"), collections.Counter()
+
+    def call(name, seconds):
+        def run():
+            calls[name] += 1
+            end = time.process_time() + seconds
+            while time.process_time() < end:
+                pass
+
+        return run
+
+    made = {peers.OURS: call("ours", 0.01), peers.EAGER: call("eager", 0.01)}
+    made |= {peers.ONNX: call("onnx", 0.04)}
+    args = peers.Config(rounds=9, sit_out=2.0)
+    times = peers.time_rows(made, args, warmup=0)
+    assert {k: len(v) for k, v in times.items()} == {
+        peers.OURS: 9,
+        peers.EAGER: 9,
+        peers.ONNX: 3,
+    }
+    assert calls == {"ours": 9, "eager": 9, "onnx": 3}
+    every = peers.time_rows(made, peers.Config(rounds=4, sit_out=0.0), warmup=0)
+    assert {len(v) for v in every.values()} == {4}
 
 
 def test_ratios_are_of_the_same_round(load):
