@@ -89,7 +89,7 @@ LIMITS: dict[str, Range] = {
     "smooth": Range(0, 100),
     "window": Range(1, 1000),
     "balance": Range(0, 1),
-    **dict.fromkeys(("diffusion_steps", "visit"), Range(1, 1000)),
+    **dict.fromkeys(("diffusion_steps", "visit", "visits"), Range(1, 1000)),
     "depth": Range(1, 256),
     "crossing": Range(0, 10**4),
     "frames": Range(2, 10**5),

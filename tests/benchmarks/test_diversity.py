@@ -5,6 +5,7 @@ import functools
 import importlib
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -210,3 +211,31 @@ def test_chunks_do_not_change_a_rollout(small):
     # The root of a pose stands at its height above the origin.
     np.testing.assert_allclose(whole.pose[:, :, 0, 1], whole.world[:, :, 0, 1])
     np.testing.assert_array_equal(whole.pose[:, :, 0, ::2], 0.0)
+
+
+@pytest.mark.slow
+def test_two_processes_end_with_the_moments_of_one(tmp_path):
+    """To the bit: rollout i draws what it draws alone, in chunks of the same size."""
+    arguments = ["--rollouts", 8, "--stream", 24, "--seconds", 0.4, "--every", 4]
+    arguments += ["--pairs", 20, "--chunk", 2]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+
+    def run(out, *more):
+        command = [sys.executable, FOLDER / "diversity.py", *map(str, arguments)]
+        return subprocess.Popen(
+            [*command, "--out", tmp_path / out, *more],
+            env=os.environ | {"JAX_PLATFORMS": "cpu"},
+        )
+
+    shared = [run("two", "--distributed", address, "2", str(i)) for i in range(2)]
+    for process in (*shared, run("one")):
+        assert process.wait(timeout=600) == 0
+    one, two = (np.load(tmp_path / x / "diversity_stream.npz") for x in ("one", "two"))
+    moments = [
+        name for name in one.files if name.endswith(("count", "mean", "squares"))
+    ]
+    assert "pose_mean" in moments and one["pose_count"] == 24
+    for name in moments:
+        np.testing.assert_array_equal(one[name], two[name], err_msg=name)

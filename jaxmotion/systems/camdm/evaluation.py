@@ -19,8 +19,8 @@ from jaxtyping import Array, Float
 from jaxmotion.control import courses, steering
 from jaxmotion.data import selection, windows
 from jaxmotion.data.clips import Clips
-from jaxmotion.diffusion import schedule
-from jaxmotion.evaluation import bench, table
+from jaxmotion.diffusion import chain, schedule
+from jaxmotion.evaluation import bench, table, timing
 from jaxmotion.evaluation.bench import Amount
 from jaxmotion.evaluation.table import Row, Rows
 from jaxmotion.evaluators import frozen as evaluators
@@ -166,14 +166,16 @@ def make_trial(
     seconds: float,
     speed: float | None,
     seed: int,
+    styles: np.ndarray | None = None,
 ) -> Trial:
-    """Commands and poses for some characters of every style.
+    """Commands and poses for some characters of the given styles; None for all.
 
     Raises:
       ValueError: if there is no such course, rollouts are too short to measure, or a
         style has no held-out clip.
     """
-    labels = np.repeat(np.arange(len(run.model.labels)), repeats)
+    styles = np.arange(len(run.model.labels)) if styles is None else styles
+    labels = np.repeat(styles, repeats)
     speeds, commands = course_of_run(run, course, labels, seconds=seconds, speed=speed)
     fps, ticks = run.model.config.fps, commands.label.shape[1]
     windows.check_ticks(ticks, fps=fps, skip=SKIP)
@@ -241,19 +243,23 @@ def score_run(
     seed: int,
     replicated: bool = False,
     control: camdm_controller.Control | None = None,
+    step: chain.StepFactory = chain.ancestral_step,
 ) -> tuple[Row, dict[str, int]]:
     """Steers the characters of a trial from held-out poses, and measures them.
 
     Args:
       count: Windows of each Fréchet distance.
       replicated: As in `made_row`.
+      step: Makes the steps of plans.
 
     Returns:
       The row, and how many rollouts diverged or froze.
     """
     model, fps = run.model, run.model.config.fps
     _, key = jax.random.split(jax.random.key(seed))
-    frames = _timed_rollouts(run, key, trial.states, trial.commands, chunk, control)
+    frames = _timed_rollouts(
+        run, key, trial.states, trial.commands, chunk, control, step
+    )
     made = windows.rollout_windows(frames, jnp.asarray(trial.labels), skip=SKIP)
     row = camdm_scoring.made_row(
         reference,
@@ -331,6 +337,69 @@ def evaluate_run(
     }
 
 
+def evaluate_samplers(
+    run: Run,
+    samplers: dict[str, tuple[chain.StepFactory, tuple[int, ...]]],
+    *,
+    rollouts: int,
+    seconds: float,
+    chunk: int | None = None,
+    evaluator_steps: int = 1500,
+    seed: int = 0,
+    evaluator: evaluators.Evaluator | None = None,
+) -> tuple[Rows, dict[str, Any]]:
+    """One model steered by several samplers, each with milliseconds of a plan.
+
+    Arguments are as for `evaluate_run`; replications have a character of each style
+    with held-out clips.
+
+    Args:
+      samplers: By name, what makes the steps, and those of the schedule to visit.
+    """
+    styles = np.unique(run.held_out.labels[run.field])
+    repeats = max(rollouts // len(styles), 2)
+    trial = make_trial(
+        run,
+        _COURSE,
+        repeats=repeats,
+        seconds=seconds,
+        speed=None,
+        seed=seed,
+        styles=styles,
+    )
+    key_fit, _ = jax.random.split(jax.random.key(seed))
+    chosen = load_evaluator(key_fit, run, evaluator, num_steps=evaluator_steps)
+    reference = reference_of_run(run, chosen, seed=seed)
+    count = reference.count(len(styles) * trial.windows)
+    truth, floor = truth_rows(run, reference, count=count, seed=seed, repeats=repeats)
+    rows, health, calls = {TRUTH: truth, FLOOR: floor}, {}, {}
+    condition = _condition(run, seed=seed)
+    given = dict(count=count, chunk=chunk, seed=seed, replicated=True)
+    for name, (step, steps) in samplers.items():
+        model = dataclasses.replace(run.model, steps=steps)
+        own = dataclasses.replace(run, model=model)
+        rows[name], health[name] = score_run(own, reference, trial, step=step, **given)
+        plan = camdm_model.sampler(
+            own.params, config=model.config, step=step, steps=steps
+        )
+        calls[name] = jax.jit(lambda key, plan=plan: plan(key, condition))
+    times = timing.time_in_turn(
+        calls, arguments=lambda i: (jax.random.key(i),), rounds=100, least=10
+    )
+    for name, found in times.items():
+        cell = bench.time_cells(found[:, 0], seed=seed)["p50"]
+        visited = len(samplers[name][1])
+        more = {"plan_time": cell, "network_calls": table.Cell(value=float(visited))}
+        rows[name] = rows[name] | more
+    return rows, {
+        "fid_windows": count,
+        "fid_reference_windows": len(reference.features),
+        "health": health,
+        "source": run.model.source,
+        "evaluator": describe_evaluator(run, chosen, evaluator),
+    }
+
+
 def describe_evaluator(
     run: Run, chosen: StyleEvaluator, evaluator: Evaluator | None
 ) -> dict[str, Any]:
@@ -381,13 +450,14 @@ def _timed_rollouts(
     commands: trajectory.Command,
     chunk: int | None,
     control: camdm_controller.Control | None = None,
+    step: chain.StepFactory = chain.ancestral_step,
 ) -> Any:
     """Frames of the characters; says how many, and how long they took in all."""
     number, ticks = commands.label.shape
     print(f"{number} rollouts of {ticks} ticks, in one program", flush=True)
     begun = time.perf_counter()
     frames = steering.steered_rollouts(
-        camdm_controller.character(run.params, run.model, control=control),
+        camdm_controller.character(run.params, run.model, control=control, step=step),
         key,
         states,
         commands,

@@ -10,6 +10,7 @@ import optax
 import pytest
 
 from jaxmotion.data import clips_io
+from jaxmotion.diffusion import chain
 from jaxmotion.learning import checkpoint, loop, runs
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import model as camdm_model
@@ -156,6 +157,28 @@ def test_what_is_wrong_is_found_before_any_training():
         camdm_evaluation.steer_one(
             run, "zombie", to_style="glad", course="forward", seconds=1.0
         )
+
+
+@pytest.mark.slow
+def test_samplers_of_one_model_are_scored_alike():
+    """The same sampler twice has the same row but for its time; another has not."""
+    run = samples.run()
+    steps = tuple(range(1, run.model.config.num_steps + 1))
+    own, other = (chain.ancestral_step, steps), (chain.ddim_step, steps[-1:])
+    rows, report = camdm_evaluation.evaluate_samplers(
+        run,
+        {"own": own, "again": own, "other": other},
+        rollouts=4,
+        seconds=5.0,
+        evaluator_steps=2,
+    )
+    times = [rows[name].pop("plan_time").value for name in ("own", "again", "other")]
+    assert min(times) > 0
+    assert rows["own"] == rows["again"]
+    assert rows["own"]["jerk"].value != rows["other"]["jerk"].value
+    assert rows["own"]["network_calls"].value == len(steps)
+    assert rows["other"]["network_calls"].value == 1
+    assert list(report["health"]) == ["own", "again", "other"]
 
 
 # --- from the end of another ------------------------------------------------------
