@@ -14,7 +14,7 @@ Examples:
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -277,10 +277,12 @@ def one_rollout(
     return Motions(world=world, pose=pose)
 
 
-def _function(load: Load, number: int, every: int, chunk: int) -> Callable:
+def _function(
+    load: Load, number: int, every: int, chunk: int, devices: Sequence[jax.Device]
+) -> Callable:
     """All rollouts: (params, key, guided, scale) -> Motions.
 
-    Each device of all processes has its share of them, and all get the motions.
+    Each device has its share of them, and all get the motions.
     """
 
     def roll(
@@ -304,9 +306,9 @@ def _function(load: Load, number: int, every: int, chunk: int) -> Callable:
     def whole(*given: Any) -> Motions:
         return roll(jnp.arange(number), *given)
 
-    if jax.device_count() == 1:
+    if len(devices) == 1:
         return jax.jit(whole)
-    mesh = Mesh(np.array(jax.devices()), ("rollouts",))
+    mesh = Mesh(np.array(devices), ("rollouts",))
     split, copy = PartitionSpec("rollouts"), PartitionSpec()
     roll = jax.shard_map(
         roll,
@@ -319,7 +321,13 @@ def _function(load: Load, number: int, every: int, chunk: int) -> Callable:
 
 
 def fit_program(
-    load: Load, number: int, *, every: int, limit: float, chunk: int | None
+    load: Load,
+    number: int,
+    *,
+    every: int,
+    limit: float,
+    chunk: int | None,
+    devices: Sequence[jax.Device] | None = None,
 ) -> Program:
     """Compiles rollouts, with the largest chunk whose program fits the limit.
 
@@ -329,21 +337,23 @@ def fit_program(
       every: Frames between kept ones.
       limit: Bytes.
       chunk: Rollouts at a time; None to choose it.
+      devices: That share them; None for those of all processes.
 
     Raises:
       ValueError: if it does not fit.
     """
+    devices = jax.devices() if devices is None else devices
     cap = CPU_CHUNK if jax.default_backend() == "cpu" else number
-    if number % jax.device_count():
+    if number % len(devices):
         raise ValueError(
-            f"--rollouts {number}: expected a multiple of the {jax.device_count()} "
+            f"--rollouts {number}: expected a multiple of the {len(devices)} "
             "devices that share them"
         )
-    size = min(number // jax.device_count(), cap if chunk is None else chunk)
+    size = min(number // len(devices), cap if chunk is None else chunk)
 
     def compiled(size: int) -> Any:
         given = load.params, jax.random.key(0), jnp.int32(0), jnp.float32(1.0)
-        return _function(load, number, every, size).lower(*given).compile()
+        return _function(load, number, every, size, devices).lower(*given).compile()
 
     program, needs = suite.fit(compiled, size, limit=limit, shrink=chunk is None)
     ticks = load.commands.label.shape[0]
@@ -479,15 +489,20 @@ def sweep(
 def stream(args: Config, load: Load) -> streams.Stream:
     """Very many rollouts: each set is rolled out, measured, and forgotten.
 
+    Every process makes whole sets on its own devices.
+
     Set number s draws from `fold_in(key, s)`.
     """
     size, limit = max(args.rollouts), args.memory_gib * suite.GIB
-    program = fit_program(load, size, every=args.every, limit=limit, chunk=args.chunk)
+    own = jax.local_devices()
+    program = fit_program(
+        load, size, every=args.every, limit=limit, chunk=args.chunk, devices=own
+    )
     told = ("visit", "style", "course", "speed", "seconds", "every", "seed", "pairs")
     about = {name: suite.settings(args)[name] for name in told} | {
         "set": size,
         "chunk": program.memory["chunk"],
-        "devices": jax.device_count(),
+        "devices": len(own),
         "params": fingerprint.fingerprint(load.params),
     }
 

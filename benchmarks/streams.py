@@ -2,7 +2,9 @@
 
 Memory is constant; what is stopped or killed goes on where it last wrote, at most
 `SAVE_S` seconds before. Sets are merged in their order, so that a stream that was
-killed ends with the same moments, to the bit, as one that was not.
+killed ends with the same moments, to the bit, as one that was not. Several processes
+make whole sets in turn and exchange moments, so theirs are the same bits, too: a set
+that they shared would come from another program, which rounds otherwise.
 """
 
 import dataclasses
@@ -15,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 import suite
+from jax.experimental import multihost_utils
 from tqdm import tqdm
 
 from jaxmotion import files
@@ -42,9 +45,9 @@ class Stream:
     spreads: dict[str, statistics.Spread] = dataclasses.field(default_factory=dict)
     history: tuple[tuple[float, ...], ...] = ()
 
-    def add(self, samples: Mapping[str, Any], seconds: float) -> "Stream":
-        """With one more set."""
-        found = {name: statistics.spread(x) for name, x in samples.items()}
+    def add(self, found: dict[str, statistics.Spread], seconds: float) -> "Stream":
+        """With the moments of one more set."""
+        found = dict(found)
         for name, old in self.spreads.items():
             found[name] = statistics.merge(old, found[name])
         return Stream(self.sets + 1, self.seconds + seconds, found, self.history)
@@ -96,6 +99,24 @@ def read(path: Path, about: str) -> Stream:
     return Stream(int(found["sets"]), float(found["seconds"]), spreads, history)
 
 
+def of_all(found: dict[str, statistics.Spread]) -> list[dict[str, statistics.Spread]]:
+    """What each process found, in their order."""
+    if jax.process_count() == 1:
+        return [found]
+    leaves, structure = jax.tree.flatten(found)
+    shapes = [np.shape(x) for x in leaves]
+    flat = np.concatenate([np.ravel(np.float64(x)) for x in leaves])
+    # As words, since JAX would make 32 bits of 64.
+    words = multihost_utils.process_allgather(flat.view(np.uint32))
+    ends = np.cumsum([np.prod(shape, dtype=int) for shape in shapes])[:-1]
+    every = []
+    for row in np.ascontiguousarray(words).view(np.float64):
+        parts = [x.reshape(s) for x, s in zip(np.split(row, ends), shapes, strict=True)]
+        spreads = jax.tree.unflatten(structure, parts)
+        every.append({k: x._replace(count=int(x.count)) for k, x in spreads.items()})
+    return every
+
+
 def run(
     make: Callable[[int], Mapping[str, Any]],
     *,
@@ -133,9 +154,13 @@ def run(
         with bar:
             while stream.sets < total:
                 begun = time.perf_counter()
-                samples = jax.block_until_ready(make(stream.sets))
-                stream = stream.add(samples, time.perf_counter() - begun)
-                bar.update(size)
+                samples = make(stream.sets + jax.process_index())
+                found = {name: statistics.spread(x) for name, x in samples.items()}
+                every = of_all(found)[: total - stream.sets]
+                seconds = (time.perf_counter() - begun) / len(every)
+                for one in every:
+                    stream = stream.add(one, seconds)
+                bar.update(size * len(every))
                 # At powers of two as well: what is drawn over a logarithm.
                 late = time.perf_counter() - wrote > SAVE_S
                 if late or stream.sets.bit_count() == 1 or stream.sets == total:

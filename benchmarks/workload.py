@@ -82,16 +82,6 @@ STEPS: dict[str, chain.StepFactory] = {
 }
 
 
-def options() -> dict[str, Any]:
-    """Options of XLA for programs of samples.
-
-    On a CPU vectors as wide as it has them: XLA's default stops at 256 bits.
-    """
-    if jax.default_backend() != "cpu":
-        return {}
-    return {"xla_cpu_prefer_vector_width": 512}
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Samples:
     """Samples to time.
@@ -151,10 +141,9 @@ class Samples:
                 check_vma=False,
             )
         given = jax.random.split(jax.random.key(1), batch), self.conditions(batch)
-        jit = functools.partial(jax.jit, compiler_options=options())
         if arguments:
-            return jit(samples), (self.params, *given)
-        return jit(functools.partial(samples, self.params)), given
+            return jax.jit(samples), (self.params, *given)
+        return jax.jit(functools.partial(samples, self.params)), given
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
