@@ -374,11 +374,19 @@ def evaluate_samplers(
     truth, floor = truth_rows(run, reference, count=count, seed=seed, repeats=repeats)
     rows, health, calls = {TRUTH: truth, FLOOR: floor}, {}, {}
     condition = _condition(run, seed=seed)
-    given = dict(count=count, chunk=chunk, seed=seed, replicated=True)
     for name, (step, steps) in samplers.items():
         model = dataclasses.replace(run.model, steps=steps)
         own = dataclasses.replace(run, model=model)
-        rows[name], health[name] = score_run(own, reference, trial, step=step, **given)
+        rows[name], health[name] = score_run(
+            own,
+            reference,
+            trial,
+            count=count,
+            chunk=chunk,
+            seed=seed,
+            replicated=True,
+            step=step,
+        )
         plan = camdm_model.sampler(
             own.params, config=model.config, step=step, steps=steps
         )
