@@ -53,6 +53,7 @@ _PATTERNS = (
     "jaxmotion/assets/*.md",
 )
 _NOTHING = "–"
+SHOWN = 3  # trainings of which each value is shown
 
 
 def pages(root: Path = ROOT) -> list[Path]:
@@ -63,6 +64,13 @@ def pages(root: Path = ROOT) -> list[Path]:
 # --- figures ------------------------------------------------------------------------
 
 
+def _mean(values: np.ndarray) -> Cell:
+    """A mean over trainings with its 95 % interval."""
+    spread = statistics.spread(values)
+    low, high = verdicts.interval(spread)
+    return Cell(value=float(spread.mean), low=low, high=high)
+
+
 def _decimals(value: float) -> int:
     text = f"{value:.3g}"
     return 0 if "e" in text else len(text.partition(".")[2])
@@ -71,7 +79,8 @@ def _decimals(value: float) -> int:
 def text_of(cells: list[Cell], column: columns.Column, *, interval: bool = True) -> str:
     """A cell as pages show it.
 
-    One training: its value with the interval. Several: the value of each, by seed.
+    One training: its value with the interval. Up to three: the value of each, by seed.
+    More: the mean over trainings with its 95 % interval.
     """
     if not cells:
         return _NOTHING
@@ -80,6 +89,10 @@ def text_of(cells: list[Cell], column: columns.Column, *, interval: bool = True)
             sum(x) for x in zip(*((x.value, x.samples) for x in cells), strict=True)
         )
         return f"{markdown.number(total)} of {samples}"
+    if len(cells) > SHOWN and all(math.isfinite(x.value) for x in cells):
+        values = np.array([x.value for x in cells])
+        if np.ptp(values):
+            return text_of([_mean(values)], column, interval=interval)
     if len(cells) > 1 and len({x.value for x in cells}) > 1:
         return " / ".join(
             markdown.number(x.value) if math.isfinite(x.value) else _NOTHING
@@ -153,7 +166,8 @@ def _where_from(one: Stored, page: Path, folder: Path) -> list[str]:
         told += [f"transcribed from {about['transcribed']}"]
         told += [f"`{about['command']}`"] if "command" in about else []
     count = sum(x is not None for x in one.measured.trainings)
-    told += [f"{count} trainings, values by seed"] if count > 1 else []
+    shown = "values by seed" if count <= SHOWN else "means over them"
+    told += [f"{count} trainings, {shown}"] if count > 1 else []
     told += [about["interval"]] if "interval" in about else []
     trainings = [x.about.get("minutes", {}) for x in one.measured.trainings if x]
     if "measured" in about and all(trainings):
@@ -201,10 +215,7 @@ def _difference(one: Stored, row: str, other: str, column: columns.Column) -> st
     own = np.array([a.value - b.value for a, b in pairs if a and b])
     if own.size < 2 or not np.isfinite(own).all():
         return _NOTHING
-    spread = statistics.spread(own)
-    low, high = verdicts.interval(spread)
-    plain = dataclasses.replace(column, kind="mean")
-    return text_of([Cell(value=float(spread.mean), low=low, high=high)], plain)
+    return text_of([_mean(own)], dataclasses.replace(column, kind="mean"))
 
 
 def _grid(store: Store, name: str, options: dict[str, Any], page: Path) -> list[str]:

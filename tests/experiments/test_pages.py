@@ -309,6 +309,22 @@ def test_digits_follow_the_interval(load, pages, value, low, high, text):
     assert pages.text_of([cell], columns.COLUMNS["fid"]) == text
 
 
+def test_of_many_trainings_the_mean_is_shown(pages, stored, tmp_path):
+    """With its interval, by SciPy."""
+    values = [1.0, 2.0, 4.0, 3.0, 2.5]
+    for seed, value in enumerate(values):
+        path = tmp_path / f"emdm/many{f'_seed{seed}' if seed else ''}.json"
+        path.parent.mkdir(exist_ok=True)
+        rows = {"a": {"fid": {"value": value, "samples": 1}}}
+        columns = {"fid": {"title": "FID", "better": "lower"}}
+        whole = dict(title="t", transcribed="x", columns=columns, rows=rows)
+        path.write_text(stored.to_text(whole))
+    text = pages.Store(tmp_path).figure("emdm/many | a | fid | interval")
+    ends = scipy.stats.t.interval(0.95, 4, np.mean(values), scipy.stats.sem(values))
+    found = [float(x) for x in re.findall(r"\d+\.?\d*", text)]
+    np.testing.assert_allclose(found, [np.mean(values), *ends], atol=0.05)
+
+
 def test_differences_are_taken_within_trainings(pages, store, tmp_path):
     """By SciPy: 1, 2 and 4 less .5; a row beside itself differs by nothing."""
     marker = (
