@@ -16,7 +16,7 @@ from jaxmotion.data import bvh as bvh_motion
 from jaxmotion.data import bvh_text, walker
 from jaxmotion.export import slim, web
 from jaxmotion.motion.skeleton import global_transforms, joint_positions
-from jaxmotion.viz import packed, page, viewer
+from jaxmotion.viz import mannequin, packed, page, viewer
 from tests import tiny
 
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
@@ -270,6 +270,8 @@ def test_a_packed_body_is_unpacked():
         np.testing.assert_allclose(got, values.ravel(), rtol=1e-6)
     weights = arrays["weights"].astype(int)
     assert (weights.sum(axis=-1) == 255).all()
+    exact = mannequin.describe(skeleton).vertices
+    assert 0 < np.abs(arrays["positions"] - exact).max() < 1e-4
     for part in ("", "crowd."):
         count = len(arrays[f"{part}positions"])
         assert arrays[f"{part}faces"].max() == count - 1
