@@ -91,6 +91,20 @@ def make(name: str, exported: Exported, arguments: dict[str, Any]) -> Graph:
     return Graph(name=name, run=run, inputs=inputs, outputs=outputs[0])
 
 
+def together(graph: Graph, number: int) -> Graph:
+    """The graph of several characters at once, who are the first axis of all arrays."""
+
+    def lead(ports: tuple[Port, ...]) -> tuple[Port, ...]:
+        return tuple(dataclasses.replace(x, shape=(number, *x.shape)) for x in ports)
+
+    return Graph(
+        name=graph.name,
+        run=jax.vmap(graph.run),
+        inputs=lead(graph.inputs),
+        outputs=lead(graph.outputs),
+    )
+
+
 def ports(trees: dict[str, Any], *, before: str = "") -> tuple[Port, ...]:
     """The arrays of trees by their place, in the order of their leaves."""
     found = []

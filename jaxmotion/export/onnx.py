@@ -173,13 +173,24 @@ def _is_lost(eqn: core.JaxprEqn) -> bool:
     Of loops it ignores that they run backward, of products of two matrices that the
     first one is turned. What it makes of a choice between truth values does not run,
     and a slice that would reach beyond the end becomes shorter instead of moving back.
+    Of what `vmap` makes it knows no rows of another axis than the first one, and no
+    batch of a product that is not in front.
     """
     if eqn.primitive.name == "dynamic_slice":
         return True
+    if eqn.primitive.name == "gather":
+        numbers = eqn.params["dimension_numbers"]
+        return numbers.start_index_map != (0,) or bool(numbers.operand_batching_dims)
+    if eqn.primitive.name.startswith("scatter"):
+        numbers = eqn.params["dimension_numbers"]
+        axes = numbers.scatter_dims_to_operand_dims
+        return axes != (0,) and axes == numbers.inserted_window_dims and len(axes) == 1
     if eqn.primitive.name == "select_n":
         return _aval(eqn.invars[1]).dtype == bool and len(eqn.invars) == 3
     if eqn.primitive.name == "dot_general":
         (first, _), batch = eqn.params["dimension_numbers"]
+        if any(axes != tuple(range(len(axes))) for axes in batch):
+            return True
         return batch == ((), ()) and _aval(eqn.invars[0]).ndim == 2 and first == (0,)
     return eqn.primitive.name == "scan" and eqn.params["reverse"]
 
@@ -214,11 +225,12 @@ def _forward(traced: core.ClosedJaxpr, values: list) -> list:
             found = [(which & yes) | (~which & no)]
         elif eqn.primitive.name == "dynamic_slice":
             found = [_within(eqn, *given)]
+        elif eqn.primitive.name == "gather" and _is_lost(eqn):
+            found = [_gather(eqn, *given)]
+        elif eqn.primitive.name.startswith("scatter") and _is_lost(eqn):
+            found = [_scatter(eqn, *given)]
         elif _is_lost(eqn):
-            (_, second), batch = eqn.params["dimension_numbers"]
-            axes = {"dimension_numbers": (((1,), second), batch)}
-            product = eqn.primitive.bind(given[0].T, given[1], **eqn.params | axes)
-            found = [product]
+            found = [_product(eqn, *given)]
         else:
             found = one_equation(eqn, jaxpr, given)
         env.update(zip(eqn.outvars, found, strict=True))
@@ -233,6 +245,66 @@ def _within(eqn: core.JaxprEqn, values: Any, *starts: Any) -> Any:
         for start, whole, size in zip(starts, values.shape, sizes, strict=True)
     ]
     return jax.lax.dynamic_slice(values, kept, sizes)
+
+
+def _product(eqn: core.JaxprEqn, first: Any, second: Any) -> Any:
+    """A product with the axes of a batch in front, and what is summed next to it."""
+    summed, batch = eqn.params["dimension_numbers"]
+    number, ends = len(batch[0]), len(batch[0]) + len(summed[0])
+
+    def free(values: Any, side: int) -> list[int]:
+        return [i for i in range(values.ndim) if i not in (*summed[side], *batch[side])]
+
+    first = first.transpose(*batch[0], *free(first, 0), *summed[0])
+    second = second.transpose(*batch[1], *summed[1], *free(second, 1))
+    axes = tuple(range(first.ndim - len(summed[0]), first.ndim))
+    front = tuple(range(number))
+    numbers = ((axes, tuple(range(number, ends))), (front, front))
+    return eqn.primitive.bind(
+        first, second, **eqn.params | {"dimension_numbers": numbers}
+    )
+
+
+def _gather(eqn: core.JaxprEqn, values: Any, starts: Any) -> Any:
+    """Windows of an array, as elements of a flat one: a single axis of indices."""
+    numbers, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
+    out, found = _aval(eqn.outvars[0]).shape, jnp.int32(0)
+    outer = [i for i in range(len(out)) if i not in numbers.offset_dims]
+    gone = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    kept = [k for k in range(values.ndim) if k not in gone]
+    inner = dict(zip(kept, numbers.offset_dims, strict=True))
+    for k, (whole, size) in enumerate(zip(values.shape, sizes, strict=True)):
+        found = found * whole
+        if k in numbers.start_index_map:
+            start = starts[..., numbers.start_index_map.index(k)]
+            start = jnp.clip(start.astype(jnp.int32), 0, whole - size)
+            found = found + jax.lax.broadcast_in_dim(start, out, outer)
+        if k in numbers.operand_batching_dims:
+            place = numbers.operand_batching_dims.index(k)
+            axis = outer[numbers.start_indices_batching_dims[place]]
+            found = found + jax.lax.broadcasted_iota(jnp.int32, out, axis)
+        if k in inner:
+            found = found + jax.lax.broadcasted_iota(jnp.int32, out, inner[k])
+    return jnp.take(values.reshape(-1), found, mode="clip")
+
+
+def _scatter(eqn: core.JaxprEqn, values: Any, index: Any, updates: Any) -> Any:
+    """Changes of rows, with their axis in front."""
+    numbers = eqn.params["dimension_numbers"]
+    (axis,), window = numbers.scatter_dims_to_operand_dims, numbers.update_window_dims
+    outer = [i for i in range(updates.ndim) if i not in window]
+    numbers = numbers._replace(
+        update_window_dims=tuple(range(len(outer), updates.ndim)),
+        inserted_window_dims=(0,),
+        scatter_dims_to_operand_dims=(0,),
+    )
+    found = eqn.primitive.bind(
+        jnp.moveaxis(values, axis, 0),
+        index,
+        updates.transpose(*outer, *window),
+        **eqn.params | {"dimension_numbers": numbers},
+    )
+    return jnp.moveaxis(found, 0, axis)
 
 
 def _scan(eqn: core.JaxprEqn, consts: list, carry: list, rows: list) -> list:

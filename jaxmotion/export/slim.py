@@ -7,7 +7,9 @@ share, packed as 16-bit floats where those are the same numbers.
 """
 
 import hashlib
+import itertools
 import tempfile
+from collections.abc import Iterator, Set
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +77,9 @@ def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:
 
     found = onnx.load_model_from_string(_folded(model))
     _clean(found.graph)
-    _tell_apart(found.graph, set())
+    graph = found.graph
+    kept = {x.name for x in (*graph.input, *graph.output)}
+    _rename(graph, {name: name for name in kept}, itertools.count(), kept)
     for tensor in found.graph.initializer:
         values = onnx.numpy_helper.to_array(tensor)
         if values.nbytes >= LEAST_BYTES:
@@ -101,59 +105,47 @@ def _folded(model: bytes) -> bytes:
 
 
 def _clean(graph: Any) -> None:
-    """Takes out the shapes of inner values and texts, also in bodies of loops."""
+    """Takes out the shapes of inner values and what is for people, also in loops."""
     del graph.value_info[:]
     graph.doc_string = ""
     for node in graph.node:
-        node.doc_string = ""
+        node.name = node.doc_string = ""
         del node.metadata_props[:]
         for attribute in node.attribute:
             if attribute.HasField("g"):
                 _clean(attribute.g)
 
 
-def _tell_apart(graph: Any, taken: set[str]) -> None:
-    """Gives each value of a loop's body a name that no other value has.
+def _rename(
+    graph: Any,
+    names: dict[str, str],
+    numbers: Iterator[int],
+    kept: Set[str] = frozenset(),
+) -> None:
+    """Gives each value a short name that no other value has, also in bodies of loops.
 
     A body may hide names of the graph around it, but the browser's runtime refuses it.
 
     Args:
-      taken: Names of the graphs around and before it; its own are added.
+      names: New names of the values that the graphs around it have.
+      kept: Names that stay.
     """
-    taken |= {x.name for x in (*graph.input, *graph.initializer)}
-    taken |= {name for node in graph.node for name in node.output if name}
-    for node in graph.node:
-        for attribute in node.attribute:
-            if attribute.HasField("g"):
-                body = attribute.g
-                own = {x.name for x in (*body.input, *body.initializer)}
-                own |= {name for x in body.node for name in x.output if name}
-                _rename(body, {x: _free(x, taken) for x in sorted(own & taken)})
-                _tell_apart(body, taken)
-
-
-def _rename(graph: Any, names: dict[str, str]) -> None:
-    """Changes names of values, also where bodies of loops in it read them."""
+    own = [x.name for x in (*graph.input, *graph.initializer)]
+    own += [name for node in graph.node for name in node.output if name]
+    names = names | {x: str(next(numbers)) for x in own if x not in kept}
     for value in (*graph.input, *graph.output, *graph.initializer):
-        value.name = names.get(value.name, value.name)
+        value.name = names[value.name]
     for node in graph.node:
         for field in (node.input, node.output):
-            field[:] = [names.get(x, x) for x in field]
+            field[:] = [names[x] if x else "" for x in field]
         for attribute in node.attribute:
             if attribute.HasField("g"):
-                _rename(attribute.g, names)
+                _rename(attribute.g, names, numbers)
 
 
 def _is_half(values: np.ndarray) -> bool:
     with np.errstate(over="ignore"):
         return bool((values.astype(np.float16).astype(np.float32) == values).all())
-
-
-def _free(name: str, taken: set[str]) -> str:
-    while name in taken:
-        name += "_"
-    taken.add(name)
-    return name
 
 
 def _refer(tensor: Any, file: str, offset: int, length: int) -> None:

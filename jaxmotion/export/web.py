@@ -3,7 +3,8 @@
     index.html, page.js, worker.js, ort.wasm.packed, models.json
     <model>/character.bin.packed   skeleton, skinned mesh, starts, names of all arrays
     <model>/weights.bin.packed     constants that its graphs share
-    <model>/<graph>.onnx.packed
+    <model>/<graph>.onnx.packed, <graph>.crowd.onnx.packed    for one character, and for
+                                   several at once, of whom a crowd is made
 
 Any web server serves it: files are packed already, and the page unpacks them itself.
 The page is bundled from the sources in `viz/web` by npm and esbuild. models.json lists
@@ -37,6 +38,9 @@ SOURCES = Path(packed.__file__).with_name("web")
 WEIGHTS = "weights.bin"
 PACKED = ".packed"
 LIST = "models.json"
+# Characters of a crowd that one call moves, and for whom one call plans: a plan's time
+# is of its products, so that more of them would only take longer.
+TOGETHER, PLANS = 16, 4
 # What a graph takes besides noise, state and command.
 SETTINGS = {"scale": jnp.float32(1.0), "locks": jnp.bool_(True)}
 
@@ -132,14 +136,19 @@ def write_character(
             if key in graphs:
                 continue
             made = graph.make(which, function, arguments)
-            content = slim.slim(onnx.content(made), weights)
-            file = key.replace("@", ".") + onnx.SUFFIX
+            places = PLANS if key != "plan_level" and key[:4] == "plan" else TOGETHER
+            file, crowd = (
+                key.replace("@", ".") + more + onnx.SUFFIX for more in ("", ".crowd")
+            )
+            for one, name in ((made, file), (graph.together(made, places), crowd)):
+                content = slim.slim(onnx.content(one), weights)
+                written.append(_write(folder / name, content, say))
             graphs[key] = {
                 "file": file,
+                "crowd": {"file": crowd, "number": places},
                 "inputs": _ports(made.inputs),
                 "outputs": _ports(made.outputs),
             }
-            written.append(_write(folder / file, content, say))
     about = {
         "format": 1,
         "model": name,

@@ -241,3 +241,37 @@ def test_onnx_of_choices_and_slices(tmp_path):
             found = session.run(None, {k: np.array(v) for k, v in given.items()})
             for a, b in zip(found, one.run(*given.values()), strict=True):
                 np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.slow
+def test_onnx_of_several_characters_at_once():
+    """Rows and windows of inner axes, by indices of all and of each, and products."""
+    pytest.importorskip("jax2onnx")
+    pick = jnp.array([3, 1, 1])
+
+    def run(x, matrix, at):  # x: [4, 3, 5]
+        rows = x[pick] + x[:, pick[1:]][jnp.array([0, 2, 3]), :1]
+        window = jax.lax.dynamic_slice(x, (at, 0, at + 1), (2, 3, 2))
+        each = jnp.take_along_axis(x, jnp.argmax(x, axis=1, keepdims=True), axis=1)
+        changed = x.at[pick[:2]].set(2.0).at[:, 1].add(x[:, 0]).at[..., 4].max(0.0)
+        turned = jnp.einsum("ij,jk,lk->il", matrix, matrix, matrix) @ x[0]
+        other = jnp.stack([matrix, matrix.T])[at % 2] @ x[1]
+        return rows, window, each, changed, turned + other
+
+    gives = ("rows", "window", "each", "changed", "turned")
+    arguments = {"x": jnp.ones((4, 3, 5)), "matrix": jnp.ones((3, 3))}
+    arguments["at"] = jnp.int32(0)
+    one = graph.make("run", Exported(run, tuple(arguments), gives), arguments)
+    draw = np.random.default_rng(3).standard_normal
+    x, matrix = draw((6, 4, 3, 5), np.float32), draw((6, 3, 3), np.float32)
+    at = np.array([0, 1, 2, 3, 9, -4], np.int32)  # the last ones reach beyond the ends
+    given = {"x": x, "matrix": matrix, "at": at}
+    session = onnx.open_session(onnx.content(graph.together(one, 6)))
+    wanted = jax.vmap(run)(*given.values())
+    for a, b in zip(session.run(None, given), wanted, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    single = onnx.open_session(onnx.content(one))
+    for i in range(6):
+        found = single.run(None, {k: np.array(v[i]) for k, v in given.items()})
+        for a, b in zip(found, wanted, strict=True):
+            np.testing.assert_allclose(a, b[i], atol=1e-5)

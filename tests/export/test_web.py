@@ -166,6 +166,35 @@ def plays_as_jax_does(packages, folder, character, *, locks):
     return said
 
 
+def moves_a_crowd_as_one_by_one(packages, folder, character, *, locks, people=11):
+    """Whether one call for several gives each what a call of their own does."""
+    steps, noise = character.tuning.own_steps, folder / "noise.f32"
+    np.random.default_rng(0).standard_normal(200_000, np.float32).tofile(noise)
+    asked = {
+        "steps": steps,
+        "people": people,
+        "commands": course(character.fps, character.labels),
+        "noise": str(noise),
+        "scale": float(character.tuning.scale),
+        "locks": locks,
+    }
+    shown, said = [], []
+    for several in (False, True):
+        out = folder / "shown.f32"
+        said.append(play(packages, folder, several=several, out=str(out), **asked))
+        assert "error" not in said[-1], said
+        frames = np.fromfile(out, np.float32)
+        shown.append(frames.reshape(len(asked["commands"]), people, -1))
+    alone, together = shown
+    away = np.linalg.norm((together - alone)[..., :3], axis=-1).max()
+    turns = [x[..., 3:].reshape(*x.shape[:2], -1, 6) for x in shown]
+    turned = angles(*turns).max()
+    print(f"root {away:.2e} m, rotations {turned:.2e} degrees, {said}")
+    assert not said[0]["crowds"] and said[1]["crowds"] == said[1]["graphs"]
+    assert np.ptp(alone[..., 2]) > 3
+    assert away < 1e-3 and turned < 0.5
+
+
 def test_an_unknown_number_of_steps_is_one_line():
     character = strider()[0]
     assert web.step_choices(character, (2, 2, 8)) == (2, 8)
@@ -222,6 +251,7 @@ def test_a_character_plays_in_the_browsers_runtime(packages, tmp_path):
     web.write_character(tmp_path, "strider", character, tick(character), steps=(2,))
     said = plays_as_jax_does(packages, tmp_path, character, locks=False)
     assert said["graphs"] == ["plan_level", "plan@2", "advance", "plan@8"]
+    moves_a_crowd_as_one_by_one(packages, tmp_path, character, locks=False)
     path = tmp_path / "advance.onnx.packed"
     path.write_bytes(web.pack(lzma.decompress(path.read_bytes())[:-400]))
     error = play(packages, tmp_path)["error"]
@@ -238,6 +268,7 @@ def test_a_shipped_model_plays_as_in_jax(packages, tmp_path, name):
     character = shipped(name)
     web.write_character(tmp_path, name, character, tick(character))
     plays_as_jax_does(packages, tmp_path, character, locks=True)
+    moves_a_crowd_as_one_by_one(packages, tmp_path, character, locks=True)
 
 
 @NODE

@@ -1,7 +1,9 @@
 // Plays a character of the page's folder in onnxruntime-web, with noise from a file.
 // Usage: node web.mjs <modules of the page> <folder with node_modules> <character>
-//   < {"steps", "start", "scale", "locks", "commands": [...], "noise": file, "out": file}
-// Writes root and rotations of every tick as float32; with no commands, only opens all.
+//   < {"steps", "start", "scale", "locks", "commands": [...], "noise": file, "out": file,
+//      "people": number, "several": whether one call moves several of them}
+// Writes root and rotations of every tick as float32, of one person after the other; with
+// no commands, only opens all. Several people get the same noise for each plan.
 
 import { readFileSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
@@ -16,13 +18,21 @@ ort.env.wasm.numThreads = 1;
 
 let at = 0;
 const noise = asked.noise && new Float32Array(readFileSync(asked.noise).buffer.slice(0));
-const draw = count => (noise ? noise.slice(at, at += count) : new Float32Array(count));
+const draw = count => {
+  if (asked.people > 1) return noise.slice(0, count);
+  return noise ? noise.slice(at, at += count) : new Float32Array(count);
+};
 const { unpacked } = await import(pathToFileURL(`${modules}/packing.js`));
 const read = file => unpacked(new Uint8Array(readFileSync(`${folder}/${file}.packed`)));
 try {
   const model = await new Model(ort, read, draw).open("character");
-  for (const steps of model.about.steps) await model.prepare(steps);
-  const state = model.start(asked.start || 0), made = [], { scale, locks } = asked;
+  const { people = 1, several, scale, locks } = asked, all = [...Array(people).keys()];
+  for (const steps of model.about.steps) {
+    await model.prepare(steps);
+    if (several !== false) await model.gather(Infinity, steps);
+  }
+  const labels = model.about.labels ? Math.max(model.about.labels.length, 1) : 1;
+  const states = all.map(i => model.start(i ? i % labels : asked.start || 0)), made = [];
   const ms = { level: [], plan: [], show: [] };
   const timed = async (name, call) => {
     const began = performance.now(), found = await call;
@@ -30,17 +40,24 @@ try {
     return found;
   };
   let plans = 0;
-  for (const command of asked.commands) {
-    const told = model.told({ ...command, scale, locks });
-    const level = await timed("level", model.level(state, told));
-    if (level) { plans += 1; await timed("plan", model.plan(level, asked.steps, state, told)); }
-    const shown = await timed("show", model.show(state, told, asked.steps));
-    made.push(...shown.root, ...shown.rotation);
+  for (let t = 0; t < asked.commands.length; t++) {
+    // Others are told the same, later.
+    const told = all.map(i => model.told({
+      ...asked.commands[Math.max(t - 11 * i, 0)], scale, locks }));
+    const levels = await timed("level", model.levels(states, told));
+    for (const level of new Set(levels)) {
+      if (!level) continue;
+      const now = all.filter(i => levels[i] === level), of = x => now.map(i => x[i]);
+      plans += now.length;
+      await timed("plan", model.plan(level, asked.steps, of(states), of(told)));
+    }
+    for (const shown of await timed("show", model.show(states, told, asked.steps)))
+      made.push(...shown.root, ...shown.rotation);
   }
   if (asked.out) writeFileSync(asked.out, new Uint8Array(Float32Array.from(made).buffer));
   const middle = x => x.sort((a, b) => a - b)[x.length >> 1] || 0;
   process.stdout.write(JSON.stringify({
-    graphs: Object.keys(model.graphs), plans, noise: at,
+    graphs: Object.keys(model.graphs), crowds: Object.keys(model.crowds), plans, noise: at,
     ms: Object.fromEntries(Object.entries(ms).map(([k, v]) => [k, middle(v)])),
   }));
 } catch (error) {

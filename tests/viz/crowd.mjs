@@ -25,15 +25,27 @@ const GRAPHS = {
     };
   },
 };
+const TOGETHER = 4, calls = {};
 const runtime = () => ({
   Tensor, env: { wasm: {} },
   InferenceSession: {
     create: async bytes => {
-      const name = new TextDecoder().decode(bytes), inputNames = [
-        "state.age", "state.z", "command.velocity"];
-      return { inputNames, run: async given => Object.fromEntries(
-        Object.entries(GRAPHS[name](given)).map(([key, values]) => [
-          key, new Tensor("float32", Float32Array.from(values), [values.length])])) };
+      const [name, several] = new TextDecoder().decode(bytes).split("."), inputNames = [
+        "state.age", "state.z", "command.velocity"], made = {}, number = several ? TOGETHER : 1;
+      const row = (given, i) => Object.fromEntries(Object.entries(given).map(([key, x]) => {
+        const each = x.data.length / number;
+        if (several && x.dims[0] !== TOGETHER) throw new Error(`${key} of no crowd`);
+        return [key, { data: x.data.slice(each * i, each * (i + 1)) }];
+      }));
+      return { inputNames, run: async given => {
+        calls[name] = [...(calls[name] || []), number];
+        const rows = [...Array(number).keys()].map(i => GRAPHS[name](row(given, i)));
+        for (const key of Object.keys(rows[0])) {
+          const data = Float32Array.from(rows.flatMap(x => x[key]));
+          made[key] = new Tensor("float32", data, [data.length]);
+        }
+        return { ...made };
+      } };
     },
   },
 });
@@ -50,12 +62,13 @@ globalThis.Worker = class {
 
 const settings = { label: 0, scale: 1, foot_lock: true, num_steps: 2, speed: 1.5, engine: 1, plan: false };
 const inputs = { held: ["forward"], azimuth: 0, target: null };
-async function play(most) {
+async function play(most, several = false) {
   const model = await new Model(runtime(), read).open("stub");
   await model.prepare(2);
   const crowd = new Crowd(model, settings, m => new Helper("http://here/", m, null), most);
   const seen = [], people = async number => {
     while (crowd.needs(number)) await crowd.enlist(2);
+    if (several) await crowd.prepare(2, number);
     crowd.resize(number);
     let data;
     for (let i = 0; i < 20; i++) data = await crowd.next(inputs, 30);
@@ -71,5 +84,7 @@ async function play(most) {
   crowd.close();
   return seen;
 }
-const alone = await play(1), helped = await play(3);
-process.stdout.write(JSON.stringify({ alone, helped, asked }));
+const alone = await play(1), single = { ...calls };
+for (const name of Object.keys(calls)) delete calls[name];
+const together = await play(1, true), several = { ...calls }, helped = await play(3);
+process.stdout.write(JSON.stringify({ alone, together, helped, asked, single, several }));

@@ -179,8 +179,10 @@ def test_formations_are_the_same():
 def test_a_crowd_walks_the_same_on_several_cores():
     """Helpers behind messages, as Workers are; graphs are written in the script."""
     joint = {"names": ["a"], "parents": [-1], "offsets": [[0.0, 0.0, 0.0]]}
+    sizes = {"command.velocity": 2, "out.frame.root_position": 3}
+    sizes |= {"out.frame.joint_rotation": 6}
     port = lambda *names: [  # noqa: E731
-        {"name": x, "dtype": "float32", "shape": [1]} for x in names
+        {"name": x, "dtype": "float32", "shape": [sizes.get(x, 1)]} for x in names
     ]
     graphs = {
         "plan_level": (port("state.age"), port("out.level")),
@@ -196,7 +198,12 @@ def test_a_crowd_walks_the_same_on_several_cores():
         "fps": 30,
         "patience": 30,
         "graphs": {
-            name: {"file": name, "inputs": takes, "outputs": gives}
+            name: {
+                "file": name,
+                "crowd": {"file": f"{name}.crowd", "number": 4},
+                "inputs": takes,
+                "outputs": gives,
+            }
             for name, (takes, gives) in graphs.items()
         },
         "runs": {2: list(graphs)},
@@ -204,7 +211,9 @@ def test_a_crowd_walks_the_same_on_several_cores():
         "weights": {"file": "weights", "parts": []},
     }
     starts = {f"state.{x}": np.zeros((1, 1), np.float32) for x in ("age", "z")}
-    files = {name: name.split("@")[0].encode() for name in graphs}
+    kinds = {x: x.split("@")[0] for x in graphs}
+    files = {name: kind.encode() for name, kind in kinds.items()}
+    files |= {f"{name}.crowd": f"{kind}.crowd".encode() for name, kind in kinds.items()}
     files |= {"character.bin": packed.pack(about, starts), "weights": b""}
     done = subprocess.run(
         ["node", str(Path(__file__).with_name("crowd.mjs")), str(WEB)],
@@ -214,8 +223,15 @@ def test_a_crowd_walks_the_same_on_several_cores():
     )
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads(done.stdout)
-    for one, other in zip(found["alone"], found["helped"], strict=True):
-        np.testing.assert_allclose(one["roots"], other["roots"], atol=1e-6)
+    for way in ("together", "helped"):
+        for one, other in zip(found["alone"], found[way], strict=True):
+            np.testing.assert_allclose(one["roots"], other["roots"], atol=1e-6)
+    # Nine are two calls of four and one of one; two are moved one by one.
+    assert set(found["single"]["advance"]) == {1}
+    several = found["several"]["advance"]
+    assert several[:60] == [4, 4, 1] * 20 and several[60:80] == [4] * 20
+    assert several[80:180] == [4, 4, 4, 1, 1] * 20 and several[180:] == [1] * 40
+    assert 4 in found["several"]["plan"]
     last = [np.reshape(x["roots"], (-1, 3)) for x in found["helped"]]
     assert [len(x) for x in last] == [9, 3, 14, 2]
     # All walked for as long as they were there, and from the start after a reset.

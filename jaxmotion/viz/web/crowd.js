@@ -56,11 +56,15 @@ export class Crowd {
   // Another group, ready to be used.
   async enlist(steps) {
     const made = this.helper(this.model);
-    await made.prepare(steps);
+    // Others come while it is made: it is ready for a crowd.
+    await made.prepare(steps, Infinity);
     this.groups.push(made);
   }
 
-  prepare(steps) { return Promise.all(this.groups.map(group => group.prepare(steps))); }
+  // Graphs for a number of diffusion steps and of characters.
+  prepare(steps, number) {
+    return Promise.all(this.groups.map(group => group.prepare(steps, number)));
+  }
 
   close() { for (const group of this.groups.slice(1)) group.close(); }
 

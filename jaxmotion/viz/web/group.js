@@ -15,8 +15,11 @@ export class Group {
       people.push({ state: this.model.start(label), told: null, waited: 0 });
   }
 
-  // Graphs for a number of diffusion steps.
-  prepare(steps) { return this.model.prepare(steps); }
+  // Graphs for a number of diffusion steps, and of people.
+  async prepare(steps, number = 1) {
+    await this.model.prepare(steps);
+    await this.model.gather(number, steps);
+  }
 
   // How many one core moves in real time, from what the last ticks took.
   get bears() {
@@ -32,27 +35,29 @@ export class Group {
     const began = performance.now(), { model, people } = this;
     const command = model.told(told), { patience } = model.about;
     let planned = 0;
-    const asked = [];
-    for (const one of people) {
-      const level = await model.level(one.state, command);
-      if (!level) { one.told = command; one.waited = 0; continue; }
-      one.waited += 1;
-      asked.push([one, level]);
-    }
+    const states = people.map(one => one.state), all = people.map(() => command);
+    const levels = await model.levels(states, all);
+    people.forEach((one, i) => {
+      one.level = levels[i]; one.waited = levels[i] ? one.waited + 1 : 0;
+      if (!one.level) one.told = command;
+    });
     // Who has waited longest comes first; who cannot wait any longer plans in any case.
-    asked.sort((a, b) => b[0].waited - a[0].waited);
-    for (const [one, level] of asked) {
-      const must = !one.told || one.waited > Math.max(patience - 2, 0);
-      const late = performance.now() - began + this.planMs > slack;
-      if (!must && (planned || people.length === 1) && late) continue;
+    let asked = people.filter(one => one.level).sort((a, b) => b.waited - a.waited);
+    const must = one => !one.told || one.waited > Math.max(patience - 2, 0);
+    while (asked.length) {
+      const { level } = asked[0], same = asked.filter(one => one.level === level);
+      const most = model.share(model.planner(level, steps), same.length);
+      const now = same.slice(0, most), hurry = now.some(must);
+      asked = asked.filter(one => !now.includes(one));
+      const late = performance.now() - began + this.planMs * most > slack;
+      if (!hurry && (planned || people.length === 1) && late) continue;
       const from = performance.now();
-      await model.plan(level, steps, one.state, command);
-      this.planMs += 0.2 * (performance.now() - from - this.planMs);
-      one.told = command; one.waited = 0; planned += 1;
+      await model.plan(level, steps, now.map(one => one.state), now.map(() => command));
+      this.planMs += 0.2 * ((performance.now() - from) / most - this.planMs);
+      for (const one of now) { one.told = command; one.waited = 0; }
+      planned += most;
     }
-    const shown = [];
-    for (const one of people)
-      shown.push(await model.show(one.state, one.told || command, steps));
+    const shown = await model.show(states, people.map(one => one.told || command), steps);
     if (!planned && people.length) this.tickMs += 0.2 * (performance.now() - began - this.tickMs);
     const { planMs, tickMs, bears } = this;
     const rest = plan ? model.rest(people[0].state) : null;
@@ -94,7 +99,7 @@ export class Helper {
     });
   }
 
-  prepare(steps) { return this.call("prepare", steps); }
+  prepare(steps, number = 1) { return this.call("prepare", steps, number); }
   resize(number, label) { return this.call("resize", number, label); }
   async next(tick) {
     const made = await this.call("next", tick), { planMs, tickMs, bears } = made;

@@ -19,6 +19,8 @@ function oneLine(error) {
   return text.length > 160 ? `... ${text.slice(-150)}` : text;
 }
 
+// So many characters are moved by one call for several, which costs about two of one.
+const FEW = 3;
 // Milliseconds in which a graph is made without anybody noticing.
 const QUICK = 700;
 const KINDS = { float32: Float32Array, int32: Int32Array, bool: Uint8Array };
@@ -56,7 +58,7 @@ export class Model {
   // ort: onnxruntime-web; read: (file name) -> promise of its bytes, unpacked; draw:
   // (count) -> noise.
   constructor(ort, read, draw = normals) {
-    Object.assign(this, { ort, read, draw, graphs: {}, left: [] });
+    Object.assign(this, { ort, read, draw, graphs: {}, crowds: {}, left: [] });
   }
 
   // Reads the character and what it needs first; rejects with an Error in one line.
@@ -89,8 +91,21 @@ export class Model {
     while (this.left.length) await this.make(this.left.shift());
   }
 
-  async make(name) {
-    const { file, inputs, outputs } = this.about.graphs[name];
+  // The graphs that move several characters at once, if there are so many.
+  async gather(number, steps) {
+    if (number < FEW) return;
+    for (const name of this.about.runs[steps]) if (!this.crowds[name]) await this.make(name, true);
+  }
+
+  // How many of a number of characters one call of a graph moves.
+  share(name, number) {
+    const most = this.crowds[name] && number >= FEW ? this.about.graphs[name].crowd.number : 1;
+    return Math.min(number, most);
+  }
+
+  async make(name, crowd = false) {
+    const about = this.about.graphs[name], { inputs, outputs } = about;
+    const { file } = crowd ? about.crowd : about;
     const bytes = await this.read(file);
     let session;
     try {
@@ -104,7 +119,7 @@ export class Model {
       throw new Error(`${this.name}/${file} is no graph that runs here: ${oneLine(error)}`);
     }
     const taken = new Set(session.inputNames);
-    this.graphs[name] = { session, outputs, inputs: inputs.filter(x => taken.has(x.name)) };
+    (crowd ? this.crowds : this.graphs)[name] = { session, outputs, inputs: inputs.filter(x => taken.has(x.name)) };
   }
 
   // How a character of a label starts: its arrays by name.
@@ -131,14 +146,29 @@ export class Model {
     };
   }
 
-  // Calls a graph; what it says of the state is the state from now on. Returns the rest.
-  async call(name, state, told) {
-    const { session, inputs, outputs } = this.graphs[name], given = {};
+  // Calls a graph for characters; what it says of their states is these from now on.
+  // Returns the rest, one for each.
+  async call(name, states, told) {
+    const made = [];
+    while (made.length < states.length) {
+      const from = made.length, to = from + this.share(name, states.length - from);
+      made.push(...await this.run(name, states.slice(from, to), told.slice(from, to)));
+    }
+    return made;
+  }
+
+  async run(name, states, told) {
+    const several = states.length > 1, { ort } = this, given = {};
+    const { session, inputs, outputs } = (several ? this.crowds : this.graphs)[name];
+    const places = several ? this.about.graphs[name].crowd.number : 1;
+    const lead = several ? [places] : [];
     for (const { name, dtype, shape } of inputs) {
-      const found = name.startsWith("noise")
-        ? new this.ort.Tensor(dtype, this.draw(size(shape)), shape)
-        : state[name] || told[name];
-      given[name] = found;
+      const each = size(shape), data = new KINDS[dtype](places * each);
+      const own = states.map((state, i) => name.startsWith("noise") ? this.draw(each)
+        : (state[name] || told[i][name]).data);
+      // Places that are left have somebody, too, whom nobody sees.
+      for (let i = 0; i < places; i++) data.set(own[Math.min(i, own.length - 1)], i * each);
+      given[name] = new ort.Tensor(dtype, data, [...lead, ...shape]);
     }
     let made;
     try {
@@ -146,34 +176,37 @@ export class Model {
     } catch (error) {
       throw new Error(`${this.name}: ${name} failed: ${oneLine(error)}`);
     }
-    const rest = {};
-    for (const { name } of outputs) {
-      const inner = name.slice(4);  // without "out."
-      if (inner in state) state[inner] = made[name]; else rest[inner] = made[name];
-    }
-    return rest;
+    return states.map((state, i) => {
+      const rest = {};
+      for (const { name, shape } of outputs) {
+        const inner = name.slice(4), each = size(shape), { type, data } = made[name];
+        const own = new ort.Tensor(type, data.slice(each * i, each * (i + 1)), shape);
+        if (inner in state) state[inner] = own; else rest[inner] = own;
+      }
+      return rest;
+    });
   }
 
-  // Which plan a tick needs, 0 for none; of who makes a frame at a time, null.
-  async level(state, told) {
-    if (!this.graphs.plan_level) return null;
-    return Number((await this.call("plan_level", state, told)).level.data[0]);
+  // Which plan each needs in a tick, 0 for none.
+  async levels(states, told) {
+    if (!this.graphs.plan_level) return states.map(() => 0);
+    return (await this.call("plan_level", states, told)).map(x => Number(x.level.data[0]));
   }
 
-  async plan(level, steps, state, told) {
+  planner(level, steps) { return `plan${level > 1 ? `_${level}` : ""}@${steps}`; }
+
+  async plan(level, steps, states, told) {
     if (level > 1) await this.finish();
-    await this.call(`plan${level > 1 ? `_${level}` : ""}@${steps}`, state, told);
+    await this.call(this.planner(level, steps), states, told);
   }
 
-  // The next frame.
-  async show(state, told, steps) {
-    const made = await this.call(this.graphs.advance ? "advance" : `step@${steps}`, state,
-      told);
-    const ball = made["frame.extra.ball"];
-    return {
+  // The next frame of each.
+  async show(states, told, steps) {
+    const name = this.graphs.advance ? "advance" : `step@${steps}`;
+    return (await this.call(name, states, told)).map(made => ({
       root: made["frame.root_position"].data, rotation: made["frame.joint_rotation"].data,
-      ball: ball ? ball.data : null,
-    };
+      ball: made["frame.extra.ball"] ? made["frame.extra.ball"].data : null,
+    }));
   }
 
   // The pose of a start, which is there before any graph is; null where none is stored.

@@ -104,6 +104,7 @@ async function choose(name, wish = {}, runtime = null) {
     next.read(about.graphs[name].file).catch(() => {});
   await runtime;
   await next.prepare(state.num_steps, true);
+  await next.gather(state.characters, state.num_steps);
   const made = new Crowd(next, state, helper, most);
   while (made.needs(state.characters)) await made.enlist(state.num_steps);
   crowd = made;
@@ -136,11 +137,12 @@ const CHANGES = {
   async num_steps(value) {
     if (!state.steps.includes(value)) throw new Error(`${value} steps are none offered`);
     note(`loading ${value} steps`);
-    await crowd.prepare(value);
+    await crowd.prepare(value, state.characters);
     state.num_steps = value; state.note = "";
   },
   async characters(value) {
     state.characters = value;
+    await crowd.prepare(state.num_steps, value);
     if (!crowd.needs(value)) { crowd.resize(value); return; }
     // Who is there goes on until another core is ready.
     const grown = crowd;
