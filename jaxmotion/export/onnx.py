@@ -21,6 +21,12 @@ from jaxmotion.diffusion.noise import loop_parts, one_equation
 from jaxmotion.export.graph import Batch, Graph, Port
 
 SUFFIX = ".onnx"
+# What becomes of a row and what comes to it.
+_CHANGES = {
+    "scatter": lambda old, new: new,
+    "scatter-add": jnp.add,
+    "scatter-max": jnp.maximum,
+}
 _MISSING = (
     'files of ONNX need packages that are not installed: pip install -e ".[export]"'
 )
@@ -181,7 +187,7 @@ def _is_lost(eqn: core.JaxprEqn) -> bool:
     if eqn.primitive.name == "gather":
         numbers = eqn.params["dimension_numbers"]
         return numbers.start_index_map != (0,) or bool(numbers.operand_batching_dims)
-    if eqn.primitive.name.startswith("scatter"):
+    if eqn.primitive.name in _CHANGES:
         numbers = eqn.params["dimension_numbers"]
         axes = numbers.scatter_dims_to_operand_dims
         return axes != (0,) and axes == numbers.inserted_window_dims and len(axes) == 1
@@ -227,7 +233,7 @@ def _forward(traced: core.ClosedJaxpr, values: list) -> list:
             found = [_within(eqn, *given)]
         elif eqn.primitive.name == "gather" and _is_lost(eqn):
             found = [_gather(eqn, *given)]
-        elif eqn.primitive.name.startswith("scatter") and _is_lost(eqn):
+        elif eqn.primitive.name in _CHANGES and _is_lost(eqn):
             found = [_scatter(eqn, *given)]
         elif _is_lost(eqn):
             found = [_product(eqn, *given)]
@@ -289,22 +295,20 @@ def _gather(eqn: core.JaxprEqn, values: Any, starts: Any) -> Any:
 
 
 def _scatter(eqn: core.JaxprEqn, values: Any, index: Any, updates: Any) -> Any:
-    """Changes of rows, with their axis in front."""
-    numbers = eqn.params["dimension_numbers"]
+    """Changes of rows one after the other, each where a mask of their axis says.
+
+    In loops the converter takes the number of changes for that of the loop's steps.
+    """
+    numbers, change = eqn.params["dimension_numbers"], _CHANGES[eqn.primitive.name]
     (axis,), window = numbers.scatter_dims_to_operand_dims, numbers.update_window_dims
     outer = [i for i in range(updates.ndim) if i not in window]
-    numbers = numbers._replace(
-        update_window_dims=tuple(range(len(outer), updates.ndim)),
-        inserted_window_dims=(0,),
-        scatter_dims_to_operand_dims=(0,),
-    )
-    found = eqn.primitive.bind(
-        jnp.moveaxis(values, axis, 0),
-        index,
-        updates.transpose(*outer, *window),
-        **eqn.params | {"dimension_numbers": numbers},
-    )
-    return jnp.moveaxis(found, 0, axis)
+    rest = [size for i, size in enumerate(values.shape) if i != axis]
+    rows = updates.transpose(*outer, *window).reshape(-1, *rest)
+    place = jnp.arange(values.shape[axis]).reshape(-1, *[1] * (values.ndim - axis - 1))
+    for at, row in zip(index.reshape(-1), rows, strict=True):
+        changed = change(values, jnp.expand_dims(row, axis))
+        values = jnp.where(place == at, changed, values)
+    return values
 
 
 def _scan(eqn: core.JaxprEqn, consts: list, carry: list, rows: list) -> list:
