@@ -190,7 +190,7 @@ def moves_a_crowd_as_one_by_one(packages, folder, character, *, locks, people=11
     turns = [x[..., 3:].reshape(*x.shape[:2], -1, 6) for x in shown]
     turned = angles(*turns).max()
     print(f"root {away:.2e} m, rotations {turned:.2e} degrees, {said}")
-    assert not said[0]["crowds"] and said[1]["crowds"] == said[1]["graphs"]
+    assert not said[0]["crowds"] and set(said[1]["crowds"]) == set(said[1]["graphs"])
     assert np.ptp(alone[..., 2]) > 3
     assert away < 1e-3 and turned < 0.5
 
