@@ -290,5 +290,5 @@ def test_a_sampler_of_emdm_opens_in_the_browsers_runtime(packages, tmp_path):
     content = web.packed.pack(about, {})
     (tmp_path / "character.bin.packed").write_bytes(web.pack(content))
     (tmp_path / "weights.bin.packed").write_bytes(web.pack(weights.packed()))
-    said = play(packages, tmp_path)
+    said = play(packages, tmp_path, several=False)
     assert said["graphs"] == list(graphs) and "error" not in said
