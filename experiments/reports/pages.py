@@ -259,7 +259,7 @@ def _claims(store: Store, name: str, options: dict[str, Any], page: Path) -> lis
             if any(one.row(name).ours for name in claim.rows):
                 own = _verdict(one.ours, claim, found)
             lines.append([*_claim(one, claim, found), own])
-    titles = ("table", "claim", "paper", "here", "verdict", "by our recipe")
+    titles = ("table", "claim", "paper", "here", "verdict", "our variant")
     return markdown.table_lines(titles, lines)
 
 
