@@ -128,10 +128,8 @@ def needed(args: Config, sources: list[Source]) -> int:
     if there < args.least:
         return args.least
     jobs = [job_of(args, sources, seed) for seed in range(there)]
-    found = {
-        x: results.read_trainings([job.measured(list(job.files)[i]) for job in jobs])
-        for i, x in enumerate(sources)
-    }
+    paths = zip(*(map(job.measured, job.files) for job in jobs), strict=True)
+    found = dict(zip(sources, map(results.read_trainings, paths), strict=True))
     made = [verdicts.decide(table, claim, found).verdict for table, claim in claims]
     return min(there + ("not decided" in made), args.most)
 

@@ -64,9 +64,8 @@ def pages(root: Path = ROOT) -> list[Path]:
 # --- figures ------------------------------------------------------------------------
 
 
-def _mean(values: np.ndarray) -> Cell:
+def _mean(spread: statistics.Spread) -> Cell:
     """A mean over trainings with its 95 % interval."""
-    spread = statistics.spread(values)
     low, high = verdicts.interval(spread)
     return Cell(value=float(spread.mean), low=low, high=high)
 
@@ -92,7 +91,9 @@ def text_of(cells: list[Cell], column: columns.Column, *, interval: bool = True)
     if len(cells) > SHOWN and all(math.isfinite(x.value) for x in cells):
         values = np.array([x.value for x in cells])
         if np.ptp(values):
-            return text_of([_mean(values)], column, interval=interval)
+            return text_of(
+                [_mean(statistics.spread(values))], column, interval=interval
+            )
     if len(cells) > 1 and len({x.value for x in cells}) > 1:
         return " / ".join(
             markdown.number(x.value) if math.isfinite(x.value) else _NOTHING
@@ -215,7 +216,9 @@ def _difference(one: Stored, row: str, other: str, column: columns.Column) -> st
     own = np.array([a.value - b.value for a, b in pairs if a and b])
     if own.size < 2 or not np.isfinite(own).all():
         return _NOTHING
-    return text_of([_mean(own)], dataclasses.replace(column, kind="mean"))
+    return text_of(
+        [_mean(statistics.spread(own))], dataclasses.replace(column, kind="mean")
+    )
 
 
 def _grid(store: Store, name: str, options: dict[str, Any], page: Path) -> list[str]:
@@ -294,9 +297,7 @@ def _claim(one: Table, claim: Claim, found: stored.Found) -> list[str]:
         cells = [x for x in verdicts.cells_of(one, row, column, found) if x]
         spread = verdicts.over_trainings(one, row, column, found)
         if spread is not None and math.isfinite(spread.mean):
-            low, high = verdicts.interval(spread)
-            mean = Cell(value=float(spread.mean), low=low, high=high)
-            here.append(f"{short} {text_of([mean], _plain(column))}")
+            here.append(f"{short} {text_of([_mean(spread)], _plain(column))}")
         elif cells:
             here.append(f"{short} {text_of(cells[:1], _plain(column))}")
     return [
