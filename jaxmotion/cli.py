@@ -110,8 +110,7 @@ LIMITS: dict[str, Range] = {
 def check(args: Arguments) -> Arguments:
     """Raises for an option out of range, before any work; None stands for a default.
 
-    Raises:
-      ValueError: names the option, its value and what is expected.
+    The `ValueError` names the option, its value and what is expected.
     """
     for field in dataclasses.fields(args):  # pyright: ignore[reportArgumentType]
         value = getattr(args, field.name)
@@ -141,8 +140,7 @@ def chosen_rows(args: Any, every: tuple[str, ...] = ()) -> tuple[str, ...]:
 def out_folder(args: Any, name: str) -> Path:
     """Folder that a command writes to: `args.out`, or one of that name in `args.run`.
 
-    Raises:
-      OSError: if it cannot be written, before any work.
+    `OSError` if it cannot be written, before any work.
     """
     out = args.out or args.run / name
     check_writable(out)
@@ -210,10 +208,8 @@ def announce(what: str, seconds: int) -> None:
 def start(main: Callable[[], None]) -> None:
     """Runs a script.
 
-    Raises:
-      SystemExit: with one line and status 1 after bad input, a training that diverged,
-        a device without enough memory, or another process that died; with status 130
-        after Ctrl-C.
+    It exits with one line and status 1 after bad input, a training that diverged, a
+    device without enough memory, or another process that died; with 130 after Ctrl-C.
     """
     try:
         main()
@@ -242,10 +238,7 @@ def is_local(host: str | None) -> bool:
 def check_address(host: str, port: int) -> None:
     """Raises if an address cannot be listened on; before minutes of compiling.
 
-    Warns where other machines may reach it.
-
-    Raises:
-      OSError: names the address.
+    Warns where other machines may reach it; the `OSError` names the address.
     """
     if not is_local(host):
         print(

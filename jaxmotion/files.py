@@ -32,11 +32,7 @@ CLIPS_MAKER = (
 
 
 def open_regular(path: str | os.PathLike) -> BinaryIO:
-    """Opens a file for reading, unless it is a pipe or a device, which may never end.
-
-    Raises:
-      OSError: if it is none, or cannot be read; names it.
-    """
+    """Opens a file for reading, unless it is a pipe or a device (`OSError`)."""
     path = os.fspath(path)
     # Before opening: to open a pipe is to wait for its other end.
     mode = os.stat(path).st_mode
@@ -46,11 +42,7 @@ def open_regular(path: str | os.PathLike) -> BinaryIO:
 
 
 def read_bytes(path: str | os.PathLike) -> bytes:
-    """Content of a regular file.
-
-    Raises:
-      OSError: see `open_regular`.
-    """
+    """Content of a regular file; see `open_regular`."""
     with open_regular(path) as file:
         return file.read()
 
@@ -60,9 +52,6 @@ def replacing(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """A file to write, which appears under its name only when it is whole.
 
     Its folder is made if need be. After an error nothing of it is left.
-
-    Raises:
-      OSError: if the file cannot be written; names it.
     """
     path = os.fspath(path)
     os.makedirs(os.path.dirname(os.path.abspath(path)), exist_ok=True)
@@ -84,11 +73,7 @@ def replacing(path: str | os.PathLike) -> Iterator[BinaryIO]:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Writes a text file, whole or not at all.
-
-    Raises:
-      OSError: if it cannot be written; names it.
-    """
+    """Writes a text file, whole or not at all; an `OSError` names it."""
     with replacing(path) as file:
         file.write(text.encode())
 
@@ -96,11 +81,7 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 def write_arrays(
     path: str | os.PathLike, arrays: Mapping[str, Any], *, compress: bool = False
 ) -> None:
-    """Writes named arrays as an npz file, whole or not at all.
-
-    Raises:
-      OSError: if it cannot be written; names it.
-    """
+    """Writes named arrays as npz file, whole or not at all; an `OSError` names it."""
     write = np.savez_compressed if compress else np.savez
     with replacing(path) as file:
         write(file, **arrays)
@@ -109,10 +90,7 @@ def write_arrays(
 def read_object(path: str | os.PathLike, *, what: str) -> dict[str, Any]:
     """JSON object of a file; `what` is what it is, or who writes it, for messages.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      OSError: if it cannot be read.
-      ValueError: if it is no JSON, or not an object; names it.
+    A `ValueError` names a file that is no JSON, or not an object.
     """
     try:
         value = json.loads(read_bytes(path))
@@ -147,10 +125,8 @@ def read_members(
 ) -> Iterator[tuple[str, bytes]]:
     """Names and contents of the wanted members of a zip, sorted by name.
 
-    Raises:
-      OSError: if it cannot be read.
-      ValueError: if it is damaged, encrypted, packed in an unknown way, or would unpack
-        to far more than its size; names it and the member.
+    A `ValueError` names a zip that is damaged, encrypted or packed in an unknown way,
+    or the member that would unpack to far more than its size.
     """
     with open_regular(path) as file, _one_line(path, "unreadable zip"):
         archive = zipfile.ZipFile(file)
@@ -192,11 +168,8 @@ def read_arrays(
     The name (its path) and what it holds are for messages; only some fields may be
     read.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      OSError: if it cannot be read.
-      ValueError: if it is damaged or no npz file, or would unpack to far more than its
-        size; names it.
+    A `ValueError` names a file that is damaged, no npz, or would unpack to far more
+    than its size.
     """
     try:
         opened = file if isinstance(file, io.BytesIO) else open_regular(file)
@@ -228,10 +201,8 @@ def read_versioned(
     For each field is wanted the kind of its numbers ("f" float, "i" integer, "U" text)
     and how many axes it has; what the file holds is for messages.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is damaged, foreign, of another version, or lacks a field; names
-        the file and the field.
+    A `ValueError` names the file and the field if it is damaged, foreign, of another
+    version, or lacks one.
     """
     path = os.fspath(path)
     fields = read_arrays(path, name=path, what=what)
@@ -255,11 +226,7 @@ def read_versioned(
 def check_fields(
     path: str, fields: Mapping[str, np.ndarray], wanted: Mapping[str, tuple[str, int]]
 ) -> None:
-    """Raises unless all arrays are there and of the wanted kind and number of axes.
-
-    Raises:
-      ValueError: names the file and the field.
-    """
+    """Raises `ValueError` unless arrays have the wanted kinds and numbers of axes."""
     for name, (kind, axes) in wanted.items():
         if name not in fields:
             raise ValueError(f"{path}: field {name!r} is missing")
@@ -272,12 +239,7 @@ def check_fields(
 
 
 def read_array(path: str | os.PathLike, *, what: str) -> np.ndarray:
-    """The array of floating-point numbers in an npy file, as float32.
-
-    Raises:
-      OSError: if it cannot be read.
-      ValueError: if it is damaged or holds something else; names it.
-    """
+    """Floating-point numbers of an npy file, float32; a `ValueError` names others."""
     with (
         open_regular(path) as file,
         _one_line(path, f"not a {what} file, or a damaged one"),

@@ -39,17 +39,10 @@ def write_rollout(
 ) -> None:
     """Writes a motion as BVH, GIF and HTML, and a ball as CSV.
 
-    Args:
-      folder: Where to; made if missing.
-      motion: Frames of one character, world.
-      desired_velocity: What was commanded, meters per second; its integral is drawn as
-        the commanded path. None if nothing was.
-      caption: Below them: the source of the data and its license.
-      name: Name of the files, without their ends.
-      ball: What the person plays with; None for nothing.
-
-    Raises:
-      OSError: if a file cannot be written.
+    The motion is one character's, world. The desired velocity, m/s, is what was
+    commanded; its integral is drawn as the commanded path; None if nothing was. The
+    caption is the source of the data and its license; the name is that of the files,
+    without their ends.
     """
     # matplotlib is slow to import, and only those who draw need it.
     from jaxmotion.viz import animation, html
@@ -108,12 +101,9 @@ def write_sweep(
 ) -> None:
     """Writes table.md, table.csv, table.json and pareto.png, and prints the table.
 
-    Args:
-      folder: Where to; it must exist.
-      report: What belongs beside it: its "title", which the plot has too, and "notes",
-        which stand below the Markdown table too.
-      quality: Column of the plot.
-      sample: What the times are of.
+    The folder must exist. Beside them stand the report's "title" (also the plot's) and
+    "notes" (also below the Markdown table); `quality` is the plot's column, `sample`
+    what the times are of.
     """
     title, notes = report["title"], [*report["notes"]]
     left_out = _draw(folder / "pareto.png", rows, points, quality, sample, title)

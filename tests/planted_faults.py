@@ -15,6 +15,7 @@ import ast
 import json
 import multiprocessing
 import os
+import resource
 import shutil
 import sys
 import tempfile
@@ -34,7 +35,9 @@ MODULES = {
     "schedule": ("diffusion/schedule.py", "diffusion/test_schedule.py"),
     "foot_lock": ("control/foot_lock.py", "control/test_foot_lock.py"),
 }
-SECONDS = 240  # a fault with which tests never end counts as found
+# A fault with which tests never end counts as found: after so many times the unfaulted
+# run's time of the processor, which other processes hardly lengthen, or so long.
+TIMES, SECONDS = 4, 1800
 COMPARE = {
     ast.Lt: "<=",
     ast.LtE: "<",
@@ -121,13 +124,15 @@ def _spread(all_: list, count: int) -> list:
     return [all_[round(i * (len(all_) - 1) / (count - 1))] for i in range(count)]
 
 
-def _run(folder: Path, tests: list[str]) -> None:
+def _run(folder: Path, tests: list[str], said: Path, most: int | None) -> None:
     import pytest
 
+    if most:
+        resource.setrlimit(resource.RLIMIT_CPU, (most, most))
     os.chdir(folder)
-    quiet = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(quiet, 1)
-    os.dup2(quiet, 2)
+    output = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    os.dup2(output, 1)
+    os.dup2(output, 2)
     sys.path[0] = str(folder)
     for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
         del sys.modules[name]  # of this repository, not of the copy
@@ -135,10 +140,13 @@ def _run(folder: Path, tests: list[str]) -> None:
     os._exit(int(pytest.main([*options, *tests])))
 
 
-def passes(folder: Path, tests: list[str]) -> bool:
-    """Whether tests of a copy pass in time, in a process of their own."""
+def passes(folder: Path, tests: list[str], said: Path, most: int | None = None) -> bool:
+    """Whether tests of a copy pass within so many seconds of processor's time.
+
+    They run in a process of their own; what they print goes to the file `said`.
+    """
     process = multiprocessing.get_context("fork").Process(
-        target=_run, args=(folder, tests)
+        target=_run, args=(folder, tests, said, most)
     )
     process.start()
     process.join(SECONDS)
@@ -146,6 +154,12 @@ def passes(folder: Path, tests: list[str]) -> bool:
         process.kill()
         process.join()
     return process.exitcode == 0
+
+
+def _spent() -> float:
+    """Seconds of processor's time of all processes that ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def main() -> None:
@@ -167,20 +181,23 @@ def main() -> None:
         import jax  # noqa: F401
         import scipy.stats  # noqa: F401
 
-        folder = Path(place) / "copy"
+        folder, said_by_tests = Path(place) / "copy", Path(place) / "output"
         shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(".git", "runs"))
         for name in args.modules or MODULES:
             path, tests = MODULES[name]
             tests = [f"tests/{one}" for one in tests.split()]
             module = folder / "jaxmotion" / path
             source = module.read_text()
-            if not passes(folder, tests):
-                sys.exit(f"{name}: its tests fail without a fault")
+            before = _spent()
+            if not passes(folder, tests, said_by_tests):
+                tail = said_by_tests.read_text()[-2000:]
+                sys.exit(f"{name}: its tests fail without a fault\n{tail}")
+            most = 10 + round(TIMES * (_spent() - before))
             left, began = [], time.perf_counter()
             planted = _spread(faults(source), args.count)
             for said, changed in planted:
                 module.write_text(changed)
-                if passes(folder, tests):
+                if passes(folder, tests, said_by_tests, most):
                     left.append(said)
                     print(f"  not found: {name}.py {said}", flush=True)
             module.write_text(source)

@@ -114,14 +114,9 @@ def _unit(degrees: np.ndarray) -> np.ndarray:
 def course_commands(
     name: str, *, seconds: float, fps: float, speed: float, label: int
 ) -> Command:
-    """Commands of a course, one per tick; a course that ends begins again.
+    """Commands of a course, one per tick [ticks, ...]; a course that ends begins again.
 
-    Args:
-      name: One of `COURSES`.
-      speed: Meters per second.
-
-    Returns:
-      [ticks, ...], for a character that starts facing +z.
+    The character starts facing +z; the speed is in meters per second.
 
     Raises:
       ValueError: if there is no such course (names those there are), the length is
@@ -150,10 +145,8 @@ def course_batch(
 ) -> Command:
     """One course for each character, with its own label and at its own speed.
 
-    Speeds are in meters per second. Commands are [characters, ticks, ...].
-
-    Raises:
-      ValueError: as `course_commands`.
+    Speeds are in meters per second, commands [characters, ticks, ...]. Raises what
+    `course_commands` does.
     """
     told = [*zip(map(int, labels), map(float, speeds), strict=True)]
     each = {

@@ -135,11 +135,7 @@ class LockState:
 
 
 def legs(skeleton: Skeleton) -> tuple[tuple[int, int, int, int], ...]:
-    """Hip, knee, ankle and toe of each foot: the joints above it.
-
-    Raises:
-      ValueError: if the skeleton names no feet, or a foot has no leg above it.
-    """
+    """Hip, knee, ankle and toe of each foot; `ValueError` for none, or without a leg."""
     if not skeleton.feet:
         raise ValueError("the skeleton names no feet: there is nothing to lock")
     found = []
@@ -328,14 +324,9 @@ def solve_leg(
 ) -> Float[Array, "3 3 3"]:
     """World rotations of hip, knee and ankle that bring the toe to a place.
 
-    They stay as they are where the toe is in its place.
-
-    Args:
-      positions: Hip, knee, ankle and toe as animated, world.
-      rotations: Their world rotations.
-      toe: Where the toe belongs, world.
-      bend: Axis that a straight leg bends about: the knee moves along the cross product
-        of it and the leg's direction.
+    They stay as they are where the toe is in its place. Positions (hip, knee, ankle and
+    toe, as animated) and rotations are in the world. A straight leg bends about `bend`:
+    the knee moves along the cross product of it and the leg's direction.
     """
     hip, knee, ankle, animated = positions
     goal = ankle + toe - animated
@@ -388,13 +379,8 @@ def place_toes(
 ) -> Float[Array, "joints 6"]:
     """Rotations of a pose whose toes are moved to other places: part 4.
 
-    Only hips, knees and ankles differ.
-
-    Args:
-      skeleton: Its feet are the toes.
-      root_position: World, meters; stays.
-      joint_rotation: The pose as animated.
-      toes: Where they belong, world; no lower than a standing toe is taken.
+    Only hips, knees and ankles differ. Places are in the world, meters; none lower than
+    that of a standing toe is taken.
     """
     positions, rotations = global_transforms(skeleton, root_position, joint_rotation)
     return _place(skeleton, positions, rotations, joint_rotation, toes, lock=lock)
@@ -444,8 +430,7 @@ def lock_frame(
 ) -> tuple[LockState, Float[Array, "3"], Float[Array, "joints 6"]]:
     """The next frame with its feet, the skeleton's toes, locked.
 
-    Returns:
-      The state, and the root's position (world, meters) and the rotations to display.
+    Beside the state come the root's position (world, meters) and the rotations.
     """
     state = _move_body(state, fps=fps, lock=lock)
     root_position = root_position.at[::2].add(state.body)
@@ -641,10 +626,7 @@ def _tuning(inner: Tuning, fps: float, lock: FootLock) -> Tuning:
 def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
     """A character that is displayed with locked feet; its states are `LockedState`s.
 
-    Its skeleton needs legs; lock None: the default settings.
-
-    Raises:
-      ValueError: if the skeleton names no feet, or a foot has no leg above it.
+    lock None: the default settings. `ValueError` unless the skeleton has feet with legs.
     """
     lock = FootLock() if lock is None else lock
     feet = init_lock(character.skeleton)
@@ -686,10 +668,7 @@ def clean_sampler(
 ) -> sampling.Sampler:
     """A sampler whose motions stand on their planted feet; see `clean_motion`.
 
-    Its skeleton needs legs; lock None: the default settings.
-
-    Raises:
-      ValueError: if the skeleton names no feet, or a foot has no leg above it.
+    lock None: the default settings. `ValueError` unless the skeleton has feet with legs.
     """
     legs(sampler.skeleton)
     return dataclasses.replace(

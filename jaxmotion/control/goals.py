@@ -210,12 +210,9 @@ def avoid(
     *,
     radius: float = RADIUS,
 ) -> Float[Array, "walkers 2"]:
-    """Velocities near those wanted with which nobody runs into anybody.
+    """Velocities, m/s, near those wanted with which nobody runs into anybody.
 
-    Args:
-      wanted: Velocities, m/s.
-      circles: Center (x, z) and radius of what stands around, meters.
-      radius: Of a walker, meters.
+    Circles are center (x, z) and radius of what stands around, meters, as `radius` is.
 
     Source: van den Berg et al. 2008, sections IV and V.
     """

@@ -136,7 +136,6 @@ def inertialize(
     rotation, all frames at once. From `duration` on the chunk is unchanged.
 
     Args:
-      past: What was displayed; its last two frames count.
       chunk: The frames that follow, of the same skeleton.
       duration: Seconds until the chunk is displayed as it is.
       half_life: If given, seconds: fades as a critically damped spring does instead.

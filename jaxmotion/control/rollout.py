@@ -121,7 +121,6 @@ class Crowd:
     """Characters that share a budget of plans, between two ticks; batch axis first.
 
     Attributes:
-      states: Their states.
       told: The command that each follows; it may not yet have heard of the newest.
       waited: Ticks that each waits for a plan.
     """

@@ -29,7 +29,6 @@ class Sampler:
 
     Attributes:
       labels: Names of the actions; none where motions have no label.
-      frames: Frames of a motion.
       source: The data that it was trained on, and their license.
       license: License of the weights; None where nobody gave one.
       params: All arrays that `method` needs.

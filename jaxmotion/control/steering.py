@@ -111,15 +111,10 @@ class Character:
     ) -> Any:
         """States of characters at the origin that face +z, batch axis first.
 
-        Args:
-          number: Characters; None for one per label that is given, or one.
-          labels: Name or index for all characters, or a sequence with one for each;
-            None for the first label.
-          clips: Start in poses of these clips instead of the model's own.
-
-        Raises:
-          ValueError: if a label is unknown, the numbers do not agree, or the system
-            cannot start so.
+        `number` None: one for each label that is given, or one. Labels are a name or an
+        index for all characters, or a sequence with one for each; None for the first.
+        `ValueError` if a label is unknown, the numbers do not agree, or the system
+        cannot start so.
         """
         found = label_indices(self.labels, labels, number)
         if clips is None:
@@ -130,11 +125,7 @@ class Character:
 
 
 def steered(model: Any, *, what: str = "this model") -> Character:
-    """The model, which must be a character.
-
-    Raises:
-      ValueError: if it makes whole motions.
-    """
+    """The model, which must be a character; raises `ValueError` for whole motions."""
     if not isinstance(model, Character):
         raise ValueError(
             f"{what} makes whole motions: it is sampled, not steered or rolled out"
@@ -147,14 +138,9 @@ def label_indices(
 ) -> np.ndarray:
     """Index of each character's label; zeros where the model has no labels.
 
-    Args:
-      names: Those that the model has; none where commands have no label.
-      labels: Name or index for all, or a sequence with one for each; None for the
-        first.
-      number: Characters; None for as many as there are labels.
-
-    Raises:
-      ValueError: if a label is unknown or the numbers do not agree.
+    The labels are a name or an index for all, or a sequence with one for each; None for
+    the first. As many characters as labels where no number is given. `ValueError` if a
+    label is unknown or the numbers do not agree.
     """
     if number is not None and not (isinstance(number, int | np.integer) and number > 0):
         raise ValueError(f"number of characters is {number!r}, expected 1 or more")
@@ -183,10 +169,7 @@ def label_indices(
 def check_labels(labels: np.ndarray | Array, names: tuple[str, ...]) -> None:
     """Raises unless labels are indices of names; compiled code cannot.
 
-    Where a model has no labels, nothing reads them and all pass.
-
-    Raises:
-      ValueError: names the range and the labels found.
+    All pass where a model has no labels; a `ValueError` names the range and the labels.
     """
     found, last = np.asarray(labels), len(names) - 1
     if names and found.size and (found.min() < 0 or found.max() > last):
@@ -210,7 +193,6 @@ def steered_rollouts(
 
     Args:
       commands: [characters, ticks, ...], as from `courses.course_batch`.
-      first: Number of the first character; see `rollout.rollout`.
       chunk: Characters to run at a time, at most (the largest number that divides
         theirs); see `rollout.rollout`.
       mesh: Devices to split the characters over; see `rollout.rollout`.
@@ -254,10 +236,7 @@ def calmest(
 
     They are to stand still for `seconds`. A shipped model starts so, with no recorded
     frame in its file. Of the `number` that are kept come the last states, and the last
-    frames [number, past, ...].
-
-    Raises:
-      ValueError: if fewer characters begin.
+    frames [number, past, ...]. Raises `ValueError` if fewer characters begin.
     """
     if not 1 <= number <= len(labels):
         raise ValueError(f"starts is {number}, expected 1 to {len(labels)}")
@@ -287,10 +266,7 @@ def chosen_starts(
 ) -> Any:
     """A start of its label for each character, drawn with equal chances.
 
-    Starts are [labels, starts, ...], of as many starts of each label.
-
-    Raises:
-      ValueError: if a label is none of the model's.
+    Starts are [labels, starts, ...]; a label that is none raises `ValueError`.
     """
     check_labels(labels, names)
     labels, number = np.asarray(labels), jax.tree.leaves(starts)[0].shape[1]
@@ -346,12 +322,7 @@ class Inputs:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Wish:
-    """What is asked of a character.
-
-    Attributes:
-      velocity: (x, z) m/s.
-      facing: (x, z), unit.
-    """
+    """What is asked of a character: velocity (x, z) in m/s, and facing, unit."""
 
     velocity: tuple[float, float] = (0.0, 0.0)
     facing: tuple[float, float] = (0.0, 1.0)
@@ -375,7 +346,6 @@ def wanted(
     facing where he did. `viz/web/steer.js` is the same for pages without a server.
 
     Args:
-      last: What was wanted a tick ago.
       position: Of the character (x, z), meters.
       speed: Without Shift, m/s.
       seconds: Of a tick.

@@ -52,11 +52,8 @@ def along(
 
     Who has stopped near its end stays, until it is lengthened.
 
-    Args:
-      last: What was wanted a tick ago.
-      position: Of the character (x, z), meters.
-      velocity: Its own, m/s; see `goals.averaged`.
-      speed: On the way, m/s.
+    The velocity is the character's own, m/s (see `goals.averaged`), `speed` that on the
+    way. Places are (x, z), meters.
     """
     # Of one length, so that waypoints compile nothing.
     points = route.points + route.points[-1:] * (MOST + 1 - len(route.points))

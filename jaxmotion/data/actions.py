@@ -161,15 +161,9 @@ def cut_actions(clips: Clips, *, longest: float = 4.0, shortest: float = 3.0) ->
 
     They do not overlap, and are named "<clip>@<first frame>+<frames>".
 
-    Args:
-      clips: Takes, with styles "neutral", "crouch", "jump" or "push" in the field
-        "style"; those of other styles are left out.
-      longest: Longest stretch, seconds.
-      shortest: Shortest stretch, seconds.
-
-    Raises:
-      ValueError: if the clips have no field "style" or one "action", or no stretch has
-        an action.
+    Takes of other styles than "neutral", "crouch", "jump" or "push" (field "style") are
+    left out; lengths are in seconds. `ValueError` without that field, with one named
+    "action", or if no stretch has an action.
     """
     if FIELD in clips.labels:
         raise ValueError(f"the clips have a label field {FIELD!r} already")

@@ -55,16 +55,11 @@ def ball_clips(
     joints: Sequence[int],
     radius: float,
 ) -> BallClips:
-    """Puts a ball beside clips.
+    """Puts a ball beside clips: its center in every frame (world, meters), and touches.
 
-    Args:
-      position: World position of the ball's center in every frame, meters; its shape,
-        [frames, 3], is checked here, since it may come from a file.
-      touch: Which of the joints touch the ball in every frame, [frames, touching].
-
-    Raises:
-      ValueError: if the frames differ in number, a position is not finite, a joint does
-        not exist, or the radius is not positive.
+    Shapes are checked here, since they may come from a file: [frames, 3], [frames,
+    touching]. `ValueError` if the frames differ in number, a position is not finite, a
+    joint does not exist, or the radius is not positive.
     """
     frames, joints = clips.num_frames, tuple(int(joint) for joint in joints)
     expected = {"ball_position": (frames, 3), "ball_touch": (frames, len(joints))}
@@ -97,11 +92,7 @@ def ball_clips(
 
 
 def save_ball_clips(path: str | os.PathLike, data: BallClips) -> None:
-    """Writes clips with a ball (.npz); the file appears under its name only when whole.
-
-    Raises:
-      OSError: if the file cannot be written.
-    """
+    """Writes clips with a ball (.npz); the file has its name only when it is whole."""
     more = {
         "ball_position": np.asarray(data.position, np.float32),
         "ball_touch": np.asarray(data.touch, bool),
@@ -114,10 +105,8 @@ def save_ball_clips(path: str | os.PathLike, data: BallClips) -> None:
 def load_ball_clips(path: str | os.PathLike) -> BallClips:
     """Reads what `save_ball_clips` wrote; checks every field.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is damaged, foreign, inconsistent, or has no ball; names the
-        file and the field.
+    A `ValueError` names the file and the field if it is damaged, foreign, inconsistent,
+    or has no ball.
     """
     path = os.fspath(path)
     fields = clips_io.read_fields(path)
@@ -136,11 +125,7 @@ def load_ball_clips(path: str | os.PathLike) -> BallClips:
 
 
 def take_ball_clips(data: BallClips, indices: Sequence[int] | np.ndarray) -> BallClips:
-    """The clips of those numbers, in that order.
-
-    Raises:
-      ValueError: if there is no such clip, or none is asked for.
-    """
+    """Clips of those numbers, in order; `ValueError` for none or an unknown one."""
     kept = take_clips(data.clips, indices)
     offsets = np.asarray(data.clips.offsets)
     frames = np.concatenate([np.arange(offsets[i], offsets[i + 1]) for i in indices])

@@ -77,8 +77,7 @@ def _subtree(bvh: Bvh, root: int) -> list[int]:
 def without_joints(bvh: Bvh, names: Collection[str]) -> Bvh:
     """The file's content without some joints, never the root, and all below them.
 
-    Raises:
-      BvhError: for an unknown joint name, or the root's.
+    `BvhError` for an unknown name or the root's.
     """
     dropped = {_require_joint(bvh, name) for name in names}
     if 0 in dropped:
@@ -139,9 +138,6 @@ def motion_from_bvh(
       scale: Meters per unit of the file; 0.01 for centimeters.
       feet: Names of the joints whose contact counts, left before right.
       tolerance: Largest change of a bone's offset within the clip, meters.
-
-    Returns:
-      The skeleton (root offset zero) and the motion, 1 / frame_time frames per second.
 
     Raises:
       BvhError: for an unknown joint name, a bone whose length changes, or a position
@@ -247,14 +243,9 @@ def bvh_from_motion(
 ) -> Bvh:
     """A motion as BVH content: six channels on the root, ZYX rotations elsewhere.
 
-    Args:
-      motion: Frames of that skeleton, without batch axes.
-      scale: Units of the file per meter; 100 for centimeters.
-      name: Name for messages.
-
-    Raises:
-      ValueError: if the motion has batch axes, no frames, another number of joints,
-        or a value that is not finite.
+    The motion is of that skeleton, without batch axes; `scale` is in units of the file
+    per meter; the name is for messages. `ValueError` if it has batch axes, no frames,
+    another number of joints, or a value that is not finite.
     """
     shape = motion.joint_rotation.shape
     if len(shape) != 3 or shape[0] == 0 or shape[1] != skeleton.num_joints:

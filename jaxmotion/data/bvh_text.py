@@ -31,11 +31,7 @@ class BvhError(ValueError):
 
 
 def number(word: str) -> float:
-    """A number as other readers take it: Python's float() knows more spellings.
-
-    Raises:
-      ValueError: if it is none.
-    """
+    """A number (else `ValueError`) as other readers take it: float() knows more."""
     if not word.isascii() or "_" in word:
         raise ValueError(f"no number: {word!r}")
     return float(word)
@@ -279,10 +275,7 @@ def _rows(lines: list[str], start: int, shape: tuple[int, int], name: str):
 def parse_bvh(text: str, *, name: str = "bvh") -> Bvh:
     r"""What BVH text says, in its own units; line ends may be \n, \r\n or \r.
 
-    The file's name is for messages.
-
-    Raises:
-      BvhError: for anything malformed; names the file and the line.
+    A `BvhError` names the file (by `name`) and the line of anything malformed.
 
     Source: Biovision's BVH format (Meredith and Maddock 2001).
     """
@@ -328,11 +321,8 @@ def read_bvh(
     """What a BVH file says, in its own units.
 
     The source is a path, the bytes of a file, or an open binary file (such as a zip
-    member); the name, by default the path, is for messages.
-
-    Raises:
-      BvhError: for anything malformed; names the file and the line.
-      OSError: if the file cannot be read.
+    member). A `BvhError` names the file (by default the path) and the line of anything
+    malformed.
     """
     if isinstance(source, bytes):
         data, default = source, "bvh"
@@ -409,11 +399,7 @@ def format_bvh(bvh: Bvh, *, decimals: int = 6) -> str:
 
 
 def write_bvh(path: str | os.PathLike, bvh: Bvh, *, decimals: int = 6) -> None:
-    """Writes a BVH file with so many decimals, whole or not at all.
-
-    Raises:
-      OSError: if the file cannot be written.
-    """
+    """Writes a BVH file with so many decimals, whole or not at all."""
     text = format_bvh(bvh, decimals=decimals)
     with files.replacing(path) as file:
         file.write(text.encode("utf-8"))

@@ -231,13 +231,8 @@ def all_captions(
 ) -> tuple[tuple[str, str], ...]:
     """Every (sentence, tokens) of a content in a style, always in the same order.
 
-    Args:
-      content: Label such as "walk-turn-left", of either set.
-      style: Label such as "elderly", of either set.
-      templates: Some of `TEMPLATES`, for example all but a held-out one.
-
-    Raises:
-      ValueError: if a label or a template is unknown; lists the known ones.
+    Labels such as "walk-turn-left" and "elderly" are of either set, templates of
+    `TEMPLATES` (all but a held-out one, say). A `ValueError` lists the known ones.
     """
     known = {
         "content": (_CONTENTS, [content]),
@@ -273,8 +268,7 @@ def captions_for(
     The clip's index makes clips with the same labels differ; the same arguments give
     the same captions. Templates are of `TEMPLATES`.
 
-    Raises:
-      ValueError: if a name is unknown, or there are fewer captions than that.
+    `ValueError` if a name is unknown, or there are fewer captions than that.
     """
     choices = all_captions(content, style, templates=templates)
     if not 0 < count <= len(choices):

@@ -51,11 +51,7 @@ class Clips:
         return self.root_position.shape[0]
 
     def names(self, field: str) -> tuple[str, ...]:
-        """Names of a label field such as "style".
-
-        Raises:
-          ValueError: if the clips have no such field; names those they have.
-        """
+        """Names of a field such as "style"; a `ValueError` says which there are."""
         fields = dict(self.label_names)
         if field not in fields:
             raise ValueError(
@@ -69,10 +65,8 @@ def check_skeletons(
 ) -> None:
     """Raises unless all skeletons have the first one's joints and bones.
 
-    Offsets may differ by the tolerance, meters.
-
-    Raises:
-      ValueError: names the two clips and the joint.
+    Offsets may differ by the tolerance, meters; a `ValueError` names two clips and the
+    joint.
     """
     first = skeletons[0]
     offsets = np.asarray(first.offsets)
@@ -128,9 +122,7 @@ def clips_from_motions(
     """Concatenates motions of one skeleton.
 
     Args:
-      motions: One motion a clip, all at the same rate.
       skeletons: The skeleton of all clips, or one a clip; then their mean is kept.
-      names: One name a clip.
       labels: For each label field, the label of each clip in words.
       label_names: Order of the words of a field; by default those that occur, sorted.
       source: Where the data came from and its license.
@@ -194,11 +186,7 @@ def _join(arrays: Sequence[Array]) -> Array:
 
 
 def clip_motion(clips: Clips, index: int) -> Motion:
-    """One clip as a motion.
-
-    Raises:
-      ValueError: if there is no such clip.
-    """
+    """One clip as a motion; `ValueError` if there is no such clip."""
     if not 0 <= index < clips.num_clips:
         raise ValueError(f"clip {index} of {clips.num_clips}: expected 0 <= index")
     start, stop = (int(frame) for frame in clips.offsets[index : index + 2])
@@ -210,10 +198,9 @@ def clip_motion(clips: Clips, index: int) -> Motion:
 
 
 def take_clips(clips: Clips, indices: Sequence[int] | np.ndarray) -> Clips:
-    """The clips of those numbers, in that order; label names are kept.
+    """The clips of those numbers, in that order, with all label names.
 
-    Raises:
-      ValueError: if there is no such clip, or none is asked for.
+    `ValueError` if there is no such clip, or none is asked for.
     """
     indices = np.asarray(indices, np.int64)
     if indices.size == 0:
@@ -243,9 +230,7 @@ def stretches(
 ) -> Clips:
     """Stretches of frames, each as one clip with the labels of the clip it is from.
 
-    Args:
-      owners: Number of each stretch's clip.
-      firsts: Its first frame, counted over all clips.
+    A stretch is its clip's number and its first frame, counted over all clips.
     """
     frames = np.concatenate(
         [np.arange(a, a + n) for a, n in zip(firsts, lengths, strict=True)]

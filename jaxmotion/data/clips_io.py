@@ -61,11 +61,8 @@ def to_fields(clips: Clips) -> dict[str, np.ndarray]:
 def save_clips(path: str | os.PathLike, clips: Clips) -> None:
     """Writes clips (.npz); the file appears under its name only when it is whole.
 
-    Its folder is made if need be.
-
-    Raises:
-      OSError: if the file cannot be written.
-      ValueError: if the fields do not agree, see `load_clips`; nothing is written.
+    Its folder is made if need be. Nothing is written if the fields do not agree
+    (`ValueError`, see `load_clips`).
     """
     fields = to_fields(clips)
     _check_fields(os.fspath(path), fields)
@@ -75,9 +72,7 @@ def save_clips(path: str | os.PathLike, clips: Clips) -> None:
 def read_fields(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """All arrays of a file of clips, each of the expected kind and number of axes.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is damaged, foreign, of another version, or lacks a field.
+    `ValueError` if the file is damaged, foreign, of another version, or lacks a field.
     """
     path = os.fspath(path)
     about: dict[str, Any] = dict(what="clips", format_name=_FORMAT, version=_VERSION)
@@ -179,11 +174,7 @@ def _check_ranges(path: str, fields: dict[str, np.ndarray], num_frames: int) -> 
 
 
 def check_rate(path: str, fps: np.ndarray | float) -> None:
-    """Raises unless a rate is one of motions.
-
-    Raises:
-      ValueError: names the file.
-    """
+    """Raises a `ValueError`, with the file, unless a rate is one of motions."""
     low, high = RATES
     if not low <= fps <= high:
         raise ValueError(
@@ -195,10 +186,8 @@ def check_rate(path: str, fps: np.ndarray | float) -> None:
 def load_clips(path: str | os.PathLike) -> Clips:
     """Clips on the default device, as `save_clips` wrote them; checks every field.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is damaged, foreign, of another version, or inconsistent; names
-        the file and the field.
+    A `ValueError` names the file and the field if it is damaged, foreign, of another
+    version, or inconsistent.
     """
     return from_fields(os.fspath(path), read_fields(path))
 
@@ -206,8 +195,7 @@ def load_clips(path: str | os.PathLike) -> Clips:
 def from_fields(path: str, fields: dict[str, np.ndarray]) -> Clips:
     """Clips, on the default device, of what `read_fields` read; checks every field.
 
-    Raises:
-      ValueError: if the fields do not agree; names the file and the field.
+    A `ValueError` names the file and the field that do not agree.
     """
     _check_fields(path, fields)
     label_fields = [str(field) for field in fields["label_fields"]]

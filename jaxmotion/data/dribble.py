@@ -61,10 +61,8 @@ class Dribble:
       thickness: Thickness of foot and shank about their bones: how high a standing toe
         joint is above the ground, and how far from it the ball's surface is when they
         touch.
-      max_height: Largest height of a touching toe above the ground.
       min_toe_speed: Least speed of a touching toe on the ground plane.
       gap: Shortest and longest time between touches.
-      max_speed: Largest speed of the ball.
       min_push: Least change of the ball's velocity along that of the toe.
       cone: Largest angle between that change and the toe's velocity, radians.
       restitution: Most that a ball bounces off a foot: the speed at which it leaves the
@@ -73,10 +71,8 @@ class Dribble:
         frames before a touch to two frames after it.
       reach: Largest distance of ball and root on the ground plane.
       wait: Longest time that a ball lies before its first touch.
-      min_frames: Fewest frames of a segment.
 
-    Raises:
-      ValueError: if a value is out of its range; names it.
+    A value out of its range raises a `ValueError` that names it.
     """
 
     radius: float = 0.11
@@ -159,9 +155,8 @@ def is_free(
 ) -> Bool[np.ndarray, "*batch frames"]:
     """Whether a ball on the ground is clear of the legs and within reach of the root.
 
-    Args:
-      place: Of the ball's center on the ground plane, meters.
-      near: Whether a touch is so near in time that a leg may come nearer.
+    The place is its center's, meters. Where `near`, a touch is so close in time that a
+    leg may come nearer.
     """
     height = np.full(place.shape[:-1], body.ground + settings.radius)
     ball = np.stack([place[..., 0], height, place[..., 1]], axis=-1)
@@ -176,7 +171,6 @@ class Segment:
     """A ball beside some frames of a clip, from its rest to its last touch.
 
     Attributes:
-      start: First frame.
       ball: Its center on the ground plane, meters.
       touch_frames: Frames of the touches, counted from `start`.
       touch_feet: Which of the feet touches.
@@ -251,9 +245,7 @@ def find_chain(
 ) -> list[int]:
     """Touches one after the other, as many as chance finds, the first one at least.
 
-    Args:
-      tried: Touches from which no way led on; those that are tried are added.
-      generator: Draws the order in which ways are tried.
+    Those from which no way leads on are added to `tried`.
     """
 
     def ways(now: int, arrive: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
@@ -308,10 +300,7 @@ def _segment(
 def find_segments(
     body: Body, settings: Dribble, generator: np.random.Generator
 ) -> list[Segment]:
-    """Stretches of a clip beside which a ball can be dribbled, perhaps none.
-
-    They are in order and do not overlap.
-    """
+    """Stretches of a clip beside which a ball can be dribbled, in order, if any."""
     touches = possible_touches(body, settings)
     tried, earliest, found = set(), 0, []
     while True:
@@ -336,9 +325,7 @@ def dribble_clips(
     "<clip>@<first frame>+<frames>". Each clip has its own random numbers, so that
     further clips after it change nothing.
 
-    Raises:
-      ValueError: if no clip has such a stretch, the clips have a field "skill", or are
-        too short to have a speed.
+    `ValueError` if no clip has such a stretch, clips have a field "skill" or no speed.
     """
     people = bodies(clips, thickness=settings.thickness)
     found = [
@@ -416,20 +403,15 @@ def resting_clips(
     farther, so that it is never nearer than that to the root. Clips whose legs go
     through wherever it might lie are left out.
 
-    Args:
-      distance: Least and largest distance of the ball from where the root comes nearest
-        to it on the ground plane, meters. (2.5, 5) is a ball off which the person is;
-        (0.4, 0.8) one in front of the feet.
-      seed: Seeds the places; each clip has its own random numbers.
-      angle: Largest angle between the clip's mean facing and the ball's direction,
-        radians; pi for anywhere.
-      travel: Clips whose root goes farther from its mean place are left out, meters.
-      radius: Of the ball, meters.
-      thickness: Of foot and shank about their bones, meters.
+    `distance` is the least and largest of the ball from where the root comes nearest to
+    it on the ground, meters. (2.5, 5) is a ball off which the person is; (0.4, 0.8) one
+    in front of the feet. At most `angle`, radians, lies between the clip's mean facing
+    and the ball's direction; clips whose root goes farther than `travel`, meters, from
+    its mean place are left out. Radius and thickness are as in `Dribble`; each clip has
+    its own random numbers.
 
-    Raises:
-      ValueError: if no clip is left, the clips have a field "skill", or the distances
-        are not positive and in order.
+    `ValueError` if no clip is left, the clips have a field "skill", or the distances
+    are not positive and in order.
     """
     if not 0 < distance[0] <= distance[1] < np.inf:
         raise ValueError(f"distance is {distance}, expected it positive and in order")
@@ -485,10 +467,7 @@ def _room(body: Body, ball: Float[np.ndarray, "tries 3"]) -> Float[np.ndarray, "
 def concatenate_ball_clips(parts: Sequence[BallClips]) -> BallClips:
     """Sets of clips with the same skeleton, label fields, rate, joints and ball as one.
 
-    The names of labels, skills among them, are merged.
-
-    Raises:
-      ValueError: if there is no part, or they differ in any of that.
+    Label names, skills too, are merged. `ValueError` if sets differ, or for none.
     """
     clips = selection.concatenate([part.clips for part in parts])
     for field in ("joints", "radius"):

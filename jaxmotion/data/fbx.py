@@ -30,13 +30,9 @@ def read_fbx(
 ) -> Recording:
     """The animation of an FBX file's bones; of several takes the longest.
 
-    Args:
-      fps: Frames per second to sample it at.
-      rest: A file without animation is one frame, as its bones are.
-
-    Raises:
-      ModuleNotFoundError: without the extra [fbx].
-      ValueError: if it is no FBX, or has no bones or no animation; names it.
+    It is sampled at `fps` frames per second; with `rest`, a file without animation is
+    one frame, as its bones are. `ModuleNotFoundError` without the extra [fbx]; a
+    `ValueError` names what is no FBX, or has no bones or no animation.
     """
     try:
         import ufbx

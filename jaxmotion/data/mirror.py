@@ -229,10 +229,8 @@ def mirror_clips(clips: Clips, *, plan: MirrorPlan | None = None) -> Clips:
     """Mirror images of all clips, named "<name>_mirrored", with swapped labels.
 
     A swapped label that is new to its field is added to the field's names. The plan is
-    by default worked out from the skeleton and all frames.
-
-    Raises:
-      ValueError: as `mirror_plan`.
+    by default worked out from the skeleton and all frames; raises what `mirror_plan`
+    does.
     """
     motion = Motion(
         root_position=clips.root_position,

@@ -81,11 +81,7 @@ class Recording:
 
 
 def read_bvh(name: str, data: bytes) -> Recording:
-    """A BVH file, of any order of channels.
-
-    Raises:
-      ValueError: if it is malformed; names it.
-    """
+    """A BVH file, of any order of channels; a `ValueError` names a malformed one."""
     content = bvh_text.read_bvh(data, name=name)
     positions, rotations = bvh.bvh_transforms(content)
     positions, rotations = np.array(positions), np.array(rotations)
@@ -193,8 +189,7 @@ def _motion(recording: Recording, scale: float, up: str) -> Motion:
 def as_recorded(recording: Recording) -> tuple[Skeleton, Motion]:
     """One file with all its joints, in meters, y up; its bones are of mean lengths.
 
-    Raises:
-      ValueError: if neither y nor z is up, or no bone has a length.
+    `ValueError` if neither y nor z is up, or no bone has a length.
     """
     scale, _ = _unit(recording)
     skeleton = dataclasses.replace(
@@ -259,10 +254,8 @@ def _pieces(
 def read_labels(name: str, text: str) -> list[tuple[str, float, float, str]]:
     """Rows (file, start, end, label) of a table of parts of files; times in seconds.
 
-    An empty end is the file's; an empty start its beginning.
-
-    Raises:
-      ValueError: names the first line that is wrong.
+    An empty end is the file's; an empty start its beginning. A `ValueError` names the
+    first line that is wrong.
     """
     rows = csv.reader(io.StringIO(text))
     head = [word.strip().lower() for word in next(rows, [])]

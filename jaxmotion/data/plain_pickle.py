@@ -54,12 +54,8 @@ def read_plain_pickle(data: bytes, *, name: str) -> Any:
     """Content of a pickle that holds only plain values and NumPy arrays.
 
     Plain values are None, numbers, text, bytes, and lists, tuples, sets and
-    dictionaries of them. Text of Python 2 is taken as Latin-1. The name is for
-    messages.
-
-    Raises:
-      ValueError: if the file is damaged, or names anything beyond NumPy arrays; it is
-        named, and not run.
+    dictionaries of them. Text of Python 2 is taken as Latin-1. A `ValueError` names a
+    file that is damaged, or names anything beyond NumPy arrays; it is not run.
     """
     try:
         return _PlainUnpickler(io.BytesIO(data), encoding="latin1").load()

@@ -90,15 +90,11 @@ def _check_commands(commands: Command) -> None:
 def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> Walk:
     """A walk in one gait that follows commands at any speed and turn.
 
-    Args:
-      commands: Velocity and facing (unit) of each frame, at least two; labels are
-        ignored.
-      gait: The manner. Speeds above its max_speed look rushed; far above, legs are too
-        short for the steps.
-
-    Raises:
-      ValueError: if a command is not finite or its facing not of length one (names the
-        frame), the rate is not positive, or the legs do not reach the steps.
+    Commands are velocity and facing (unit) of each frame, two at least; labels are
+    ignored. Speeds above the gait's max_speed look rushed; far above, legs are too
+    short for the steps. `ValueError` for a command that is not finite or a facing not
+    of length one (names the frame), a rate that is not positive, or steps that legs do
+    not reach.
     """
     _check_fps(fps)
     _check_commands(commands)
@@ -172,15 +168,9 @@ def make_clips(
 ) -> Clips:
     """Clips of random walks, the same number in every gait, with labels "style".
 
-    The same seed gives the same clips.
-
-    Args:
-      minutes: Minutes of all clips together, rounded up to whole clips of each gait.
-      gaits: Manners by name; None for all of `GAITS`.
-
-    Raises:
-      ValueError: if minutes or fps is not positive, a clip has fewer than two frames,
-        or there is no gait.
+    The same seed gives the same clips. The minutes are of all clips together, rounded
+    up to whole clips of each gait (None: all of `GAITS`). `ValueError` if they or fps
+    are not positive, a clip has fewer than two frames, or there is no gait.
     """
     _check_fps(fps)
     gaits = GAITS if gaits is None else gaits

@@ -15,9 +15,7 @@ from jaxmotion.motion.skeleton import Motion
 def slerp(
     a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"], t: Float[Array, "*batch"]
 ) -> Float[Array, "*batch 4"]:
-    """Spherical interpolation of unit quaternions along the shorter arc.
-
-    From a at t = 0 to b at t = 1.
+    """Spherical interpolation of unit quaternions, a to b in t, along the shorter arc.
 
     Source: Shoemake 1985.
     """
@@ -106,11 +104,8 @@ def _between(
 def resample_clips(clips: Clips, fps: float) -> Clips:
     """All clips at another rate, as `resample` makes each, in one compiled call.
 
-    A clip's first frame stays its first. The rate is at most 16 times and at least 1/16
-    of theirs.
-
-    Raises:
-      ValueError: if the rate is out of that range.
+    A clip's first frame stays its first. `ValueError` for a rate more than 16 times or
+    less than 1/16 of theirs.
     """
     ratio = clips.fps / fps if fps > 0 else 0.0
     if not 1 / 16 <= ratio <= 16:

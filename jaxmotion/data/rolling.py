@@ -50,11 +50,9 @@ def roll(
 ) -> Float[np.ndarray, "*batch times 2"]:
     """Where a ball is, meters on the ground, on its way to a place: (1).
 
-    Args:
-      displacement: From where it starts to that place, meters on the ground.
-      seconds: Time of arrival, positive; the ball may stop there before.
-      deceleration: Of a rolling ball, positive, meters per second squared.
-      times: Between 0 and `seconds`.
+    The displacement is from its start to that place; it arrives after `seconds`,
+    positive, or stops there before. The deceleration is positive, m/s^2; times are in
+    0..seconds.
     """
     distance = np.linalg.norm(displacement, axis=-1)
     speed = start_speed(distance, seconds, deceleration)[..., None]
@@ -71,12 +69,7 @@ def end_velocities(
 ) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch 2"]]:
     """Velocities, m/s, of a ball that leaves, and of one that has arrived.
 
-    The second is zero where the ball stopped on the way.
-
-    Args:
-      displacement: From where it starts to where it has to be, meters on the ground.
-      seconds: Time of arrival, positive.
-      deceleration: Of a rolling ball, positive, meters per second squared.
+    The second is zero where the ball stopped on the way. Arguments as of `roll`.
     """
     distance = np.linalg.norm(displacement, axis=-1)
     speed = start_speed(distance, seconds, deceleration)
@@ -110,10 +103,8 @@ class Body:
 def bodies(clips: Clips, *, thickness: float) -> list[Body]:
     """What a ball meets of each clip.
 
-    A standing toe's joint is the thickness, meters, above the ground.
-
-    Raises:
-      ValueError: if a clip has one frame, or the skeleton no feet.
+    A standing toe is the thickness, meters, above the ground. `ValueError` if a clip
+    has one frame, or the skeleton no feet.
     """
     skeleton, offsets = clips.skeleton, np.asarray(clips.offsets)
     if not skeleton.feet:

@@ -23,13 +23,9 @@ def _indices(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
 
 
 def select(clips: Clips, field: str, names: Sequence[str]) -> Clips:
-    """Clips with one of some labels of a field, in the same order.
+    """Clips with one of some labels of a field, in order; label indices stay.
 
-    Label indices stay as they were.
-
-    Raises:
-      ValueError: if the field or a name is unknown (lists the known ones), or no clip
-        is left.
+    A `ValueError` lists the known ones if a name is unknown, and says if none is left.
     """
     if isinstance(names, str):
         raise ValueError(f"names should be a sequence of labels, found {names!r}")
@@ -56,9 +52,6 @@ def relabel(clips: Clips, field: str) -> Clips:
     """Renumbers a label field to the labels that occur, in the old order.
 
     After `select`, a network needs as many label embeddings as labels that occur.
-
-    Raises:
-      ValueError: if the field is unknown.
     """
     names = clips.names(field)
     used, compact = np.unique(np.asarray(clips.labels[field]), return_inverse=True)
@@ -73,10 +66,7 @@ def relabel(clips: Clips, field: str) -> Clips:
 def merge_labels(clips: Clips, field: str, merge: Mapping[str, str]) -> Clips:
     """Gives clips of some labels another one, for sets that name one thing twice.
 
-    Labels that no clip has any more are gone.
-
-    Raises:
-      ValueError: if the field or a label is unknown; lists the known ones.
+    Labels that no clip has any more are gone; a `ValueError` lists the known ones.
     """
     words = clips.names(field)
     numbers = np.arange(len(words))
@@ -89,11 +79,7 @@ def merge_labels(clips: Clips, field: str, merge: Mapping[str, str]) -> Clips:
 
 
 def frequent_labels(clips: Clips, field: str, *, least: int) -> tuple[str, ...]:
-    """Labels that at least so many clips have, in their order.
-
-    Raises:
-      ValueError: if the field is unknown.
-    """
+    """Labels that at least so many clips have, in their order."""
     words = clips.names(field)
     counts = np.bincount(np.asarray(clips.labels[field]), minlength=len(words))
     return tuple(w for w, n in zip(words, counts, strict=True) if n >= least)
@@ -108,9 +94,7 @@ def split_clips(
     least one stays in the training part and, where n > 1, at least one is held out.
     Both parts keep the original order; the same seed splits the same clips alike.
 
-    Raises:
-      ValueError: if the fraction is out of range, the field is unknown, or no label has
-        two clips.
+    `ValueError` if the fraction is out of range, or no label has two clips.
     """
     if not 0.0 < fraction < 1.0:
         raise ValueError(f"fraction should be between 0 and 1, found {fraction}")
@@ -129,8 +113,7 @@ def split_clips(
 def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
     """Training clips and those held out by name, both in the original order.
 
-    Raises:
-      ValueError: if a name is unknown, or no clip would be left to train on.
+    `ValueError` if a name is unknown, or no clip would be left to train on.
     """
     unknown = [name for name in held_out if name not in clips.clip_names]
     if unknown:
@@ -169,8 +152,7 @@ def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
     those of the parts. The first part's skeleton is kept, whose offsets others may
     differ from by the tolerance, meters.
 
-    Raises:
-      ValueError: if there is no part, or the fields, rates or skeletons differ.
+    `ValueError` if there is no part, or fields, rates or skeletons differ.
     """
     if not parts:
         raise ValueError("no clips to concatenate")

@@ -31,9 +31,8 @@ def upsample(motion: Motion, fps: float) -> Motion:
     The same one if it has that rate. The last frame is the last that is not after the
     motion's own.
 
-    Raises:
-      ValueError: if the rate is lower than the motion's or more than 16 times as high,
-        or there are fewer than two frames.
+    `ValueError` for a rate that is lower than the motion's or more than 16 times as
+    high, or fewer than two frames.
     """
     frames = motion.root_position.shape[0]
     if not (np.isfinite(fps) and motion.fps <= fps <= 16 * motion.fps):
@@ -73,8 +72,7 @@ def chest_joint(skeleton: Skeleton) -> int:
     Spine2, Chest2, Chest or Spine1, the first of these that exists, in any case and
     after a prefix like "mixamorig:".
 
-    Raises:
-      ValueError: if there is none; names the joints.
+    A `ValueError` names the joints if there is none.
     """
     plain = plain_names(skeleton)
     for name in _CHESTS:
@@ -102,8 +100,7 @@ def simulation_bone(skeleton: Skeleton, motion: Motion) -> Trajectory:
     Position under the chest and facing of the hips, both filtered (Savitzky-Golay of
     degree 3 over about half a second and a second).
 
-    Raises:
-      ValueError: if a joint that it needs is missing, or the clip is too short.
+    `ValueError` if a joint that it needs is missing, or the clip is too short.
 
     Source: Holden et al. 2020, released pipeline.
     """

@@ -21,11 +21,7 @@ from jaxmotion import files
 
 
 def read_array(path: Path) -> Float[np.ndarray, "..."]:
-    """An array of numbers in an npy file, as float32.
-
-    Raises:
-      ValueError: if it is missing, damaged or of other contents; names it.
-    """
+    """Numbers in an npy file, as float32; a `ValueError` names one without them."""
     try:
         return files.read_array(path, what="feature")
     except FileNotFoundError:
@@ -68,9 +64,8 @@ def _parse_time(where: str, field: str, text: str) -> float:
 def parse_captions(text: str, *, path: str) -> list[Caption]:
     """Captions of a file, one per line; empty lines are skipped.
 
-    Raises:
-      ValueError: if there is no caption, or a line lacks its tags or times; names the
-        file and the line.
+    A `ValueError` names the file, and the line that lacks its tags or times, or says
+    that there is no caption.
     """
     captions = []
     for number, line in enumerate(text.splitlines(), start=1):
@@ -115,10 +110,6 @@ def cut_recording(
 
     A recording or a clip of the wrong length is left out; with a recording go all
     captions that cut it.
-
-    Args:
-      cut_fps: Frames per second by which times become frames.
-      max_frames: Most frames of a clip.
 
     Returns:
       (name, frames, (sentence, tokens) of each caption) of each clip. The clip of line

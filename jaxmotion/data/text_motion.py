@@ -86,11 +86,7 @@ class TextMotions:
         return self.features.shape[1]
 
     def clips_of(self, split: str) -> Int[np.ndarray, "_"]:
-        """Numbers of the clips of a split, ascending; empty if it has none.
-
-        Raises:
-          ValueError: if there is no such split; names those there are.
-        """
+        """Numbers of a split's clips, ascending; `ValueError` for an unknown split."""
         if split not in self.split_names:
             raise ValueError(
                 f"unknown split {split!r}: there are {', '.join(self.split_names)}"
@@ -107,12 +103,8 @@ def check_statistics(
 ) -> None:
     """Raises unless both have one usable number for each feature.
 
-    Args:
-      names: What to call them in messages, such as their files.
-
-    Raises:
-      ValueError: if a length is wrong, a value is not finite, or a deviation is not
-        positive; names the channels.
+    `names` is what to call them, such as their files. A `ValueError` names the channels
+    that are not finite, or deviations that are not positive.
     """
     for name, values in zip(names, (mean, std), strict=True):
         if values.shape != (num_features,):
@@ -222,19 +214,10 @@ def text_motions(
 ) -> TextMotions:
     """Concatenates clips with captions.
 
-    Args:
-      features: Feature vectors of each clip.
-      captions: For each clip its (sentence, tokens), at least one.
-      splits: "train", "val" or "test" for each clip.
-      names: One name a clip.
-      mean: Mean of each feature; without it and std, those of the training clips.
-      source: Where the data came from and its license.
-
-    Returns:
-      The clips, in the order given.
-
-    Raises:
-      ValueError: names the clip or the channels that are not as they should be.
+    Of each clip: its feature vectors, one (sentence, tokens) or more, its split
+    ("train", "val" or "test") and name. Without mean and deviation, those of the
+    training clips are taken. A `ValueError` names the clip or the channels that are not
+    as they should be.
     """
     _check_clips(features, captions, splits, names)
     if not (np.isfinite(fps) and fps > 0):
@@ -268,9 +251,6 @@ def save_text_motions(path: str | os.PathLike, motions: TextMotions) -> None:
     """Writes clips with captions (.npz); the file appears only when it is whole.
 
     Its folder is made if need be.
-
-    Raises:
-      OSError: if the file cannot be written.
     """
     fields = {name: np.asarray(getattr(motions, name)) for name in _FIELDS}
     # Without the type an empty list of names would be stored as numbers.
@@ -339,10 +319,8 @@ def _check_ranges(
 def load_text_motions(path: str | os.PathLike) -> TextMotions:
     """Clips on the host, as `save_text_motions` wrote them; checks every field.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is damaged, foreign, of another version, or inconsistent; names
-        the file and the field.
+    A `ValueError` names the file and the field if it is damaged, foreign, of another
+    version, or inconsistent.
     """
     path = os.fspath(path)
     fields = files.read_versioned(
@@ -369,9 +347,6 @@ def is_text_motions(path: str | os.PathLike) -> bool:
     """Whether a file says that it holds text motions; nothing else of it is checked.
 
     False also for what is no npz file.
-
-    Raises:
-      OSError: if it cannot be read.
     """
     name = os.fspath(path)
     try:
@@ -417,13 +392,8 @@ def text_arrays(
 ) -> TextArrays:
     """The z-scored clips of a split on the default device, for `sample_text_batch`.
 
-    Args:
-      split: "train", "val" or "test".
-      max_frames: Frames of a sample; 196 in the published experiments.
-
-    Raises:
-      ValueError: if the split has no clips, a clip is shorter than a unit (names it),
-        or max_frames is.
+    Samples have `max_frames` frames, 196 in the published experiments. `ValueError` if
+    the split has no clips, or a clip (named) or max_frames is shorter than a unit.
     """
     clips = motions.clips_of(split)
     if clips.size == 0:

@@ -154,10 +154,8 @@ def solve_pose(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Root positions, meters, and parent-local rotations of the whole body.
 
-    The path is the body's ground position, meters; yaw its facing, radians.
-
-    Raises:
-      ValueError: if the legs do not reach the steps; names the first such frame.
+    The path is the body's ground position, meters; yaw its facing, radians. A
+    `ValueError` names the first frame in which legs do not reach their steps.
     """
     side = _smoothed(
         steps.contact[:, 0].astype(float) - steps.contact[:, 1], 0.08 * fps

@@ -37,11 +37,8 @@ def window_starts(
 ) -> tuple[Int[np.ndarray, "windows"], Int[np.ndarray, "windows"]]:
     """First frame (over all clips) and clip of all windows that lie within one clip.
 
-    Both are empty if no clip is long enough.
-
-    Args:
-      offsets: First frame of each clip, and the number of frames at the end.
-      stride: Frames between the starts of windows of one clip.
+    `offsets` are those of `Clips`; `stride` is between the starts of windows of one
+    clip. Both are empty if no clip is long enough.
     """
     starts = [
         np.arange(a, b - length + 1, stride)
@@ -60,13 +57,8 @@ def window_index(
 ) -> WindowIndex:
     """Lists all windows of a length that lie within one clip.
 
-    Args:
-      stride: Frames between the starts of windows of one clip.
-      short: What to do with clips shorter than a window.
-
-    Raises:
-      ValueError: if a clip is shorter than a window and short is "error" (names the
-        first such clip), or if no clip is long enough.
+    `stride` is between the starts of windows of one clip. `ValueError` if no clip is
+    long enough, or a clip is too short (named) and that is an error.
     """
     offsets = np.asarray(clips.offsets)
     lengths = np.diff(offsets)
@@ -236,11 +228,7 @@ def eval_windows(clips: Clips, *, stride: int, field: str) -> EvalWindows:
 
 
 def check_ticks(ticks: int, *, fps: float, skip: int) -> None:
-    """Raises unless rollouts are long enough to be measured, the first `skip` left out.
-
-    Raises:
-      ValueError: names the length that is needed.
-    """
+    """Raises a `ValueError`, with the length needed, unless rollouts are as long."""
     if ticks < skip + EVAL_WINDOW:
         raise ValueError(
             f"rollouts of {ticks / fps:g} s are too short to measure: expected at "
@@ -255,10 +243,7 @@ def rollout_windows(
     """Consecutive windows of the rollouts' frames [characters, ticks, ...].
 
     Their group is the character. The first `skip` ticks, where the data's own pose
-    still shows, are left out.
-
-    Raises:
-      ValueError: if the rollouts are shorter than what is left out and one window.
+    still shows, are left out; `ValueError` if no window remains.
     """
     motion = frames.motion
     characters, ticks = motion.root_position.shape[:2]

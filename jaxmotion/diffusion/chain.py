@@ -35,10 +35,8 @@ StepFactory = Callable[[Schedule, Denoiser], Step]
 class Multistep:
     """A step that looks back: what the chain walks is the sample and its history.
 
-    Attributes:
-      step: Maps (key, state at t, t) to the state at t - 1.
-      init: Maps a sample to a state without history.
-      finish: Maps a state to its sample.
+    `step` maps (key, state at t, t) to the state at t - 1; `init` makes a state without
+    history of a sample, `finish` a sample of a state.
     """
 
     step: Step
@@ -84,15 +82,11 @@ def reverse_chain(
     both parts, gives what the whole chain gives.
 
     Args:
-      step: Maps (key, x_t, t) to x_{t-1}.
       key: Consumed; step t gets `fold_in(key, t)`.
       x: What the step walks at step `start`: a sample, or any pytree of arrays.
       start: First t, at most the T of the step's schedule (the chain cannot see the
         schedule: a larger start clamps); static.
       stop: Step at which the result lies, 0 = clean; static.
-
-    Returns:
-      The same at step `stop`.
 
     Raises:
       ValueError: unless start >= stop >= 0, both integers.
@@ -117,12 +111,8 @@ def reverse_chain_trace(
 ) -> tuple[Any, Any]:
     """Like `reverse_chain`, and keeps every state on the way.
 
-    Returns:
-      x at step `stop`, and x at steps start - 1, start - 2, ..., stop on a new leading
-      axis: the last of them is the first result.
-
-    Raises:
-      ValueError: unless start >= stop >= 0, both integers.
+    Beside x at step `stop` comes x at steps start - 1, start - 2, ..., stop on a new
+    leading axis: the last of them is the first result.
     """
 
     def body(x_t: Any, t: Array) -> tuple[Any, Any]:
@@ -190,10 +180,7 @@ def ddim_step(
 
     eta, in [0, 1], is the share of the posterior's standard deviation that is drawn as
     noise: 0 draws none; 1 is `ancestral_step`. At t = 1 the result is the prediction
-    itself.
-
-    Raises:
-      ValueError: if eta is a Python number out of range.
+    itself. `ValueError` if eta is a Python number out of range.
 
     Source: Song et al. 2020 (DDIM), eq. 12 and 16, written with x_0.
     """
@@ -220,13 +207,7 @@ def ddim_step(
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class SolverState:
-    """What DPM-Solver++ 2M walks.
-
-    Attributes:
-      x: Sample at step t.
-      x_0: Prediction of the step before, from t + 1.
-      known: Whether there was a step before.
-    """
+    """What DPM-Solver++ 2M walks: x at t, and x_0 as predicted from t + 1, if known."""
 
     x: Float[Array, "*shape"]
     x_0: Float[Array, "*shape"]
@@ -286,9 +267,6 @@ def sample(
     """Draws a sample: normal noise, then the whole reverse chain.
 
     The shape and T (`num_steps`) of the step's schedule are static.
-
-    Raises:
-      ValueError: if num_steps is negative or no integer.
 
     Source: Ho et al. 2020, alg. 2.
     """

@@ -24,14 +24,8 @@ def classifier_free(
     the network, vectorized over the two conditions, with one key, so that a stochastic
     denoiser draws the same latent for both.
 
-    Args:
-      denoise: Predicts x_0 from (key, x_t, t, cond).
-      cond: Condition, any pytree of arrays.
-      null_cond: Condition that stands for "none", of the same structure and shapes.
-      scale: Guidance scale; may be traced.
-
-    Raises:
-      ValueError: if the two conditions differ in structure, shape or dtype.
+    The null condition has the other's structure, shapes and types (else `ValueError`);
+    the scale may be traced.
 
     Source: Chen et al. 2024 (CAMDM), eq. 5; Ho & Salimans 2022.
     """
@@ -82,10 +76,7 @@ def gradient_guidance(
     gradient goes through the network to its noisy input, so the prediction moves only
     where a change of the input would have moved it.
 
-    Args:
-      denoise: Predicts x_0; differentiable in x_t.
-      objective: Scalar of the prediction.
-      scale: Step size; 0 leaves the prediction as it is; may be traced.
+    The scale may be traced; 0 leaves the prediction as it is.
 
     Source: Li et al. 2024 (AAMDM), eq. 13; Rempe et al. 2023 (TRACE).
     """
@@ -128,10 +119,7 @@ def dsg_step(
     of length sqrt(n) `last_sigma`.
 
     Args:
-      denoise: Predicts x_0; differentiable in x_t.
-      objective: Scalar of the prediction, whose gradient is finite.
-      rate: 0 keeps the drawn direction, 1 takes the descent's; may be traced.
-      last_sigma: sigma of the step from t = 1; None for that of t = 2, as the released
+      objective: Of the prediction; its gradient is finite.
         code's clipped variance has it. It is a fifth of the data's deviation at T = 8,
         all of it along one direction: smaller values disturb less.
 

@@ -42,9 +42,8 @@ def draw_noise(function: Callable[..., Any], key: Key, *args: Any) -> Tape:
 
     Only the shapes of the arguments matter, and may stand for them.
 
-    Raises:
-      ValueError: if the function draws something else than normal noise, or its keys
-        depend on its data.
+    `ValueError` if the function draws something else than normal noise, or its keys
+    depend on its data.
     """
     return jax.jit(_drawer(_trace(function, args)[0]))(key)
 
@@ -52,10 +51,9 @@ def draw_noise(function: Callable[..., Any], key: Key, *args: Any) -> Tape:
 def with_noise(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function of its noise instead of its key, which it takes first.
 
-    Returns:
-      `(tape, *args)`, which gives what `function(key, *args)` gives where the tape is
-      `draw_noise(function, key, *args)`. It raises `ValueError` where that does, and
-      for a tape of other shapes.
+    `(tape, *args)` gives what `function(key, *args)` gives where the tape is
+    `draw_noise(function, key, *args)`. It raises `ValueError` where that does, and for
+    a tape of other shapes.
     """
 
     def run(tape: Tape, *args: Any) -> Any:

@@ -67,16 +67,10 @@ def cosine_schedule(
 ) -> Schedule:
     """Cosine schedule; the default of MDM, CAMDM and SMGDiff.
 
-    alpha_bar(u) is proportional to cos^2 of (u + offset) / (1 + offset) * pi / 2 with
-    u = t / T. All arguments are static.
-
-    Args:
-      num_steps: T, at least 1.
-      offset: Keeps the first steps from vanishing; at least 0.
-      max_beta: Upper bound of beta, in (0, 1).
-
-    Raises:
-      ValueError: if an argument is out of range.
+    alpha_bar(u) is proportional to cos^2 of (u + offset) / (1 + offset) * pi / 2 with u
+    = t / T; the offset, at least 0, keeps the first steps from vanishing, and beta is
+    at most `max_beta`, in (0, 1). All arguments are static; `ValueError` out of these
+    ranges.
 
     Source: Nichol & Dhariwal 2021, eq. 17; clipping as in the released code of CAMDM.
     """
@@ -112,18 +106,10 @@ def linear_schedule(
 ) -> Schedule:
     """Variances on a straight line.
 
-    The default bounds were chosen for T = 1000. All arguments are static.
-
-    Args:
-      num_steps: T, at least 1.
-      beta_min: First variance, in (0, 1].
-      beta_max: Last variance, in (0, 1].
-      scaled: Multiplies both bounds by 1000 / T, so that few steps add as much noise
-        as 1000 would; needs T >= 1000 * beta_max.
-
-    Raises:
-      ValueError: if an argument is out of range, or a scaled bound exceeds 1; names
-        the smallest usable number of steps.
+    From `beta_min` to `beta_max`, both in (0, 1], chosen for T = 1000. Where `scaled`,
+    both are multiplied by 1000 / T, so that few steps add as much noise as 1000 would.
+    All arguments are static. `ValueError` for one out of range, or T < 1000 * beta_max
+    if scaled; names the smallest usable number of steps.
 
     Source: Ho et al. 2020, section 4; `scaled` as in the released code of MDM and
     CAMDM.
@@ -156,18 +142,10 @@ def vp_schedule(
 ) -> Schedule:
     """Variance-preserving diffusion cut into T steps; the default of EMDM.
 
-    The continuous process runs over times t_min..1 and its noise rate grows from
-    beta_min to beta_max. The table starts from clean data at t_min, so alpha_bar_T
-    is the same for every T. All arguments are static.
-
-    Args:
-      num_steps: T, at least 1.
-      beta_min: Noise rate at time 0, more than 0.
-      beta_max: Noise rate at time 1, at least beta_min.
-      t_min: Time of the clean sample, in [0, 1).
-
-    Raises:
-      ValueError: if an argument is out of range.
+    The continuous process runs over times t_min..1 (t_min in [0, 1)) and its noise rate
+    grows from beta_min > 0 to beta_max. The table starts from clean data at t_min, so
+    alpha_bar_T is the same for every T. All arguments are static; `ValueError` out of
+    range.
 
     Source: Song et al. 2021, eq. 32-33; discretized as in Xiao et al. 2022 (DDGAN) and
     the released code of EMDM. Differs: those give the clean sample a variance of 1e-8.
@@ -188,16 +166,10 @@ def vp_schedule(
 
 
 def schedule_from_betas(beta: Float[Array, " steps"]) -> Schedule:
-    """Schedule with the given variances.
+    """Schedule with the given variances of steps 1..T, in (0, 1); the last may be 1.
 
-    Under jit the values are not known and therefore not checked.
-
-    Args:
-      beta: Variance added at steps 1..T, in (0, 1); the last may be 1.
-
-    Raises:
-      ValueError: if beta is empty, not one-dimensional, or has a value out of range;
-        names the first such step.
+    A `ValueError` names the first step out of range. Under jit the values are not known
+    and therefore not checked.
 
     Source: Ho et al. 2020, eq. 2.
     """
@@ -223,14 +195,8 @@ def respace(schedule: Schedule, steps: tuple[int, ...]) -> Schedule:
     kept there and beta spans the gap. A network trained on the given schedule must be
     told the old step, as `chain.respaced` does.
 
-    Args:
-      steps: Steps to keep, in 1..T, strictly increasing, at least one; static.
-
-    Returns:
-      A schedule of len(steps) steps.
-
-    Raises:
-      ValueError: if steps is empty, out of range or not increasing.
+    `steps` are in 1..T, strictly increasing, one at least, and static (else
+    `ValueError`).
 
     Source: Nichol & Dhariwal 2021, section 4 (fast sampling).
     """
@@ -247,11 +213,7 @@ def respace(schedule: Schedule, steps: tuple[int, ...]) -> Schedule:
 
 
 def spread_steps(total: int, number: int) -> tuple[int, ...]:
-    """Steps for `respace`: evenly spread over 1..total, the last among them.
-
-    Raises:
-      ValueError: unless 1 <= number <= total.
-    """
+    """Steps for `respace`: evenly spread over 1..total, the last of them total."""
     if not 1 <= number <= total:
         raise ValueError(f"{number} steps of {total}, expected 1 to {total}")
     return tuple(-(-total * k // number) for k in range(1, number + 1))
@@ -293,16 +255,9 @@ def q_sample(
 ) -> Float[Array, "*shape"]:
     """Noisy sample x_t of a clean one.
 
-    At t = 0 it is x_0 itself.
-
-    Args:
-      x_0: Clean sample, in normalized units.
-      t: Step in 0..T, a scalar or one for each index of x_0's leading axes. Steps out
-        of range clamp, they do not raise.
-      noise: Standard normal noise.
-
-    Raises:
-      ValueError: at trace time, if shapes do not fit.
+    At t = 0 it is x_0 itself, in normalized units. t is in 0..T, a scalar or one for
+    each index of x_0's leading axes. Steps out of range clamp, they do not raise;
+    shapes that do not fit raise `ValueError`, at trace time.
 
     Source: Ho et al. 2020, eq. 4.
     """
@@ -320,13 +275,7 @@ def q_step(
 ) -> Float[Array, "*shape"]:
     """One noising step x_{t-1} -> x_t.
 
-    Args:
-      t: Step in 1..T, a scalar or one for each index of x_prev's leading axes. Steps
-        out of range clamp, they do not raise.
-      noise: Standard normal noise.
-
-    Raises:
-      ValueError: at trace time, if shapes do not fit.
+    t is in 1..T, the noise standard normal; shapes and clamping as in `q_sample`.
 
     Source: Ho et al. 2020, eq. 2.
     """
@@ -341,8 +290,6 @@ def posterior_weight(
     schedule: Schedule, t: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
     """How much the mean of x_{t-1} moves with x_0: 1 at t = 1, little at noisy steps.
-
-    Steps out of 1..T clamp.
 
     Source: Ho et al. 2020, eq. 7: the factor of x_0.
     """
@@ -363,16 +310,8 @@ def posterior(
 
     At t = 1 the variance is exactly zero and the mean is x_0.
 
-    Args:
-      x_0: Clean sample (or its prediction), in normalized units.
-      t: Step in 1..T, a scalar or one for each index of x_0's leading axes. Steps out
-        of range clamp, they do not raise.
-
-    Returns:
-      Mean, and variance that broadcasts to it.
-
-    Raises:
-      ValueError: at trace time, if shapes do not fit.
+    t is in 1..T, x_0 in normalized units, maybe predicted; the variance broadcasts to
+    the mean. Shapes and clamping as in `q_sample`.
 
     Source: Ho et al. 2020, eq. 6-7; EMDM alg. 2 with its index shifted by one.
     """
@@ -397,13 +336,7 @@ def noise_from_x0(
 ) -> Float[Array, "*shape"]:
     """Noise that takes x_0 to x_t.
 
-    Args:
-      x_0: Clean sample, in normalized units.
-      t: Step in 1..T (at 0 there is no noise to find), a scalar or one for each index
-        of x_0's leading axes. Steps out of range clamp, they do not raise.
-
-    Raises:
-      ValueError: at trace time, if shapes do not fit.
+    t is in 1..T (at 0 there is no noise to find); shapes and clamping as in `q_sample`.
 
     Source: Ho et al. 2020, eq. 4, solved for the noise.
     """
@@ -424,14 +357,7 @@ def x0_from_noise(
     Errors of the noise grow by 1 / sqrt(alpha_bar_t): some 160 at the last step of 8
     cosine steps.
 
-    Args:
-      schedule: Table of T steps; alpha_bar_t must not be 0.
-      noise: The noise (or its prediction).
-      t: Step in 0..T, a scalar or one for each index of x_t's leading axes. Steps out
-        of range clamp, they do not raise.
-
-    Raises:
-      ValueError: at trace time, if shapes do not fit.
+    There alpha_bar_t must not be 0. Shapes and clamping as in `q_sample`.
 
     Source: Ho et al. 2020, eq. 4, solved for x_0.
     """

@@ -51,14 +51,8 @@ def trajectory_error(
     means nothing at rest, so frames in which either speed is below `min_speed` are left
     out; the part that remains is returned.
 
-    Args:
-      wanted_velocity: Velocity (x, z) that the user asked for in each frame, m/s; the
-        last is not used.
-      position: Root position (x, z) in each frame, meters.
-      min_speed: Meters per second.
-
-    Raises:
-      ValueError: if there are fewer than two frames.
+    Velocities (x, z) and `min_speed` are in m/s, positions in meters. Raises
+    `ValueError` for fewer than two frames.
 
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 5; wrapped.
     """
@@ -148,10 +142,7 @@ def creep(
     """How far a character that should stand goes from its place within `length` frames.
 
     Largest distance, meters, of the root (x, z) from the first frame of a part of that
-    length; mean over all whole parts.
-
-    Raises:
-      ValueError: if there is no whole part.
+    length; mean over all whole parts, of which there must be one (`ValueError`).
     """
     parts = position.shape[-2] // length
     if parts < 1:

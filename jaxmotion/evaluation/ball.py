@@ -54,17 +54,12 @@ def touch_events(
 
     The ground pushes too. A ball in flight accelerates by 9.8: below that threshold the
     flight and the kicks at its two ends are a single event. A bounce is one as well.
+    The threshold is in m/s^2, exclusive; the paper's 2 is a second difference of 2.2 mm
+    at 30 fps, which noise in a recording exceeds.
 
-    Args:
-      threshold: Meters per second squared, exclusive. The paper's 2 is a second
-        difference of 2.2 mm at 30 fps, which noise in a recording exceeds.
-
-    Returns:
-      First frames of events, and all their frames. Never the first or the last frame of
-      the clip, which have no acceleration.
-
-    Raises:
-      ValueError: if there are fewer than three frames.
+    Given are first frames of events, and all their frames: never the first or the last
+    frame of the clip, which have no acceleration. Fewer than three frames:
+    `ValueError`.
 
     Source: SMGDiff, eq. 10.
     """
@@ -88,12 +83,6 @@ def foot_ball_distance(
     frames and one frame on either side: meters, added over events, and the number of
     events. A touch by the surface of a foot leaves the ball's radius and half a foot.
 
-    Args:
-      joints: World positions of the joints that may touch it (feet, or hands), meters.
-      threshold: Acceleration of an event, meters per second squared, exclusive.
-
-    Raises:
-      ValueError: if there are fewer than three frames.
     """
     starts, distances = _event_distances(ball, joints, fps, threshold)
     return Tally(
@@ -114,19 +103,8 @@ def touch_count(
     """Touches, and those in which the ball is pushed by nothing.
 
     An event of `touch_events` is missed if its distance, as in `foot_ball_distance`, is
-    above `max_distance`. Divide by the minutes for touches a minute.
-
-    Args:
-      joints: World positions of the joints that may touch it, meters.
-      threshold: Acceleration of an event, meters per second squared, exclusive.
-      max_distance: From a joint to the ball's center, meters, inclusive: the ball's
-        radius, half a foot, and a margin.
-
-    Returns:
-      Numbers of touches and of missed ones among them, and the minutes of motion.
-
-    Raises:
-      ValueError: if there are fewer than three frames.
+    above `max_distance` (meters, inclusive: the ball's radius, half a foot, and a
+    margin). The minutes are those of motion.
     """
     starts, distances = _event_distances(ball, joints, fps, threshold)
     touches = jnp.sum(starts, axis=-1, dtype=ball.dtype)
@@ -149,20 +127,10 @@ def untouched_acceleration(
 ) -> Tally:
     """How much the ball accelerates while no joint is near it.
 
-    Over the frames in which, as in the frames before and after, every joint is farther
-    than `max_distance`. A rolling ball is slowed by a few tenths of a meter per second
-    squared, a flying one falls with 9.8: compare with real motions.
-
-    Args:
-      joints: World positions of the joints that may touch it, meters.
-      max_distance: From a joint to the ball's center, meters, inclusive.
-
-    Returns:
-      Length of the acceleration in meters per second squared, added over these frames,
-      and their number.
-
-    Raises:
-      ValueError: if there are fewer than three frames.
+    The acceleration, m/s^2, is added over the frames in which, as in the frames before
+    and after, every joint is farther than `max_distance` (meters, inclusive) from the
+    center. A rolling ball is slowed by a few tenths, a flying one falls with 9.8:
+    compare with real motions. Fewer than three frames: `ValueError`.
     """
     size = jnp.linalg.norm(ball_accelerations(ball, fps), axis=-1)[..., 1:-1]
     is_free = _least_nearby(_nearest(ball, joints))[..., 1:-1] > max_distance

@@ -74,8 +74,7 @@ def _check_distinct(points: Sequence[Point]) -> tuple[Point, ...]:
 def plain_points(texts: Sequence[str]) -> tuple[Point, ...]:
     """Numbers of steps T, from texts such as "8".
 
-    Raises:
-      ValueError: if one is no positive number, or given twice.
+    Raises `ValueError` if one is no positive number, or given twice.
     """
     numbers = [_number(text, 1) for text in texts]
     return _check_distinct(
@@ -90,10 +89,8 @@ def taught_points(texts: Sequence[str]) -> tuple[Point, ...]:
     """Numbers of steps T, and students of such models, in this order.
 
     A text is "8" for a model of 8 steps, or "1/8" for its student of 1 step, which
-    comes after it.
-
-    Raises:
-      ValueError: if one is neither, is given twice, or is a student of none before it.
+    comes after it. `ValueError` if one is neither, is given twice, or has no teacher
+    before it.
     """
     points: list[Point] = []
     for text in texts:
@@ -123,10 +120,8 @@ def paired_points(texts: Sequence[str]) -> tuple[Point, ...]:
     """Polish steps preceded by draft steps, in this order.
 
     A text is "2+3" for 2 polish steps after 3 draft steps (either may be 0), or "2" for
-    2 after the paper's 3 draft steps.
-
-    Raises:
-      ValueError: if one is neither, has no step at all, or is given twice.
+    2 after the paper's 3. `ValueError` if one is neither, has no step, or is given
+    twice.
     """
     points = []
     for text in texts:
@@ -173,10 +168,7 @@ Budget = dict[str, Any]
 def resolve(amounts: Amounts, name: str, changes: Sequence[str] = ()) -> Budget:
     """The numbers of a budget ("quick" or "full"), some changed by "number=value".
 
-    They are whole where the budget's are whole.
-
-    Raises:
-      ValueError: names the field that is wrong.
+    They are whole where the budget's are; a `ValueError` names the field that is wrong.
     """
     if name not in BudgetName.__args__:
         raise ValueError(
@@ -215,7 +207,6 @@ class Job:
     Attributes:
       data: Files of clips.
       models: Folder of the trained models.
-      seed: Seeds everything random.
       evaluator: A frozen evaluator; None to train one.
     """
 
@@ -252,7 +243,6 @@ class Bench:
 
     Attributes:
       data: Files of clips, where none are given.
-      amounts: Its budgets.
       points: Reads step counts: `texts -> points`.
       train: The command of the system's script, with its options, that leaves a point's
         model in the job's folder; one that is there is left alone.
@@ -284,13 +274,8 @@ def call_time(
 ) -> Cell:
     """Median time of one call, milliseconds, with the ends of the middle half.
 
-    For a column beside the scores; benchmarks measure better.
-
-    Args:
-      run: A jitted function of a key.
-      parts: Parts of the call's time that is given, such as its frames.
-      seconds: Calls go on for so long, but for no more than 200 of them.
-      least: Number of calls, at least.
+    For a column beside the scores; benchmarks measure better. The time is that of one
+    of the call's parts, such as its frames.
     """
     times = timing.time_calls(
         run, arguments=_key, rounds=200, warmup=2, limit_s=seconds, least=least

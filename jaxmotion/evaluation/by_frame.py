@@ -97,10 +97,8 @@ def by_frame(
     A difference belongs to its last frame: a jump from frame 4 to frame 5 shows in the
     jerk of frames 5, 6 and 7 (as 1 : 2 : 1) and in the slide of frame 5.
 
-    Args:
-      positions: World, meters.
-      place: Place of each frame, in 0..num_places-1; others are left out.
-      contact_height: A foot joint below this height should not move, meters.
+    Positions are in the world; a foot below `contact_height` should not move; meters.
+    Places out of 0..num_places-1 are left out.
     """
     return means(
         rough_sums(

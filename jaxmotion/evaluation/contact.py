@@ -22,11 +22,7 @@ class Slide(NamedTuple):
 def foot_steps(
     foot_positions: Float[Array, "*batch frames feet 3"],
 ) -> Float[Array, "*batch frames-1 feet"]:
-    """Distance, meters, on the ground from each frame to the next.
-
-    Raises:
-      ValueError: if there are fewer than two frames.
-    """
+    """Distance, meters, on the ground from each frame to the next."""
     if foot_positions.shape[-3] < 2:
         raise ValueError("1 frame or none, expected at least 2 to have a step")
     return jnp.linalg.norm(jnp.diff(foot_positions[..., ::2], axis=-3), axis=-1)
@@ -45,16 +41,9 @@ def slide_distance(
     horizontal distance to the next frame, summed, divided by the time summed. To join
     clips, weight their speeds with their seconds.
 
-    Args:
-      foot_positions: World positions of the toes, meters, ground at y = 0.
-      max_height: Meters, exclusive ("below, e.g., 1 cm" in the paper).
-
-    Returns:
-      Meters per second (zero where no foot is ever low) and the seconds that feet were
-      low, added over feet.
-
-    Raises:
-      ValueError: if there are fewer than two frames.
+    Speed in m/s (zero where no foot is ever low), and the seconds that feet were low,
+    added over feet. Positions are those of toes (world, meters, ground at y = 0);
+    `max_height`, exclusive, is "below, e.g., 1 cm" in the paper.
 
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 2. Differs: a second of low
       foot, so that it depends on neither length nor frame rate.
@@ -80,13 +69,8 @@ def skate_ratio(
     A foot skates from one frame to the next if it is lower than `max_height` in both
     and moves faster than `min_speed` on the ground.
 
-    Args:
-      foot_positions: World positions of feet or toes, meters, ground at y = 0.
-      max_height: Meters, exclusive.
-      min_speed: Meters per second, exclusive. The source's 2.5 cm a frame at 20 fps.
-
-    Raises:
-      ValueError: if there are fewer than two frames.
+    World positions, meters, ground at y = 0; both bounds are exclusive. The source's
+    speed is 2.5 cm a frame at 20 fps.
 
     Source: Karunratanakul et al. 2023 (GMD), with a threshold per second. Real data do
       not score zero (about 0.05 there).
@@ -111,13 +95,8 @@ def skating_frame_ratio(
     / H clipped to [0, 1]: fully on the ground, not at all from H on. A frame counts if
     that exceeds `min_speed`.
 
-    Args:
-      foot_positions: World positions of feet or toes, meters, ground at y = 0.
-      height: H, meters.
-      min_speed: Meters per second, exclusive; ours, since the source sums the measure.
-
-    Raises:
-      ValueError: if there are fewer than two frames.
+    World positions, meters, ground at y = 0; `height` is H. The speed, exclusive, is
+    ours, since the source sums the measure.
 
     Source: Zhang et al. 2018 (MANN), section 8; cited for AAMDM's "footskating frame
       ratio" by Li et al. 2024.

@@ -29,12 +29,8 @@ def diversity(
     that the mean is unbiased; there two random subsets are paired, and a sample may
     meet itself.
 
-    Args:
-      features: One row a sample, of all conditions together.
-      num_pairs: Pairs to draw (the source: 200 or 300).
-
-    Raises:
-      ValueError: if there are fewer than two samples.
+    Features are one row a sample, of all conditions together; the source draws 200 or
+    300 pairs.
 
     Source: Guo et al. 2020 (Action2Motion).
     """
@@ -49,11 +45,7 @@ def multimodality(
 ) -> Float[Array, ""]:
     """Mean Euclidean distance of random pairs of samples of the same condition.
 
-    In the features' units, of `num_pairs` pairs for each condition (the source: 10 or
-    20).
-
-    Raises:
-      ValueError: if a condition has fewer than two samples.
+    In the features' units; `num_pairs` are of each condition (the source: 10 or 20).
 
     Source: Guo et al. 2020 (Action2Motion), with pairs of two different samples.
     """
@@ -73,11 +65,7 @@ def joint_distance(
 
     Over random pairs of two different samples, their frames and joints. Unlike
     `diversity` it has the unit of a length and does not grow with frames or joints.
-    Positions are in the frame they are to be compared in: world for the whole rollout,
-    root-local for the pose alone.
-
-    Raises:
-      ValueError: if there are fewer than two samples.
+    Positions are world for the whole rollout, root-local for the pose alone.
     """
 
     def distance(pair: tuple[Array, Array]) -> Array:
@@ -99,11 +87,7 @@ def intra_style_variance(
     sentence: the variance of each joint's spatial location, averaged over all joints,
     of motions generated with the same control. Here: at each frame and joint the mean
     squared distance to the mean over the repeats, unbiased, averaged over frames and
-    joints. Positions are in meters, in the frame they are to be compared in: world for
-    the whole rollout, root-local for the pose alone.
-
-    Raises:
-      ValueError: if there are fewer than two repeats.
+    joints. Positions as in `joint_distance`.
 
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 4 (no code was released).
     """

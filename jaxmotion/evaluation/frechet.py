@@ -17,12 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Moments:
-    """Mean and covariance of features.
+    """Mean and covariance, unbiased (divided by count - 1), of features.
 
     Leading axes come from `jax.vmap` over sets; the functions here take one set.
-
-    Attributes:
-      covariance: Unbiased (divided by count - 1).
     """
 
     mean: Float[Array, "*batch features"]
@@ -32,13 +29,7 @@ class Moments:
 
 @jax.jit
 def moments(features: Float[Array, "samples features"]) -> Moments:
-    """Mean and unbiased covariance of one row per sample.
-
-    Raises:
-      ValueError: if there are fewer than two samples.
-
-    Source: Heusel et al. 2017.
-    """
+    """Mean and unbiased covariance of one row per sample, two at least."""
     count = features.shape[0]
     if count < 2:
         raise ValueError(f"{count} samples, expected at least 2 to have a covariance")
@@ -58,8 +49,6 @@ def masked_moments(
 
     One program thus serves subsets of any size. The covariance is NaN where fewer than
     two rows count.
-
-    Source: Heusel et al. 2017.
     """
     weight = mask.astype(features.dtype)[:, None]
     count = jnp.sum(weight)

@@ -44,13 +44,9 @@ class BiasCheck(NamedTuple):
 def subset_sizes(count: int, *, number: int = 15, least: int) -> tuple[int, ...]:
     """Ascending sizes evenly spaced from the least to all samples, as in the source.
 
-    Args:
-      number: Sizes; 15 in the source.
-      least: The smallest. At least the number of features (the source: 5,000 for
-        2,048): below it (1) has further terms, and the line misses them.
-
-    Raises:
-      ValueError: if fewer than two different sizes fit.
+    Fewer than two different sizes raise `ValueError`. The least is at least the number
+    of features (the source: 5,000 for 2,048): below it (1) has further terms, and the
+    line misses them.
     """
     if number < 2 or not 2 <= least <= count - number + 1:
         raise ValueError(
@@ -77,14 +73,7 @@ def frechet_bias(
     repeat it with independent samples for that. What the reference lacks in samples is
     not extrapolated away.
 
-    Args:
-      features: Features of all samples of a model, one row each.
-      reference: Moments of what they are compared with, of as many samples as there
-        are.
-
-    Raises:
-      ValueError: if there are fewer than two different sizes or one is not in
-        2..samples.
+    The sizes, two at least, are in 2..samples (else `ValueError`).
 
     Source: Chong and Forsyth 2020, sec. 3; theirs is one subset of each of 15 sizes.
     """

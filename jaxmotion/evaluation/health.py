@@ -74,8 +74,6 @@ def frozen_frames(
     the root; speeds and the velocity (x, z) asked for in each frame are in meters per
     second.
 
-    Raises:
-      ValueError: if a window is shorter than a frame.
     """
     length = round(seconds * fps)
     if length < 1:
@@ -105,14 +103,7 @@ def is_frozen(
     min_speed: Scalar = 0.05,
     commanded: Scalar = 0.3,
 ) -> Bool[Array, "*batch"]:
-    """Whether a character stops moving its limbs for some seconds while told to travel.
-
-    True where any window of `frozen_frames` is frozen; never for motions shorter than
-    one.
-
-    Raises:
-      ValueError: if a window is shorter than a frame.
-    """
+    """Whether any window of `frozen_frames` is frozen; never if there is none."""
     found = frozen_frames(
         positions,
         wanted_velocity,

@@ -23,17 +23,12 @@ def locomotion_metrics(
     *,
     contact_height: Scalar,
 ) -> dict[str, Float[Array, " windows"]]:
-    """Metrics of windows.
+    """Metrics of windows [windows, frames, ...], world.
 
-    Args:
-      skeleton: The skeleton; its feet are the joints whose sliding counts.
-      motion: Windows [windows, frames, ...], world.
-      wanted_velocity: Velocity asked for in each frame, meters per second.
-      contact_height: A foot joint below this height should not move, meters.
-
-    Returns:
-      trajectory_error and orientation_error in radians; slide_speed in m/s
-      over slide_seconds of low feet; skate_ratio; acceleration, m/s^2; jerk, m/s^3.
+    Velocities are in meters per second; a foot joint (the skeleton's feet) below the
+    contact height, meters, should not move. Given are trajectory_error and
+    orientation_error in radians; slide_speed in m/s over slide_seconds of low feet;
+    skate_ratio; acceleration, m/s^2; jerk, m/s^3.
     """
     fps = motion.fps
     positions = joint_positions(skeleton, motion)

@@ -39,14 +39,8 @@ def r_precision(
     motions is meant, and real motions too score below 1: compare only figures of the
     same pools, or of many.
 
-    Args:
-      top: The largest k, at most pool.
-
-    Returns:
-      Fractions for k = 1..top, in 0..1; NaN if an embedding is.
-
-    Raises:
-      ValueError: if there are fewer samples than a pool, or shapes differ.
+    Fractions for k = 1..top, in 0..1; NaN if an embedding is. `ValueError` if there are
+    fewer samples than a pool, or shapes differ.
 
     Source: Guo et al. 2022 (T2M), R-precision.
     """
@@ -80,9 +74,6 @@ def matching_distance(
     """Mean Euclidean distance of sentences to their own motions (MM-Dist).
 
     In units of the embedding, over all rows.
-
-    Raises:
-      ValueError: if shapes differ.
 
     Source: Guo et al. 2022 (T2M), multimodal distance.
     """

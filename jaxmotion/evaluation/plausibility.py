@@ -78,9 +78,6 @@ def skating(
     rate. World positions of feet or toes, meters; the ground is the height that these
     have when the body stands.
 
-    Raises:
-      ValueError: if there are fewer than two frames.
-
     Source: Yuan et al. 2023 (PhysDiff), with joints instead of vertices.
     """
     steps = contact.foot_steps(foot_positions)

@@ -26,9 +26,6 @@ def acceleration(
     Second differences times fps^2. Real motion does not score zero, and a frozen one
     does: compare with the data's own value.
 
-    Raises:
-      ValueError: if there are fewer than three frames.
-
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 3, in its usual meaning (the
       paper's unit is that of a speed; see `camdm_release.coherence`).
     """
@@ -42,9 +39,6 @@ def jerk(
     """Mean length of the joints' jerk (world), over frames and joints, m/s^3.
 
     Third differences times fps^3.
-
-    Raises:
-      ValueError: if there are fewer than four frames.
 
     Source: Flash and Hogan 1985, who make its square least.
     """

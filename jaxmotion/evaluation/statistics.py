@@ -27,8 +27,6 @@ def confidence_interval(
     literature on text to motion takes 1.96 instead of t, and its released scripts
     divide by n: for n = 20 their half widths are 9 % less.
 
-    Raises:
-      ValueError: if there are fewer than two samples.
     """
     count = samples.shape[0]
     if count < 2:
@@ -39,11 +37,7 @@ def confidence_interval(
 
 
 class Spread(NamedTuple):
-    """What is kept of samples that are gone; in float64.
-
-    Attributes:
-      squares: Sum of their squared deviations from it.
-    """
+    """Count, mean and sum of squared deviations from it of samples, in float64."""
 
     count: int
     mean: np.ndarray | np.float64
@@ -92,9 +86,6 @@ def bootstrap_interval(
 
     The statistic takes independent samples and an argument `axis`; the interval holds
     the part `level`, in (0, 1), of the resampled values.
-
-    Raises:
-      ValueError: if there are fewer than two samples.
 
     Source: Efron 1979.
     """

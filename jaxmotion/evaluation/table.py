@@ -24,7 +24,6 @@ class Cell:
 
     Attributes:
       low: Lower end of its interval; None where none is given.
-      high: Upper end.
       samples: Clips, rollouts or resamples that it came from.
     """
 

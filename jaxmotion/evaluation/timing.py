@@ -23,7 +23,6 @@ class Timing:
       compile_s: Seconds of tracing, lowering and compiling.
       p50_ms: Median of the timed calls, milliseconds.
       p95_ms: 95th percentile, milliseconds.
-      runs: Timed calls.
       memory_mib: What the program needs at its peak, as its compiler says: arguments,
         results and what lies between, MiB. Constants of the program are not in it.
     """
@@ -81,17 +80,10 @@ def time_in_turn(
     Every round calls each once; the order moves on by one a round, so that none always
     runs after the same other.
 
-    Args:
-      calls: By name; what they return is waited for if it is JAX's.
-      arguments: Arguments of the calls of round i, warm-up included; making them is not
-        timed.
-      rounds: Timed rounds.
-      warmup: Rounds before, fewer where they take a quarter of the limit.
-      limit_s: Stop after so many seconds, but not before the least number of rounds.
-
-    Returns:
-      For each name an array [rounds, 2]: milliseconds of wall clock, and of processor
-      time of all threads of this process.
+    Arguments are of the calls of round i, warm-up included; making them is not timed.
+    Warm-up is shorter where it takes a quarter of the limit, seconds, after which only
+    the least number of rounds is still made. Given is for each name an array [rounds, 2]:
+    milliseconds of wall clock, and of processor time of all threads of this process.
     """
     names, made = list(calls), 0
 

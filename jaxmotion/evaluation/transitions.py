@@ -40,17 +40,9 @@ def transition(
     over rollouts would otherwise be of the easy changes alone. The paper does not say
     which of both its means are.
 
-    Args:
-      recognized: Whether each window shows the style that was commanded.
-      starts: Starts of the windows, seconds since the command, ascending, not negative.
-      limit: Latest start of the first window that shows it, seconds.
-      hold: Windows that must show it without a gap; more than 1 if styles flicker.
-
-    Returns:
-      Seconds (times the frame rate for the paper's frames) and success.
-
-    Raises:
-      ValueError: if `hold` is not in 1..windows.
+    Starts are seconds since the command, ascending, not negative; the limit is that of
+    the first window that shows the style, seconds; `hold`, in 1..windows (else
+    `ValueError`), is more than 1 if styles flicker.
 
     Source: Chen et al. 2024 (CAMDM), tables 2 and 4, where people judged.
     """

@@ -24,11 +24,7 @@ from jaxmotion.typing import Key, Params
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config:
-    """Size of the evaluator.
-
-    Attributes:
-      state_scale: Standard deviation of the states before the first frame.
-    """
+    """Size of the evaluator; `state_scale` is the deviation of the first states."""
 
     num_classes: int
     num_joints: int
@@ -96,13 +92,9 @@ def train(
 ) -> tuple[Params, dict[str, Array]]:
     """Trains an evaluator as one compiled program.
 
-    Args:
-      x: Joint positions, meters, of motions that start at the origin facing +z.
-      batch: Motions an update, drawn with replacement.
-      learning_rate: Of Adam, with cosine decay to a tenth.
-
-    Returns:
-      The moving average of the parameters, and losses and accuracies by step.
+    Positions of joints, meters, are of motions that start at the origin facing +z; they
+    are drawn with replacement; Adam's rate has a cosine decay to a tenth. With the
+    moving average of the parameters come losses and accuracies by step.
     """
     return style_evaluator.train_classifier(
         key,

@@ -53,12 +53,8 @@ class Evaluator:
         released with CAMDM).
       field: Label field of the clips that the classes are from.
       labels: Names of the classes, in their order.
-      joints: Names of the skeleton's joints, in their order.
-      frames: Frames of what it looks at.
       source: Data that it was trained on, and their license.
       clips: Fingerprint of the training clips.
-      seed: Seeds parameters and batches.
-      updates: Updates of its training.
       accuracy: On clips that it was not trained on, in [0, 1]; NaN if nobody said.
       path: Its file; None for one that was not loaded.
     """
@@ -95,9 +91,7 @@ class Evaluator:
 def released_style(path: Path) -> Evaluator:
     """The style classifier released with CAMDM, 100style_position_classifier.pth.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: see `published.load_style_classifier`.
+    `ValueError` as `published.load_style_classifier`.
     """
     params, labels = published.load_style_classifier(path)
     return Evaluator(
@@ -132,11 +126,7 @@ def to_json(evaluator: Evaluator) -> dict[str, Any]:
 
 
 def save(path: Path, evaluator: Evaluator) -> None:
-    """Writes an evaluator as one npz file, whole or not at all.
-
-    Raises:
-      OSError: if the file cannot be written.
-    """
+    """Writes an evaluator as one npz file, whole or not at all."""
     # All digits: what is loaded must score as what was saved.
     checkpoint.export_params(
         path, evaluator.params, to_json(evaluator), dtype=np.float32
@@ -146,9 +136,8 @@ def save(path: Path, evaluator: Evaluator) -> None:
 def load(path: Path) -> Evaluator:
     """Reads what `save` wrote; checks every field.
 
-    Raises:
-      ValueError: if it is missing, damaged, foreign or of another version; names the
-        file and the field.
+    A `ValueError` names the file and the field if it is missing, damaged, foreign or of
+    another version.
     """
     params, value = checkpoint.import_params(path)
     expected = {"format": _FORMAT, "version": _VERSION}
@@ -202,10 +191,7 @@ def params_for(
 ) -> Params | None:
     """Parameters of a frozen evaluator for a run that it fits; None without one.
 
-    It scores `frames` frames at a time.
-
-    Raises:
-      ValueError: if it does not fit; names its file and the field.
+    It scores `frames` frames. A `ValueError` names its file and a field that differs.
     """
     if evaluator is None:
         return None
@@ -221,10 +207,7 @@ def params_for(
 
 
 def clips_fingerprint(data: Clips | BallClips, field: str) -> str:
-    """Fingerprint of clips, their labels of `field`, and of the ball if there is one.
-
-    12 hexadecimal digits.
-    """
+    """12 hexadecimal digits of clips, their labels of `field`, and perhaps a ball."""
     clips = data.clips if isinstance(data, BallClips) else data
     arrays = {
         "root_position": clips.root_position,

@@ -44,8 +44,7 @@ class InferenceBatchNorm(nn.Module):
 class ResidualConvolution(nn.Module):
     """Convolution of width 3, norm and leaky ReLU, added to a 1 x 1 convolution.
 
-    Attributes:
-      frozen: Batch norm in inference mode in place of group norm.
+    Where `frozen`, batch norm in inference mode takes the place of group norm.
     """
 
     channels: int
@@ -69,9 +68,7 @@ class ResidualConvolution(nn.Module):
 class WindowClassifier(nn.Module):
     """Windows of poses to features and class logits.
 
-    Attributes:
-      dropout: Rate after the convolutions.
-      frozen: Batch norms in inference mode in place of layer and group norms.
+    Where `frozen`, batch norms in inference mode replace layer and group norms.
     """
 
     num_classes: int
@@ -154,11 +151,7 @@ _SLOPE = 0.2
 
 
 class MovementEncoder(nn.Module):
-    """Two convolutions of width 4 and stride 2, and a linear layer.
-
-    Attributes:
-      dropout: Rate after each convolution.
-    """
+    """Two convolutions of width 4 and stride 2, and a linear layer."""
 
     width: int = 512
     dropout: float = 0.2
@@ -193,8 +186,7 @@ class MovementEncoder(nn.Module):
 class SequenceEncoder(nn.Module):
     """Linear layer, bidirectional GRU with learned first states, and two layers more.
 
-    Attributes:
-      width: Channels of the GRU, one direction.
+    The width is that of one direction of the GRU.
     """
 
     width: int
@@ -229,8 +221,7 @@ class SequenceEncoder(nn.Module):
 class TextEncoder(nn.Module):
     """Word vectors, plus a linear layer of their tags, through a sequence encoder.
 
-    Attributes:
-      width: Channels of the GRU, one direction.
+    The width is that of one direction of the GRU.
     """
 
     width: int = 512
@@ -256,10 +247,7 @@ class TextEncoder(nn.Module):
 class Matcher(nn.Module):
     """Both towers: motions and sentences to embeddings that can be compared.
 
-    Attributes:
-      motion_width: Channels of the motions' GRU, one direction.
-      text_width: Channels of the sentences' GRU, one direction.
-      dropout: Rate in the movement encoder.
+    Widths are those of one direction of the GRUs.
     """
 
     movement_width: int = 512
@@ -288,10 +276,8 @@ class Matcher(nn.Module):
         reach 3 frames beyond it, so motions that are to be compared are padded to one
         length (there 196 frames). Training needs rngs={"dropout": key}.
 
-        Args:
-          features: Normalized to mean 0 and deviation 1, without contact labels.
-          padding: What is seen beyond the whole movements: "zeros", or "kept", what is
-            there.
+        Features have mean 0 and deviation 1, no contact labels; `padding` "kept" sees
+        what is there beyond the whole movements.
         """
         units = frames // UNIT
         if padding == "zeros":
@@ -318,9 +304,6 @@ class Matcher(nn.Module):
         *,
         train: bool = False,
     ) -> tuple[Float[Array, "batch embedding"], Float[Array, "batch embedding"]]:
-        """Embeddings of the sentences and of the motions; see the two methods.
-
-        Training needs rngs={"dropout": key}.
-        """
+        """Embeddings of sentences and motions; training needs rngs={"dropout": key}."""
         motion = self.embed_motion(features, frames, train=train)
         return self.embed_text(vectors, tags, words), motion

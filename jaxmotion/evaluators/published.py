@@ -22,16 +22,11 @@ def load_matcher(
 
     Means and deviations of the features are files of their own there.
 
-    Args:
-      path: A file of PyTorch with the three encoders' state dicts (released as
-        text_mot_match/model/finest.tar), or a .safetensors file with the same arrays
-        as "text_encoder.gru.weight_ih_l0" and so on.
-      config: Its size; None for HumanML3D's.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if the file is damaged or foreign, or arrays are missing, unknown or
-        of another shape; names them all.
+    The file is PyTorch's with the three encoders' state dicts (released as
+    text_mot_match/model/finest.tar), or .safetensors with the same arrays as
+    "text_encoder.gru.weight_ih_l0" and so on; its size by default HumanML3D's. A
+    `ValueError` says if it is damaged or foreign, and names all arrays that are
+    missing, unknown or of another shape.
     """
     path, c = os.fspath(path), config or MatcherConfig()
     weights = arrays(read_weights(path))
@@ -94,10 +89,8 @@ def load_style_classifier(
     with its state dict under "state_dict", and "class_names"; runs no code. A window
     has `frames` frames.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if the file is damaged or foreign, or arrays are missing, unknown or
-        of another shape; names them all.
+    A `ValueError` says if it is damaged or foreign, and names all arrays that are
+    missing, unknown or of another shape.
     """
     path = os.fspath(path)
     content = read_weights(path)

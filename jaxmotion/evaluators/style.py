@@ -27,11 +27,7 @@ from jaxmotion.typing import Key, Params
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config:
-    """Size of the evaluator.
-
-    Attributes:
-      frames: Frames of a window, at 30 fps.
-    """
+    """Size of the evaluator; windows of `frames` are at 30 fps."""
 
     num_classes: int
     num_joints: int
@@ -84,8 +80,7 @@ RELEASED_JOINTS = _RELEASED_NAMES[1]
 def released_joints(skeleton: Skeleton) -> tuple[int, ...]:
     """The joints that the released classifier looks at, in its order.
 
-    Raises:
-      ValueError: if the skeleton has neither Mixamo's nor 100STYLE's names.
+    `ValueError` if the skeleton has neither Mixamo's nor 100STYLE's names.
     """
     plain = plain_names(skeleton)
     for names in _RELEASED_NAMES:
@@ -104,9 +99,6 @@ def released_input(
 
     Positions of 15 joints relative to the root, each frame (of 30 per second) turned so
     that hips and shoulders face +x.
-
-    Raises:
-      ValueError: see `released_joints`.
 
     Source: released feature extractor of CAMDM (Chen et al. 2024).
     """
@@ -218,15 +210,9 @@ def train_classifier(
 ) -> tuple[Params, dict[str, Array]]:
     """Trains any classifier of motions as one compiled program.
 
-    Args:
-      init: Initial parameters from a key.
-      batch: Samples per update, drawn with replacement.
-      learning_rate: Of Adam, with cosine decay to a tenth.
-      weight_decay: Decoupled.
-      max_norm: Clip the gradient to this global norm; None to leave it.
-
-    Returns:
-      The moving average of the parameters, and losses and accuracies by step.
+    Samples are drawn with replacement; Adam's rate has a cosine decay to a tenth;
+    weight decay is decoupled; the gradient is clipped to a global norm, None for not.
+    With the moving average of the parameters come losses and accuracies by step.
     """
     key_init, key_train = jax.random.split(key)
     optimizer = training.make_optimizer(
@@ -274,11 +260,7 @@ def contact_height(skeleton: Skeleton, real: EvalWindows) -> float:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StyleEvaluator:
-    """A style evaluator and its size.
-
-    Attributes:
-      classes: Its class of each label; none if they are the same.
-    """
+    """A style evaluator and its size; its class of each label, if they differ."""
 
     params: Params
     config: Config

@@ -70,9 +70,7 @@ class MatcherConfig:
     Attributes:
       num_features: Channels of a frame, without the 4 contact labels: 259 for
         HumanML3D, 247 for KIT-ML.
-      motion_width: Channels of the motions' GRU, one direction.
-      text_width: Channels of the sentences' GRU, one direction.
-      dropout: Rate in the movement encoder.
+        motion_width, text_width: Channels of the GRUs, one direction.
     """
 
     num_features: int = 259
@@ -95,12 +93,9 @@ class MatcherConfig:
 class Pairs:
     """Motions, and in the same row a sentence that describes each.
 
-    Attributes:
-      features: Normalized features, without contact labels.
-      frames: Frames of each motion, at least 4.
-      vectors: Word vectors.
-      tags: One-hot parts of speech, in the order of `TAGS`.
-      words: Words of each sentence, with the marks of start and end.
+    Features are normalized, without contact labels, of 4 frames or more; tags are
+    one-hot parts of speech, in the order of `TAGS`; words include the marks of start
+    and end.
     """
 
     features: Float[Array, "*batch frames channels"]
@@ -135,11 +130,8 @@ def embed_motion(
 ) -> Float[Array, "batch embedding"]:
     """Embeds motions, for every measure of text-to-motion.
 
-    Args:
-      features: As in `Pairs`; all padded to the length used in training.
-      frames: Frames of each motion, at least 4; those beyond a multiple of 4 do not
-        count.
-      padding: What is seen beyond a motion's frames: "zeros", or "kept", what is there.
+    Features are as in `Pairs`, all padded to the length used in training; frames beyond
+    a multiple of 4 do not count. `padding` says what is seen there: "zeros", or "kept".
     """
     return blocks.apply(
         params, config.network, features, frames, padding=padding, method="embed_motion"
@@ -169,9 +161,6 @@ def matcher_loss(
     A mismatched pair is a sentence and the motion some rows on, one number of rows for
     the batch. If it has the same sentence, the pair is pushed apart all the same. The
     key is consumed by dropout and the shift.
-
-    Raises:
-      ValueError: if there is one pair only.
 
     Source: Hadsell et al. 2006; Guo et al. 2022 (T2M).
     """
@@ -206,13 +195,9 @@ def train_matcher(
 ) -> tuple[Params, dict[str, Array]]:
     """Trains an evaluator as one compiled program.
 
-    Args:
-      sample_batch: `(key, data) -> Pairs`, traced.
-      optimizer: None for the source's: Adam at 1e-4, gradients clipped to 0.5 (here of
-        all parts together, there of each encoder).
-
-    Returns:
-      The moving average of the parameters, and losses by step.
+    `sample_batch(key, data) -> Pairs` is traced. The source's optimizer, by default, is
+    Adam at 1e-4, gradients clipped to 0.5 (here of all parts together, there of each
+    encoder). With the moving average of the parameters come losses by step.
     """
     key_init, key_train = jax.random.split(key)
     if optimizer is None:
@@ -269,12 +254,8 @@ def encode_tokens(
       vocabulary: Vectors of words, GloVe's for published weights; a word that it lacks
         is "unk/OTHER", as in the source. None for `word_vectors`.
 
-    Returns:
-      Word vectors and one-hot classes, zero after the sentence, and its number of
-      words including both marks.
-
-    Raises:
-      ValueError: if a token has no part of speech.
+    Word vectors and one-hot classes are zero after the sentence; its number of words
+    includes both marks. `ValueError` if a token has no part of speech.
     """
     pairs = [("sos", "OTHER")]
     for token in tokens[:MAX_WORDS]:

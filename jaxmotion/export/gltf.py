@@ -110,8 +110,6 @@ def to_glb(skeleton: Skeleton, motion: Motion) -> bytes:
 
     Joints are nodes 0, 1, ... by their names; all rotations are against the T-pose.
 
-    Raises:
-      ValueError: if a frame is not finite.
     """
     for name in ("root_position", "joint_rotation"):
         finite = np.isfinite(np.asarray(getattr(motion, name))).reshape(
@@ -178,12 +176,7 @@ def to_glb(skeleton: Skeleton, motion: Motion) -> bytes:
 
 
 def save_glb(path: str | Path, skeleton: Skeleton, motion: Motion) -> None:
-    """Writes `to_glb`.
-
-    Raises:
-      OSError: if the file cannot be written.
-      ValueError: if a frame is not finite.
-    """
+    """Writes `to_glb`; `ValueError` if a frame is not finite."""
     content = to_glb(skeleton, motion)
     with files.replacing(path) as file:
         file.write(content)

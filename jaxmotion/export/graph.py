@@ -48,8 +48,7 @@ class Port:
 class Graph:
     """A function of arrays, for one character.
 
-    Attributes:
-      run: `(*inputs) -> outputs`, arrays in the order of the ports.
+    `run` is `(*inputs) -> outputs`, arrays in the order of the ports.
     """
 
     name: str
@@ -61,13 +60,9 @@ class Graph:
 def make(name: str, exported: Exported, arguments: dict[str, Any]) -> Graph:
     """The graph of a function.
 
-    Args:
-      exported: The function. Where it takes a "key", the graph takes "noise".
-      arguments: Values of its other arguments by name, of one character; only shapes
-        matter.
-
-    Raises:
-      ValueError: if it draws something else than normal noise.
+    Where the function takes a "key", the graph takes "noise" (`ValueError` for any but
+    normal noise). Arguments are the others by name, of one character; only shapes
+    matter.
     """
     function, takes = exported.function, exported.takes
     given = {name: arguments[name] for name in takes if name != "key"}

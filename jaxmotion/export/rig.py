@@ -61,11 +61,7 @@ class Rig:
     sole: float | None
 
     def rest(self, roles: Any = None) -> Rest:
-        """For `transfer.retarget`; for the roles see `roles.find_roles`.
-
-        Raises:
-          OSError, ValueError: see `transfer.rest`; names the file.
-        """
+        """For `transfer.retarget`; for the roles see `roles.find_roles`."""
         try:
             given = self.roles if roles is None else roles
             return transfer.rest(self.skeleton, given=given, sole=self.sole)
@@ -326,10 +322,8 @@ def _vrm_roles(content: dict) -> dict[str, int]:
 def read_rig(path: str | Path) -> Rig:
     """A character of a .glb, .gltf or .vrm file.
 
-    Raises:
-      OSError: if it or a buffer beside it cannot be read.
-      ValueError: if it is damaged, has no skeleton or several, or one that cannot be
-        animated; names the file.
+    A `ValueError` names the file if it is damaged, has no skeleton or several, or one
+    that cannot be animated.
     """
     path = Path(path)
     name = str(path)
@@ -451,11 +445,7 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def to_glb(rig: Rig, motion: Motion) -> bytes:
-    """The rig's own file with one animation of one character, in place of its own.
-
-    Raises:
-      ValueError: if a frame is not finite.
-    """
+    """The rig's own file with one animation of one character, in place of its own."""
     positions, turned = kinematics(rig.skeleton, motion)
     if not np.isfinite(positions).all() or not np.isfinite(turned).all():
         bad = ~np.isfinite(positions).all(axis=(1, 2))
@@ -532,8 +522,6 @@ def save_onto(
 
     For the rig's roles see `roles.find_roles`.
 
-    Raises:
-      OSError, ValueError: see `transfer.rest` and `to_glb`.
     """
     world = kinematics(skeleton, motion)[1]
     function = transfer.Retarget(

@@ -33,13 +33,8 @@ def check() -> None:
 def write(path: Path, graph: Graph, *, batch: Batch = None) -> None:
     """Writes a graph as one file for all platforms, which holds its parameters too.
 
-    Args:
-      batch: None for one character, without an axis for it; a number of them, or
-        `graph.ANY`, for a first axis of all arrays.
-
-    Raises:
-      OSError: if the file cannot be written.
-      ValueError: if the package is missing.
+    As in `onnx.write`, the batch is None for one character, without an axis for it, a
+    number of them, or `graph.ANY`. `ValueError` if the package is missing.
     """
     check()
     lead = () if batch is None else (batch,)

@@ -49,9 +49,7 @@ def save(
     """Writes one step, whole or not at all, and removes the oldest beyond `keep`.
 
     The folder is made if missing; the config, which rebuilds the model, must be JSON.
-
-    Raises:
-      OSError: if the folder cannot be written.
+    Raises `OSError` if it cannot be written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -145,10 +143,9 @@ def _damaged(folder: Path, step: int, what: str) -> CheckpointError:
 
 
 def load_config(folder: str | Path, step: int | None = None) -> dict[str, Any]:
-    """Config of a step; the newest if none is given.
+    """Config of a step (None: the newest).
 
-    Raises:
-      CheckpointError: if there is none, or it is not what was saved; names the folder.
+    A `CheckpointError` names the folder if there is none or it is not what was saved.
     """
     folder = Path(folder)
     step = _newest(folder, step)
@@ -215,7 +212,6 @@ def restore_part(
     Args:
       like: Field names to nested dicts of arrays (or ShapeDtypeStructs), of the same
         structure and shapes.
-      step: None for the newest.
       within: Field of the state whose fields they are, such as "generator"; None for
         the state itself.
 
@@ -277,10 +273,9 @@ def export_params(
     *,
     dtype: type = np.float16,
 ) -> None:
-    """Writes parameters and config as one small npz file, whole or not at all.
+    """Writes parameters, a nested dict, and their config (JSON) whole or not at all.
 
-    The parameters are a nested dict, the config (what rebuilds the model) JSON; float16
-    halves the size at three decimal digits.
+    float16 halves the npz file at three decimal digits.
     """
     leaves = jax.tree_util.tree_leaves_with_path(params)
     arrays = {
@@ -346,10 +341,9 @@ def _read_export(
 
 
 def export_config(path: str | Path) -> dict[str, Any]:
-    """Config of an export, without its parameters; `import_params` checks both.
+    """Config of an export alone; `import_params` checks both.
 
-    Raises:
-      CheckpointError: if the file is no export.
+    Raises `CheckpointError` if the file is no export.
     """
     return _read_export(path, ("config",))[2]
 
@@ -357,8 +351,7 @@ def export_config(path: str | Path) -> dict[str, Any]:
 def import_params(path: str | Path) -> tuple[Params, dict[str, Any]]:
     """Parameters as float32, and the config, as `export_params` wrote them.
 
-    Raises:
-      CheckpointError: if the file is no such export, or damaged.
+    Raises `CheckpointError` if the file is no such export, or damaged.
     """
     arrays, text, config = _read_export(path)
     checksum = arrays.pop("checksum", None)
@@ -377,11 +370,7 @@ def import_params(path: str | Path) -> tuple[Params, dict[str, Any]]:
 
 
 def check_params(path: str | Path, params: Params, like: Params) -> None:
-    """Raises unless parameters that were read have a model's structure and shapes.
-
-    Raises:
-      CheckpointError: names the file.
-    """
+    """Raises `CheckpointError`, with the file, unless shapes are those of `like`."""
     want, got = (jax.tree.map(lambda x: tuple(x.shape), x) for x in (like, params))
     if want != got:
         raise CheckpointError(f"{path}: parameters of another model")

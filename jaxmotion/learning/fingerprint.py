@@ -58,10 +58,6 @@ def json_checksum(value: Any) -> str:
 
 
 def file_fingerprint(path: str | Path) -> str:
-    """Names a file by its bytes: 12 hexadecimal digits of their SHA-256.
-
-    Raises:
-      OSError: if it cannot be read.
-    """
+    """Names a file by its bytes: 12 hexadecimal digits of their SHA-256."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:_DIGITS]

@@ -43,7 +43,6 @@ class Loop:
     Attributes:
       num_steps: Updates of the whole run, a resumed part included.
       chunk: Updates of one row of losses, and of a compiled call at most.
-      save_every: Updates between checkpoints.
       folder: Run folder: checkpoints in `checkpoints`, losses in `losses.jsonl`.
       config: JSON that rebuilds the model, stored with each checkpoint.
       show: Names of the values on the progress bar.
@@ -57,11 +56,7 @@ class Loop:
     show: tuple[str, ...] = ("loss",)
 
     def __post_init__(self):
-        """Checks what would fail after the first chunk, which would be lost.
-
-        Raises:
-          ValueError: names the field.
-        """
+        """Raises a `ValueError`, with the field, for what would fail after a chunk."""
         for name in ("num_steps", "chunk", "save_every"):
             if getattr(self, name) < 1:
                 raise ValueError(
@@ -70,13 +65,7 @@ class Loop:
 
 
 def check_writable(folder: str | Path) -> None:
-    """Raises if a folder cannot be written, or not be made; called before any work.
-
-    Leaves nothing behind: whoever writes first makes the folder.
-
-    Raises:
-      OSError: names the folder.
-    """
+    """Raises `OSError` if a folder cannot be written or made; leaves nothing behind."""
     there = Path(folder).absolute()
     try:
         while not there.exists():
@@ -90,10 +79,8 @@ def check_writable(folder: str | Path) -> None:
 def check_finite(info: dict[str, Any], first_step: int, folder: Path) -> None:
     """Raises at the first loss of a chunk, one row per step, that is not finite.
 
-    Steps are counted from 1; the run's checkpoint folder names the last good one.
-
-    Raises:
-      TrainingDiverged: names the step, the losses and the last good checkpoint.
+    Steps are counted from 1. `TrainingDiverged` names the step, the losses and the last
+    good checkpoint in the run's folder.
     """
     bad = np.flatnonzero(~np.isfinite(np.asarray(info["loss"])))
     if bad.size == 0:
@@ -133,11 +120,9 @@ def _held_interrupt() -> Iterator[list[int]]:
 
 
 def read_losses(path: Path) -> list[dict[str, Any]]:
-    """Rows of a `losses.jsonl`; without a last one that a kill tore.
+    """Rows of a `losses.jsonl`, without a last one that a kill tore.
 
-    Raises:
-      OSError: if it cannot be read.
-      ValueError: if a line is no row with a step; names the file and the line.
+    Raises `ValueError`, with file and line, for a line that is no row with a step.
     """
     rows = []
     for number, line in enumerate(
@@ -243,7 +228,6 @@ def train(
         at a time where a chunk takes longer than about a second.
       state: New, or restored from `<folder>/checkpoints`; donated.
       key: The same for all parts of a run.
-      loop: How long, and what to write.
 
     Raises:
       TrainingDiverged: if a loss is not finite; nothing of that chunk is saved.

@@ -88,7 +88,6 @@ def foot_slide_loss(
     stances. Both frames of a pair must count; for averages see the module.
 
     Args:
-      foot_positions: Predicted world positions, meters.
       contact: Whether the foot stands between this frame and the next (the last frame's
         value is unused).
 

@@ -20,11 +20,7 @@ from jaxmotion.motion.skeleton import MAX_METERS, Skeleton, check_skeleton
 
 
 def check_system(value: dict[str, Any], system: str, *, where: str) -> None:
-    """Raises unless the JSON of the file `where` is of a system.
-
-    Raises:
-      ValueError: names the file, the system found and the one expected.
-    """
+    """Raises a `ValueError` unless the JSON of the file `where` is of a system."""
     if value.get("system") != system:
         raise ValueError(
             f"{where}: field 'system' is {value.get('system')!r}, expected {system!r}"
@@ -68,9 +64,7 @@ def skeleton_to_json(skeleton: Skeleton) -> dict[str, Any]:
 def skeleton_from_json(value: Any) -> Skeleton:
     """Inverse of `skeleton_to_json`.
 
-    Raises:
-      KeyError: if a field is missing.
-      ValueError: if the fields are not those of a skeleton; says what is wrong.
+    Raises `KeyError` for a missing field, `ValueError` for one that is wrong.
     """
     if not isinstance(value, dict):
         raise ValueError(f"a JSON {type(value).__name__}, expected an object")
@@ -140,12 +134,8 @@ def _check_field(name: str, kind: Any, value: Any) -> Any:
 def config_from_json(kind: type, value: Any) -> Any:
     """A configuration from the JSON of `dataclasses.asdict`, with every field checked.
 
-    Fields of its dataclass are whole numbers, numbers, truth values, choices, lists and
-    such dataclasses.
-
-    Raises:
-      ValueError: names the field that is missing, unknown, of another kind or out of
-        range.
+    Fields are whole numbers, numbers, truth values, choices, lists, such dataclasses; a
+    `ValueError` names one that is missing, unknown, of another kind or out of range.
     """
     if not isinstance(value, dict):
         raise ValueError(f"a JSON {type(value).__name__}, expected an object")
@@ -168,11 +158,7 @@ def config_from_json(kind: type, value: Any) -> Any:
 
 
 def names_from_json(value: Any) -> tuple[str, ...]:
-    """A list of different names.
-
-    Raises:
-      ValueError: if it is none.
-    """
+    """A list of different names; raises `ValueError` if it is none."""
     right = isinstance(value, list) and all(isinstance(x, str) for x in value)
     if not right or len(set(value)) < len(value):
         raise ValueError(f"{value!r:.60}, expected a list of different names")
@@ -184,9 +170,8 @@ def numbers_from_json(
 ) -> list[int | float]:
     """A list of finite numbers.
 
-    Raises:
-      ValueError: if it is none, a number is less than `least` or above 1e6, or there
-        are not `size` of them; names it.
+    A `ValueError` names it if it is none, a number is below `least` or above 1e6, or
+    there are not `size` of them.
     """
     if not isinstance(value, list):
         raise ValueError(f"{name} is {value!r:.60}, expected a list of numbers")
@@ -210,9 +195,7 @@ def normalizer_to_json(normalizer: Normalizer) -> dict[str, Any]:
 def normalizer_from_json(value: Any, *, size: int) -> Normalizer:
     """Inverse of `normalizer_to_json`; other fields are left out.
 
-    Raises:
-      KeyError: if a field is missing.
-      ValueError: if one is not so many numbers; says what is wrong.
+    Raises `KeyError` for a missing field, `ValueError` for one of other numbers.
     """
     # A feature that never varies has a tiny deviation, but not none.
     made = {

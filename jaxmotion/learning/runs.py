@@ -66,10 +66,9 @@ class Content:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run folder; its model, source and split are those of its `Content`.
+    """A run folder, of a system; model, source and split are those of its `Content`.
 
     Attributes:
-      system: Whose run it is.
       settings: JSON of how model and data were made.
       files: Fingerprint of each file in `data`, by file name.
     """
@@ -88,11 +87,7 @@ class Run:
         return self.folder / _CONFIG
 
     def file(self, name: str) -> Path:
-        """A file of the data.
-
-        Raises:
-          ValueError: if config.json lists no such file.
-        """
+        """A file of the data; raises `ValueError` if config.json lists no such one."""
         if name not in self.files:
             raise ValueError(
                 f"{self.config}: field 'files' lists {sorted(self.files)}, expected "
@@ -256,12 +251,10 @@ def _read(folder: Path, system: str | None) -> dict[str, Any]:
 def load(folder: Path, *, system: str | None = None) -> Run:
     """Loads a run folder and checks that its data are those it was made with.
 
-    It must be the system's; None for any.
-
     Raises:
       OSError: if a file is missing or cannot be read.
-      ValueError: if it is no run folder, one of another system or of a newer format, or
-        its data are other than they were; names the file and the field.
+      ValueError: if it is no run folder, one of another system (None: any may be) or of
+        a newer format, or its data are other than they were; names file and field.
     """
     value = _read(folder, system)
     run = Run(
@@ -365,9 +358,8 @@ def make_optimizer(budget: Budget) -> training.Optimizer:
 def check_stage(run: Run, stage: str) -> dict[str, Any]:
     """JSON of a stage's newest checkpoint.
 
-    Raises:
-      CheckpointError: if there is no checkpoint, or it is of another stage or system;
-        names the folder.
+    A `CheckpointError` names the folder if there is none, or it is of another stage or
+    system.
     """
     value = checkpoint.load_config(run.checkpoints(stage))
     for field, expected in (("system", run.system), ("stage", stage)):
@@ -382,9 +374,7 @@ def check_stage(run: Run, stage: str) -> dict[str, Any]:
 def check_model(run: Run, stage: str, model: dict[str, Any]) -> None:
     """Raises unless a stage's newest checkpoint is of this model.
 
-    Raises:
-      CheckpointError: if there is none, or of another stage or system.
-      ValueError: if its networks are others; names the fields that differ.
+    `CheckpointError` as `check_stage`; a `ValueError` names the fields that differ.
     """
     differ = model_json.differences(check_stage(run, stage).get("model", {}), model)
     if differ:
@@ -394,11 +384,8 @@ def check_model(run: Run, stage: str, model: dict[str, Any]) -> None:
 def stage_config(run: Run, stage: str, kind: type, **more: Any) -> Any:
     """The configuration that a stage was trained with.
 
-    `more` gives fields that stages of that kind do not decide.
-
-    Raises:
-      CheckpointError: if there is no checkpoint, or it is of another stage or system.
-      ValueError: if its fields are not those of the dataclass; names the first.
+    `more` gives fields that stages of that kind do not decide. `CheckpointError` as
+    `check_stage`; a `ValueError` names the first field that is not the dataclass's.
     """
     value = check_stage(run, stage).get("model")
     try:
@@ -416,11 +403,8 @@ def _stage_json(run: Run, stage: str, model: dict[str, Any]) -> dict[str, Any]:
 def store(run: Run, stage: str, state: Any, *, model: dict[str, Any]) -> None:
     """Writes what is made without training as a stage: its checkpoint of step 0.
 
-    The model is the JSON of what rebuilds its structure.
-
-    Raises:
-      OSError: if it cannot be written.
-      ValueError: if the stage has a checkpoint.
+    The model is the JSON of its structure. Raises `OSError` if it cannot be written,
+    `ValueError` if the stage has a checkpoint.
     """
     place = run.checkpoints(stage)
     if checkpoint.latest_step(place) is not None:
@@ -469,7 +453,6 @@ def fit(
       model: JSON of what rebuilds the stage's networks.
       settings: JSON of how the stage is trained besides the budget.
       key: Key of batches and noise; None for one of the budget's seed.
-      show: Names on the progress bar.
 
     Raises:
       CheckpointError: if the folder holds another stage.
@@ -523,9 +506,7 @@ def minimize(
 ) -> training.TrainState:
     """Trains a stage of one network by a loss, with the budget's optimizer.
 
-    Args:
-      loss: `(params, key, batch) -> (loss, info)`.
-      **more: As `fit` takes them.
+    The loss is `(params, key, batch) -> (loss, info)`; `more` is as `fit` takes it.
     """
     optimizer = make_optimizer(budget)
     return fit(
@@ -549,10 +530,8 @@ def load_params(
 ) -> Params:
     """Averaged parameters of a stage, or of the generator of an adversarial one.
 
-    `init` makes parameters of the same shapes; it is never run.
-
-    Raises:
-      CheckpointError: if there is none, or it is of another stage or size.
+    `init` makes parameters of the same shapes; it is never run. Raises
+    `CheckpointError` if there is no checkpoint, or it is of another stage or size.
     """
     check_stage(run, stage)
     found = checkpoint.restore_part(
@@ -568,11 +547,9 @@ def restore_evaluator(
 ) -> Params:
     """Parameters of an evaluator that must have been trained as the JSON `value` says.
 
-    `init` makes parameters of the same shapes; it is never run.
-
-    Raises:
-      CheckpointError: if there is none.
-      ValueError: if it was trained otherwise; names the field.
+    `init` makes parameters of the same shapes; it is never run. Raises
+    `CheckpointError` if there are none, a `ValueError` with the field if it was trained
+    otherwise.
     """
     found = checkpoint.load_config(folder)
     for field, expected in value.items():

@@ -188,10 +188,7 @@ def make_optimizer(
 
 
 def init_train_state(params: Params, optimizer: Optimizer) -> TrainState:
-    """State before the first step; its EMA starts at the parameters.
-
-    The optimizer is that of `make_update`.
-    """
+    """State before `make_update`'s first step; its EMA starts at the parameters."""
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         params=params,
@@ -253,7 +250,6 @@ def train_chunk(
         number of updates made as `step`.
       sample_batch: `(key, data) -> batch`; leaves of the batch have the batch axis
         first.
-      num_steps: Updates a call.
       mesh: Split each batch over the mesh's first axis; state and data are
         replicated (`replicate`). The result is that of one device up to rounding.
 

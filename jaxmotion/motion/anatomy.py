@@ -159,11 +159,8 @@ def find_limbs(
 def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> Anatomy:
     """What the joints of a skeleton are.
 
-    Sides are LEFT, RIGHT or MIDDLE of each joint; None for what the names say, and
-    where they say nothing, the zero pose.
-
-    Raises:
-      ValueError: if `sides` are not one a joint.
+    Sides are LEFT, RIGHT or MIDDLE, one a joint; None for what the names say, and where
+    they say nothing, the zero pose.
     """
     parents = skeleton.parents
     if sides is not None and (
@@ -420,10 +417,8 @@ def as_t_pose(skeleton: Skeleton, motion: Motion) -> tuple[Skeleton, Motion]:
 def mixamo_names(skeleton: Skeleton, *, prefix: str = "mixamorig:") -> tuple[str, ...]:
     """Names of the joints as Mixamo's characters have them, which engines know.
 
-    Joints that those have not, such as fingers, keep their names.
-
-    Raises:
-      ValueError: if no trunk with arms and legs of two sides is found.
+    Joints that those have not, such as fingers, keep their names. `ValueError` if no
+    trunk with arms and legs of two sides is found.
     """
     found = find_anatomy(skeleton)
     sided = {limb.side for limb in (*found.arms, *found.legs)}

@@ -53,12 +53,9 @@ class Scene:
 def control_weight(
     ball: Float[Array, "*batch 3"], root: Float[Array, "*batch 3"], *, reach: Scalar
 ) -> Float[Array, "*batch"]:
-    """How much the person controls the ball: w of (1), kept in 0..1.
+    """How much the person controls the ball: w of (1), in 0..1 (the clamp is ours).
 
-    1 above or below the root, 0 from the reach (meters on the ground) on. World
-    positions, meters.
-
-    Source: SMGDiff, eq. 1; the clamp is ours.
+    World positions and the reach, on the ground, are in meters.
     """
     square = jnp.sum((ball - root)[..., ::2] ** 2, axis=-1)
     # A ball right at the root has a distance without gradient.
@@ -70,12 +67,9 @@ def control_weight(
 def ball_velocities(
     ball: Float[Array, "*batch frames 3"], fps: Scalar
 ) -> Float[Array, "*batch frames 3"]:
-    """Velocity, meters per second, with which the ball arrived in each frame.
+    """Velocity, meters per second, with which the ball (meters) arrived in each frame.
 
-    Positions are in meters; the first frame's velocity is that of the second.
-
-    Raises:
-      ValueError: if there are fewer than two frames.
+    The first frame's is that of the second; `ValueError` for fewer than two frames.
     """
     _check_frames(ball, 2)
     step = jnp.diff(ball, axis=-2) * fps
@@ -89,10 +83,7 @@ def ball_accelerations(
     """Second difference of the ball's position about each frame, m/s^2.
 
     Positions are in meters. Zero in the first and the last frame, which have no
-    neighbor.
-
-    Raises:
-      ValueError: if there are fewer than three frames.
+    neighbor; `ValueError` for fewer than three frames.
 
     Source: SMGDiff, eq. 10.
     """
@@ -118,9 +109,8 @@ def encode_ball(
 ) -> Float[Array, "*batch frames 7"]:
     """Features of a ball: (1), relative to the root.
 
-    Weighted place relative to the root 3, velocity 3, weight 1; positions are in
-    meters, the velocity in meters per second. Control ends at the reach, meters on the
-    ground.
+    Weighted place relative to the root 3, velocity 3, weight 1; in meters and meters
+    per second. Control ends at the reach, meters on the ground.
 
     Source: SMGDiff, eq. 1-2.
     """

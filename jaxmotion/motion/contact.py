@@ -22,15 +22,9 @@ def foot_contacts(
     `max_height` at most in frame f. The last frame, which has no next one, takes the
     speed with which it was reached.
 
-    Args:
-      foot_positions: World positions, meters, y up.
-      max_speed: Meters per second, in space (not only on the ground). CAMDM's foot loss
-        has 0.01 m a frame at 30 fps, which is 0.3.
-      max_height: Meters above the ground; infinite, that is no test of height, as in
-        CAMDM's foot loss.
-
-    Raises:
-      ValueError: if there are fewer than two frames.
+    Positions are in the world, meters, y up; the speed, m/s, is in space (not only on
+    the ground). CAMDM's foot loss has 0.01 m a frame at 30 fps, and no test of height.
+    `ValueError` for fewer than two frames.
 
     Source: Chen et al. 2024 (CAMDM), released code, with thresholds per second.
     """
@@ -49,14 +43,9 @@ def ball_contact_gate(
 ) -> Bool[Array, "*batch frames"]:
     """Frames in which something must have pushed the ball, never the first and last.
 
-    Args:
-      ball: Positions of the ball's center, meters.
-      threshold: Least acceleration, meters per second squared. The paper's 2 is 2.2 mm
-        of second difference at 30 fps, which a model's jitter exceeds; a ball that
-        flies falls with 9.8.
-
-    Raises:
-      ValueError: if there are fewer than three frames.
+    The ball's center is in meters, the threshold in m/s^2. The paper's 2 is 2.2 mm of
+    second difference at 30 fps, which a model's jitter exceeds; a ball that flies falls
+    with 9.8. `ValueError` for fewer than three frames.
 
     Source: SMGDiff, eq. 10.
     """
@@ -81,13 +70,8 @@ def ball_contact_loss(
     the lifted foot is chosen. The gate, the choice and the comparison are constants of
     the gradient, which is zero where a joint is at the ball's center.
 
-    Args:
-      joints: World positions of the joints that may touch, meters.
-      ball: World positions of the ball's center, meters.
-      grounded: Whether each joint stands, 0 to 1.
-      gate: Frames of a touch.
-      max_distance: Weighted distances up to here count as a touch, meters.
-      grounded_weight: At least 1.
+    Positions, of the joints that may touch and of the ball's center, are in the world,
+    meters. `grounded` says whether each joint stands, 0 to 1; its weight is at least 1.
 
     Source: SMGDiff, eq. 11-12, with the missing norm; the quotient there divides a
     frame's term by one.

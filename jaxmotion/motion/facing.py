@@ -46,10 +46,8 @@ def hip_joints(skeleton: Skeleton) -> tuple[int, int]:
     LeftHip/RightHip (100STYLE, SMPL) and L_Hip/R_Hip (BallPlay-M), in any case and
     after a prefix like "mixamorig:".
 
-    Raises:
-      ValueError: if no pair is found; names the pairs it knows and the joints.
-
-    Source: the joints that CAMDM's code takes the facing from.
+    A `ValueError` names the pairs it knows and the joints if none is found. CAMDM's
+    code takes the facing from these joints, too.
     """
     plain = plain_names(skeleton)
     for left, right in _HIPS:
@@ -90,14 +88,8 @@ def hip_facing(
 ) -> Float[Array, "*batch 2"]:
     """Unit facing (x, z) of poses from their hips, world.
 
-    +z where the hips lie above each other.
-
-    Args:
-      joint_rotation: Parent-local rotations, two columns each; the root's is global.
-      hips: Left and right hip joint; found by name if not given.
-
-    Raises:
-      ValueError: if `hips` is not given and the names are unknown.
+    Rotations are parent-local, two columns each; the root's is global. +z where the
+    hips lie above each other. Hips are found by name (else `ValueError`) if not given.
 
     Source: Chen et al. 2024 (CAMDM), released code.
     """
@@ -113,10 +105,7 @@ def body_facing(
 ) -> Float[Array, "*batch 2"]:
     """Unit facing (x, z) from hips and shoulders alike, as in CAMDM's evaluation.
 
-    All in the world.
-
-    Raises:
-      ValueError: if hips or shoulders are not found by name.
+    All in the world; `ValueError` if hips or shoulders are not found by name.
 
     Source: Chen et al. 2024 (CAMDM), released code.
     """

@@ -24,8 +24,7 @@ from jaxmotion.motion.trajectory import PlanarFrame, root_trajectory
 class FeatureLayout:
     """Names of the slices of a feature vector; hashable, and static under jit.
 
-    Attributes:
-      fields: (name, start, stop) of each slice, in order and without gaps.
+    Fields are (name, start, stop) of each slice, in order and without gaps.
     """
 
     fields: tuple[tuple[str, int, int], ...] = jax.tree.static()
@@ -50,11 +49,7 @@ class FeatureLayout:
 
 
 def feature_layout(**sizes: int) -> FeatureLayout:
-    """Layout of fields that follow each other, with so many numbers each.
-
-    Raises:
-      ValueError: if a size is not positive.
-    """
+    """Layout of fields that follow each other, with so many numbers (positive) each."""
     fields, start = [], 0
     for name, size in sizes.items():
         fields.append((name, start, start + size))
@@ -65,11 +60,7 @@ def feature_layout(**sizes: int) -> FeatureLayout:
 def pack(
     layout: FeatureLayout, parts: Mapping[str, Float[Array, "*batch _"]]
 ) -> Float[Array, "*batch features"]:
-    """Joins named parts, one of each field's size, into feature vectors.
-
-    Raises:
-      ValueError: if names or sizes are not those of the layout.
-    """
+    """Joins named parts, one of each field's size (else `ValueError`), into vectors."""
     names = [name for name, _, _ in layout.fields]
     if set(parts) != set(names):
         raise ValueError(f"parts are {sorted(parts)}, expected {sorted(names)}")
@@ -85,11 +76,7 @@ def pack(
 def unpack(
     layout: FeatureLayout, features: Float[Array, "*batch features"]
 ) -> dict[str, Float[Array, "*batch _"]]:
-    """Inverse of `pack`.
-
-    Raises:
-      ValueError: if the vectors are not of the layout's size.
-    """
+    """Inverse of `pack`; `ValueError` if the vectors are not of the layout's size."""
     if features.shape[-1] != layout.size:
         raise ValueError(
             f"features have {features.shape[-1]} numbers, expected {layout.size}"
@@ -103,11 +90,7 @@ RotationLayout = Literal["rows", "columns"]
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Normalizer:
-    """An affine map to zero mean and unit deviation.
-
-    Attributes:
-      std: Standard deviation of each feature, never below the floor it was fitted with.
-    """
+    """An affine map to zero mean and unit deviation; `std` is at least the floor."""
 
     mean: Float[Array, " features"]
     std: Float[Array, " features"]
@@ -221,9 +204,6 @@ def motion_features(
     (J + 1) * 6 per frame; positions are in meters, and 6D is the first two "rows" of
     each matrix, as in the released code, or its first two "columns".
 
-    Raises:
-      ValueError: if the layout is neither.
-
     Source: Chen et al. 2024 (CAMDM), sec. 3.1 and released code.
     """
     _check_layout(rotation_layout)
@@ -244,11 +224,8 @@ def motion_from_features(
 ) -> Motion:
     """Inverse of `motion_features`; any finite features give rotations (Gram-Schmidt).
 
-    The last three of a frame's (J + 1) * 6 numbers are ignored.
-
-    Raises:
-      ValueError: if the layout is neither, or the size is not (J + 1) * 6, J >= 1.
-
+    The last three of a frame's (J + 1) * 6 numbers are ignored; `ValueError` for other
+    sizes.
     Source: Chen et al. 2024 (CAMDM), sec. 3.1 and released code.
     """
     _check_layout(rotation_layout)

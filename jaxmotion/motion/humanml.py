@@ -105,9 +105,6 @@ def canonical_joints(
 
     World positions, y up; a second call changes nothing.
 
-    Raises:
-      ValueError: if the number of joints is not the layout's.
-
     Source: Guo et al. 2022 (HumanML3D), released code.
     """
     if joints.shape[-2] != layout.num_joints:
@@ -153,10 +150,6 @@ def features_from_joints(
     """Features of clips, not normalized, a vector per frame but for the last one.
 
     World positions, y up, at the frame rate of the data set; need not be canonical.
-
-    Raises:
-      ValueError: if the number of joints is not the layout's, or there are fewer than
-        two frames.
 
     Source: Guo et al. 2022 (HumanML3D), released code.
     """
@@ -210,9 +203,6 @@ def joints_from_features(
     The root of the first frame is above the origin and faces +z. Only the root's
     channels and `joint_position` count; the others repeat what is in them and may
     contradict it where a network has made them.
-
-    Raises:
-      ValueError: if the vectors do not have the layout's length.
 
     Source: Guo et al. 2022 (HumanML3D), released code.
     """

@@ -90,8 +90,7 @@ def joint_mapping(skeleton: Skeleton) -> Float[Array, "22 joints"]:
     LaFAN1, Mixamo and Bandai Namco Research, in any case and after a prefix like
     "mixamorig:"; joints that are not needed are left out.
 
-    Raises:
-      ValueError: if no rig fits; names what is missing from the one that fits best.
+    A `ValueError` names what is missing from the rig that fits best.
     """
     plain = plain_names(skeleton)
 

@@ -40,8 +40,6 @@ def query(path: Trajectory, frame: PlanarFrame) -> Float[Array, "*batch 12"]:
 def path_features(bone: Trajectory, *, fps: float) -> Float[Array, "frames 12"]:
     """`query` of every frame of a clip; beyond its end the last frame counts.
 
-    The simulation bone of one clip is in the world.
-
     Source: Li et al. 2024 (AAMDM), section 3.6; clamped as in Holden et al. 2020.
     """
     frames = bone.position.shape[0]

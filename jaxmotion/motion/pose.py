@@ -36,10 +36,7 @@ _CONTACT_FILTER = 6  # frames of the median at 60 frames per second
 
 
 def pose_layout(num_joints: int) -> FeatureLayout:
-    """Fields of a pose vector, 15 J + 8 features.
-
-    Source: Li et al. 2024 (AAMDM), section 3.6.
-    """
+    """Fields of a pose vector, 15 J + 8 features."""
     return feature_layout(
         position=3 * num_joints,
         rotation=6 * num_joints,
@@ -105,9 +102,7 @@ def pose_vectors(
     frames, the first and the last step). Of the skeleton's two feet the left one is
     first.
 
-    Raises:
-      ValueError: if there are fewer than three frames, or the feet are not two.
-
+    `ValueError` for fewer than three frames, or other than two feet.
     Source: Li et al. 2024 (AAMDM), section 3.6; Holden et al. 2020, released code.
     """
     frames, fps = motion.root_position.shape[0], motion.fps
@@ -146,13 +141,8 @@ def character_transforms(
     Unlike `skeleton.forward_kinematics` it takes the translations from the pose, so a
     network that predicts them is told how they move the joints after them.
 
-    Args:
-      parents: -1 for joint 0.
-      position: Local translations, meters.
-      rot6d: Local rotations, two columns each; made orthonormal.
-
-    Returns:
-      Positions, meters, and rotation matrices.
+    Translations are in meters; rotations, two columns each, are made orthonormal. Given
+    are positions, meters, and rotation matrices.
 
     Source: F of Li et al. 2024 (AAMDM), eq. 1.
     """
@@ -174,9 +164,8 @@ def advance_frame(
 ) -> PlanarFrame:
     """Moves the simulation bone (world) on by one frame.
 
-    Args:
-      velocity: In its own axes, meters per second; the vertical part is not used.
-      angular_velocity: In its own axes, radians per second; the vertical part counts.
+    Both velocities are in its own axes, m/s and rad/s: of the one the horizontal part
+    counts, of the other the vertical one.
 
     Source: Holden et al. 2020, released code: p += R v dt, R = exp(w dt) R.
     """

@@ -118,10 +118,7 @@ def matrix_from_rot6d(rot6d: Float[Array, "*batch 6"]) -> Float[Array, "*batch 3
 
 @jax.jit
 def rot6d_from_matrix(matrix: Float[Array, "*batch 3 3"]) -> Float[Array, "*batch 6"]:
-    """The first two columns of a rotation matrix, `[c1, c2]`.
-
-    Source: Zhou et al. 2019, eq. 14.
-    """
+    """The first two columns of a rotation matrix, `[c1, c2]`."""
     return jnp.concatenate([matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
 

@@ -47,11 +47,7 @@ class Skeleton:
         return len(self.parents)
 
     def index(self, name: str) -> int:
-        """Index of the joint of that name.
-
-        Raises:
-          ValueError: if the skeleton has no such joint; names those it has.
-        """
+        """Index of the joint of that name; a `ValueError` names those there are."""
         if name not in self.names:
             raise ValueError(
                 f"unknown joint {name!r}: the skeleton has {', '.join(self.names)}"
@@ -82,11 +78,7 @@ class Motion:
 
 
 def check_parents(parents: tuple[int, ...]) -> None:
-    """Raises unless every parent precedes its joint and only joint 0 is a root.
-
-    Raises:
-      ValueError: names the first joint that breaks the rule.
-    """
+    """Raises `ValueError` unless parents come before joints and joint 0 is the root."""
     for joint, parent in enumerate(parents):
         expected = parent == -1 if joint == 0 else 0 <= parent < joint
         if not expected:
@@ -97,8 +89,7 @@ def check_parents(parents: tuple[int, ...]) -> None:
 def check_skeleton(*, offsets: Any, parents: Any, names: Any, feet: Any) -> None:
     """Raises unless values, which may come from a file, are fields of a `Skeleton`.
 
-    Raises:
-      ValueError: names the field, what was expected and what was found.
+    A `ValueError` names the field, what was expected and what was found.
     """
     for field, values in (("parents", parents), ("feet", feet)):
         for value in values:
@@ -198,11 +189,8 @@ def global_transforms(
 ) -> tuple[Float[Array, "*batch joints 3"], Float[Array, "*batch joints 3 3"]]:
     """World positions, meters, and world rotation matrices of all joints.
 
-    Rotations are parent-local, two columns each. Differentiable in reverse mode only:
-    its gradient is written out.
-
-    Raises:
-      ValueError: if the number of rotations is not the skeleton's number of joints.
+    Rotations are parent-local, two columns each, one a joint (else `ValueError`).
+    Differentiable in reverse mode only: its gradient is written out.
     """
     if joint_rotation.shape[-2] != skeleton.num_joints:
         raise ValueError(
@@ -227,12 +215,7 @@ def forward_kinematics(
     root_position: Float[Array, "*batch 3"],
     joint_rotation: Float[Array, "*batch joints 6"],
 ) -> Float[Array, "*batch joints 3"]:
-    """World positions of all joints, meters.
-
-    Rotations are parent-local, two columns each.
-
-    Raises:
-      ValueError: if the number of rotations is not the skeleton's number of joints.
+    """World positions of all joints, meters, as `global_transforms` has them.
 
     Source: Chen et al. 2024 (CAMDM), eq. 3.
     """
@@ -242,11 +225,7 @@ def forward_kinematics(
 def joint_positions(
     skeleton: Skeleton, motion: Motion
 ) -> Float[Array, "*batch frames joints 3"]:
-    """World positions, meters, of all joints in all frames of a motion.
-
-    Raises:
-      ValueError: if the motion has another number of joints.
-    """
+    """World positions, meters, of all joints in all frames of a motion."""
     return forward_kinematics(skeleton, motion.root_position, motion.joint_rotation)
 
 

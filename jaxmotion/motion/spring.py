@@ -40,14 +40,8 @@ def spring(
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
     """Moves a value toward a goal as a critically damped spring does.
 
-    Args:
-      x: Value now, in any unit.
-      v: Its velocity, units per second.
-      half_life: Seconds; below 1e-5 counts as 1e-5 (at once).
-      dt: Seconds to move on, not negative. An array gives many times at once.
-
-    Returns:
-      Value and velocity at that time.
+    Value and velocity (units per second) after `dt` seconds, not negative; an array
+    gives many times at once. A half-life, seconds, below 1e-5 counts as that (at once).
 
     Source: Büttner and Clavet 2015; orangeduck's Motion-Matching, spring.h.
     """
@@ -70,16 +64,8 @@ def velocity_spring(
 ) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"], Float[Array, "*shape"]]:
     """Moves a position whose velocity is a spring toward a goal velocity.
 
-    Args:
-      x: Position, meters.
-      v: Velocity, meters per second.
-      a: Acceleration, meters per second squared.
-      goal_velocity: Velocity it tends to, meters per second.
-      half_life: Seconds; below 1e-5 counts as 1e-5 (at once).
-      dt: Seconds to move on, not negative. An array gives many times at once.
-
-    Returns:
-      Position, velocity and acceleration at that time.
+    Position, velocity and acceleration (meters, seconds) at that time; `half_life` and
+    `dt` are as of `spring`.
 
     Source: orangeduck's Motion-Matching, controller.cpp
       (simulation_positions_update).
@@ -108,15 +94,9 @@ def facing_spring(
 ) -> tuple[Float[Array, "*batch 2"], Float[Array, "*batch"]]:
     """Turns a facing direction toward a goal along the shorter arc.
 
-    Args:
-      facing: Unit vectors (x, z); a zero vector counts as +z.
-      turn_rate: Radians per second, positive from +z toward +x.
-      goal: Unit vectors to come to rest at; a zero vector counts as +z.
-      half_life: Seconds; below 1e-5 counts as 1e-5 (at once).
-      dt: Seconds to move on, not negative.
-
-    Returns:
-      Unit facing and turn rate at that time.
+    Directions are unit vectors (x, z); a zero vector counts as +z. The turn rate is in
+    radians per second, positive from +z toward +x; `half_life` and `dt` are as of
+    `spring`.
 
     Source: orangeduck's Motion-Matching, spring.h, for rotations about one axis.
     """

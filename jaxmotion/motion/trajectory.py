@@ -78,11 +78,7 @@ def root_trajectory(
 ) -> Trajectory:
     """Path of the root and the facing of the hips in every frame, world.
 
-    The left and right hip joint are found by name if not given.
-
-    Raises:
-      ValueError: if `hips` is not given and the names are unknown.
-
+    Hips are found by name (else `ValueError`) if not given.
     Source: Chen et al. 2024 (CAMDM), released code: facing from the hips only.
     """
     hips = hip_joints(skeleton) if hips is None else hips
@@ -104,19 +100,10 @@ def desired_trajectory(
 ) -> Trajectory:
     """Path that a user's command asks for, from where the character is now.
 
-    Position follows the goal-velocity spring, facing the spring on the circle. All
-    times are evaluated at once, in closed form.
-
-    Args:
-      frame: Where the character is and faces, world.
-      velocity: Its velocity, meters per second, world.
-      num_frames: Length of the path; frame i is (i + 1) / fps seconds ahead.
-      half_life: Half-life of both springs, seconds.
-      acceleration: Meters per second squared, world; zero if not given.
-      turn_rate: Turn rate of the facing, radians per second; zero if not given.
-
-    Returns:
-      The path, world.
+    Position follows the goal-velocity spring, facing the spring on the circle, all
+    times at once and in closed form. Frame i of the path is (i + 1) / fps seconds
+    ahead. All is in the world, in meters, seconds and radians; acceleration and turn
+    rate are zero if not given.
 
     Source: Chen et al. 2024 (CAMDM), sec. 3.2; Büttner and Clavet 2015.
     """
@@ -161,11 +148,7 @@ def extend(
       mirror_facing: Copy the facing of each reflected point, as the paper says;
         else the last facing is held, as the released code does.
 
-    Returns:
-      The path followed by its extension, F + num_frames frames.
-
-    Raises:
-      ValueError: if `reuse` is not in 1 .. F-1, or `num_frames` is negative.
+    `ValueError` if `reuse` is not in that range, or `num_frames` is negative.
 
     Source: Chen et al. 2024 (CAMDM), sec. 3.2 and fig. 3.
     """
@@ -201,15 +184,8 @@ def blend(
     The weight of the desired path at frame i of F, counted from 1, is
     1 - (1 - i/F)^bias: the greater the bias, the more responsive.
 
-    Args:
-      predicted: The model's own future path.
-      desired: The path that the user asks for, of the same length.
-      bias_position: Exponent for positions (released scene 0.7, its code 0.4).
-      bias_facing: Exponent for facings (released code 2.2).
-
-    Returns:
-      The path to condition the model on. Where the blend of two opposite facings is
-      zero, it faces as desired.
+    Released exponents: of positions 0.7 (its scene) and 0.4 (its code), of facings 2.2.
+    Where the blend of two opposite facings is zero, it faces as desired.
 
     Source: Holden et al. 2017 (PFNN); Chen et al. 2024 (CAMDM), released code.
     """
@@ -287,8 +263,5 @@ def smooth(
 def integrate_path(
     velocity: Float[Array, "*batch frames 2"], fps: float
 ) -> Float[Array, "*batch frames 2"]:
-    """Path, meters, from the origin with given velocities, meters per second.
-
-    A point stands at its entry after each frame.
-    """
+    """Path, meters, from the origin: after each frame of velocities, m/s."""
     return jnp.cumsum(velocity, axis=-2) / fps

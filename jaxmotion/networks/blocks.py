@@ -49,13 +49,10 @@ def sized(kind: type, config: Any, **more: Any) -> Any:
 def known_labels(
     labels: Int[Array, "*batch"], number: int, *, what: str = "labels"
 ) -> Int[Array, "*batch"]:
-    """Labels, refused or clipped where they are not in 0..number - 1.
+    """Labels; a concrete one out of 0..number - 1 is refused, a traced one clipped.
 
-    A concrete label out of range is refused; a traced one, whose value is not known, is
-    taken for the nearest. (JAX's own gather would make NaN of it.)
-
-    Raises:
-      ValueError: names the range, `what`, and the labels found.
+    (JAX's own gather would make NaN of it.) The `ValueError` names the range, `what`,
+    and the labels found.
     """
     if not isinstance(labels, Tracer):
         found = np.asarray(labels)
@@ -69,9 +66,6 @@ def sinusoidal_positions(num: int, width: int) -> Float[Array, "{num} {width}"]:
     """Table of sinusoidal position codes: sine on even channels, cosine on odd.
 
     It is made in float64, so high positions stay exact.
-
-    Raises:
-      ValueError: if width is odd.
 
     Source: Vaswani et al. 2017, section 3.5, with base 10000.
     """
@@ -91,11 +85,7 @@ def add_rows(
 
 
 def fold_frames(x: Float[Array, "*batch frames features"], n: int) -> Array:
-    """Puts n neighboring frames into one row of n times as many features.
-
-    Raises:
-      ValueError: if the number of frames is not a multiple of n.
-    """
+    """Each n frames as one row of n times the features; no remainder (`ValueError`)."""
     frames, features = x.shape[-2:]
     if frames % n:
         raise ValueError(f"{frames} frames are no multiple of frames_per_token {n}")
@@ -178,10 +168,7 @@ class Projections(NamedTuple):
 
 
 class Prefix(NamedTuple):
-    """Keys and values of tokens that do not see those that attend to them.
-
-    Laid out as the products read them, so that a sampler's steps need not.
-    """
+    """Keys and values of tokens that do not see those that attend to them."""
 
     key: Float[Array, "*batch heads channels tokens"]
     value: Float[Array, "*batch heads tokens channels"]
@@ -226,8 +213,7 @@ class TimeEmbedding(nn.Module):
 class LabelEmbedding(nn.Module):
     """A learned row for each label; `nn.Embed` cannot look up one label of one.
 
-    Labels out of range are refused, or in a compiled program take the nearest row
-    (`known_labels`).
+    Labels out of range are as in `known_labels`.
     """
 
     num_labels: int
@@ -247,8 +233,6 @@ class EncoderLayer(nn.Module):
     """Transformer encoder layer.
 
     Attributes:
-      heads: Attention heads; divides width.
-      dropout: Rate on attention weights, and on the three branch outputs.
       norm: "post", or "pre"; see the module's docstring.
       activation: Of the feed-forward layer.
     """
@@ -298,11 +282,9 @@ class EncoderLayer(nn.Module):
     ) -> Float[Array, "*batch queries width"]:
         """The rest of the layer for the tokens that the queries came from.
 
-        Args:
-          projections: Queries of those tokens, keys and values of all tokens.
-          mask: Tokens of `projections` that may be attended to; None for all.
-          prefix: More tokens to attend to. They stay apart, so that `vmap` shares one
-            prefix among many `x` without a copy.
+        The projections are queries of those tokens, keys and values of all; the mask
+        says which may be attended to (None: all). A prefix is more tokens to attend to.
+        They stay apart, so that `vmap` shares one prefix among many `x` without a copy.
         """
         query, key, value = projections
         drop = lambda y: self.drop(y, deterministic=not train)  # noqa: E731
@@ -338,13 +320,7 @@ class EncoderLayer(nn.Module):
         mask: Bool[Array, "*batch tokens"] | None = None,
         prefix: Prefix | None = None,
     ) -> Float[Array, "*batch out width"]:
-        """The whole layer.
-
-        Args:
-          last: Return only the last so many tokens; None for all.
-          mask: Tokens that may be attended to; None for all.
-          prefix: As for `attend`.
-        """
+        """The whole layer; only the last so many tokens, where given. See `attend`."""
         projections = self.project(x, last=last)
         return self.attend(
             x if last is None else x[..., -last:, :],

@@ -25,19 +25,12 @@ EPSILON = 1e-5
 
 
 def quick_gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """CLIP's stand-in for GELU: x sigmoid(1.702 x).
-
-    Source: Hendrycks & Gimpel 2016, section 2.
-    """
+    """CLIP's stand-in for GELU: x sigmoid(1.702 x), of Hendrycks & Gimpel 2016."""
     return x * jax.nn.sigmoid(1.702 * x)
 
 
 class ClipLayer(nn.Module):
-    """Pre-norm transformer layer with a causal mask.
-
-    Attributes:
-      heads: Attention heads; divides width.
-    """
+    """Pre-norm transformer layer with a causal mask."""
 
     width: int
     heads: int
@@ -73,11 +66,8 @@ class ClipLayer(nn.Module):
 class ClipText(nn.Module):
     """Token ids to one vector a text. The defaults are ViT-B/32's.
 
-    Attributes:
-      vocabulary: Tokens known.
-      context: Most tokens of a text, with those of start and end.
-      heads: Attention heads; divides width.
-      end_of_text: Id of the token whose row is read.
+    The row of the token `end_of_text` is read; `context` are the most tokens of a text,
+    with those of start and end.
     """
 
     vocabulary: int = 49408
@@ -112,8 +102,6 @@ class ClipText(nn.Module):
         end-of-text token, and its first one ends the text. (The released code takes the
         largest id of a row: with its vocabulary the same place.)
 
-        Raises:
-          ValueError: at trace time, if the rows are longer than the context.
         """
         tokens = ids.shape[-1]
         if tokens > self.context:

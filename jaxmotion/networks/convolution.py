@@ -31,8 +31,6 @@ def convolve(
     Dilations and `feature_group_count` are 1; padding is "SAME", "VALID", or zeros
     before and after.
 
-    Raises:
-      ValueError: if something is dilated or grouped.
     """
     del dimension_numbers
     if {*lhs_dilation, *rhs_dilation, feature_group_count} != {1}:

@@ -35,7 +35,6 @@ class MlpWeights(NamedTuple):
       condition: Weights of the condition for the sums.
       inputs: Weights of the noisy vector and the latent.
       hidden: Weights of each layer's hidden channels, but the first's.
-      norms: Parameters of the norms.
     """
 
     steps: Float[Array, "rows sums"]
@@ -97,10 +96,7 @@ def _group_norm(
 class ConditionedMlp(nn.Module):
     """Maps a noisy vector, its step and a condition to a vector.
 
-    Attributes:
-      width: Channels of a hidden layer; a multiple of 16.
-      time_width: Channels of the step's embedding; even.
-      groups: Groups of the norms.
+    The width is a multiple of 16; the step's embedding is even.
     """
 
     features: int
@@ -118,12 +114,9 @@ class ConditionedMlp(nn.Module):
         condition: Float[Array, "*batch condition"],
         latent: Float[Array, "*batch latent"] | None = None,
     ) -> Float[Array, "*batch out"]:
-        """A vector of `features` channels.
+        """A vector of `features` channels; t in 1..T is one for all or one a sample.
 
-        Args:
-          t: Step in 1..T, one for all or one a sample.
-          condition: What the result depends on besides.
-          latent: Noise of a generator; None for none.
+        The latent is a generator's noise; None for none.
         """
         time = blocks.TimeEmbedding(self.time_width, name="TimeEmbedding_0")
         time(self.num_steps)
@@ -187,11 +180,7 @@ class ConditionedMlp(nn.Module):
 
 
 class PairDiscriminator(nn.Module):
-    """Logit that (x_{t-1}, x_t) is a pair of the data, given a condition.
-
-    Attributes:
-      time_width: Channels of the step's embedding; even.
-    """
+    """Logit that (x_{t-1}, x_t) is a pair of the data; the step's embedding is even."""
 
     num_steps: int
     width: int = 512

@@ -27,11 +27,7 @@ class Layers:
         self.used: set[str] = set()
 
     def shape(self, name: str, axes: int) -> tuple[int, ...]:
-        """Shape of an array that decides the size of the others.
-
-        Raises:
-          ValueError: if it is missing, has another number of axes, or is empty.
-        """
+        """Shape that others follow; `ValueError` for no array, or one of other axes."""
         found = self.weights[name].shape if name in self.weights else None
         if found is None or len(found) != axes or 0 in found:
             raise ValueError(
@@ -64,9 +60,8 @@ class Layers:
     def finish(self, params: Params, *, ignore: Collection[str] = ()) -> Params:
         """The parameters on the device; names may be left that begin as `ignore` says.
 
-        Raises:
-          ValueError: if arrays are missing, unknown, of another shape or not finite;
-            names them all.
+        A `ValueError` names all arrays that are missing, unknown, of another shape or
+        not finite.
         """
         told = {
             "missing": sorted(self.missing),

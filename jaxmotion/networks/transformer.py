@@ -42,7 +42,6 @@ class Context:
     """What one condition contributes to all denoising steps.
 
     Attributes:
-      tokens: Condition tokens with their positions.
       projections: The first layer's queries, keys and values of them.
       steps: Embeddings of steps 0..T, with the time token's position; one table for
         a batch (guidance stacks whole contexts).
@@ -63,8 +62,6 @@ class PrefixContext:
 
     Attributes:
       layers: Keys and values of the condition tokens in each layer.
-      steps: As in `Context`.
-      last: As in `Context`.
     """
 
     layers: tuple[blocks.Prefix, ...]
@@ -191,11 +188,9 @@ class CamdmTransformer(nn.Module):
     ) -> Context | PrefixContext:
         """What does not depend on the noisy sample.
 
-        Args:
-          path: Ground positions (x, z) of the future, meters from the last pose.
-          facing: 6D rotations of the future facings.
-          keep_past: Where False the past is zeroed (its token is then the bias),
-            which is the null condition of classifier-free guidance.
+        The path is ground positions (x, z), meters from the last pose, facings are 6D
+        rotations. Where `keep_past` is False the past is zeroed (its token is then the
+        bias), which is the null condition of classifier-free guidance.
         """
         n = self.frames_per_token
         kept = jnp.where(keep_past[..., None, None], past, 0.0)
@@ -305,10 +300,7 @@ class CamdmTransformer(nn.Module):
         *,
         train: bool = False,
     ) -> Float[Array, "*batch future features"]:
-        """`encode`, then `denoise`; arguments as there.
-
-        Training needs rngs={"dropout": key}.
-        """
+        """`encode`, then `denoise`; training needs rngs={"dropout": key}."""
         context = self.encode(past, path, facing, label, keep_past, train=train)
         return self.denoise(context, x_t, t, train=train)
 

@@ -60,11 +60,7 @@ _LEGACY = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."  # a pickled magic number
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stored:
-    """An array of a file.
-
-    Attributes:
-      read: Reads it; raises ValueError if the file is damaged.
-    """
+    """An array of a file; `read` raises `ValueError` if that is damaged."""
 
     shape: tuple[int, ...]
     read: Callable[[], np.ndarray]
@@ -98,9 +94,7 @@ def read_weights(path: str | os.PathLike) -> dict[str, Any]:
     for what is neither; objects with attributes are dictionaries of them. For the flat
     formats one dictionary of arrays.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if it is truncated, damaged or of another format; names it.
+    A `ValueError` names a file that is truncated, damaged or of another format.
     """
     path = os.fspath(path)
     if not os.path.exists(path):

@@ -40,8 +40,7 @@ def count(function: Callable, *arguments: Any) -> Work:
     The function must not have been traced before with arguments of these shapes if it
     is jitted: JAX would take the old trace, in which no call is marked.
 
-    Raises:
-      ValueError: if there is work in a loop whose length the trace does not know.
+    `ValueError` if there is work in a loop whose length the trace does not know.
     """
     depth = 0
 

@@ -40,12 +40,7 @@ MARK = "jaxmotion:"
 
 
 def packages() -> tuple[ModuleType, ModuleType]:
-    """MuJoCo and mink.
-
-    Raises:
-      ModuleNotFoundError: without the extra [robot].
-      ValueError: if MuJoCo cannot be loaded.
-    """
+    """MuJoCo, mink; `ModuleNotFoundError` without [robot], `ValueError` if broken."""
     try:
         import mink
         import mujoco
@@ -65,9 +60,7 @@ def packages() -> tuple[ModuleType, ModuleType]:
 class Foot:
     """A rigid foot as balls around points: those of its geometry that are lowest.
 
-    Attributes:
-      centers: [n, 3] from the ankle in the zero pose, our axes, meters.
-      radii: [n].
+    Centers [n, 3] are from the ankle in the zero pose, our axes; radii [n]; meters.
     """
 
     centers: np.ndarray
@@ -84,11 +77,9 @@ class Robot:
     """A humanoid of MuJoCo's.
 
     Attributes:
-      name: Its file.
       model: MuJoCo's, with a site for each role.
       rest: As a person of hips, chest, head and limbs of two bones.
       bodies: The body that each role moves.
-      feet: Left and right.
       joints: Its joints but the free one, in MuJoCo's order.
       tree: Its bodies, the free one first.
       free: Index of the free joint.
@@ -436,14 +427,10 @@ def read_robot(
 ) -> Robot:
     """A humanoid of an MJCF or URDF file.
 
-    Args:
-      roles: Bodies of some roles, or a JSON file of them; see `roles.find_roles`.
-
-    Raises:
-      ModuleNotFoundError: without the extra [robot].
-      OSError: if it cannot be read.
-      ValueError: if MuJoCo cannot read it, it has no free joint, or its bodies are no
-        person's that stands in the zero pose; names the file.
+    Roles are bodies of some, or a JSON file of them; see `roles.find_roles`.
+    `ModuleNotFoundError` without the extra [robot]; a `ValueError` names a file that
+    MuJoCo cannot read, that has no free joint, or whose bodies are no person's that
+    stands in the zero pose.
     """
     path = Path(path)
     mujoco, _ = packages()

@@ -317,8 +317,7 @@ class _Goals:
 def _goals(robot: Robot, motion: Motion, fps: float, wider: float) -> _Goals:
     """Where a motion of the robot as a person wants it, with feet that stand.
 
-    Args:
-      wider: How much further from the middle its hip joints are than the motion's.
+    Its hip joints are by `wider` further from the middle than the motion's.
     """
     rest = robot.rest
     places, turns = anatomy.kinematics(rest.skeleton, motion)
@@ -398,16 +397,11 @@ def follow(
     *,
     fps: float = 50.0,
 ) -> RobotMotion:
-    """A motion on a robot.
+    """A motion [frames, ...] of one character on a robot.
 
-    Args:
-      motion: [frames, ...] of one character.
-      fps: Frames per second that are wanted; mjlab's policies act at 50.
-
-    Raises:
-      ModuleNotFoundError: without the extra [robot].
-      ValueError: if the source is no person's skeleton, the motion is not that of one
-        character over two frames or more, or the rate is none.
+    mjlab's policies act at 50 frames per second. `ModuleNotFoundError` without the
+    extra [robot]; `ValueError` if the source is no person's skeleton, the motion is not
+    one character's over two frames or more, or the rate is none.
     """
     if np.ndim(motion.root_position) != 2 or len(motion.root_position) < 2:
         raise ValueError(
@@ -448,10 +442,9 @@ def follow(
 def _solve(
     robot: Robot, goals: _Goals, fps: float, hips: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States that meet the goals as well as the limits allow.
+    """States [F, nq] that meet the goals as well as the limits allow.
 
-    Returns:
-      [F, nq]; how far the feet are off [F, 2]; places of the hips [F, 3], our axes.
+    Beside them: how far the feet are off [F, 2]; places of the hips [F, 3], our axes.
     """
     mujoco, mink = packages()
     model, columns = robot.model, robot.columns
@@ -539,8 +532,7 @@ def render(
 ) -> Iterator[np.ndarray]:
     """Pictures [height, width, 3] by MuJoCo's renderer, of every so many frames.
 
-    Raises:
-      RuntimeError: where there is no OpenGL; see MuJoCo's MUJOCO_GL.
+    `RuntimeError` where there is no OpenGL; see MuJoCo's MUJOCO_GL.
     """
     mujoco, _ = packages()
     model = _stage(motion.robot)

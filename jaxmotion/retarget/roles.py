@@ -188,14 +188,10 @@ def find_roles(
 ) -> dict[str, str]:
     """The joint of each role.
 
-    Args:
-      skeleton: Its zero pose should be a person's, or its joints have names.
-      given: Joints of some roles, which count first; or a JSON file of them.
-
-    Raises:
-      OSError: if the file cannot be read.
-      ValueError: if a role or joint is unknown, or arms and legs are not all found;
-        says what was found and what is missing.
+    Its zero pose should be a person's, or its joints have names. Those `given` (by
+    role, or a JSON file of them) count first. `ValueError` if a role or joint is
+    unknown, or arms and legs are not all found; says what was found and what is
+    missing.
     """
     if isinstance(given, str | Path):
         given = files.read_object(given, what="roles and their joints")

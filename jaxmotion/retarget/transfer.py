@@ -93,9 +93,7 @@ def rest(
       sole: How far below the ankle joints the ground is when a foot is flat; None for
         an adult's.
 
-    Raises:
-      OSError, ValueError: see `roles.find_roles`.
-      ValueError: if a bone of a limb has no length.
+    `ValueError` as `roles.find_roles`, or if a bone of a limb has no length.
     """
     roles = names.find_roles(skeleton, given)
     found = names.anatomy_of(skeleton, roles)
@@ -286,10 +284,8 @@ def two_bones(
 ) -> Float[Array, "limbs 3 batch"]:
     """Where the middle joints of limbs are whose ends reach for goals.
 
-    Args:
-      goal: Of its end; beyond its reach, it points there.
-      pole: A direction, to the side of which the middle joint is.
-      a, b: Lengths of the two bones.
+    Goals beyond reach are pointed at; the middle joint is to the side of the pole, a
+    direction; a and b are the bones' lengths.
 
     Source: the law of cosines.
     """
@@ -664,15 +660,10 @@ def retarget(
 ) -> Retarget:
     """The function that makes motions of the target of motions of the source.
 
-    Args:
-      source: Such as `model.skeleton`.
-      target: Any person's skeleton; or a `Rest`, where more is known of it.
-      roles: Of the target; see `roles.find_roles`.
-      motion: Any second of the source's, where its zero pose does not tell how its
-        limbs are turned about themselves; see `anatomy.t_pose`.
-
-    Raises:
-      OSError, ValueError: see `rest`; says which of the two.
+    The target is any person's skeleton, or a `Rest` where more is known of it; roles
+    are the target's, see `roles.find_roles`. Any second of the source's motion tells
+    how its limbs are turned about themselves where its zero pose does not, see
+    `anatomy.t_pose`. Raises as `rest`, and says which of the two.
     """
     both = []
     world = None

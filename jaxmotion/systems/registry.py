@@ -77,11 +77,7 @@ SYSTEMS = {
 
 
 def get(name: str) -> System:
-    """The record of a system.
-
-    Raises:
-      ValueError: if there is none of that name; names those there are.
-    """
+    """The record of a system."""
     if name not in SYSTEMS:
         raise ValueError(
             f"system: unknown system {name!r}, expected one of {', '.join(SYSTEMS)}"

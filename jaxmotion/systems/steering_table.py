@@ -344,8 +344,6 @@ class _Real:
 
     Those with the label, if their clips know it.
 
-    Attributes:
-      values: Metrics of the windows and their clips, by name of the clips.
     """
 
     def __init__(self, clips: dict[str, Clips], *, label: str):
@@ -439,25 +437,17 @@ def steering_table(
 ) -> Steered:
     """Steers characters straight on and along courses, and measures them.
 
-    Args:
-      held_out: Clips that it never saw: rows of real motion, where the ground is, and
-        poses to start from if it starts from clips.
-      train: Clips that it was trained on: rows of real motion.
-      label: Label of all characters, and of the real windows if the clips know it.
-      speeds: What characters are told that go straight on, m/s; 0 to stand.
-      names: Courses that they follow besides.
-      course_speed: What they are told there, m/s.
-      places: Frames of a plan to play.
-      rollouts: Characters per speed and per course; all courses begin with the same
-        poses and noise.
-      seconds: Length of each rollout; the first three are left out.
-      foot_lock: Settings of the lock for second rows; None for none.
-      chunk: Characters to run at a time, at most (the largest number that divides
-        theirs).
+    Held-out clips, which it never saw, and training clips give rows of real motion, the
+    ground, and poses to start from if it starts from clips. All characters have the
+    label, as have the real windows if the clips know it. They go straight on at
+    `speeds`, m/s (0 to stand), and follow the courses `names` at `course_speed`; so
+    many rollouts per speed and course, which all begin with the same poses and noise,
+    and whose first three seconds are left out. `places` frames of a plan are played; at
+    most `chunk` characters run at a time. With settings of the lock there are second
+    rows.
 
-    Raises:
-      ValueError: if rollouts are too short to measure, there is no such label or
-        course, or the skeleton has no feet to lock.
+    `ValueError` if rollouts are too short to measure, there is no such label or course,
+    or the skeleton has no feet to lock.
     """
     fps = character.fps
     index = character.label(label) if character.labels else 0

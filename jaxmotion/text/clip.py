@@ -85,9 +85,7 @@ _OPENAI_HEAD = 64  # channels of a head
 class ClipModel:
     """A text tower with its tokenizer.
 
-    Attributes:
-      tokenizer: Tokenizer of the package `tokenizers`.
-      fingerprint: Eight hexadecimal digits that change with weights and tokenizer.
+    The fingerprint, eight hexadecimal digits, changes with weights and tokenizer.
     """
 
     network: ClipText
@@ -99,14 +97,12 @@ class ClipModel:
 def load_clip(folder: str | os.PathLike) -> ClipModel:
     """Reads a text tower.
 
-    Args:
-      folder: With model.safetensors, config.json and tokenizer.json, or with one .pt
-        file of OpenAI's and tokenizer.json. Sizes that the config does not name are
-        those of ViT-B/32, as on the hub.
+    The folder has model.safetensors, config.json and tokenizer.json, or one .pt file of
+    OpenAI's and tokenizer.json. Sizes that the config does not name are those of
+    ViT-B/32, as on the hub.
 
     Raises:
       FileNotFoundError: if a file is missing; names all that are.
-      ModuleNotFoundError: if `tokenizers` is not installed.
       ValueError: if a file is damaged or does not fit the others; names its fields or
         keys (five at most), what was expected and what was found.
     """
@@ -294,9 +290,8 @@ def tokenize(
     `max_tokens`, those of start and end included (22 in EMDM and MDM on HumanML3D);
     None: a text beyond the context is an error.
 
-    Raises:
-      ValueError: if max_tokens is not in 3..context, or a text is too long or contains
-        a token of start or end; names the text, the limit and its length.
+    A `ValueError` names the text that is too long (with limit and length), or contains
+    a token of start or end; or a limit not in 3..context.
     """
     network = model.network
     if max_tokens is not None and not 3 <= max_tokens <= network.context:

@@ -41,8 +41,7 @@ class TextEncoder:
     def encode(self, texts: Sequence[str]) -> Float[np.ndarray, "texts dimensions"]:
         """Vectors of texts, float32; runs of white space count as one space.
 
-        Raises:
-          ValueError: if a text is empty, or the encoder cannot take it; names it.
+        A `ValueError` names a text that is empty, or that the encoder cannot take.
         """
         plain = plain_texts(texts)
         if not plain:
@@ -58,11 +57,7 @@ class TextEncoder:
 
 
 def plain_texts(texts: Sequence[str]) -> list[str]:
-    """Texts with single spaces between words.
-
-    Raises:
-      ValueError: if it is one string, or a text is empty; gives the text's index.
-    """
+    """Texts, single spaces between words; a `ValueError` gives an empty one's index."""
     if isinstance(texts, str):
         raise ValueError(f"expected a sequence of texts, found one: {texts!r}")
     plain = [" ".join(text.split()) for text in texts]
@@ -116,9 +111,8 @@ def make_encoder(name: str, *, max_tokens: int | None = None) -> TextEncoder:
 
     For `max_tokens` see `clip_encoder`; the others read any text whole.
 
-    Raises:
-      ModuleNotFoundError: if a package is missing; says how to install it.
-      ValueError: if it is none of the three; see also `clip.load_clip`.
+    `ModuleNotFoundError` if a package is missing, with how to install it; `ValueError`
+    if it is none of the three, see also `clip.load_clip`.
     """
     if name == "wordllama":
         return wordllama_encoder()
@@ -135,9 +129,7 @@ def make_encoder(name: str, *, max_tokens: int | None = None) -> TextEncoder:
 class UniqueTexts(NamedTuple):
     """Every text once: the vectors of all are vectors[index].
 
-    Attributes:
-      vectors: One row a different text, in the order of first appearance.
-      index: Row of each text.
+    Vectors are in the order of first appearance.
     """
 
     vectors: Float[np.ndarray, "unique dimensions"]
@@ -156,10 +148,8 @@ def encode_unique(
     encoder. With the vectors of the different texts comes where each text is among
     them.
 
-    Raises:
-      OSError: if the cache cannot be written.
-      ValueError: if a text is empty (gives its index), or the cache is damaged, foreign
-        or of another encoder (names file and field).
+    A `ValueError` gives the index of an empty text, or names the cache's file and field
+    if it is damaged, foreign or of another encoder.
     """
     plain = plain_texts(texts)
     rows = {text: row for row, text in enumerate(dict.fromkeys(plain))}

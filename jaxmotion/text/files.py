@@ -7,11 +7,7 @@ from typing import Any
 
 
 def require(package: str) -> ModuleType:
-    """Imports a package that only texts need.
-
-    Raises:
-      ModuleNotFoundError: if it is not installed; says how to install it.
-    """
+    """Imports a package that only texts need; if it lacks, says how to install it."""
     try:
         return importlib.import_module(package)
     except ModuleNotFoundError as error:
@@ -32,12 +28,8 @@ def missing(package: str) -> ModuleNotFoundError:
 def read_tokenizer(path: str | os.PathLike) -> Any:
     """Reads a tokenizer.json into a `tokenizers.Tokenizer`; it neither pads nor cuts.
 
-    Its `encode_batch` may be called by several threads.
-
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ModuleNotFoundError: if the package `tokenizers` is not installed.
-      ValueError: if it is no tokenizer; names the file.
+    Its `encode_batch` may be called by several threads. `ModuleNotFoundError` without
+    `tokenizers`; a `ValueError` names a file that is none.
     """
     path = os.fspath(path)
     if not os.path.isfile(path):

@@ -55,8 +55,7 @@ def encode(
 ) -> Float[np.ndarray, "texts dimensions"]:
     """Hashed n-grams of texts, of at least one dimension: float32 vectors of length 1.
 
-    Raises:
-      ValueError: if dimensions is not positive, or a text has no words; names it.
+    A `ValueError` names a text without words.
     """
     if dimensions < 1:
         raise ValueError(f"dimensions should be positive, found {dimensions}")

@@ -30,9 +30,7 @@ _TOKENIZER = "tokenizers/l2_supercat_tokenizer_config.json"
 class WordLlama:
     """Token embeddings with their tokenizer.
 
-    Attributes:
-      tokenizer: Tokenizer of the package `tokenizers`.
-      embedding: One row a token.
+    The tokenizer is of the package `tokenizers`; the embedding has one row a token.
     """
 
     tokenizer: Any
@@ -42,9 +40,8 @@ class WordLlama:
 def load_wordllama() -> WordLlama:
     """Reads the two files from where the package is installed; needs no network.
 
-    Raises:
-      FileNotFoundError: if the installed package does not carry them.
-      ModuleNotFoundError: if `wordllama`, `tokenizers` or `safetensors` is missing.
+    `FileNotFoundError` if it does not carry them, `ModuleNotFoundError` without
+    `wordllama`, `tokenizers` or `safetensors`.
     """
     found = importlib.util.find_spec("wordllama")
     if found is None or found.origin is None:

@@ -400,12 +400,7 @@ def save_pictures(
 ) -> None:
     """Writes pictures [height, width, 3] of another renderer as an animated GIF.
 
-    Args:
-      fps: Pictures per second; a GIF's times are hundredths of a second.
-
-    Raises:
-      ValueError: if there are none.
-      OSError: if the file cannot be written.
+    A GIF's times are hundredths of a second. `ValueError` if there are none.
     """
     path = drawing.check_writable(path)
     images = [Image.fromarray(picture) for picture in pictures]

@@ -32,14 +32,9 @@ class Camera:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pixels of world points.
 
-        Args:
-          points: [..., 3] meters.
-          frame: Frame of the camera; an array of frames must broadcast against
-            `points`.
-
-        Returns:
-          [..., 2] pixels from the upper left; [...] pixels a meter there; [...] meters
-          toward the viewer, seen from the target.
+        Points [..., 3] are in meters; an array of frames must broadcast against them.
+        Given are [..., 2] pixels from the upper left; [...] pixels a meter there; [...]
+        meters toward the viewer, seen from the target.
         """
         local = (points - self.targets[frame]) @ self.axes.T
         near = local[..., 2]
@@ -66,23 +61,14 @@ def view_axes(*, azimuth: float, elevation: float) -> np.ndarray:
 
 
 def toward(walked: np.ndarray) -> float:
-    """Azimuth of a view toward which characters come, all in all, degrees.
-
-    Args:
-      walked: [characters, F, 2] their paths (x, z), meters.
-    """
+    """Azimuth of a view toward which characters come, all in all, degrees."""
     way = (walked[:, -1] - walked[:, 0]).mean(axis=0)
     moved = np.linalg.norm(way) > 0.3
     return 35.0 + (float(np.rad2deg(np.arctan2(*way))) if moved else 0.0)
 
 
 def smooth(values: np.ndarray, frames: float) -> np.ndarray:
-    """Gaussian mean over time, continued straight beyond both ends.
-
-    Args:
-      values: [F, D].
-      frames: Standard deviation.
-    """
+    """Gaussian mean over time, continued straight beyond both ends."""
     reach = max(int(3 * frames), 1)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(frames, 1e-3)) ** 2)
     mode: dict[str, Any] = {"reflect_type": "odd"} if len(values) > 1 else {}

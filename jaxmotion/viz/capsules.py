@@ -13,12 +13,9 @@ _PALETTE = ("#c9ced6", "#3c424b")
 def describe(
     skeleton: Skeleton, joints: np.ndarray, ends: np.ndarray, radii: np.ndarray
 ) -> Mannequin:
-    """A body of rigid capsules.
+    """A body of rigid capsules, each with the joint [n] that it follows.
 
-    Args:
-      joints: [n] that each follows.
-      ends: [n, 2, 3] from its joint in the zero pose, meters.
-      radii: [n] meters.
+    Ends [n, 2, 3] are from its joint in the zero pose; these and radii are in meters.
     """
     places = zero_pose(skeleton)
     ball, faces = raster.sphere()

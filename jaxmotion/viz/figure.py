@@ -11,11 +11,7 @@ COMMANDED, WALKED = "#2ca02c", "#ff7f0e"
 
 
 def check_writable(path: str | Path) -> Path:
-    """The path of a file that can be written, asked before anything is drawn.
-
-    Raises:
-      OSError: names the file.
-    """
+    """The path of a file that can be written (else `OSError`), asked before drawing."""
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -366,10 +366,6 @@ def page(stage: Stage, *, title: str = "", caption: str = "") -> str:
 def save_html(
     path: str | Path, stage: Stage, *, title: str = "", caption: str = ""
 ) -> None:
-    """Writes the page; see there.
-
-    Raises:
-      OSError: if the file cannot be written.
-    """
+    """Writes the page; see there."""
     text = page(stage, title=title, caption=caption)
     drawing.check_writable(path).write_text(text, encoding="utf-8")

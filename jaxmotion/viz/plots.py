@@ -100,13 +100,8 @@ def write_dots(
 ) -> None:
     """Draws two axes a metric, with one line a method and a scale of their own.
 
-    Args:
-      methods: Names, from above.
-      sources: Names of the left and the right source of every panel.
-      absent: What stands where the left or the right source has no value.
-
-    Raises:
-      OSError: if the file cannot be written.
+    Names are from above; sources are those left and right in every panel; `absent` is
+    what stands where they have no value.
     """
     path = figure.check_writable(path)
     across = min(_ACROSS, len(panels))
@@ -237,9 +232,6 @@ def write_pareto(
       references: Value, lower and upper end of second costs that are lines.
       broken: Names of points that fail in other ways: hollow, and beaten by all.
 
-    Raises:
-      OSError: if the file cannot be written.
-      ValueError: if a broken name is of no point.
     """
     unknown = set(broken) - set(names)
     if unknown:
@@ -302,8 +294,6 @@ def write_scatter(
       shown: Points drawn of a cloud, at most.
       seed: Seeds the choice of these.
 
-    Raises:
-      OSError: if the file cannot be written.
     """
     path = figure.check_writable(path)
     center = (marks.max(axis=0) + marks.min(axis=0)) / 2
@@ -342,8 +332,6 @@ def plot_sweep(
       lines: Label to (x, y, upper end of the whisker or None).
       ticks: What stands below x = 0, 1, 2, ...; none for numbers.
 
-    Raises:
-      OSError: if the file cannot be written.
     """
     path = figure.check_writable(path)
     drawing = Figure(figsize=(6, 4), dpi=110, layout="constrained")
@@ -549,11 +537,6 @@ def write_curves(path: str | Path, panels: tuple[Curves, ...], *, title: str) ->
     Axes are logarithmic where what is drawn differs by much: upright each for itself,
     across all of them where some lines are much longer than others.
 
-    Args:
-      panels: What to draw, each with a finite value.
-
-    Raises:
-      OSError: if the file cannot be written.
     """
     path = figure.check_writable(path)
     across = min(_ACROSS, len(panels))

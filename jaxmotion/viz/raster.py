@@ -110,9 +110,7 @@ def covered(
 ) -> np.ndarray:
     """Whether each pixel [height, width] is in a triangle, seen from whichever side.
 
-    Args:
-      points: [V, 2 or more] right and down, pixels.
-      faces: [T, 3].
+    Points [V, 2 or more] are right and down, pixels.
     """
     inside = _inside(points, faces, width, height, two_sided=True)
     found = np.zeros((height, width), bool)

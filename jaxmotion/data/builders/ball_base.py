@@ -42,12 +42,8 @@ def ball_example(
 ) -> tuple[str, dict]:
     """Key and features of one clip with a ball, as a builder's generator yields them.
 
-    Args:
-      name: Unique name of the clip.
-      labels: One word for each label field.
-      ball: World position of the ball's center in every frame, meters, y up.
-      touch: Which of the joints touch the ball in every frame.
-      radius: Of the ball, meters.
+    The ball's center is in the world, meters, y up; `touch` says which of the joints
+    touch it. Labels are one word a field; the name is unique.
     """
     _, features = base.example(name, skeleton, motion, labels)
     features |= {
@@ -64,11 +60,8 @@ def ball_clips_from_source(
 ) -> BallClips:
     """All clips of a prepared builder, with their ball, sorted by name.
 
-    Offsets of skeletons may differ by the tolerance, meters.
-
-    Raises:
-      ValueError: if the clips have different skeletons, rates, balls or touching
-        joints; names two.
+    Offsets of skeletons may differ by the tolerance, meters. A `ValueError` names two
+    clips with different skeletons, rates, balls or touching joints.
     """
     records = base.read_records(builder)
     clips = base.clips_from_records(builder, records, tolerance=tolerance)

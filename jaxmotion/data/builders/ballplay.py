@@ -129,9 +129,8 @@ def read_skill(label: str) -> str:
 def read_fields(path: str, data: bytes) -> dict[str, np.ndarray]:
     """The arrays of the file, checked; numbers are float64.
 
-    Raises:
-      ValueError: if a field is missing, of another shape or not finite, or the clips'
-        boundaries do not ascend; names the file and the field.
+    A `ValueError` names the file and the field that is missing, of another shape or not
+    finite, or says that the clips' boundaries do not ascend.
     """
     fields = files.read_arrays(io.BytesIO(data), name=path, what="BallPlay-M")
     wanted = {field: (kind, 1 + len(s)) for field, (kind, s) in _FRAMES.items()}

@@ -116,13 +116,9 @@ def _read_lists(folder: Path, number: str, stem: str) -> dict[str, list[str]]:
 def read_labels(path: str, data: bytes, names: dict[str, list[str]]) -> dict[str, str]:
     """Content and style of a clip from its ids, checked against its file name.
 
-    Args:
-      path: The clip's JSON file, named dataset-<n>_<content>_<style>_<number>.json.
-      data: Its content, such as {"content": 7, "style": 0}.
-      names: The published label lists.
-
-    Raises:
-      ValueError: if the JSON is malformed, an id is unknown, or the name disagrees.
+    The file is named dataset-<n>_<content>_<style>_<number>.json and holds such as
+    {"content": 7, "style": 0}. `ValueError` if the JSON is malformed, an id is unknown,
+    or the name disagrees.
     """
     try:
         ids = json.loads(data)

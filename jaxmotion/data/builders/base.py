@@ -148,19 +148,13 @@ def read_files(
 ) -> Iterator[tuple[str, bytes]]:
     """Files of a folder or, where it has none of the kind, of the zips in it.
 
-    Args:
-      manual_dir: Folder; searched with all folders below it.
-      suffixes: Wanted ends of file names, lower case.
-      stem: Only files below a folder of that name (in the path or inside the zip), or
-        in a zip named so.
-      unique: Whether files are told apart by their names alone, without folders.
+    Folders below it are searched, too. Suffixes are lower case; with a stem, only files
+    below a folder of that name (in the path or inside the zip), or in a zip named so,
+    count; where `unique`, files are told apart by their names alone, without folders.
+    Given are path (for zips "archive.zip/member") and content, sorted by path.
 
-    Yields:
-      Path (for zips "archive.zip/member") and content, sorted by path.
-
-    Raises:
-      FileNotFoundError: if the folder is missing or has no such file.
-      ValueError: if a zip cannot be unpacked, or two files have one name; names them.
+    A `ValueError` names a zip that cannot be unpacked, or two files of one name;
+    `FileNotFoundError` without folder or files.
     """
     folder = Path(manual_dir)
     if not folder.is_dir():
@@ -207,10 +201,9 @@ def prepare(
     The builder was made with `file_format="array_record"`; with `overwrite` the files
     are read again.
 
-    Raises:
-      FileNotFoundError: if the folder or its files are missing.
-      OSError: if the builder's folder cannot be written, as on a full disk.
-      ValueError: if a file is malformed; names it.
+    `FileNotFoundError` if the folder or its files are missing, `OSError` if the
+    builder's cannot be written, as on a full disk; a `ValueError` names a malformed
+    file.
     """
     folder = Path(manual_dir)
     if not folder.is_dir() or not any(folder.iterdir()):
@@ -233,11 +226,7 @@ def prepare(
 
 
 def read_text(path: str, data: bytes) -> str:
-    """Content of a text file.
-
-    Raises:
-      ValueError: if it is no UTF-8; names the file.
-    """
+    """Content of a text file; a `ValueError` names one that is no UTF-8."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -258,10 +247,8 @@ def read_records(builder: MotionBuilder) -> list[dict]:
 def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Clips:
     """All clips of a prepared builder, sorted by name.
 
-    Offsets of skeletons may differ by the tolerance, meters.
-
-    Raises:
-      ValueError: if the clips have different skeletons or rates; names two.
+    Offsets of skeletons may differ by the tolerance, meters; a `ValueError` names two
+    clips with other skeletons or rates.
     """
     return clips_from_records(builder, read_records(builder), tolerance=tolerance)
 
@@ -269,13 +256,7 @@ def clips_from_source(builder: MotionBuilder, *, tolerance: float = 1e-3) -> Cli
 def clips_from_records(
     builder: MotionBuilder, records: Sequence[Mapping], *, tolerance: float
 ) -> Clips:
-    """Clips of what `read_records` read, in that order.
-
-    Offsets of skeletons may differ by the tolerance, meters.
-
-    Raises:
-      ValueError: if the clips have different skeletons or rates; names two.
-    """
+    """Clips of what `read_records` read, in that order; see `clips_from_source`."""
     skeletons, motions = [], []
     for record in records:
         skeletons.append(

@@ -43,11 +43,7 @@ def joint_positions(
 ) -> Float[np.ndarray, "frames joints 3"]:
     """World positions of all joints, meters.
 
-    Args:
-      root: World position of the root, meters.
-      world: World rotations.
-      offsets: Joint position in its parent's frame, meters; the root's is unused.
-      parents: Parent of each joint, smaller than the joint.
+    The root's offset is unused; each parent is smaller than its joint.
     """
     found = [root]
     for joint, parent in enumerate(parents[1:], start=1):
@@ -69,12 +65,8 @@ def fit_rotations(
     where a small e leaves to G only what the bones do not decide: how a single one
     turns about itself. A joint without children keeps G.
 
-    Args:
-      position: World positions of the joints, meters.
-      world: World rotations to start from.
-
-    Returns:
-      Joint positions in their parents' frames (the root's is zero), and rotations.
+    Positions are in the world, meters; with the rotations come the joints' positions in
+    their parents' frames (the root's is zero).
 
     Source: the orthogonal Procrustes problem (Schönemann 1966).
     """

@@ -86,11 +86,8 @@ def read_clips(
 ) -> tuple[list[np.ndarray], list[np.ndarray], list[str]]:
     """Rotation vectors [frames, 72], positions [frames, 24, 3] and action of each clip.
 
-    Positions are in meters.
-
-    Raises:
-      ValueError: if the file is no plain pickle or a field is not as it should be;
-        names the field and the clip.
+    Positions are in meters. A `ValueError` names the field and the clip that are wrong,
+    or says that the file is no plain pickle.
     """
     content = read_plain_pickle(data, name=path)
     if not isinstance(content, dict):

@@ -203,13 +203,8 @@ def text_motions_from_source(
     own, the parts of them that captions with times cut out, if they are as long. They
     come split by split, sorted by name.
 
-    Args:
-      builder: A prepared `HumanML3D`.
-      cut_fps: Frames per second by which the times of captions become frames. The
-        released loaders take 20 for both sets; KIT-ML's own rate is 12.5.
-
-    Raises:
-      ValueError: if no clip is left.
+    Times of captions become frames by `cut_fps`. The released loaders take 20 for both
+    sets; KIT-ML's own rate is 12.5. `ValueError` if no clip is left.
 
     Source: the data loader released with T2M.
     """

@@ -16,10 +16,8 @@ def read_name(name: str) -> dict[str, str]:
     """Labels from a file name such as walk1_subject5 or aiming1_subject1_walk2.
 
     theme ("walk", "aiming"), subject ("subject5") and action: the label of a cut, or
-    the theme of a whole take. The name comes without its ending.
-
-    Raises:
-      ValueError: if the name is none of these.
+    the theme of a whole take. The name comes without its ending; a `ValueError` says if
+    it is none of these.
     """
     match = _NAME.fullmatch(name)
     if match is None:

@@ -111,10 +111,8 @@ def read_skeleton(path: str, data: bytes) -> Skeleton:
     """SMPL's joints with the bones of a skeleton.npz.
 
     Its feet are ankles and feet, left before right; row 0 of its offsets is where the
-    pelvis lies from the model's origin.
-
-    Raises:
-      ValueError: if the offsets are missing, malformed or not finite; names the file.
+    pelvis lies from the model's origin. A `ValueError` names a file whose offsets are
+    missing, malformed or not finite.
     """
     fields = _arrays(path, data, {"offsets": (24, 3)}, "skeleton")
     return Skeleton(
@@ -126,11 +124,7 @@ def read_skeleton(path: str, data: bytes) -> Skeleton:
 
 
 def read_skill(path: str) -> str:
-    """The skill, one of six, that a sequence's file name or folder names.
-
-    Raises:
-      ValueError: if neither names one.
-    """
+    """One of six skills, from a file's name or folder; `ValueError` if it says none."""
     place = PurePosixPath(path.replace("\\", "/"))
     for skill in SKILLS:
         if place.stem.startswith(f"{skill}_"):
@@ -146,9 +140,8 @@ def read_skill(path: str) -> str:
 def read_sequence(path: str, data: bytes, skeleton: Skeleton) -> tuple[str, dict]:
     """Key and features of one sequence at 30 frames per second, y up.
 
-    Raises:
-      ValueError: if a field is missing, malformed or not finite, the name says no
-        skill, or fewer than three frames are left; names the file and the field.
+    A `ValueError` names the file and the field if one is missing, malformed or not
+    finite, the name says no skill, or fewer than three frames are left.
     """
     skill = read_skill(path)
     shapes = {field: (None, width) for field, width in _FRAMES.items()}

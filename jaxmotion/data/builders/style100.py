@@ -112,11 +112,7 @@ def _plan(skeleton: Skeleton) -> mirror.MirrorPlan:
 
 
 def toes(skeleton: Skeleton, path: str) -> tuple[int, ...]:
-    """The outermost pair of toe joints, left before right.
-
-    Raises:
-      BvhError: if there is none; names the file.
-    """
+    """Outermost pair of toe joints, left before right; `BvhError` if it has none."""
     plain = plain_names(skeleton)
     for pair in _FEET:
         if set(pair) <= set(plain):
@@ -134,8 +130,7 @@ def cut_clip(content: bvh_text.Bvh, cut: tuple[int, int]) -> bvh_text.Bvh:
     frames start//2 : stop//2 is taken, or one already taken at 30. The cut's first and
     last (exclusive) frame are at 60.
 
-    Raises:
-      BvhError: if the rate is another, or the cut is not within the recording.
+    `BvhError` if the rate is another, or the cut is not within the recording.
     """
     fps = bvh.frame_rate(content.frame_time)
     if fps not in (60.0, 30.0):
@@ -171,8 +166,7 @@ def read_cuts(path: str, text: str) -> dict[tuple[str, str], tuple[int, int]]:
     The text is Frame_Cuts.csv: a header, then style and start, stop for each action in
     the order of `ACTIONS`. An empty cell or one with an "n" (NA, nan) means missing.
 
-    Raises:
-      ValueError: names the file, the line and the cell.
+    A `ValueError` names the file, the line and the cell.
     """
     cuts = {}
     for number, row in enumerate(csv.reader(io.StringIO(text)), start=1):
@@ -203,8 +197,7 @@ def read_symmetric(path: str, text: str) -> dict[str, bool]:
     The text is Dataset_List.csv: a header, then name, description, stochastic y/n,
     symmetric y/n, notes.
 
-    Raises:
-      ValueError: names the file and the line.
+    A `ValueError` names the file and the line.
     """
     symmetric = {}
     for number, row in enumerate(csv.reader(io.StringIO(text)), start=1):

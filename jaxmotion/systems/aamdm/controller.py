@@ -200,11 +200,8 @@ def guided(
 ) -> Stepper:
     """AAMDM as a stepper steered by the objective's gradient, unless the goal is None.
 
-    Args:
-      scale: Strength of the guidance, epsilon of eq. 13.
-      guided_steps: How many at the chain's end are guided; None for all (paper).
-      memory: How the noise of its posteriors is remembered; None draws it anew in every
-        frame (paper).
+    The scale is epsilon of eq. 13. So many steps at the chain's end are guided, None
+    for all (paper); without a memory, noise is drawn anew in every frame (paper).
     """
 
     def step(key: Key, previous: Array, goal: Array | None, **noise: Array) -> Array:
@@ -269,10 +266,9 @@ def controller(
 ) -> Controller:
     """The run-time as the three functions that `rollout.rollout` composes.
 
-    Args:
-      steered: Whether commands matter; if not, none of the steering is compiled in.
-      bounded: Whether frames are kept within the bounds of the data; ours.
-      half_life: Of the springs that turn a command into a path, seconds.
+    Unless `steered`, no steering is compiled in; `bounded` (ours) keeps frames within
+    the bounds of the data. The half-life, seconds, is that of the springs from command
+    to path.
     """
 
     def wanted(state: CharacterState, command: Command) -> Array:
@@ -323,12 +319,7 @@ def exports(controller: Controller) -> dict[str, Exported]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Method:
-    """What makes a controller of `(networks' parameters, space)`; hashable.
-
-    Attributes:
-      guided_steps: How many at the chain's end are guided; None for all.
-      memory: How the noise of the posteriors is remembered.
-    """
+    """What makes a controller of `(networks' parameters, space)`; hashable."""
 
     config: aamdm_model.Config
     num_joints: int
@@ -405,9 +396,7 @@ def load_run(
 ) -> tuple[aamdm_training.Run, aamdm_stored.Model, Params]:
     """A run folder, its model, and networks: 3 drafts and 2 polishes, embedded.
 
-    Raises:
-      CheckpointError: if a stage was not trained.
-      ValueError: if it is no run folder of AAMDM.
+    `CheckpointError` if a stage was not trained.
     """
     run = aamdm_training.load_run(path)
     space = aamdm_training.load_space(run, "embedded")
@@ -454,17 +443,10 @@ def load_character(
     """The character of a run folder or an exported file.
 
     It starts in the model's own frames where it has some, else in held-out poses.
-    Commands have no labels.
-
-    Args:
-      step: Makes the chain's step; the default is the paper's.
-      noise_half_life: Seconds in which the noise of the posteriors is forgotten; 0 to
-        draw it anew in every frame (paper). None for what the model was exported with,
-        0 for a run folder.
-
-    Raises:
-      CheckpointError: if a stage was not trained, or the file is damaged.
-      ValueError: if it is of another system.
+    Commands have no labels. Noise of the posteriors is forgotten in `noise_half_life`
+    seconds; 0 draws it anew in every frame (paper), None is what the model was exported
+    with, 0 for a run folder. `CheckpointError` if a stage was not trained, or the file
+    is damaged, `ValueError` for another system.
     """
     if path.is_file():
         model, networks = aamdm_stored.load(path)

@@ -19,11 +19,7 @@ from jaxmotion.motion import path_features, pose
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class PoseData:
-    """Frames of clips, concatenated.
-
-    Attributes:
-      offsets: First frame of each clip, and the number of frames at the end.
-    """
+    """Frames of clips, concatenated; offsets are those of `Clips`."""
 
     poses: Float[Array, "frames features"]
     paths: Float[Array, "frames 12"]
@@ -39,10 +35,7 @@ class PoseData:
 def starts(data: PoseData, length: int, *, stride: int = 1) -> Int[Array, " windows"]:
     """First frames of all windows of `length` frames that lie within one clip.
 
-    Within a clip they are `stride` frames apart.
-
-    Raises:
-      ValueError: if no clip is long enough.
+    They are `stride` frames apart in a clip; `ValueError` if none is long enough.
     """
     found, _ = windows.window_starts(np.asarray(data.offsets), length, stride=stride)
     if not found.size:
@@ -63,8 +56,6 @@ def balanced_starts(
     the facing. The power is that of `windows.repeat_rare`; 0 lists each once, as
     `starts`.
 
-    Raises:
-      ValueError: if no clip is long enough.
     """
     first = np.asarray(starts(data, length))
     if not power:
@@ -90,14 +81,9 @@ def take(data: PoseData, spans: list[tuple[int, int]]) -> PoseData:
 
 
 def split_ends(data: PoseData, fraction: float) -> tuple[PoseData, PoseData]:
-    """Holds out the end of every clip.
+    """Holds out a part, in (0, 1), at the end of every clip, and a second before it.
 
-    Args:
-      fraction: Part of each clip to hold out, in (0, 1); the second before it is in
-        neither part.
-
-    Raises:
-      ValueError: if the fraction is out of range, or a part would be empty.
+    `ValueError` if it is out of range, or a part would be empty.
     """
     if not 0.0 < fraction < 1.0:
         raise ValueError(f"fraction should be between 0 and 1, found {fraction}")
@@ -117,11 +103,8 @@ def split_ends(data: PoseData, fraction: float) -> tuple[PoseData, PoseData]:
 def pose_data(clips: Clips, *, fps: float = 60.0) -> tuple[PoseData, tuple[str, ...]]:
     """Frames of clips at another rate, and the names of the clips that were used.
 
-    Clips too short for a simulation bone are left out.
-
-    Raises:
-      ValueError: if the skeleton lacks a joint, the rate cannot be reached, or all
-        clips are too short.
+    Clips too short for a simulation bone are left out. `ValueError` if all are, the
+    skeleton lacks a joint, or the rate cannot be reached.
     """
     skeleton = clips.skeleton
     least = simulation.least_frames(fps)

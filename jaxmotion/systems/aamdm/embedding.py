@@ -269,9 +269,6 @@ def loss(
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """The autoencoder's loss on pairs of neighboring frames; L1 means throughout.
 
-    Returns:
-      The weighted sum, and "value", "change" and "latent", its weighted parts.
-
     Source: Li et al. 2024 (AAMDM), eq. 1-4.
     """
     del key

@@ -68,13 +68,7 @@ def start_states(
 def commands(
     run: Run, number: int, ticks: int, *, course: str, speed: float
 ) -> Command:
-    """Commands [characters, ticks, ...], the same for every one of `number` characters.
-
-    The course is one of `courses.COURSES`, the speed in meters per second.
-
-    Raises:
-      ValueError: if there is no such course.
-    """
+    """Commands [characters, ticks, ...], the same for every character; speed in m/s."""
     fps = run.train.fps
     one = courses.course_commands(
         course, seconds=ticks / fps, fps=fps, speed=speed, label=0
@@ -90,15 +84,7 @@ def roller(
     steered: bool,
     bounded: bool = True,
 ) -> Callable[[Key, CharacterState, Command], tuple[CharacterState, Frame]]:
-    """Rollouts as one jitted function.
-
-    Args:
-      steered: Whether commands matter.
-      bounded: Whether frames are kept within the bounds of the data.
-
-    Returns:
-      `roll(key, states, commands) -> (states, frames)`.
-    """
+    """Jitted rollouts, `roll(key, states, commands) -> (states, frames)`."""
     driver = aamdm_controller.controller(
         step,
         space,
@@ -119,12 +105,9 @@ def positions_of(skeleton: Skeleton, frames: Frame) -> jax.Array:
 def data_frames(
     run: Run, data: PoseData, number: int, ticks: int, *, seed: int
 ) -> Frame:
-    """Windows of real frames as if they were rollouts.
+    """Windows of real frames as if they were rollouts that wanted their own path.
 
-    They wanted their own path and velocity.
-
-    Raises:
-      ValueError: if no clip is that long.
+    `ValueError` if no clip is that long.
     """
     first = starts(data, ticks)
     chosen = np.random.default_rng(seed).integers(0, first.shape[0], number)
@@ -190,7 +173,6 @@ class Reference:
 
     Attributes:
       normalizer: Normalizer of joint positions in the character's axes.
-      moments: Moments of the training frames' positions, normalized.
       toe_height: Height of the resting toes, meters.
       root_height: Median height of the root, meters.
     """
@@ -240,17 +222,10 @@ def free_row(
 ) -> Row:
     """Columns that need no commands, of frames [characters, ticks, ...].
 
-    Args:
-      key: Of the pairs for diversity.
-      groups: Groups of rollouts for the intervals of DIV and FID; divides their number.
-
-    Returns:
-      div and fid over groups; ffr_mann, ffr_gmd, speed, acceleration and jerk over
-      rollouts; diverged, the number of rollouts with numbers that no body shows. If a
-      position is not finite there is no other column.
-
-    Raises:
-      ValueError: if the groups do not divide the rollouts.
+    Of `groups` of rollouts, which divide their number (else `ValueError`), are div and
+    fid; over rollouts ffr_mann, ffr_gmd, speed, acceleration and jerk; diverged is the
+    number of those with numbers that no body shows. If a position is not finite there
+    is no other column.
     """
     if frames.root_position.shape[0] % groups:
         raise ValueError(
@@ -368,15 +343,9 @@ def score_stepper(
 ) -> Row:
     """Row of free rollouts, with columns of steered ones whose names end in "_uc".
 
-    Args:
-      rollouts: Characters, free and steered.
-      ticks: Length of a rollout after its first second, where the data's own pose still
-        shows.
-      speed: Meters per second that are commanded.
-      groups: As in `free_row`.
-
-    Returns:
-      Columns of `free_row`, these "_uc", and those of `control_row`.
+    Free and steered characters each last so many ticks after a first second, where the
+    data's own pose still shows. The speed is in m/s. Columns are those of `free_row`,
+    these "_uc", and those of `control_row`.
     """
     fps, row = run.train.fps, {}
     skip = round(fps)

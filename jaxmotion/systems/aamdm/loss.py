@@ -65,17 +65,10 @@ def polisher_loss(
     predicted from it and from the prediction of the frame before; the gradient runs
     through the whole window, of `config.window` + 1 frames.
 
-    Args:
-      change: Deviation of each channel's changes; where they are predicted only. Errors
-        are then measured in it.
-      pose_error: Error of the poses that windows of frames mean, from those that others
-        do; where `config.weight_pose` is not zero only.
-
-    Returns:
-      The weighted sum, and its terms "value" and "velocity", and "pose" if it counts.
-
-    Raises:
-      ValueError: if `change` or `pose_error` does not fit the method.
+    Errors are measured in the `change`, the deviation of each channel's changes, where
+    these are predicted; `pose_error` is that of the poses that windows of frames mean,
+    and needed where `config.weight_pose` is not zero (else `ValueError`). Terms are
+    "value" and "velocity", and "pose" if it counts.
     """
     aamdm_model.check_change(config, change)
     if (pose_error is None) != (config.weight_pose == 0):
@@ -155,8 +148,7 @@ def generator_loss(
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """The generator's loss on windows, which has no further terms.
 
-    Windows have `config.gan_window` frames, at least three; `change` is the deviation
-    of each channel's changes, where they are predicted only.
+    The arguments are those of `discriminator_loss`.
     """
     previous, t, _, x_t, fake = _pairs(params, key, windows, config, change)
     net = aamdm_model.discriminator(config)

@@ -40,18 +40,14 @@ class Config:
     rest is ours.
 
     Attributes:
-      drafts: Steps of the generator, the first of the chain (paper: 3).
-      polishes: Steps of the diffusion model, the last of the chain (paper: 2).
       schedule: "cosine", or "vp" (which keeps less of the sample at each step).
       predict: What the networks predict: the "frame" (paper), or its "change" since the
         previous one in deviations of changes (ours), in which the polisher's errors are
         then measured, too.
-      latent: Channels of the generator's latent.
       window: Frames that the diffusion model predicts in a row in training (paper).
       gan_window: Frames of the windows of the GAN, at least three (paper: 10).
       levels: Steps that each network learns: "all", or its "own" (ours), those that
         the chain asks it for: the first drafts, or the last polishes.
-      weight_velocity: Weight of the differences of neighboring frames.
       weight_pose: Weight of the errors of the poses that the polisher's frames mean, as
         the autoencoder measures them; ours.
       weight_foot: Weight of the errors of slow toes' velocities over the ground, in the
@@ -61,7 +57,6 @@ class Config:
         rollout recovers after leaving the data. 0 for none.
       own_previous: Probability that the GAN's previous frame in training is the
         generator's own prediction of it.
-      weight_r1: Weight of the discriminator's gradient penalty, gamma.
     """
 
     features: int
@@ -153,11 +148,7 @@ def to_frame(
 
 
 def check_change(config: Config, change: Array | None) -> None:
-    """Raises unless the deviation of changes is there exactly if it is needed.
-
-    Raises:
-      ValueError: if it is missing, or given for nothing.
-    """
+    """Raises `ValueError` unless the deviation of changes is there if it is needed."""
     if (change is None) != (config.predict == "frame"):
         found = "none" if change is None else f"shape {change.shape}"
         raise ValueError(
@@ -236,21 +227,15 @@ def sampler(
 ) -> Sample:
     """The sampler of the next frame.
 
-    Args:
-      params: Parameters of the generator and the polisher; the discriminator's are not
-        used, and one that takes no steps may be missing.
-      change: Deviation of each channel's changes; where they are predicted only.
-      step: Makes the chain's step from the schedule and a denoiser; the default is the
-        paper's. One that looks back forgets where the polisher takes over.
+    Of the parameters the discriminator's are not used, and those of a network that
+    takes no steps may be missing; `change` is as in `to_frame`. A step that looks back
+    forgets where the polisher takes over.
 
-    Returns:
-      `sample(key, previous, *, objective=None, scale=0.0, guided_steps=None,
-      noise=None) -> next`. With an objective of the predicted frame so many steps at
-      the chain's end are guided down its gradient, by default all (eq. 13). `noise` is
-      that of the posteriors, [T, features], for steps that take one.
+    `sample(key, previous, *, objective=None, scale=0.0, guided_steps=None, noise=None)
+    -> next`: with an objective of the predicted frame so many steps at the chain's end
+    are guided down its gradient, by default all (eq. 13). `noise` is that of the
+    posteriors, [T, features], for steps that take one.
 
-    Raises:
-      ValueError: if `change` does not fit what is predicted.
     """
     check_change(config, change)
     table, net = config.table(), network(config)

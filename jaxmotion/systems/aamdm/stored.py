@@ -85,9 +85,8 @@ def export(path: Path, model: Model, networks: Params) -> None:
 def load(path: Path) -> tuple[Model, Params]:
     """Reads what `export` wrote: the model, and the chain's networks.
 
-    Raises:
-      CheckpointError: if the file is damaged or no such file.
-      ValueError: if it is of another system; names the field that is wrong.
+    `CheckpointError` if the file is damaged or none; a `ValueError` names the field
+    that is wrong, or another system.
     """
     params, value = checkpoint.import_params(path)
     where = str(path)

@@ -41,18 +41,10 @@ SpaceName = Literal["embedded", "full_pose"]
 def frame_windows(
     frames: Array, data: PoseData, length: int, *, batch: int, balance: float = 0.0
 ) -> tuple[Callable, tuple[Array, Int[Array, " windows"]]]:
-    """Windows of frames for training.
+    """`sample_batch(key, arrays) -> windows` of so many frames, and its arrays.
 
-    Args:
-      length: Frames per window.
-      balance: How much more often rare speeds and turns are drawn; see
-        `data.balanced_starts`.
-
-    Returns:
-      `sample_batch(key, arrays) -> windows`, and its arrays.
-
-    Raises:
-      ValueError: if no clip is long enough.
+    By `balance` rare speeds and turns are drawn more often, see `data.balanced_starts`.
+    `ValueError` if no clip is long enough.
     """
     offsets = jnp.arange(length)
 
@@ -67,13 +59,7 @@ def frame_windows(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run folder and its data.
-
-    Attributes:
-      embedding: Sizes of the autoencoder.
-      train: Training frames.
-      held_out: Frames that no network saw.
-    """
+    """A run folder and its data; no network saw frames that are held out."""
 
     record: runs.Run
     skeleton: Skeleton
@@ -105,15 +91,9 @@ def prepare(
 ) -> Run:
     """Makes the frames of a run folder, or loads those it has.
 
-    Args:
-      field: Label field by which clips are chosen.
-      labels: Their labels; none: all clips.
-      held_out: Part of each clip, at its end, to hold out.
-      balance: As in `frame_windows`, for all stages.
-
-    Raises:
-      OSError: if the clips cannot be read.
-      ValueError: if the folder's frames were made otherwise, or the clips do not fit.
+    Clips are chosen by labels of the field (none: all); of each a part at its end is
+    held out. The balance is as in `frame_windows`, for all stages. `ValueError` if the
+    folder's frames were made otherwise, or the clips do not fit.
     """
 
     def make() -> runs.Content:
@@ -159,12 +139,7 @@ _FILES = ("train.npz", "held_out.npz")
 
 
 def load_run(folder: Path) -> Run:
-    """Loads the data of a run folder.
-
-    Raises:
-      OSError: if a file is missing.
-      ValueError: if it is no run folder of AAMDM; names the file and the field.
-    """
+    """Loads the data of a run folder; a `ValueError` names what is none of AAMDM's."""
     return _decode(runs.load(folder, system=SYSTEM))
 
 
@@ -286,11 +261,7 @@ def make_space(run: Run, autoencoder: Autoencoder | None) -> Space:
 
 
 def load_space(run: Run, name: SpaceName) -> Space:
-    """A space of a run folder.
-
-    Raises:
-      CheckpointError: if the run has not made it.
-    """
+    """A space of a run folder; `CheckpointError` if the run has not made it."""
     structure = []
 
     def leaves() -> dict[str, Array]:
@@ -443,9 +414,8 @@ def load_networks(
 ) -> tuple[Params, aamdm_model.Config]:
     """Parameters of a trained chain's stages that take steps, and their configuration.
 
-    Raises:
-      CheckpointError: if a stage that it needs is missing, or of another kind.
-      ValueError: if a stage was trained for another space.
+    `CheckpointError` if a stage is missing or of another kind, `ValueError` if it was
+    trained for another space.
     """
     own = {"drafts": drafts, "polishes": polishes}
     network = "polisher" if polishes else "generator"

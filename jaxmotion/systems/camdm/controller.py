@@ -150,10 +150,7 @@ def init_state(
 ) -> CharacterState:
     """State of a character that has shown `past` (world) and has no plan yet.
 
-    The springs start at the mean velocity of the poses.
-
-    Raises:
-      ValueError: if there are fewer poses.
+    The springs start at the mean velocity of the poses; `ValueError` for fewer of them.
     """
     frames = past.root_position.shape[-2]
     if frames < config.past:
@@ -238,10 +235,7 @@ def wanted_trajectory(
     config: camdm_model.Config,
     control: Control,
 ) -> trajectory.Trajectory:
-    """Steps 1a to 1c: the user's path, blended with the model's own.
-
-    It has the next `config.future` frames, world.
-    """
+    """Steps 1a to 1c: the user's path, blended with the model's own."""
     here = trajectory.PlanarFrame(
         origin=state.past.root_position[-1, ::2], facing=state.facing
     )
@@ -384,15 +378,9 @@ def controller(
 ) -> Controller:
     """The run-time of one character, for `rollout.tick` and `rollout.rollout`.
 
-    Its second planner is the guided one.
-
-    Args:
-      table: Schedule; None for the cosine one of `config.num_steps`.
-      step: Makes the chain's step; the default is the paper's.
-      steps: Steps of the schedule to visit, increasing; None for all.
-
-    Raises:
-      ValueError: if `control.apply` is not in 1..`config.future`.
+    Its second planner is the guided one. `steps` are those of the schedule (None: the
+    cosine one) to visit, increasing; None for all. `ValueError` if `control.apply` is
+    not in 1..`config.future`.
     """
     control = Control() if control is None else control
     if not 1 <= control.apply <= config.future:
@@ -479,7 +467,7 @@ def character(
     """A model as a character to be steered.
 
     Args:
-      model: The model. Without poses of its own (`starts`) it starts from clips alone.
+        model: Without poses of its own (`starts`) it starts from clips alone.
       control: Constants of the run-time; None for `OWN_STARTS` where the model has
         poses of its own, else for the paper's.
       step: Makes the chain's step, such as `chain.dpm_solver_step`. Another
@@ -487,8 +475,7 @@ def character(
       steps: Steps of the schedule to visit, increasing up to T, or how many of them,
         evenly spread; None for the model's.
 
-    Raises:
-      ValueError: if the steps are none of its schedule.
+    `ValueError` if the steps are none of its schedule.
     """
     if control is None and model.starts is not None:
         control = OWN_STARTS
@@ -532,9 +519,7 @@ def load_character(
     It starts in the model's own poses where it has some, else in the mean pose of its
     data where it knows that, else in poses of the clips that the run was trained on.
 
-    Raises:
-      CheckpointError: if there is no whole checkpoint.
-      ValueError: if it is of another system or damaged.
+    `CheckpointError` if there is no whole checkpoint, `ValueError` for another system.
     """
     model, params = camdm_model.load(path)
     made = character(params, model, control=control, step=step, steps=steps)
@@ -559,11 +544,7 @@ def start_states(
     """States of characters that start with real poses of their style, batch axis first.
 
     Each is moved so that it stands at the origin and faces +z. The label field `field`
-    is the style.
-
-    Raises:
-      ValueError: if a label is none of the model's, or a style has no clip that is long
-        enough; names it.
+    is the style. A `ValueError` names a style without a clip that is long enough.
     """
     past = model.config.past
     index = windows.window_index(clips, past, short="skip")
@@ -583,11 +564,7 @@ def start_states(
 def own_states(
     model: camdm_model.Model, labels: np.ndarray, *, seed: int = 0
 ) -> CharacterState:
-    """States of characters that start with the model's own poses of their style.
-
-    Raises:
-      ValueError: if the model has no poses of its own, or no such style.
-    """
+    """States of characters that start with the model's own poses of their style."""
     if model.starts is None:
         raise ValueError("the model has no poses to start from: give clips")
     chosen = chosen_starts(model.starts, labels, model.labels, seed=seed)

@@ -49,13 +49,10 @@ def loss(
 ) -> tuple[Float[Array, ""], dict[str, Array]]:
     """The weighted sum of a student's losses, and its terms by name, unweighted.
 
-    Nothing is dropped in the networks.
-
-    Args:
-      batch: Windows of `config.window` frames, and their styles.
-      config: The method, the same for both.
-      steps: Steps of the schedule that the student's plans visit.
-      target: "chain", or "consistency" with as many random steps per window.
+    Nothing is dropped in the networks, and both have one config. `steps`, of the
+    schedule, are those that the student's plans visit; a batch is windows of
+    `config.window` frames and their styles. With target "consistency" there are as many
+    random steps per window.
     """
     key_example, key_pairs = jax.random.split(key)
     condition, x_0 = camdm_loss.examples(
@@ -104,19 +101,11 @@ def prepare(
 ) -> tuple[runs.Run, Params]:
     """Makes a student's run folder, or loads it, and the teacher's averaged parameters.
 
-    Args:
-      source: Run folder of the teacher; or a shipped model or an exported file.
-      data: Clips; None for those that the teacher's run was trained on.
-      held_out_clips: Clips of `data` that a shipped or exported teacher never saw.
-      steps: Steps of the schedule that the student's plans visit.
-      mirrored: Whether it learns from mirrored copies of the clips as well.
-      balance: How much more often rare changes of speed and direction are drawn; see
-        `windows.balance`.
-
-    Raises:
-      OSError: if a file cannot be read.
-      ValueError: if the steps are not the teacher's, the clips do not fit it, or the
-        folder was made otherwise.
+    The teacher is a run folder, a shipped model or an exported file; without `data` the
+    student gets the clips that it was trained on, else those of them that are not held
+    out, which a shipped or exported teacher never saw. `steps` of the schedule are what
+    its plans visit; `balance` is as in `windows.balance`. `ValueError` if the steps are
+    not the teacher's, the clips do not fit it, or the folder was made otherwise.
     """
     if source.is_dir():
         taught = camdm_training.load_run(source, data)
@@ -163,10 +152,8 @@ def prepare(
 def train(run: runs.Run, teacher: Params, budget: runs.Budget) -> None:
     """Trains a student from its newest checkpoint, or from the teacher's parameters.
 
-    Raises:
-      ValueError: if no clip is as long as a window, or the checkpoint has other
-        settings.
-      TrainingDiverged: if a loss is not finite.
+    `ValueError` if no clip is as long as a window or the checkpoint has other settings,
+    `TrainingDiverged` if a loss is not finite.
     """
     model = camdm_model.from_json(run.model, where=str(run.config))
     config, settings = model.config, run.settings

@@ -52,9 +52,6 @@ def course_of_run(
     """Speeds [characters] and commands [characters, ticks, ...] of a `courses.COURSES`.
 
     The speed is in meters per second; None for each style's own median speed.
-
-    Raises:
-      ValueError: if there is no such course.
     """
     speeds = np.asarray(selection.label_speeds(run.train, field=run.field))[labels]
     speeds = speeds if speed is None else np.full(labels.shape, speed)
@@ -75,16 +72,9 @@ def steer_one(
 ) -> tuple[Motion, Float[Array, "frames 2"]]:
     """Steers one character from a pose of the training clips.
 
-    Args:
-      course: One of `courses.COURSES`.
-      to_style: Its style from half time on; None for the same.
-      speed: Meters per second; None for the first style's own median speed.
-
-    Returns:
-      The motion, and the velocity asked for in each frame, meters per second.
-
-    Raises:
-      ValueError: if there is no such course or style; names those there are.
+    From half time on its style is `to_style`, if given. The speed is in m/s; None for
+    the first style's own median speed. With the motion comes the velocity asked for in
+    each frame, m/s. A `ValueError` names the courses or styles that there are.
     """
     model = run.model
     label = steering.label_indices(model.labels, style)
@@ -109,10 +99,7 @@ def own_starts(run: Run, *, number: int, seed: int = 0) -> Motion:
     """Poses that the model itself stands in (`Model.starts`), none of them recorded.
 
     Characters of each style stand still for twelve seconds; of sixteen the calmest
-    `number` are taken.
-
-    Raises:
-      ValueError: if a style has no clip to begin with.
+    `number` are taken. `ValueError` if a style has no clip to begin with.
     """
     model, found = run.model, []
     character = camdm_controller.character(run.params, model)
@@ -141,8 +128,6 @@ class Trial:
     Attributes:
       labels: Style of each character; `repeats` neighbors have one style.
       repeats: Characters of a style.
-      speeds: Meters per second, of each character.
-      commands: Commands of each character and tick.
       states: In held-out poses.
     """
 
@@ -170,9 +155,8 @@ def make_trial(
 ) -> Trial:
     """Commands and poses for some characters of the given styles; None for all.
 
-    Raises:
-      ValueError: if there is no such course, rollouts are too short to measure, or a
-        style has no held-out clip.
+    `ValueError` if there is no such course, rollouts are too short, or a style
+    has no held-out clip.
     """
     styles = np.arange(len(run.model.labels)) if styles is None else styles
     labels = np.repeat(styles, repeats)
@@ -247,13 +231,8 @@ def score_run(
 ) -> tuple[Row, dict[str, int]]:
     """Steers the characters of a trial from held-out poses, and measures them.
 
-    Args:
-      count: Windows of each Fréchet distance.
-      replicated: As in `made_row`.
-      step: Makes the steps of plans.
-
-    Returns:
-      The row, and how many rollouts diverged or froze.
+    Fréchet distances are of `count` windows each; `replicated` is as in `made_row`.
+    With the row comes how many rollouts diverged or froze.
     """
     model, fps = run.model, run.model.config.fps
     _, key = jax.random.split(jax.random.key(seed))
@@ -293,21 +272,13 @@ def evaluate_run(
 ) -> tuple[Rows, dict[str, Any]]:
     """Steers characters in every style, and measures them beside held-out clips.
 
-    Args:
-      course: One of `courses.COURSES`.
-      rollouts: Characters, spread evenly over the styles; at least one a style.
-      speed: Meters per second; None for each style's own median speed.
-      chunk: Characters to run at a time, at most.
-      evaluator_steps: Updates of the evaluator of styles, if it is trained here.
-      evaluator: A frozen evaluator of styles; None to train one.
-      control: Constants of the run-time; None for the model's.
+    Rollouts are spread evenly over the styles, at least one a style, at most `chunk` at
+    a time; the speed is in m/s, None for each style's own median. Without a frozen
+    evaluator one is trained in `evaluator_steps` updates; `control` None is the
+    model's. Beside the table come speeds, health, counts and versions.
 
-    Returns:
-      The table, and what belongs beside it: speeds, health, counts, versions.
-
-    Raises:
-      ValueError: before any training, if there is no such course, rollouts are too
-        short, a style has no held-out clip, or the evaluator does not fit the run.
+    `ValueError`, before any training, if there is no such course, rollouts are too
+    short, a style has no held-out clip, or the evaluator does not fit the run.
     """
     model = run.model
     repeats = max(rollouts // len(model.labels), 1)
@@ -419,11 +390,7 @@ def describe_evaluator(
 def load_evaluator(
     key: Key, run: Run, evaluator: evaluators.Evaluator | None, *, num_steps: int
 ) -> style_evaluator.StyleEvaluator:
-    """The frozen evaluator if there is one, else one trained on the run's clips.
-
-    Raises:
-      ValueError: if the evaluator does not fit the run; names the field.
-    """
+    """The frozen evaluator, if it fits the run (`ValueError`), or one trained here."""
     model = run.model
     kind, labels, joints = "style", model.labels, model.skeleton.names
     classes: tuple[int, ...] = ()
@@ -482,12 +449,8 @@ def train_style(
 ) -> Evaluator:
     """CAMDM's evaluator, of windows of 60 frames.
 
-    Args:
-      held_out: Clips for its accuracy.
-      field: Label field that it recognizes.
-
-    Raises:
-      ValueError: if a part has no clip as long as a window, or there is no such field.
+    Held-out clips give its accuracy; it recognizes labels of the field. `ValueError` if
+    a part has no clip as long as a window, or there is no such field.
     """
     key_fit, _ = jax.random.split(jax.random.key(seed))
     found = style_evaluator.fit(key_fit, train, field=field, num_steps=num_steps)

@@ -43,12 +43,9 @@ class Config:
     """Architecture and method; the defaults are the paper's.
 
     Attributes:
-      past: Past poses of the condition, frames.
-      future: Poses of a sample, frames.
       num_steps: T of the cosine schedule (paper 8, released weights 4).
       network: "transformer", or the ablation's "mlp" or "single_token".
       width: Channels of a token (released code; the paper does not say).
-      depth: Layers (released code 4; the ablation's MLP 8).
       frames_per_token, token_margin, token_window, norm, attention, frame_kernel: Of
         the `CamdmTransformer`; the paper's by default.
       seam_half_life: The same; with it the losses of displacements, accelerations and
@@ -68,14 +65,12 @@ class Config:
       rotation_mean: Mean of those features (`camdm_loss.mean_rotations`); ours, empty
         for none in the paper.
       drop_past: Probability that the past is zeroed in training.
-      weight_data: Weight of the mean squared error of features (eq. 2).
       weight_velocity: Weight of the displacements of rotations.
       weight_position: Weight of the joint positions (eq. 3).
       weight_position_velocity: Weight of the displacements of joint positions (released
         code; not in the paper's eq. 4).
       weight_acceleration: Weight of the second differences of joint positions; ours, 0
         in the paper.
-      weight_foot: Weight of foot sliding.
       contact_speed: A foot slower than this stands, meters per second.
     """
 
@@ -165,11 +160,7 @@ Network = (
 
 
 def network(config: Config) -> Network:
-    """The denoiser's Flax module, with `encode`, `denoise` and their composition.
-
-    Raises:
-      ValueError: if its predictions should go on from the past, and it cannot.
-    """
+    """The denoiser's Flax module, with `encode`, `denoise` and their composition."""
     if config.seam_half_life and config.network != "transformer":
         raise ValueError(
             f"seam_half_life is {config.seam_half_life:g}, expected 0 with the network "
@@ -244,11 +235,8 @@ def sampler(
     Inside a jitted function that closes over concrete parameters they are constants,
     which the compiler lays out once: fastest at batch 1, one program a model.
 
-    Args:
-      table: Schedule; None for the cosine one of `config.num_steps`.
-      step: Makes the chain's step from the schedule and the denoiser; the default is
-        the paper's.
-      steps: Steps of the schedule to visit, increasing; None for all.
+    `steps` of the schedule (None: the cosine one) are visited, increasing; None for
+    all.
 
     Returns:
       `sample(key, condition, *, scale=None) -> [future, features]`. With a scale, the
@@ -308,7 +296,6 @@ class Model:
     """Everything but the parameters.
 
     Attributes:
-      labels: Names of the styles.
       source: The data, and its license.
       starts: Poses to start from, [labels, number, past, ...], at the origin facing +z;
         None where characters start from clips. A shipped model has its own, which it
@@ -329,11 +316,7 @@ class Model:
 
 
 def with_steps(model: Model, steps: tuple[int, ...]) -> Model:
-    """The model whose plans visit these steps; none: its own.
-
-    Raises:
-      ValueError: if they are not steps of its schedule.
-    """
+    """The model whose plans visit these steps of its schedule; none: its own."""
     if not steps:
         return model
     return dataclasses.replace(model, steps=check_steps(steps, config=model.config))
@@ -373,11 +356,7 @@ def _starts_from_json(value: Any, config: Config, where: str) -> Motion | None:
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
-    """Inverse of `to_json`; `where` is the file, for messages.
-
-    Raises:
-      ValueError: names the file and the field that is missing or wrong.
-    """
+    """Inverse of `to_json`; a `ValueError` names the file (`where`) and the field."""
     model_json.check_system(value, SYSTEM, where=where)
     parts = {
         "config": lambda x: model_json.config_from_json(Config, x),
@@ -419,11 +398,7 @@ def _shapes(model: Model, where: Path) -> Params:
 
 
 def check_clips(model: Model, clips: Clips, field: str) -> None:
-    """Raises unless clips have the model's skeleton, rate and (in `field`) styles.
-
-    Raises:
-      ValueError: names what differs.
-    """
+    """Raises a `ValueError` unless clips have the model's skeleton, rate and styles."""
     pairs = {
         "joints": (model.skeleton.names, clips.skeleton.names),
         "parents": (model.skeleton.parents, clips.skeleton.parents),
@@ -440,9 +415,7 @@ def check_clips(model: Model, clips: Clips, field: str) -> None:
 def fitting_clips(model: Model, clips: Clips) -> tuple[Clips, str]:
     """Those of the clips that have the model's styles, and the label field with them.
 
-    Raises:
-      ValueError: if no field has them all, or the clips are of another skeleton or
-        rate.
+    `ValueError` if no field has them all, or skeleton or rate are others.
     """
     field = selection.label_field(clips, model.labels)
     if field is not None:
@@ -461,14 +434,10 @@ def fitting_clips(model: Model, clips: Clips) -> tuple[Clips, str]:
 def load(folder: str | Path) -> tuple[Model, Params]:
     """Model and averaged parameters (EMA) of a run folder or an exported file.
 
-    Args:
-      folder: Name of a shipped model ("locomotion"), run folder that
-        `experiments/camdm.py train` made, or npz file that `camdm.py export` wrote.
-
-    Raises:
-      OSError: if there is no such file, or no run folder.
-      CheckpointError: if there is no checkpoint, or it is corrupt or foreign.
-      ValueError: if its JSON is not that of a CAMDM model.
+    The folder is a shipped model's name ("locomotion"), a run folder of `camdm.py
+    train`, or a file of `camdm.py export`. `OSError` if there is none,
+    `CheckpointError` if its checkpoint is missing, corrupt or foreign, `ValueError` if
+    its JSON is not that of a CAMDM model.
     """
     path = Path(folder)
     if not path.exists():

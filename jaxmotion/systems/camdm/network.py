@@ -22,11 +22,7 @@ from jaxmotion.networks import blocks
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class FlatContext:
-    """What one condition contributes to all steps.
-
-    Attributes:
-      steps: Embeddings of steps 0..T, one table for a batch.
-    """
+    """What one condition contributes to all steps, 0..T, which a batch shares."""
 
     condition: Float[Array, "*batch width"]
     steps: Float[Array, "*stack steps width"]

@@ -37,8 +37,6 @@ def load(
     a <name>.config.json beside the file, else the release's 10, 45, 4 and 4.
 
     Args:
-      path: The checkpoint or ONNX file.
-      skeleton: The skeleton that it was trained on, its joints in the same order.
       labels: Names of the styles; None for those of "100style_conditions.json" beside
         the file.
 
@@ -154,12 +152,7 @@ def _check_skeleton(
 
 
 def read_styles(path: Path) -> tuple[str, ...]:
-    """Names of styles from a JSON file with a list "styles".
-
-    Raises:
-      OSError: if it cannot be read.
-      ValueError: if it has no such list; names it.
-    """
+    """Names from a JSON file's list "styles"; a `ValueError` names one without it."""
     styles = _read_json(path).get("styles")
     if not isinstance(styles, list) or not all(isinstance(x, str) for x in styles):
         raise ValueError(f"{path}: field 'styles' should be a list of names")

@@ -120,10 +120,8 @@ def clip_metrics(
     With a command trajectory, and orientation if the skeleton has shoulders (found by
     name); radians.
 
-    Args:
-      motion: [frames, ...], world, meters.
-      frames: That are the clip's own; None for all.
-      command: Given in each frame, unsmoothed; None for clips that nobody steered.
+    The motion [frames, ...] is in the world, meters; the first `frames` are the clip's
+    own (None: all); the command is that of each frame, unsmoothed.
     """
     positions = joint_positions(skeleton, motion)
     root, toes = positions[:, 0], positions[:, jnp.array(toe_joints(skeleton))]
@@ -282,10 +280,9 @@ def row(
 ) -> dict[str, table.Cell]:
     """Columns, with intervals over recordings or groups of them; angles in degrees.
 
-    Args:
-      values: From `metrics`, and "fid" from `distances`; those that are not numbers are
-        left out, as the scripts do.
-      group: Group of each recording, such as its replication; None for each on its own.
+    Values are those of `metrics`, and "fid" of `distances`; what is not a number is
+    left out, as the scripts do. A group is such as a replication; None for each by
+    itself.
     """
     found = {}
     for name, (column, scale) in COLUMNS.items():

@@ -86,22 +86,13 @@ def frechet_cells(
     seed: int,
     repeats: int = 5,
 ) -> Row:
-    """The cell "fid", and "fid_unbiased" if there are enough windows.
-
-    There are `repeats` subsets of `count` windows.
-    """
+    """The cell "fid", and "fid_unbiased" if there are enough windows."""
     fid = frechet_cell(feature, reference, count=count, seed=seed, repeats=repeats)
     return {"fid": fid} | unbiased_cells(feature, reference, seed=seed)
 
 
 def random_half(clips: np.ndarray, labels: np.ndarray, seed: int) -> np.ndarray:
-    """True for the windows of a random half of each style's clips.
-
-    Clips and labels are those of each window.
-
-    Raises:
-      ValueError: if there is one clip only.
-    """
+    """True for the windows of a random half of each style's clips (not only one)."""
     different, first = np.unique(clips, return_index=True)
     if len(different) < 2:
         raise ValueError("one clip, expected at least two to compare halves")
@@ -143,11 +134,8 @@ def metric_row(
 ) -> Row:
     """All columns but the Fréchet distances, with intervals over clips or rollouts.
 
-    Angles are in degrees.
-
-    Args:
-      hits: From `style.features_and_hits`; None to leave style accuracy out.
-      height: Below it a foot joint should not move, meters.
+    Angles are in degrees. `hits` come from `style.features_and_hits`; None leaves style
+    accuracy out. Below `height`, meters, a foot joint should not move.
     """
     run = functools.partial(_metrics, skeleton, jnp.float32(height))
     values = in_batches(run, found)
@@ -268,10 +256,7 @@ def make_reference(
 def real_rows(
     reference: Reference, *, count: int, seed: int, repeats: int = 5
 ) -> tuple[Row, Row]:
-    """Rows of held-out clips, and of half of the training clips beside the others.
-
-    Their Fréchet distances are of `repeats` subsets of `count` windows.
-    """
+    """Rows of held-out clips, and of half of the training clips beside the others."""
     distances = functools.partial(
         frechet_cells, count=count, seed=seed, repeats=repeats
     )
@@ -293,11 +278,9 @@ def made_row(
 ) -> Row:
     """Row of rollouts in which `repeats` neighbors share style and commands.
 
-    Args:
-      repeats: Such neighbors; with one there is no column of diversity.
-      count: Windows of each Fréchet distance.
-      replicated: Intervals run over replications, of which every neighbor belongs to
-        another, instead of over rollouts and random subsets.
+    Fréchet distances are of `count` windows each; with one neighbor there is no column
+    of diversity. Where `replicated`, intervals run over replications, of which every
+    neighbor belongs to another, instead of over rollouts and random subsets.
     """
     features, hits = features_and_hits(reference.skeleton, made, reference.evaluator)
     grouped = made

@@ -88,13 +88,8 @@ FITTING["planted"] = FITTING["small"]
 def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
     """A model for clips; where rotations are scaled, with the mean of their rotations.
 
-    Args:
-      clips: Their skeleton, rate, styles and source become the model's.
-      field: Label field that is the style.
-      **sizes: Fields of `camdm.Config`, but for those that the clips decide.
-
-    Raises:
-      ValueError: if the clips have no such field.
+    Skeleton, rate, styles (labels of `field`) and source are those of the clips;
+    `sizes` are the other fields of `camdm.Config`.
     """
     config = camdm_model.Config(
         num_joints=clips.skeleton.num_joints,
@@ -122,10 +117,8 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
 def continued(model: Model, path: Path) -> tuple[Model, Params]:
     """A run's or exported model's averaged parameters, to be trained as this model.
 
-    Weights of the losses, attention and noise levels are this model's.
-
-    Raises:
-      ValueError: if skeleton, styles or sizes differ; names which.
+    Weights of the losses, attention and noise levels are this model's. A `ValueError`
+    names skeleton, styles or sizes that differ.
     """
     first, params = load(path)
     # What has no parameters. Attention to a prefix alone is soon learned anew.
@@ -154,11 +147,7 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
 def window_sampler(
     *, field: str, batch: int
 ) -> Callable[[Key, tuple[Clips, windows.WindowIndex]], tuple[skeleton.Motion, Array]]:
-    """Random windows and their styles (`field`), as `camdm_loss.loss` takes them.
-
-    Returns:
-      `(key, (clips, index)) -> (motion, label)`.
-    """
+    """`(key, (clips, index)) -> (motion, label)`: random windows and their styles."""
 
     def sample_batch(
         key: Key, data: tuple[Clips, windows.WindowIndex]
@@ -176,13 +165,9 @@ CONTENTS = ("walk", "walk-turn-left", "walk-turn-right", "run")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """What a run left behind.
+    """What a run left behind: averaged parameters, and its clips without mirrored ones.
 
-    Attributes:
-      params: Its averaged parameters.
-      train: Clips that it was trained on, without mirrored ones.
-      held_out: Clips that it never saw.
-      field: Label field that is the style.
+    No network saw those held out; the style is the label field `field`.
     """
 
     model: camdm_model.Model
@@ -203,17 +188,10 @@ def split_data(
 ) -> tuple[Clips, Clips]:
     """Training and held-out clips; the same for every run with these arguments.
 
-    Args:
-      contents: Keep only clips of these contents; none, or clips without such a
-        field: keep all.
-      label: Label field that is the style.
-      held_out: Part of each style's clips to hold out, in (0, 1).
-      labels: Keep only clips of these styles, and forget the others; none: keep all.
-      held_out_clips: Hold out these clips, by name, instead of a part.
-
-    Raises:
-      OSError: if the file cannot be read.
-      ValueError: if it holds no clips, or an argument does not fit them.
+    Kept are clips of these contents (none, or clips without such a field: all) and
+    styles, labels of the field `label` (others are forgotten; none: all). Held out is a
+    part of each style's clips, in (0, 1), or those named in `held_out_clips`.
+    `ValueError` if the file holds no clips, or an argument does not fit them.
     """
     clips = clips_io.load_clips(data)
     clips.names(label)
@@ -229,13 +207,8 @@ def split_data(
 def released_skeleton(path: Path, *, scale: float) -> Skeleton:
     """The skeleton of a BVH file as CAMDM's preprocessing leaves it.
 
-    Args:
-      path: The file; fingers and eyes are dropped.
-      scale: Meters per unit of the file.
-
-    Raises:
-      OSError: if it cannot be read.
-      BvhError: if it is malformed or has no toes.
+    Fingers and eyes are dropped; the scale is in meters per unit. `BvhError` if the
+    file is malformed or has no toes.
     """
     from jaxmotion.data.builders import style100
 
@@ -275,16 +248,9 @@ def prepare(
 ) -> runs.Run:
     """Makes model and clips of a run folder, or loads those it has.
 
-    Args:
-      data: Clips; which of them, the next five arguments say as for `split_data`.
-      mirrored: Whether it is trained on mirrored copies of the clips as well.
-      balance: How much more often rare changes of speed and direction are drawn; see
-        `windows.balance`.
-      settings: JSON of what `make` makes the model from.
-
-    Raises:
-      OSError: if the clips cannot be read.
-      ValueError: if the folder was made otherwise, or the clips do not fit.
+    Clips are chosen and split as by `split_data`; `balance` is as in `windows.balance`;
+    `settings` is the JSON of what `make` makes the model from. `ValueError` if the
+    folder was made otherwise, or the clips do not fit.
     """
     chosen = dict(
         label=label,
@@ -329,8 +295,7 @@ def training_windows(
 ) -> tuple[Clips, windows.WindowIndex]:
     """Clips of a run, mirrored ones included, and where their windows are; says so.
 
-    Raises:
-      ValueError: if no clip is as long as a window.
+    `ValueError` if no clip is as long as a window.
     """
     clips = clips_io.load_clips(run.file(_FILES[0]))
     if run.settings["mirror"]:
@@ -356,12 +321,8 @@ def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> No
     """Trains the model of a run, from its newest checkpoint if there is one.
 
     A new training starts with the parameters of `init`, a run folder or exported model;
-    None for random ones.
-
-    Raises:
-      ValueError: if no clip is as long as a window, or the checkpoint has other
-        settings.
-      TrainingDiverged: if a loss is not finite.
+    None for random ones. `ValueError` if no clip is as long as a window, or the
+    checkpoint has other settings; `TrainingDiverged` if a loss is not finite.
     """
     model = from_json(run.model, where=str(run.config))
     config = model.config
@@ -390,16 +351,9 @@ def load_run(
 ) -> Run:
     """Loads a run folder.
 
-    Args:
-      data: Other clips, to choose and split as those that it was trained on; None for
-        these.
-      contents: Keep only clips of these contents, of those that the run used; none:
-        keep all.
-
-    Raises:
-      OSError: if the clips cannot be read.
-      ValueError: if the folder has no whole checkpoint of such a run, or the clips are
-        not the model's; names the folder or what differs.
+    Other data are chosen and split as those that it was trained on; of `contents`, if
+    any, clips of these alone are kept. A `ValueError` names a folder without a whole
+    checkpoint of such a run, or what differs in the clips.
     """
     run = runs.load(folder, system=SYSTEM)
     model, params = load(folder)
@@ -421,14 +375,9 @@ def exported_run(
 ) -> Run:
     """A shipped or exported model beside clips with its styles.
 
-    Args:
-      source: Name of a shipped model, or file of `camdm.py export`.
-      data: Clips; of other styles than the model's they are left out.
-      held_out_clips: Those of them that the model never saw, by name.
-
-    Raises:
-      OSError: if a file cannot be read.
-      ValueError: if no clips are given, or they do not fit the model; names what.
+    The source is a shipped model's name or a file of `camdm.py export`. Clips of other
+    styles are left out; `held_out_clips` names those that the model never saw.
+    `ValueError` if no clips are given, or they do not fit the model; names what.
     """
     model, params = load(source)
     if data is None or not held_out_clips:

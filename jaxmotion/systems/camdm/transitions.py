@@ -74,18 +74,10 @@ def make_changes(
 ) -> Changes:
     """Every ordered pair of styles, in each replication.
 
-    Args:
-      course: One of `courses.COURSES`.
-      before: Seconds in the first style, at least half a window.
-      limit: Seconds after the command in which the change must have come.
-      replications: Sets of all pairs, each with start poses of its own.
-
-    Returns:
-      The changes; their rollouts last so long that the last window is whole.
-
-    Raises:
-      ValueError: if there are fewer than two styles or replications, no such course,
-        or no time.
+    They spend `before` seconds, at least half a window, in the first style, and have
+    `limit` seconds from the command on to change; rollouts last until the last window
+    is whole. Replications are sets of all pairs, each with start poses of its own.
+    `ValueError` for fewer than two styles or replications, no such course, or no time.
     """
     number, fps = len(run.model.labels), run.model.config.fps
     least = {"styles": (number, 2), "replications": (replications, 2)}
@@ -145,8 +137,7 @@ def find_changes(
 ) -> tuple[Bool[np.ndarray, "characters windows"], np.ndarray]:
     """Whether each window about or after the command shows the new style.
 
-    Returns:
-      Decisions, and the windows' centers in seconds after the command, from 0 on.
+    Given are decisions, and windows' centers in seconds after the command, from 0 on.
     """
     centers = np.arange(0, round(changes.limit * fps) + 1, STRIDE)
     found = []
@@ -216,12 +207,9 @@ def evaluate_transitions(
 ) -> dict[str, dict[str, table.Cell]]:
     """One row for each run-time, and one of characters who keep their style.
 
-    Args:
-      controls: Constants of the run-time, by row; the last row's serve for those who
-        keep their style.
-      chunk: Characters to run at a time, at most.
-      seed: Seeds the noise, the same for all rows.
-      report: Called with each row's name when it is measured.
+    The run-times' constants are by row; the last row's serve for those who keep their
+    style. All rows have the same noise, and at most `chunk` characters at a time;
+    `report` is called with each row's name.
     """
     real = windows.eval_windows(
         run.held_out, stride=windows.EVAL_WINDOW, field=run.field

@@ -80,11 +80,8 @@ def load_evaluator(
 ) -> Params:
     """The run's evaluator, trained on its training clips if it is not there yet.
 
-    A frozen evaluator, if given, takes its place.
-
-    Raises:
-      ValueError: if the folder's was trained otherwise, or the evaluator does not fit
-        the run; names the field.
+    A frozen evaluator, if given, takes its place. A `ValueError` names the field if the
+    folder's was trained otherwise, or the evaluator does not fit the run.
     """
     frozen = evaluators.params_for(
         evaluator,
@@ -149,12 +146,9 @@ def scorer(
 ) -> Callable[[Key, Array, Int[Array, " batch"]], dict[str, Array]]:
     """Scores of a set of motions, as one compiled program.
 
-    Args:
-      reference: Moments of the real features.
-      ground: Height of the lowest joint of a person who stands, meters.
-
-    Returns:
-      `score(key, positions, actions) -> scores`. The actions are in ascending order,
+    The reference is moments of the real features; `ground` is the height, meters, of
+    the lowest joint of a person who stands. In `score(key, positions, actions) ->
+    scores` the actions are in ascending order,
       each as often as the others. "deviation": of joints from where they are in the
       mean motion of an action, root mean square, cm, with the hips above the origin.
     """
@@ -196,10 +190,7 @@ def scorer(
 
 
 def ground_height(run: ActionRun) -> float:
-    """Height of the lowest joint of a person who stands in the run's clips, meters.
-
-    The median over frames of the height of the lowest joint.
-    """
+    """Height, meters, of the lowest joint of who stands: the median over frames."""
     motion = Motion(
         root_position=run.clips.root_position,
         joint_rotation=run.clips.joint_rotation,
@@ -215,9 +206,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
     Motions made from nothing are compared with real ones of all actions; they have no
     accuracy and no multimodality.
 
-    Raises:
-      ValueError: if the run has other data, there are too few samples, or a frozen
-        evaluator does not fit.
+    `ValueError` if there are too few samples, or data or a frozen evaluator do not fit.
     """
     for name in ("matcher", "glove"):
         if (found := getattr(settings, name)) is not None:

@@ -34,11 +34,7 @@ MERGE = ("bye=wave-right-hand", "byebye=wave-both-hands", "dash=run")
 
 
 def merges(pairs: tuple[str, ...]) -> dict[str, str]:
-    """The new label of each old one, from pairs "old=new".
-
-    Raises:
-      ValueError: if a pair is not of that form.
-    """
+    """The new label of each old one, from pairs "old=new" (else `ValueError`)."""
     merge = {}
     for pair in pairs:
         old, equals, new = pair.partition("=")
@@ -53,10 +49,7 @@ def merges(pairs: tuple[str, ...]) -> dict[str, str]:
 class ActionArrays:
     """Clips by action, on the device.
 
-    Attributes:
-      members: Clips of each action, filled up with -1.
-      counts: Clips of each action.
-      frames: Frames of a sample.
+    Members are clips of each action, filled up with -1; a sample has so many frames.
     """
 
     clips: Clips
@@ -75,15 +68,9 @@ def prepare_clips(
 ) -> tuple[Clips, tuple[str, ...]]:
     """Clips of all files at one rate, and the labels that were too rare.
 
-    Args:
-      paths: Files of clips of one skeleton.
-      field: Label field that is the action.
-      merge: Labels that are the same action as others, and those others.
-      least: Fewest clips of an action.
-
-    Raises:
-      OSError: if a file cannot be read.
-      ValueError: if the files or labels do not fit, or nothing is left.
+    Actions are labels of the field; `merge` gives labels that are the same action as
+    others, and those others; an action has `least` clips at least. `ValueError` if
+    files or labels do not fit, or nothing is left.
     """
     if not paths:
         raise ValueError("no files of clips: at least one is needed")
@@ -103,10 +90,7 @@ def prepare_clips(
 def action_arrays(clips: Clips, *, field: str, frames: int) -> ActionArrays:
     """Puts clips on the device, listed by action (`field`).
 
-    A sample has `frames` frames.
-
-    Raises:
-      ValueError: if an action has no clip; names it.
+    A sample has `frames` frames; a `ValueError` names an action without a clip.
     """
     names = clips.names(field)
     labels = np.asarray(clips.labels[field])
@@ -154,12 +138,8 @@ _FIT = 2048
 class ActionRun:
     """A run folder and its data.
 
-    Attributes:
-      clips: All clips, at the run's rate, those that are held out last.
-      train: Training clips on the device.
-      held_out: Clips that no network saw.
-      representation: Features of the skeleton's motions.
-      field: Label field that is the action.
+    Clips are at the run's rate, those that no network saw last; actions are labels of
+    `field`.
     """
 
     record: runs.Run
@@ -193,15 +173,10 @@ def prepare(
 ) -> ActionRun:
     """Makes the clips of a run folder, or loads those it has.
 
-    Args:
-      data: As `prepare_clips` takes them; so are field, merge, least and fps.
-      task: "action", or "none" for motions from nothing.
-      frames: Frames of a sample.
-      held_out: Part of each action's clips to hold out.
-
-    Raises:
-      OSError: if a file cannot be read.
-      ValueError: if the folder was made otherwise, or files or labels do not fit.
+    The task is "action", or "none" for motions from nothing; a sample has `frames`
+    frames; a part of each action's clips is held out; other arguments as
+    `prepare_clips`. `ValueError` if the folder was made otherwise, or files or labels
+    do not fit.
     """
 
     def make() -> runs.Content:
@@ -247,12 +222,7 @@ def prepare(
 
 
 def load_run(folder: Path) -> ActionRun:
-    """Loads the data of a run folder.
-
-    Raises:
-      OSError: if a file is missing.
-      ValueError: if it is no run folder of EMDM with actions; names the field.
-    """
+    """Loads the data of a run folder; a `ValueError` names what is none of actions."""
     return _decode(runs.load(folder, system=emdm_training.SYSTEM))
 
 
@@ -322,16 +292,9 @@ def clip_features(
 ) -> tuple[list[Float[np.ndarray, "_ features"]], float]:
     """HumanML3D's features of every clip, and how well they give its joints back.
 
-    Args:
-      clips: Clips of a skeleton that `humanml_skeleton.joint_mapping` knows, at the
-        rate of the features.
-
-    Returns:
-      One array per clip, of one frame less than the clip; and the largest error of
-      joints to features to joints, meters.
-
-    Raises:
-      ValueError: if the skeleton is unknown.
+    Clips are of a skeleton that `humanml_skeleton.joint_mapping` knows (else
+    `ValueError`), at the features' rate; features have one frame less. The error is the
+    largest of joints to features to joints, meters.
     """
     mapping = humanml_skeleton.joint_mapping(clips.skeleton)
     offsets = np.asarray(clips.offsets)
@@ -382,17 +345,9 @@ def from_labels(
     Clips of unseen pairs are the split "val": nothing is trained on them. A part of the
     others is the split "test".
 
-    Args:
-      clips: With label fields "content" and "style".
-      unseen: Pairs "content/style".
-      held_out: Part of the other clips in "test".
-      least: Shortest clip, frames at the new rate.
-
-    Returns:
-      The text motions, and the largest error of joints to features to joints, meters.
-
-    Raises:
-      ValueError: if a label or the skeleton is unknown, or no clip has an unseen pair.
+    The pairs are "content/style", label fields of the clips; `least` is in frames at
+    the new rate. The error is as `clip_features`'s. `ValueError` if a label or the
+    skeleton is unknown, or no clip has an unseen pair.
     """
     words = [
         np.array(clips.names(field))[np.asarray(clips.labels[field])]

@@ -68,12 +68,8 @@ def evaluate_run(
 ) -> tuple[Rows, dict[str, by_frame.ByFrame], RowScorer]:
     """The table of a run's rows, jerk and slide by place in a token, and what scored.
 
-    Args:
-      rows: Which rows and samplers; none: all that were trained.
-      long_replications: Replications of rows with 500 network calls and more.
-
-    Raises:
-      ValueError: if nothing was trained, or a row was not.
+    Without `rows` all that were trained; those with 500 network calls and more have
+    `long_replications`. `ValueError` if nothing was trained, or a row was not.
     """
     run = runs.load(folder, system=emdm_training.SYSTEM)
     rows = rows or trained_rows(folder)
@@ -139,13 +135,9 @@ def make_motions(
 
     One motion in all where a run has neither.
 
-    Args:
-      frames: Length; None for the model's longest.
-      scale: Guidance; None for the paper's.
-
-    Raises:
-      ValueError: if an action is unknown, a text is empty or too long, the length is
-        out of range, or the run has another task.
+    By default motions have the model's longest length and the paper's guidance.
+    `ValueError` if an action is unknown, a text is empty or too long, the length is out
+    of range, or the run has another task.
     """
     record = runs.load(folder, system=emdm_training.SYSTEM)
     task, given = record.settings["task"], {"action": actions, "text": texts}
@@ -191,17 +183,10 @@ def exports(
 ) -> tuple[dict[str, Exported], emdm_model.Condition, dict[str, Any]]:
     """What can leave Python: "sample", from a condition to a motion.
 
-    Args:
-      folder: The run folder, or an exported file.
-      row: Which model of a run folder.
-      scale: Guidance; None for the paper's.
-
-    Returns:
-      The function by its name, a condition, and what else a player must know.
-
-    Raises:
-      CheckpointError: if the row was not trained.
-      ValueError: if it is no run folder of EMDM, or there is no such row.
+    The folder may be an exported file; the row is of a run folder; the scale None is
+    the paper's. With the function by its name come a condition, and what else a player
+    must know. `CheckpointError` if the row was not trained, `ValueError` if there is
+    none such.
     """
     emdm_training.check_rows((row,))
     if folder.is_file():

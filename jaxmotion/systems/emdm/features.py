@@ -21,11 +21,7 @@ from jaxmotion.systems.emdm.loss import Geometry
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Representation:
-    """What turns motions of one skeleton into features and back.
-
-    Attributes:
-      normalizer: Mean and deviation of the features.
-    """
+    """What turns motions of one skeleton into features and back."""
 
     skeleton: Skeleton
     normalizer: features.Normalizer

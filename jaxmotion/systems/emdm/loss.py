@@ -78,16 +78,10 @@ def geometric_loss(
     config: Config,
     geometry: Geometry | None,
 ) -> tuple[Float[Array, ""], Info]:
-    """Weighted errors of features, joint positions, frame differences and feet.
+    """Weighted errors of features, joint positions, frame differences and feet, of x_0.
 
-    Args:
-      prediction: Of x_0.
-      t: Steps of the noise that it is predicted from.
-      geometry: None if the three last weights are 0.
-
-    Returns:
-      The loss, and its terms, unweighted but for `config.fade_geometry` and
-      `config.weigh_levels`.
+    Without geometry the three last weights are 0; t is the steps that it is predicted
+    from. Terms are unweighted but for `config.fade_geometry` and `config.weigh_levels`.
 
     Source: EMDM, eq. 11-12; MDM, eq. 3-5.
     """

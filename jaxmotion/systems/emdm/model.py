@@ -45,8 +45,6 @@ class Config:
       schedule: "vp" (EMDM's), or MDM's "cosine".
       num_steps: T.
       latent: Channels of z; 0 for a deterministic denoiser, that is a diffusion model.
-      width: Channels of a token of the generator.
-      depth: Its encoder layers.
       frames_per_token, token_margin, token_window, norm: Of the `SequenceGenerator`;
         the paper's by default.
       mask_frames: What of the zeros that follow a motion's end is seen. True (ours):
@@ -108,11 +106,7 @@ class Config:
     r1_every: int = 15
 
     def __post_init__(self):
-        """Checks what would fail late or never.
-
-        Raises:
-          ValueError: names the field.
-        """
+        """Raises a `ValueError`, with the field, for what would fail late or never."""
         if (self.condition == "none") != (self.condition_size == 0):
             raise ValueError(
                 f"condition_size is {self.condition_size}, expected "
@@ -155,11 +149,7 @@ class Condition:
 def action_vectors(
     actions: Int[Array, "*batch"], number: int
 ) -> Float[Array, "*batch {number}"]:
-    """One-hot vectors of actions; in compiled code an unknown one is the nearest.
-
-    Raises:
-      ValueError: outside compiled code, if an action is not in 0..number - 1.
-    """
+    """One-hot vectors of actions; see `blocks.known_labels` for unknown ones."""
     if number:
         actions = blocks.known_labels(actions, number, what="actions")
     return jax.nn.one_hot(actions, number)
@@ -173,8 +163,7 @@ def make_condition(
 ) -> Condition:
     """Conditions of motions of given lengths, frames; None for the model's longest.
 
-    Raises:
-      ValueError: if a vector or a length does not fit the model; names both.
+    A `ValueError` names the vector or length that does not fit the model.
     """
     if vector.shape[-1] != config.condition_size:
         raise ValueError(
@@ -243,11 +232,8 @@ def sampler(
     Inside a jitted function that closes over concrete parameters they are constants,
     which the compiler lays out once: fastest at batch 1, one program a model.
 
-    Args:
-      params: The generator's.
-      step: Makes the chain's step from the schedule and the denoiser; the default is
-        that of EMDM and DDPM.
-      steps: Steps of the schedule to visit, increasing; None for all.
+    The parameters are the generator's; `steps` of the schedule are visited, increasing,
+    None for all.
 
     Returns:
       `sample(key, condition, *, scale=None) -> [frames, features]`. With a scale, the

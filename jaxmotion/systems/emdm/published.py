@@ -42,10 +42,8 @@ def load(
       num_steps: T; a checkpoint does not say.
       heads: Attention heads of the generator; a checkpoint does not say.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if the file is damaged or foreign, or arrays are missing, unknown or
-        of another shape; names them all.
+    A `ValueError` says if the file is damaged or foreign, and names all arrays that are
+    missing, unknown or of another shape.
     """
     path = os.fspath(path)
     content = read_weights(path)

@@ -23,12 +23,7 @@ from jaxmotion.typing import Key, Params
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Model:
-    """Everything but the generator's parameters.
-
-    Attributes:
-      labels: Names of the actions.
-      source: The data, and their license.
-    """
+    """Everything but the generator's parameters."""
 
     config: emdm_model.Config
     representation: Representation
@@ -66,11 +61,7 @@ def _representation(value: Any) -> Representation:
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
-    """Inverse of `to_json`; `where` is the file, for messages.
-
-    Raises:
-      ValueError: names the file and the field that is missing or wrong.
-    """
+    """Inverse of `to_json`; a `ValueError` names the file (`where`) and the field."""
     model_json.check_system(value, emdm_training.SYSTEM, where=where)
     parts = {
         "config": lambda x: model_json.config_from_json(emdm_model.Config, x),
@@ -102,10 +93,8 @@ def load(path: Path, *, row: str = "emdm") -> tuple[Model, Params]:
 
     The row says which model of a folder that `experiments/emdm.py train` made.
 
-    Raises:
-      CheckpointError: if the row was not trained, or the file is damaged.
-      OSError: if a file cannot be read.
-      ValueError: if it is of another system, or makes no motions of actions.
+    `CheckpointError` if the row was not trained or the file is damaged, `ValueError`
+    for another system, or one that makes no motions of actions.
     """
     if path.is_file():
         params, value = checkpoint.import_params(path)
@@ -142,9 +131,7 @@ _FREE = (
 def start_of(path: Path, model: Model, *, row: str = "emdm") -> Params:
     """Averaged parameters of a folder's row or an exported file, to train on from.
 
-    Raises:
-      ValueError: if sizes, skeleton, labels or units of features differ from the
-        model's to train; names which.
+    A `ValueError` names sizes, skeleton, labels or units of features that differ.
     """
     first, params = load(path, row=row)
 

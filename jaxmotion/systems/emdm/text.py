@@ -71,10 +71,9 @@ def default_form(encoder: str) -> TextForm:
 def make_encoder(name: str, form: TextForm) -> text_encoder.TextEncoder:
     """The encoder that a user asks for, reading as much of a text as the form says.
 
-    Raises:
-      ModuleNotFoundError: if a package is missing; says how to install it.
-      ValueError: if there is no such encoder, or it is not CLIP and the form is
-        "released"; names it.
+    `ModuleNotFoundError` if a package is missing, with how to install it; a
+    `ValueError` names an encoder that there is not, or that is not CLIP in the form
+    "released".
     """
     if form == "released" and name in text_encoder.OWN:
         raise ValueError(
@@ -86,11 +85,7 @@ def make_encoder(name: str, form: TextForm) -> text_encoder.TextEncoder:
 
 
 def check_words(texts: Sequence[str]) -> None:
-    """Raises if a text is too long.
-
-    Raises:
-      ValueError: names the text's number and length.
-    """
+    """Raises a `ValueError`, with its number and length, if a text is too long."""
     for i, text in enumerate(texts):
         if (found := len(text.split())) > MAX_WORDS:
             raise ValueError(
@@ -115,18 +110,11 @@ def prepare(
 ) -> TextRun:
     """Makes the text motions of a run folder, or loads those it has.
 
-    Args:
-      data: One file of text motions, or files of labeled clips.
-      form: How much of a text it reads, and how its vectors are scaled.
-      unseen: Pairs "content/style" of labeled clips to keep for evaluation.
-      least: Frames of the shortest labeled clip that gets a caption.
-      fps: Frames per second of labeled clips' features.
-      frames: Longest motion.
-      held_out: Part of labeled clips to hold out.
-
-    Raises:
-      OSError: if a file cannot be read.
-      ValueError: if the folder was made otherwise, or an argument is wrong.
+    Data are one file of text motions or files of labeled clips, whose pairs
+    "content/style" in `unseen` are kept for evaluation, as is a part of the others;
+    they have `least` frames or more, and features at `fps`. The form says how much of a
+    text is read, and how vectors are scaled; motions have `frames` at most.
+    `ValueError` if the folder was made otherwise, or an argument is wrong.
     """
 
     def make() -> runs.Content:
@@ -178,9 +166,7 @@ def prepare(
 def load_run(folder: Path) -> TextRun:
     """Loads the data of a run folder; captions are encoded once and kept there.
 
-    Raises:
-      OSError: if a file cannot be read.
-      ValueError: if it is no run folder of EMDM with texts; names the field.
+    A `ValueError` names the field of what is no run folder of EMDM with texts.
     """
     return _decode(runs.load(folder, system=emdm_training.SYSTEM))
 
@@ -207,8 +193,7 @@ def _decode(record: runs.Run) -> TextRun:
 def encode(run: TextRun, texts: Sequence[str]) -> Float[Array, "texts channels"]:
     """Vectors of new sentences, one row each, as the networks of a run know them.
 
-    Raises:
-      ValueError: if a text is empty or too long; names its number.
+    A `ValueError` names the number of a text that is empty or too long.
     """
     check_words(texts)
     return jnp.asarray(run.encoder.encode(texts) * run.scale, jnp.float32)

@@ -114,8 +114,7 @@ def train_evaluator(
 ) -> Evaluator:
     """The run's evaluator, trained on its training clips if it is not there yet.
 
-    Raises:
-      ValueError: if the folder's was trained otherwise; names the field.
+    A `ValueError` names the field in which the folder's was trained otherwise.
     """
     folder = run.record.folder / "matcher"
     config = text_motion_evaluator.MatcherConfig(
@@ -179,8 +178,7 @@ def load_glove(folder: Path) -> dict[str, np.ndarray]:
     The folder has our_vab_data.npy [words, 300], our_vab_words.pkl (the words) and
     our_vab_idx.pkl (row of each); nothing in the pickles is run.
 
-    Raises:
-      ValueError: if a file is missing, damaged or does not fit the others; names it.
+    A `ValueError` names a file that is missing, damaged or does not fit the others.
     """
     data, listed, rows = (folder / name for name in GLOVE)
     vectors = read_array(data)
@@ -226,14 +224,9 @@ def read_statistics(
     sqrt(p (1 - p)). In both published evaluators (HumanML3D's and KIT-ML's) it is a
     25th of that, in the statistics of a data set once that.
 
-    Args:
-      folder: Has mean.npy and std.npy, as in the evaluator's meta folder, or the same
-        under another of the released names.
-      num_features: Channels of a frame, with the 4 contact labels at its end.
-
-    Raises:
-      ValueError: if there are none, they are no statistics of so many features, or not
-        an evaluator's; names the file.
+    The folder has mean.npy and std.npy, as the evaluator's meta folder, or the same
+    under another of the released names; features end in the 4 contact labels. A
+    `ValueError` names the file if there are none, of so many features, of an evaluator.
     """
     for names in _STATISTICS:
         paths = [folder / name for name in names]
@@ -266,14 +259,9 @@ def read_statistics(
 def published_evaluator(run: TextRun, path: Path, *, glove: Path) -> Evaluator:
     """An evaluator with published weights; its statistics lie beside them.
 
-    Args:
-      run: Run of HumanML3D's features, or KIT-ML's for its evaluator.
-      path: File of the weights (finest.tar or safetensors).
-      glove: Folder of its word vectors, for `load_glove`.
-
-    Raises:
-      OSError: if the weights are missing.
-      ValueError: if weights, statistics or word vectors do not fit; names them.
+    The run is of HumanML3D's features, or KIT-ML's for its evaluator; the path is
+    finest.tar or safetensors; `glove` is for `load_glove`. A `ValueError` names what
+    does not fit: weights, statistics or word vectors.
     """
     width = run.motions.num_features
     config = text_motion_evaluator.MatcherConfig(num_features=width - _CONTACTS)
@@ -299,11 +287,9 @@ def embed(
 ) -> Float[Array, "batch embedding"]:
     """Embeds motions, normalized anew as the evaluator expects; one row each.
 
-    Args:
-      x: Z-scored features of the run.
-      padding: What the evaluator sees beyond a motion's end: "zeros", as beyond that of
-        real motions, or "kept", what is there, as the release does with generated
-        motions.
+    x is z-scored features of the run. Beyond a motion's end the evaluator sees "zeros",
+    as beyond that of real motions, or what is there ("kept"), as the release does with
+    generated motions.
     """
     # At once, and not by way of the raw features, which would lose digits.
     wide = lambda v: np.asarray(v, np.float64)  # noqa: E731
@@ -364,9 +350,8 @@ _SEEN = {"zeros": "zeros", "kept": "the model's output, as in the released evalu
 def row_scorer(folder: Path, settings: Settings) -> RowScorer:
     """The evaluator of a run folder, and real motions' scores.
 
-    Raises:
-      ValueError: if the run has other data, there are too few samples, or an
-        evaluator of actions is given.
+    `ValueError` if the run has other data, there are too few samples, or the evaluator
+    is one of actions.
     """
     if settings.evaluator is not None:
         raise ValueError(

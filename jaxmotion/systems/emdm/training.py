@@ -50,11 +50,7 @@ SAMPLERS: dict[str, tuple[str, int]] = {"ddim_10": ("ddpm_1000", 10)}
 
 
 def check_rows(names: tuple[str, ...]) -> None:
-    """Raises unless all are rows or samplers.
-
-    Raises:
-      ValueError: names the first unknown one and those there are.
-    """
+    """Raises a `ValueError`, with those there are, unless all are rows or samplers."""
     known = (*ROWS, *SAMPLERS)
     for name in names:
         if name not in known:
@@ -64,11 +60,7 @@ def check_rows(names: tuple[str, ...]) -> None:
 
 
 def row_config(base: Config, row: str) -> Config:
-    """Configuration of a row or of a sampler's, from that of the row "emdm".
-
-    Raises:
-      ValueError: if there is no such row.
-    """
+    """Configuration of a row (or a sampler's), from that of the row "emdm"."""
     check_rows((row,))
     trained = SAMPLERS[row][0] if row in SAMPLERS else row
     return dataclasses.replace(base, **ROWS[trained])
@@ -76,9 +68,6 @@ def row_config(base: Config, row: str) -> Config:
 
 def ddim_steps(num_steps: int, count: int) -> tuple[int, ...]:
     """Steps that "ddimN" of guided-diffusion visits: 1, 1 + T/N, ..., never T itself.
-
-    Raises:
-      ValueError: if N does not divide T.
 
     Source: released code of MDM (there counted from 0).
     """
@@ -135,14 +124,9 @@ def gan_update(
 ) -> training.Update:
     """One update of the discriminator, then of the generator; R1 every k-th time.
 
-    Args:
-      optimizers: The generator's and the discriminator's.
-      geometry: See `emdm_loss.generator_loss`.
-      ema: Decay of the generator's average.
-      alone: First updates, of the generator without a discriminator (ours).
-
-    Returns:
-      `update(state, key, batch) -> (state, info)` of a `GanState`.
+    `update(state, key, batch) -> (state, info)` is of a `GanState`. Optimizers are the
+    generator's and the discriminator's; `ema` decays the generator's average; the first
+    `alone` updates are the generator's without a discriminator (ours).
     """
 
     def update(state: Any, key: Key, batch: emdm_loss.Batch) -> tuple[Any, dict]:
@@ -197,9 +181,8 @@ def train_row(
     generator's, but for the part of them, `alone`, that the generator learns without
     it. The generator starts from `start`, if given.
 
-    Raises:
-      ValueError: if the row has a checkpoint of other sizes or data.
-      TrainingDiverged: if a loss is not finite.
+    `ValueError` if its checkpoint has other sizes or data; `TrainingDiverged` if a loss
+    is not finite.
     """
     config = row_config(task.base, row)
     flat = not (config.weight_position or config.weight_velocity or config.weight_foot)
@@ -259,10 +242,7 @@ def import_row(task: Task, weights: Path, *, heads: int, num_steps: int) -> Conf
     Of the task's data only what it is conditioned on and how it looks counts; for the
     other arguments see `emdm_published.load`.
 
-    Raises:
-      FileNotFoundError: if there is no such file.
-      ValueError: if the row exists, or the file is damaged or does not fit the run;
-        names what differs.
+    A `ValueError` names what differs if the row exists, or the file does not fit.
     """
     base = task.base
     config, params = emdm_published.load(
@@ -283,9 +263,7 @@ def import_row(task: Task, weights: Path, *, heads: int, num_steps: int) -> Conf
 def load_row(run: runs.Run, row: str) -> tuple[Params, Config]:
     """Averaged parameters of a row's (or sampler's) generator, and its configuration.
 
-    Raises:
-      CheckpointError: if the row was not trained here.
-      ValueError: if its configuration has other fields than this version's.
+    `CheckpointError` if the row was not trained here.
     """
     stage = _stage(row)
     config = runs.stage_config(run, stage, Config)

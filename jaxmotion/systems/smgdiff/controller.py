@@ -106,10 +106,8 @@ class PlayerState:
 def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerState:
     """State of a player that has shown `past` (world) and has no plan yet.
 
-    Until its first plan it would go on with its mean velocity.
-
-    Raises:
-      ValueError: if there are fewer frames.
+    Until its first plan it would go on with its mean velocity. `ValueError` for fewer
+    frames.
     """
     frames = past.ball.shape[-2]
     if frames < config.past:
@@ -282,12 +280,9 @@ def controller(
 ) -> Controller:
     """The run-time of one player, for `rollout.tick` and `rollout.rollout`.
 
-    Args:
-      generate: Paths: `smgdiff_trajectory.sampler`, or `straight`.
-      sample: Plans: `smgdiff_guidance.sampler`.
-
-    Raises:
-      ValueError: if `control.apply` is not in 1..`config.future`.
+    Paths are `smgdiff_trajectory.sampler`'s or `straight`, plans
+    `smgdiff_guidance.sampler`'s. `ValueError` if `control.apply` is not in
+    1..`config.future`.
     """
     control = Control() if control is None else control
     if not 1 <= control.apply <= config.future:
@@ -316,13 +311,8 @@ class Method:
 
     Those are of the motion model and of the paths, and the representation.
 
-    Attributes:
-      config: The motion model.
-      paths: The generator of paths.
-      guided: Contact guidance; tuned for short trainings.
-      control: Constants of the run-time; None for the defaults.
-      step: Makes the step of both chains where they are not guided.
-      steps: Steps of the motion model's schedule to visit; None for all.
+    Both chains take `step` where they are not guided; `steps` of the motion model's
+    schedule are visited, None for all. Guidance is tuned for short trainings.
     """
 
     config: Config
@@ -379,9 +369,7 @@ def start_states(
 
     Each is moved so that it stands at the origin and faces +z.
 
-    Raises:
-      ValueError: if a label is none of the model's, or a skill has no clip that is
-        long enough; names it.
+    A `ValueError` names a skill without a clip that is long enough.
     """
     check_labels(labels, model.labels)
     arrays = smgdiff_data.scene_arrays(data, model.config.past)
@@ -407,11 +395,7 @@ def start_states(
 
 
 def own_states(model: Model, labels: np.ndarray, *, seed: int) -> PlayerState:
-    """States of players that start with the model's own frames of their skill.
-
-    Raises:
-      ValueError: if the model has no frames of its own, or no such skill.
-    """
+    """States of players that start with the model's own frames of their skill."""
     if model.starts is None:
         raise ValueError("the model has no frames to start from")
     chosen = chosen_starts(model.starts, labels, model.labels, seed=seed)
@@ -423,9 +407,7 @@ def own_states(model: Model, labels: np.ndarray, *, seed: int) -> PlayerState:
 def load_run(path: Path) -> tuple[smgdiff_training.Run, Model, dict[str, Params]]:
     """A run folder, and its model of 8 steps of motion and 1 of paths.
 
-    Raises:
-      CheckpointError: if a stage was not trained.
-      ValueError: if it is no run folder of SMGDiff.
+    `CheckpointError` if a stage was not trained.
     """
     run = smgdiff_training.load_run(path)
     return run, *smgdiff_training.load_networks(run)
@@ -467,9 +449,8 @@ def load_character(
     was trained on. `step` makes the step of the unguided parts of the chain; the
     default is the paper's.
 
-    Raises:
-      CheckpointError: if a stage was not trained, or the file is damaged.
-      ValueError: if it is of another system.
+    `CheckpointError` if a stage was not trained or the file is damaged, `ValueError`
+    for another system.
     """
     if path.is_file():
         model, params = smgdiff_model.import_file(path)

@@ -36,16 +36,10 @@ def split(
 ) -> tuple[BallClips, BallClips]:
     """Training and held-out clips; pieces of one recording stay together.
 
-    Recordings are grouped by their first piece's skill, so that every skill with two
-    recordings has one on either side.
-
-    Args:
-      data: The clips; what stands before "@" or "#" in a name is its recording, of
-        which a mirror image is one, too.
-      fraction: Part of the recordings to hold out, in (0, 1).
-
-    Raises:
-      ValueError: if the fraction is out of range, or a part would be empty.
+    What stands before "@" or "#" in a name is its recording, of which a mirror image is
+    one, too. Recordings are grouped by their first piece's skill, so that every skill
+    with two has one on either side; a part of them, in (0, 1), is held out.
+    `ValueError` if it is out of range, or a part would be empty.
     """
     if not 0.0 < fraction < 1.0:
         raise ValueError(f"fraction should be between 0 and 1, found {fraction}")
@@ -68,10 +62,7 @@ def split(
 def scene_arrays(data: BallClips, length: int, *, stride: int = 1) -> SceneArrays:
     """Lists windows of `length` frames; clips that are too short are left out.
 
-    Within a clip their starts are `stride` frames apart.
-
-    Raises:
-      ValueError: if no clip is long enough.
+    Within a clip their starts are `stride` frames apart; `ValueError` for no windows.
     """
     index = windows.window_index(data.clips, length, stride=stride, short="skip")
     return SceneArrays(data=data, index=index)
@@ -100,11 +91,9 @@ def all_scenes(
 def fit_representation(
     arrays: SceneArrays, *, past: int, windows_used: int = 2000
 ) -> smgdiff_scene.Representation:
-    """Fits the features' mean and deviation to windows spread over the clips.
+    """Fits features' mean and deviation to at most so many windows, spread over clips.
 
-    Args:
-      past: Frames of a window before the plan.
-      windows_used: Windows to look at, at most.
+    The first `past` frames of a window come before the plan.
     """
     number = arrays.index.starts.shape[0]
     chosen = np.unique(np.linspace(0, number - 1, windows_used).astype(int))

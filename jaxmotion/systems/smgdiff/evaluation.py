@@ -43,11 +43,9 @@ from jaxmotion.typing import Key
 def plan_many(
     plan: SamplePlan, model: Model, *, chunk: int
 ) -> Callable[[Key, Condition], Scene]:
-    """Plans for many conditions, as one compiled program.
+    """`run(key, conditions) -> scenes`, in the frames of the plans; one program.
 
-    Returns:
-      `run(key, conditions) -> scenes` in the frames of the plans; condition i draws
-      from `fold_in(key, i)`.
+    Condition i draws from `fold_in(key, i)`.
     """
 
     @jax.jit
@@ -67,15 +65,7 @@ def plan_many(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Setting:
-    """What all rows of a table share.
-
-    Attributes:
-      evaluator: Evaluator of skills.
-      score: From `smgdiff_scores.scorer`.
-      known: Held-out moments.
-      replications: Sets of windows and noise.
-      seed: Seeds both.
-    """
+    """What all rows of a table share; the seed is that of windows and noise."""
 
     evaluator: smgdiff_scoring.SkillEvaluator
     score: smgdiff_scoring.Score
@@ -107,13 +97,8 @@ def make_setting(
 ) -> Setting:
     """Trains the evaluator and draws the windows.
 
-    Args:
-      number: Windows of either part, at most.
-      replications: Sets of half of the held-out windows.
-      evaluator: A frozen evaluator; None to train one.
-
-    Raises:
-      ValueError: if clips are too short or few, or the evaluator does not fit.
+    There are at most `number` windows of either part; replications are sets of half of
+    the held-out ones. A frozen evaluator must fit (`ValueError`); None to train one.
     """
     frozen = evaluators.params_for(
         evaluator,
@@ -194,10 +179,8 @@ def train_ball(
 ) -> Evaluator:
     """SMGDiff's evaluator of skills, of joints and ball.
 
-    The held-out clips give its accuracy; `frames` is the length of a plan.
-
-    Raises:
-      ValueError: if clips are too short or too few.
+    The held-out clips give its accuracy; `frames` is the length of a plan. `ValueError`
+    if clips are too short or too few.
     """
     model = smgdiff_training.make_model(train, sizes={"future": frames})
     draw = functools.partial(smgdiff_scoring.eval_windows, model=model)
@@ -290,8 +273,7 @@ def schedule_table(
 ) -> tuple[Rows, Places]:
     """Table 4: where in a chain of `steps` guidance acts, by names of `SCHEDULES`.
 
-    Returns:
-      The rows, and jerk and slide by place in a token.
+    With the rows come jerk and slide by place in a token.
     """
     rows, places = real_rows(run, setting), {}
     for name in names:

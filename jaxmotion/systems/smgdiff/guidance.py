@@ -70,11 +70,7 @@ SCHEDULES = {
 
 
 def on_schedule(guided: Guidance, name: str) -> Guidance:
-    """Guidance that acts where a schedule says.
-
-    Raises:
-      ValueError: if there is no such schedule; names those there are.
-    """
+    """Guidance where a schedule says; a `ValueError` names those there are."""
     if name not in SCHEDULES:
         raise ValueError(
             f"unknown schedule {name!r}: expected one of {', '.join(SCHEDULES)}"
@@ -84,14 +80,10 @@ def on_schedule(guided: Guidance, name: str) -> Guidance:
 
 
 def segments(guided: Guidance, num_steps: int) -> tuple[tuple[bool, int, int], ...]:
-    """Cuts a chain of T steps where guidance begins and ends.
+    """Cuts a chain of T steps where guidance begins and ends: T down to 0.
 
-    Returns:
-      (whether it is guided, first step, step of its result) of each segment, from T
-      down to 0.
-
-    Raises:
-      ValueError: if more steps are guided than there are.
+    Of each segment: whether it is guided, its first step, and that of its result.
+    `ValueError` if more steps are guided than there are.
     """
     if min(guided.start, guided.end) < 0 or guided.start + guided.end > num_steps:
         raise ValueError(
@@ -145,15 +137,9 @@ def sampler(
 ) -> SamplePlan:
     """The sampler of plans, `sample(key, condition) -> [future, features]`.
 
-    Gradients are compiled into the guided segments only.
-
-    Args:
-      step: Makes the step of the unguided segments from the schedule and the denoiser;
-        the default is the paper's.
-      steps: Steps of the schedule to visit, increasing; None for all.
-
-    Raises:
-      ValueError: if more steps are guided than there are.
+    Gradients are compiled into the guided segments only; `step` makes the others'.
+    `steps` of the schedule are visited, increasing; None for all. `ValueError` if more
+    are guided than there are.
     """
     number = config.num_steps if steps is None else len(steps)
     net, parts = network(config), segments(guided, number)

@@ -35,9 +35,7 @@ def situation(
 ) -> tuple[Condition, Float[Array, "future features"]]:
     """What a plan is made for at a moment of a recording, and the future features.
 
-    Args:
-      window: Past and future frames, world.
-      course: Path that is wanted in each of them, world.
+    Window (past and future frames) and the wanted path are in the world.
     """
     last = config.past - 1
     past = jax.tree.map(lambda x: x[: config.past], window)

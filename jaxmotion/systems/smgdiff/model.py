@@ -37,9 +37,6 @@ class Config:
 
     Attributes:
       num_features: Channels of a frame, from `feature_layout`.
-      num_labels: Skills.
-      past: Past frames of the condition.
-      future: Frames of a sample.
       num_steps: T of the cosine schedule.
       width: Channels of a token (CAMDM's).
       frames_per_token, token_margin, token_window, norm, attention, frame_kernel: Of
@@ -49,9 +46,7 @@ class Config:
       seam_features: Channels of root and rotations, which come first; 0 without.
       noise_levels: Noise levels of one window in training; ours, 1 in the paper.
       own_levels: As in `camdm.Config`; ours, 0 in the paper.
-      weight_data: Weight of the mean squared error of features.
       weight_velocity: Weight of the displacements of features.
-      weight_position: Weight of the joint positions.
       weight_position_velocity: Weight of the displacements of joint positions (CAMDM's;
         not in the paper).
       weight_foot: Weight of feet that slide while they stand.
@@ -152,9 +147,6 @@ class Model:
     """Everything but the parameters.
 
     Attributes:
-      config: Config of the motion model.
-      paths: Config of the trajectory generator.
-      labels: Names of the skills.
       speeds: Median speed of the root in each skill, meters per second.
       source: The data, and its license.
       starts: Frames to start from, [labels, number, past, ...], of players at the
@@ -248,11 +240,7 @@ def _representation(value: Any) -> Representation:
 
 
 def from_json(value: dict[str, Any], *, where: str) -> Model:
-    """Inverse of `to_json`; `where` is the file, for messages.
-
-    Raises:
-      ValueError: names the file and the field that is missing or wrong.
-    """
+    """Inverse of `to_json`; a `ValueError` names the file (`where`) and the field."""
     model_json.check_system(value, SYSTEM, where=where)
     parts = {
         "config": lambda x: model_json.config_from_json(Config, x),
@@ -280,9 +268,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
 def import_file(path: Path) -> tuple[Model, dict[str, Params]]:
     """Model and parameters, of "motion" and of "paths", of an exported file.
 
-    Raises:
-      CheckpointError: if it is damaged or no such file.
-      ValueError: if it is of another system.
+    `CheckpointError` if it is damaged or none, `ValueError` for another system.
     """
     params, value = checkpoint.import_params(path)
     model = from_json(value, where=str(path))

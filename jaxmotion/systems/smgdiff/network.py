@@ -18,11 +18,7 @@ CHANNELS = 4
 
 
 class TrajectoryGenerator(nn.Module):
-    """The denoiser of paths: (x, z) and facing (x, z) of each frame.
-
-    Attributes:
-      token_margin, token_window: As in `transformer.CamdmTransformer`.
-    """
+    """The denoiser of paths: (x, z) and facing (x, z) of each frame."""
 
     past: int
     future: int

@@ -44,10 +44,7 @@ Play = Callable[[Key, EvalWindows], Scene]
 
 
 def wishes(known: EvalWindows, model: Model) -> Wish:
-    """What users would have asked for: the mean velocity of what was recorded.
-
-    In the frames of the plans.
-    """
+    """What users would have asked for: the recorded mean velocity, in plans' frames."""
     skeleton, config = model.representation.skeleton, model.config
 
     def one(known: EvalWindows) -> Wish:
@@ -73,14 +70,9 @@ def player(
 ) -> Play:
     """Rollouts of players that keep their first command, as one compiled program.
 
-    Args:
-      ticks: Frames of a rollout.
-      repeats: Players of each start.
-      chunk: Players at a time, at most (the largest number that divides theirs).
-
-    Returns:
-      `play(key, known) -> scenes` [players, ticks, ...]; those of one start are
-      neighbors.
+    There are `repeats` players of each start, at most `chunk` at a time (the largest
+    number that divides theirs). Given is `play(key, known) -> scenes` [players, ticks,
+    ...]; those of one start are neighbors.
     """
     driver = smgdiff_controller.controller(
         generate,
@@ -140,10 +132,7 @@ def score_players(
     They are scored from their second plan on, in windows of a plan's length;
     "pose_variance" is the variance of joints over players of one start, in the world.
 
-    Args:
-      play: From `player`, of two plans' length or more.
-      repeats: Players of each start.
-      starts: Starts of a replication.
+    Players last for two plans' length or more; `starts` are those of a replication.
     """
     key, future = jax.random.key(setting.seed + 3), model.config.future
     spread = jax.jit(lambda scene: _diversity(scene, model, repeats))
@@ -196,10 +185,8 @@ def path_spread(
 ) -> dict[str, Float[Array, "..."]]:
     """How much paths vary at a fixed input, beside how much people's do.
 
-    Args:
-      known: Moments of held-out recordings.
-      seen: Moments of recordings among which similar inputs are looked for.
-      repeats: Paths of each wish, and similar inputs of each.
+    Known are moments of held-out recordings; among those `seen` similar inputs are
+    looked for, `repeats` of each wish, as are its paths.
 
     Returns:
       By frame, root mean square distances in cm: of generated paths from the mean of
@@ -273,13 +260,9 @@ def path_table(
 ) -> tuple[Rows, dict[str, Any]]:
     """Table 2: steered players with and without generated paths and guidance.
 
-    Args:
-      steps: T of the motion model.
-      starts: Starts of players of a replication.
-      repeats: Players of each start.
-
-    Returns:
-      The rows, and how much each generator's paths vary (`path_spread`).
+    The motion model has T = `steps`; `starts` of players are those of a replication,
+    with `repeats` players each. Beside the rows stands how much each generator's paths
+    vary (`path_spread`).
     """
     model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
     generators = _generators(run)
@@ -329,8 +312,7 @@ def skill_commands(
 ) -> trajectory.Command:
     """Each skill at its own speed, for an equal time, with turns to either side.
 
-    Raises:
-      ValueError: if the model has no such skill, or there is less than a tick of each.
+    `ValueError` if the model has no such skill, or there is less than a tick of each.
     """
     ticks = round(seconds * model.config.fps)
     if ticks < len(skills):
@@ -367,10 +349,7 @@ def play_one(
 ) -> Scene:
     """One player that starts with training frames of its first command's skill.
 
-    Args:
-      commands: One a tick.
-      steps: T of the motion model.
-      paths: As in `path_sampler`.
+    Commands are one a tick; `steps` is the motion model's T; paths as `path_sampler`'s.
     """
     model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
     driver = smgdiff_controller.controller(

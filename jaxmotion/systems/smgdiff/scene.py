@@ -98,11 +98,9 @@ def fit(
 ) -> Representation:
     """Mean of each feature, and one deviation for those of a kind.
 
-    Args:
-      scenes: Windows of the training data, batch first, seen from `plan_frame`.
-      joints: Those that may touch the ball.
-      radius: Of the ball, meters.
-      floor: Least deviation, in the features' units.
+    Scenes are windows of the training data, batch first, seen from `plan_frame`; joints
+    may touch the ball, whose radius is in meters. The least deviation is in features'
+    units.
     """
     size = feature_layout(skeleton, joints).size
     unit = features.Normalizer(mean=jnp.zeros(size), std=jnp.ones(size))

@@ -48,11 +48,7 @@ class Thresholds:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class SkillEvaluator:
-    """A trained evaluator of skills, and what real windows look like to it.
-
-    Attributes:
-      reference: Moments of its features over windows of training clips.
-    """
+    """A trained evaluator of skills; moments of its features over training clips."""
 
     params: Params
     reference: frechet.Moments
@@ -87,12 +83,7 @@ def make_evaluator(
     num_steps: int,
     frozen: Params | None = None,
 ) -> SkillEvaluator:
-    """Trains an evaluator of skills on real windows, which are its reference, too.
-
-    Args:
-      scenes: Windows of training clips, as long as those that are to be scored.
-      frozen: Parameters of one that was trained before; None to train one.
-    """
+    """Trains an evaluator of skills on real windows, which are its reference, too."""
     config = style_evaluator.Config(
         num_classes=num_labels,
         num_joints=representation.skeleton.num_joints + 1,
@@ -119,11 +110,9 @@ Score = Callable[..., dict[str, Float[Array, ""]]]
 
 
 def scorer(evaluator: SkillEvaluator, limits: Thresholds) -> Score:
-    """Scores of a set of windows, as one compiled program.
+    """`score(scenes, wanted, labels) -> scores` of windows, one compiled program.
 
-    Returns:
-      `score(scenes, wanted, labels) -> scores`: wanted is a path (world or frame of the
-      plan, as the scenes), labels the skills.
+    Wanted is a path, where the scenes are: world or frame of the plan.
     """
     representation = evaluator.representation
     skeleton = representation.skeleton
@@ -207,11 +196,7 @@ def contact_scores(
 class EvalWindows:
     """Moments of recordings: what is known, and what then happened.
 
-    Attributes:
-      condition: Condition of the plans.
-      future: What then happened, in the frame of the plan.
-      past: The frames before, in the same frame.
-      label: Skill.
+    Frames before and after are in the frame of the plan.
     """
 
     condition: Condition
@@ -225,8 +210,7 @@ def eval_windows(
 ) -> EvalWindows:
     """At most `number` moments spread at random over clips, of the model's lengths.
 
-    Raises:
-      ValueError: if no clip is long enough, or there are fewer than 4 moments.
+    `ValueError` if no clip is long enough, or there are fewer than 4 moments.
     """
     config = model.config
     arrays = smgdiff_data.scene_arrays(data, config.window, stride=config.past)

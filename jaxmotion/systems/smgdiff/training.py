@@ -24,12 +24,7 @@ from jaxmotion.typing import Key, Params
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run folder, its model and its data.
-
-    Attributes:
-      train: Clips that it was trained on.
-      held_out: Clips that it never saw.
-    """
+    """A run folder, its model and its data."""
 
     record: runs.Run
     model: Model
@@ -42,13 +37,9 @@ def make_model(
 ) -> Model:
     """A model for clips with a ball, its features standardized on them.
 
-    Args:
-      data: Training clips; their skeleton, rate, skills and source become the model's.
-      sizes: Fields of `smgdiff.Config`, but for those that the clips decide.
-      paths: The same of `smgdiff_trajectory.Config`.
-
-    Raises:
-      ValueError: if no clip is as long as a window.
+    Skeleton, rate, skills and source are those of the clips; `sizes` are fields of
+    `smgdiff.Config`, `paths` of `smgdiff_trajectory.Config`. `ValueError` if no clip is
+    as long as a window.
     """
     clips, labels = data.clips, data.clips.names(smgdiff_data.FIELD)
     names = smgdiff_scene.feature_layout(clips.skeleton, data.joints)
@@ -75,11 +66,7 @@ def make_model(
 
 
 def check_stage_name(stage: str) -> tuple[str, int]:
-    """Kind ("motion" or "paths") and T of a stage such as "motion_8" or "paths_1".
-
-    Raises:
-      ValueError: if there is no such stage.
-    """
+    """Kind and T of a stage such as "motion_8" or "paths_1" (else `ValueError`)."""
     kind, _, steps = stage.partition("_")
     if kind not in ("motion", "paths") or not steps.isdecimal() or int(steps) < 1:
         raise ValueError(
@@ -90,11 +77,7 @@ def check_stage_name(stage: str) -> tuple[str, int]:
 
 
 def with_steps(model: Model, stage: str) -> Model:
-    """The model with the number of steps that a stage such as "motion_8" says.
-
-    Raises:
-      ValueError: if there is no such stage.
-    """
+    """The model with the number of steps that a stage such as "motion_8" says."""
     kind, steps = check_stage_name(stage)
     field = "config" if kind == "motion" else "paths"
     changed = dataclasses.replace(getattr(model, field), num_steps=steps)
@@ -111,8 +94,7 @@ def continued(model: Model, path: Path) -> tuple[Model, dict[str, Params]]:
     The units of features go with them; weights of the losses, attention, noise levels
     and seam are this model's.
 
-    Raises:
-      ValueError: if skeleton, skills or sizes differ; names which.
+    A `ValueError` names skeleton, skills or sizes that differ.
     """
     first, params = load(path)
 
@@ -148,9 +130,7 @@ def prepare(
     Sizes and paths are as `make_model` takes them; `held_out` is the part of the
     recordings to hold out; `init` is a model to start from.
 
-    Raises:
-      OSError: if the clips cannot be read.
-      ValueError: if the folder was made otherwise, or the clips do not fit.
+    `ValueError` if the folder was made otherwise, or the clips do not fit.
     """
 
     def make() -> runs.Content:
@@ -190,12 +170,7 @@ _FILES = ("train.npz", "held_out.npz")
 
 
 def load_run(folder: Path) -> Run:
-    """Reads a run folder.
-
-    Raises:
-      OSError: if a file is missing.
-      ValueError: if one is damaged or foreign; names it and the field.
-    """
+    """Reads a run folder; a `ValueError` names the file and field that are wrong."""
     return _decode(runs.load(folder, system=SYSTEM))
 
 
@@ -221,9 +196,7 @@ def init_stage(key: Key, model: Model, stage: str) -> Params:
 def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
     """The model with a stage's number of steps, and the stage's averaged parameters.
 
-    Raises:
-      CheckpointError: if the stage was not trained, or with other sizes.
-      ValueError: if there is no such stage.
+    `CheckpointError` if the stage was not trained, or with other sizes.
     """
     model = with_steps(run.model, stage)
     runs.check_model(run.record, stage, stage_json(model, stage))
@@ -234,9 +207,7 @@ def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
 def load(path: Path) -> tuple[Model, dict[str, Params]]:
     """Model and parameters of a file, or of a folder's "motion_8" and "paths_1".
 
-    Raises:
-      CheckpointError: if a stage was not trained, or the file is damaged.
-      ValueError: if it is of another system.
+    `CheckpointError` if a stage was not trained or the file is damaged.
     """
     if path.is_file():
         return smgdiff_model.import_file(path)
@@ -244,11 +215,7 @@ def load(path: Path) -> tuple[Model, dict[str, Params]]:
 
 
 def load_networks(run: Run) -> tuple[Model, dict[str, Params]]:
-    """The model of 8 steps of motion and 1 of paths, and its parameters.
-
-    Raises:
-      CheckpointError: if a stage was not trained.
-    """
+    """The model of 8 steps of motion and 1 of paths, and its parameters."""
     model, motion = load_stage(run, "motion_8")
     paths, path_params = load_stage(run, "paths_1")
     model = dataclasses.replace(model, paths=paths.paths)
@@ -301,10 +268,8 @@ def train_stage(
     stage starts with the parameters of `init`, and then has no draft; None for random
     ones.
 
-    Raises:
-      ValueError: if there is no such stage, its checkpoint has other settings, or the
-        model of `init` does not fit.
-      TrainingDiverged: if a loss is not finite.
+    `ValueError` if there is no such stage, its checkpoint has other settings, or the
+    model of `init` does not fit; `TrainingDiverged` if a loss is not finite.
     """
     model = with_steps(run.model, stage)
     arrays = smgdiff_data.scene_arrays(run.train, model.config.window)

@@ -33,9 +33,6 @@ class Config:
     """Architecture and method.
 
     Attributes:
-      num_labels: Skills.
-      past: Displayed frames that are seen.
-      future: Frames of a path.
       num_steps: T (paper 1).
       token_margin, token_window: As in `transformer.CamdmTransformer`.
       meters: Unit of the network's positions.
@@ -62,11 +59,7 @@ class Config:
 class Wish:
     """What a path is made for, in the frame of the last displayed pose.
 
-    Attributes:
-      past: Displayed path.
-      velocity: Wanted velocity (x, z), meters per second; the target point is one
-        second of it away.
-      label: Skill.
+    The target point is one second of the velocity (x, z; m/s) away; past is displayed.
     """
 
     past: trajectory.Trajectory
