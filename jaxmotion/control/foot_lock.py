@@ -135,7 +135,7 @@ class LockState:
 
 
 def legs(skeleton: Skeleton) -> tuple[tuple[int, int, int, int], ...]:
-    """Hip, knee, ankle and toe of each foot; `ValueError` for none, or without a leg."""
+    """Hip, knee, ankle and toe of each foot; `ValueError` if one has no leg."""
     if not skeleton.feet:
         raise ValueError("the skeleton names no feet: there is nothing to lock")
     found = []
@@ -626,7 +626,7 @@ def _tuning(inner: Tuning, fps: float, lock: FootLock) -> Tuning:
 def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
     """A character that is displayed with locked feet; its states are `LockedState`s.
 
-    lock None: the default settings. `ValueError` unless the skeleton has feet with legs.
+    lock None: default settings. `ValueError` unless the skeleton has feet with legs.
     """
     lock = FootLock() if lock is None else lock
     feet = init_lock(character.skeleton)
@@ -668,7 +668,7 @@ def clean_sampler(
 ) -> sampling.Sampler:
     """A sampler whose motions stand on their planted feet; see `clean_motion`.
 
-    lock None: the default settings. `ValueError` unless the skeleton has feet with legs.
+    lock None: default settings. `ValueError` unless the skeleton has feet with legs.
     """
     legs(sampler.skeleton)
     return dataclasses.replace(

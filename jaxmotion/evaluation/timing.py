@@ -81,8 +81,8 @@ def time_in_turn(
     runs after the same other.
 
     Arguments are of the calls of round i, warm-up included; making them is not timed.
-    Warm-up is shorter where it takes a quarter of the limit, seconds, after which only
-    the least number of rounds is still made. Given is for each name an array [rounds, 2]:
+    Warm-up is shorter where it takes a quarter of the limit (seconds), after which only
+    the least number of rounds is made. Given is for each name an array [rounds, 2]:
     milliseconds of wall clock, and of processor time of all threads of this process.
     """
     names, made = list(calls), 0
