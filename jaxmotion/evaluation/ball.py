@@ -82,7 +82,6 @@ def foot_ball_distance(
     Of each event of `touch_events` the smallest distance of any joint, over the event's
     frames and one frame on either side: meters, added over events, and the number of
     events. A touch by the surface of a foot leaves the ball's radius and half a foot.
-
     """
     starts, distances = _event_distances(ball, joints, fps, threshold)
     return Tally(

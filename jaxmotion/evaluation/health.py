@@ -73,7 +73,6 @@ def frozen_frames(
     glides. After the last whole window no frame is. World positions, meters, joint 0
     the root; speeds and the velocity (x, z) asked for in each frame are in meters per
     second.
-
     """
     length = round(seconds * fps)
     if length < 1:

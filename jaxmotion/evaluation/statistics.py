@@ -26,7 +26,6 @@ def confidence_interval(
     interval is right for few samples of a Gaussian; the deviation is with n - 1. The
     literature on text to motion takes 1.96 instead of t, and its released scripts
     divide by n: for n = 20 their half widths are 9 % less.
-
     """
     count = samples.shape[0]
     if count < 2:

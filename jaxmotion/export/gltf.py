@@ -109,7 +109,6 @@ def to_glb(skeleton: Skeleton, motion: Motion) -> bytes:
     """A motion of one character as the bytes of a .glb file.
 
     Joints are nodes 0, 1, ... by their names; all rotations are against the T-pose.
-
     """
     for name in ("root_position", "joint_rotation"):
         finite = np.isfinite(np.asarray(getattr(motion, name))).reshape(

@@ -521,7 +521,6 @@ def save_onto(
     """Writes a rig's file, animated by the motion of another skeleton.
 
     For the rig's roles see `roles.find_roles`.
-
     """
     world = kinematics(skeleton, motion)[1]
     function = transfer.Retarget(

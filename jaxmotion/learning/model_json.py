@@ -9,6 +9,7 @@ import json
 import math
 import typing
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -293,3 +294,25 @@ def differences(
 def _short(value: Any) -> str:
     text = value if value == "not recorded" else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def check_start(
+    path: Path, found: dict[str, Any], wanted: dict[str, Any], *, free: tuple[str, ...]
+) -> None:
+    """Raises a `ValueError`, with what differs, unless one model can go on as another.
+
+    Both are JSON, `found` that of the file `path`. In "config" and "paths" what begins
+    with a weight's name or a `free` one may differ, since it has no parameters.
+    """
+
+    def part(value: dict[str, Any]) -> dict[str, Any]:
+        free_ = ("weight_", *free)
+        return value | {
+            name: {k: x for k, x in value[name].items() if not k.startswith(free_)}
+            for name in ("config", "paths")
+            if name in value
+        }
+
+    differ = differences(part(found), part(wanted))
+    if differ:
+        raise ValueError(f"{path}: expected a model like the one to train: {differ}")

@@ -101,7 +101,6 @@ class ClipText(nn.Module):
         Ids are in 0..vocabulary-1, at most `context` of them; every row holds the
         end-of-text token, and its first one ends the text. (The released code takes the
         largest id of a row: with its vocabulary the same place.)
-
         """
         tokens = ids.shape[-1]
         if tokens > self.context:

@@ -30,7 +30,6 @@ def convolve(
     Sums over the width of the kernel of frames in the order batch, time, channels.
     Dilations and `feature_group_count` are 1; padding is "SAME", "VALID", or zeros
     before and after.
-
     """
     del dimension_numbers
     if {*lhs_dilation, *rhs_dilation, feature_group_count} != {1}:

@@ -343,7 +343,6 @@ class _Real:
     """Windows of real clips, and where the ground is by the first clips.
 
     Those with the label, if their clips know it.
-
     """
 
     def __init__(self, clips: dict[str, Clips], *, label: str):

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -231,7 +232,6 @@ def write_pareto(
       y: The same of its second.
       references: Value, lower and upper end of second costs that are lines.
       broken: Names of points that fail in other ways: hollow, and beaten by all.
-
     """
     unknown = set(broken) - set(names)
     if unknown:
@@ -293,7 +293,6 @@ def write_scatter(
       marks: Points drawn as crosses in every panel.
       shown: Points drawn of a cloud, at most.
       seed: Seeds the choice of these.
-
     """
     path = figure.check_writable(path)
     center = (marks.max(axis=0) + marks.min(axis=0)) / 2
@@ -331,7 +330,6 @@ def plot_sweep(
     Args:
       lines: Label to (x, y, upper end of the whisker or None).
       ticks: What stands below x = 0, 1, 2, ...; none for numbers.
-
     """
     path = figure.check_writable(path)
     drawing = Figure(figsize=(6, 4), dpi=110, layout="constrained")
@@ -499,6 +497,12 @@ def smoothed(
     return (sums[last + 1] - sums[first]) / (last + 1 - first)
 
 
+def _lines_below(curves: Curves) -> int:
+    """Lines of a legend below the axes: 0 where few names fit in between the curves."""
+    names = len(curves.lines) + len(curves.references)
+    return math.ceil(names / 2) if names > 5 else 0
+
+
 def _draw_curves(axes: Axes, curves: Curves, *, wide: bool) -> None:
     shown = [value[:1] for value in curves.references.values()]
     _draw_references(axes, curves.references)
@@ -526,7 +530,10 @@ def _draw_curves(axes: Axes, curves: Curves, *, wide: bool) -> None:
     axes.set_title(curves.title, fontsize=9, parse_math=False)
     axes.set_xlabel(curves.xlabel, fontsize=8)
     axes.set_ylabel(curves.ylabel, fontsize=8)
-    axes.legend(fontsize=7)
+    below: dict[str, Any] = dict(
+        loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2
+    )
+    axes.legend(fontsize=7, **below if _lines_below(curves) else {})
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.3, which="both")
 
@@ -536,12 +543,12 @@ def write_curves(path: str | Path, panels: tuple[Curves, ...], *, title: str) ->
 
     Axes are logarithmic where what is drawn differs by much: upright each for itself,
     across all of them where some lines are much longer than others.
-
     """
     path = figure.check_writable(path)
     across = min(_ACROSS, len(panels))
     down = math.ceil(len(panels) / across)
-    size = (4.0 * across + 0.4, 3.2 * down + 0.5)
+    height = 3.2 + 0.15 * max(map(_lines_below, panels))
+    size = (4.0 * across + 0.4, height * down + 0.5)
     canvas = Figure(figsize=size, dpi=110, layout="constrained")
     canvas.suptitle(title, fontsize=11)
     grid = canvas.subplots(down, across, squeeze=False).ravel()

@@ -3,7 +3,6 @@
 import collections
 import csv
 import dataclasses
-import importlib
 import json
 import os
 import subprocess
@@ -21,9 +20,9 @@ from jaxmotion.networks import work
 from jaxmotion.systems import registry
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
+from tests.benchmarks.conftest import FOLDER
 from tests.retarget import rigs
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
 SMALL = ["--width", "16", "--runs", "2", "--limit", "1"]
 # Script -> arguments, and what its rows are told apart by.
 SCRIPTS = {
@@ -39,14 +38,6 @@ SCRIPTS = {
         ("characters", "chunk"),
     ),
 }
-
-
-@pytest.fixture(scope="module")
-def load():
-    """Imports a module of the folder, as a script there finds its neighbors."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(FOLDER))
-        yield importlib.import_module
 
 
 def run_script(name, *arguments):

@@ -2,13 +2,11 @@
 
 import dataclasses
 import functools
-import importlib
 import json
 import os
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -19,19 +17,11 @@ from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import tiny
+from tests.benchmarks.conftest import FOLDER
 
-FOLDER = Path(__file__).parents[2] / "benchmarks"
 CONFIG = tiny.config(depth=1, heading="facing", num_steps=2)
 CONTROL = camdm_controller.Control(apply=4, reuse=6)
 TICKS = 10
-
-
-@pytest.fixture(scope="module")
-def load():
-    """Imports a module of the folder, as a script there finds its neighbors."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(FOLDER))
-        yield importlib.import_module
 
 
 @pytest.mark.slow

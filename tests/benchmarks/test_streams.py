@@ -1,21 +1,9 @@
 """Streams that are stopped, and what a crowd's cost is fitted by."""
 
-import importlib
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
-
-FOLDER = Path(__file__).parents[2] / "benchmarks"
-
-
-@pytest.fixture(scope="module")
-def load():
-    """Imports a module of the folder, as a script there finds its neighbors."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(FOLDER))
-        yield importlib.import_module
 
 
 def make(number, stop=None):

@@ -138,19 +138,47 @@ def test_angles_are_those_of_the_law_of_cosines():
     assert np.arccos(cosine) == pytest.approx(want, abs=1e-4)
 
 
-def test_knees_stay_in_front():
-    """From far back to far ahead, also through a straight leg."""
-    root = stood(0.05)
+@pytest.mark.parametrize("yaw", [0.0, 1.5])
+def test_knees_stay_in_front(yaw):
+    """From far back to far ahead, also through a straight leg, wherever they face."""
+    root, c, s = stood(0.05), np.cos(yaw), np.sin(yaw)
+    facing = np.array([s, 0.0, c])
     for bend in (0.0, 0.02, 0.3):
-        joints = pose(bend)
+        joints = pose(bend).at[0].set(jnp.array([c, 0, -s, 0, 1, 0]))
         for ahead in np.linspace(-0.5, 0.5, 11):
-            wanted = toes_of(root, joints) + np.array([0.0, 0.1, ahead])
+            away = np.array([0.0, 0.1, 0.0]) + ahead * facing
+            wanted = toes_of(root, joints) + away
             hip, knee, ankle = positions_of(root, place(root, joints, wanted))[1:4]
-            # In front of the line from hip to ankle, seen by a body that faces +z.
+            # In front of the line from hip to ankle, and not aside.
             line = (ankle - hip) / np.linalg.norm(ankle - hip)
             out = (knee - hip) - np.dot(knee - hip, line) * line
-            front = np.array([0.0, 0.0, 1.0]) - line[2] * line
-            assert np.dot(out, front) > -1e-3, (bend, ahead)
+            assert np.dot(out, facing - np.dot(facing, line) * line) > -1e-3
+            assert abs(np.dot(out, [c, 0.0, -s])) < 1e-3, (bend, ahead)
+
+
+def test_a_straight_leg_that_stands_apart_reaches():
+    """Its axis is at right angles to the leg, although the hips' line is not."""
+    root, joints = stood(0.0), pose(0.0)
+    c, s = np.cos(0.6), np.sin(0.6)
+    joints = joints.at[1].set(jnp.array([c, s, 0, -s, c, 0]))
+    wanted = toes_of(root, joints) + np.array([[-0.02, 0.15, 0.04], [0, 0, 0]])
+    found = positions_of(root, place(root, joints, wanted))
+    np.testing.assert_allclose(found[4], wanted[0], atol=1e-3)
+
+
+def test_the_plane_of_a_nearly_straight_leg_does_not_jump():
+    """A leg bent a little sideways bends on as it is; straighter ones turn ahead."""
+    root, sines, asides = stood(0.0), np.array([0.0, 0.01, 0.019, 0.0196, 0.03]), []
+    for s in sines:
+        c = np.sqrt(1.0 - s**2)
+        joints = pose(0.0).at[2].set(jnp.array([c, s, 0, -s, c, 0]))
+        wanted = toes_of(root, joints) + np.array([0.0, 0.2, 0.0])
+        hip, knee, ankle = positions_of(root, place(root, joints, wanted))[1:4]
+        line = (ankle - hip) / np.linalg.norm(ankle - hip)
+        out = (knee - hip) - np.dot(knee - hip, line) * line
+        asides.append(np.degrees(np.arctan2(abs(out[0]), out[2])))
+    expected = np.degrees(np.arctan2(sines, np.maximum(1.0 - sines / 0.02, 0.0)))
+    np.testing.assert_allclose(asides, expected, atol=3.0)
 
 
 def test_a_leg_that_is_pulled_too_far_never_snaps():
@@ -160,6 +188,13 @@ def test_a_leg_that_is_pulled_too_far_never_snaps():
         joints_now = place(root, joints, toes + np.array([0.0, 0.0, away]))
         hip, _, ankle = positions_of(root, joints_now)[1:4]
         lengths.append(np.linalg.norm(ankle - hip))
+    # The approach to full stretch, in closed form.
+    hip, _, ankle = positions_of(root, joints)[1:4]
+    asked = np.linalg.norm(ankle + np.linspace([0] * 3, [0, 0, 1.0], 41) - hip, axis=1)
+    begin, rest = 0.87 - LOCK.softness, LOCK.softness
+    expected = begin + rest * (1.0 - np.exp(-(asked - begin) / rest))
+    expected = np.where(asked > begin, expected, asked)
+    np.testing.assert_allclose(lengths, expected, atol=3e-4)
     assert max(lengths) < 0.45 + 0.42
     assert np.all(np.diff(lengths) > -1e-4)
     assert np.abs(np.diff(lengths)).max() < 0.03
@@ -482,6 +517,27 @@ def test_a_skeleton_without_legs_is_refused(skeleton):
         foot_lock.legs(skeleton)
     with pytest.raises(ValueError, match="names no feet"):
         foot_lock.legs(dataclasses.replace(SKELETON, feet=()))
+
+
+def test_legs_begin_at_the_hips_whatever_is_above_them():
+    trunk = Skeleton(
+        offsets=jnp.zeros((10, 3)),
+        parents=(-1, 0, *(parent + 1 for parent in SKELETON.parents[1:])),
+        names=("Root", *NAMES),
+        feet=(5, 9),
+    )
+    assert foot_lock.legs(trunk) == ((2, 3, 4, 5), (6, 7, 8, 9))
+
+
+def test_feet_that_stand_close_together_stay_locked():
+    """Less than `crossing` apart, but no lock has brought them there."""
+    side = jnp.array([1.0, 0.0, 0.0])
+    state = foot_lock.init_lock(SKELETON)
+    for i in range(6):
+        # The model spreads them slowly by 1 mm a frame.
+        toes = jnp.array([[0.01 + 0.001 * i, 0.02, 0.0], [-0.01, 0.02, 0.0]])
+        state = foot_lock.step_lock(state, toes, fps=FPS, lock=LOCK, side=side)
+    assert bool(state.locked.all())
 
 
 def test_a_toe_that_swings_is_off_the_ground():

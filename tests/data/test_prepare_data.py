@@ -126,24 +126,13 @@ def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
         ({"manual_dir": None}, FileNotFoundError, "needs --manual-dir"),
         ({"out": tmp_path / "file" / "o.npz"}, OSError, "file"),
         ({"out": tmp_path}, IsADirectoryError, "is a folder"),
-        ({"fps": 0.0}, ValueError, "--fps"),
         ({"fps": 1e300}, ValueError, "--fps should be in 0.001..100000, found 1e.300"),
         ({"seed": -1}, ValueError, "--seed should be in 0..2"),
-        ({"scale": 0.0}, ValueError, "--scale should be above 0, found 0.0"),
-        ({"cut_fps": -1.0}, ValueError, "--cut-fps"),
     ]
     for change, error, message in cases:
         with pytest.raises(error, match=message):
             script.prepare(script.Config(**{**base, **change}))
     assert sorted(os.listdir(tmp_path)) == ["file", "raw"]
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_write_permission_is_an_error(script, raw, tmp_path):
-    (tmp_path / "locked").mkdir(mode=0o500)
-    out = tmp_path / "locked" / "o.npz"
-    with pytest.raises(PermissionError):
-        script.prepare(script.Config(source="bandai_namco/2", manual_dir=raw, out=out))
 
 
 # Larger files than allowed stand for a full disk.
@@ -162,14 +151,6 @@ def run_full(*arguments) -> tuple[int, str]:
     done = subprocess.run(line, capture_output=True, text=True, check=False)
     assert "Traceback" not in done.stderr
     return done.returncode, done.stderr[done.stderr.rindex("error: ") :].strip()
-
-
-@pytest.mark.slow
-def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path):
-    out = tmp_path / "made" / "w.npz"
-    status, line = run_full("procedural", "--out", out)
-    assert (status, line) == (1, f"error: [Errno 27] File too large: '{out}'")
-    assert os.listdir(out.parent) == []
 
 
 @pytest.mark.slow

@@ -142,14 +142,9 @@ def test_missing_damaged_and_foreign_files_are_named(saved, tmp_path):
     np.savez(tmp_path / "other.npz", weights=np.zeros(3))
     with pytest.raises(ValueError, match="other.npz: not a text motions.*weights"):
         load(tmp_path / "other.npz")
-    np.savez(tmp_path / "p.npz", x=np.array([{}], dtype=object))
-    with pytest.raises(ValueError, match="p.npz: not a text motions file, or a dam"):
-        load(tmp_path / "p.npz")
-    whole = saved.read_bytes()
-    for cut in (0, 10, len(whole) // 2, len(whole) - 30):
-        saved.write_bytes(whole[:cut])
-        with pytest.raises(ValueError, match="m.npz: not a text motions file, or a"):
-            load(saved)
+    saved.write_bytes(saved.read_bytes()[:-30])
+    with pytest.raises(ValueError, match="m.npz: not a text motions file, or a"):
+        load(saved)
 
 
 FIELDS = {

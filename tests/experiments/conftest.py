@@ -5,7 +5,12 @@ import re
 import sys
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
+
+import jaxmotion as jm
+from jaxmotion.control import steering
 
 FOLDER = Path(__file__).parents[2] / "experiments"
 
@@ -43,3 +48,17 @@ def help_of(invoke, capsys):
         return re.sub(r"[│\s]+", " ", capsys.readouterr().out)
 
     return read
+
+
+def check_face_steers(run):
+    """A run loaded twice and steered with other values is one program."""
+    found = []
+    for seed in range(2):
+        model = jm.load(run)
+        states = model.start(2, seed=seed)
+        commands = jm.commands("forward", model, 2, seconds=0.1, speed=0.5 + seed)
+        found.append(jm.rollout(model, jax.random.key(seed), states, commands))
+        counted = counted if seed else steering._rollouts._cache_size()
+    assert steering._rollouts._cache_size() == counted
+    assert np.isfinite(np.asarray(found[1].root_position)).all()
+    assert np.abs(found[0].root_position - found[1].root_position).max() > 1e-4

@@ -5,19 +5,16 @@ import json
 import re
 import runpy
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
 
-import jaxmotion as jm
-from jaxmotion.control import steering
 from jaxmotion.data import bvh_text, clips_io, procedural
 from jaxmotion.learning import checkpoint
+from tests.experiments.conftest import check_face_steers
 
 ROOT = Path(__file__).parents[2]
 SCRIPT = ROOT / "experiments" / "aamdm.py"
@@ -200,18 +197,15 @@ BAD = [
         "train --data {data} --out {run} {settings} --polisher-steps 5",
         "polisher: has 10 steps, expected at most the 5 to train",
     ),
-    ("evaluate --run {empty}", "{empty}"),
     ("evaluate --run {gone}", "{gone}"),
     ("evaluate --run {begun}", "{begun}: no row was trained to its end"),
     ("evaluate --run {run} --rows amdm6", "unknown row 'amdm6'"),
     ("evaluate --run {run} --rows mvae", "mvae"),
     ("evaluate --run {run} --out {file}/below", "plain/below"),
     ("evaluate --run {run} --seconds 60 --rows lmm", "3600 frames of a window"),
-    ("rollout --run {empty}", "{empty}"),
     ("rollout --run {run} --row amdm6", "unknown row 'amdm6'"),
     ("rollout --run {run} --row mvae", "full_pose.*no checkpoint"),
     ("rollout --run {run} --row polish1_draft3", "T4.*no checkpoint"),
-    ("rollout --run {run} --seconds 0", "--seconds is 0.0, expected"),
 ]
 
 
@@ -246,21 +240,6 @@ def test_what_is_wrong_is_said_in_one_line(
     assert losses(trained) == before
 
 
-def run(line):
-    command = [sys.executable, str(SCRIPT), *line.split()]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-
-
 @pytest.mark.slow
 def test_a_run_is_steered_by_the_face(trained):
-    """Loaded twice, steered with other values: one program."""
-    found = []
-    for seed in range(2):
-        model = jm.load(trained)
-        states = model.start(2, seed=seed)
-        commands = jm.commands("forward", model, 2, seconds=0.1, speed=0.5 + seed)
-        found.append(jm.rollout(model, jax.random.key(seed), states, commands))
-        counted = counted if seed else steering._rollouts._cache_size()
-    assert steering._rollouts._cache_size() == counted
-    assert np.isfinite(np.asarray(found[1].root_position)).all()
-    assert np.abs(found[0].root_position - found[1].root_position).max() > 1e-4
+    check_face_steers(trained)

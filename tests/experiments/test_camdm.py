@@ -384,7 +384,6 @@ BAD = [
         "run: expected a model .*config.depth is 1, given 2",
     ),
     ("train --data {data} --out {out} --devices 64", ValueError, "devices is 64, "),
-    ("train --data {data} --out {out} --held-out 2", ValueError, "--held-out is 2.0"),
     (
         "distill --run {run} --out {out}",
         ValueError,
@@ -393,19 +392,14 @@ BAD = [
     ("distill --run {gone} --out {out}", OSError, "gone"),
     ("distill --run {run} --out {file}/below --visit 2", OSError, "plain/below"),
     ("distill --run {run} --out {run} --visit 2", ValueError, "other data; use anoth"),
-    ("distill --run {run} --out {out} --visit 0", ValueError, "--visit is 0, expec"),
     ("export --run {run} --out {empty}", OSError, "empty is a folder"),
-    ("export --run {empty} --out {out}", OSError, "empty"),
-    ("evaluate --run {gone}", OSError, "gone"),
     ("rollout --run {empty} --style neutral", OSError, "empty"),
     ("rollout --run {run} --style sad", ValueError, "the model has neutral, zombie"),
     ("rollout --run {run} --style zombie --to-style sad", ValueError, "label 'sad'"),
     ("rollout --run {run} --style zombie --data {gone}", OSError, "gone"),
     ("rollout --run {run} --style zombie --out {file}/below", OSError, "plain/below"),
-    ("rollout --run {run} --style zombie --seconds 0", ValueError, "--seconds is 0.0"),
     ("evaluate --run {empty}", OSError, "empty"),
     ("evaluate --run {run} --seconds 2", ValueError, "too short to measure"),
-    ("evaluate --run {run} --data {gone}", OSError, "gone"),
 ]
 
 
@@ -442,29 +436,10 @@ def test_an_unknown_course_lists_the_known_ones(call, trained, capsys):
         assert word in text.out + text.err
 
 
-def run(line):
-    command = [sys.executable, str(SCRIPT), *line.split()]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-
-
 def test_from_a_shell_an_error_is_one_line(tmp_path):
-    done = run(f"train --data {tmp_path}/gone.npz --out {tmp_path}/out")
+    line = f"train --data {tmp_path}/gone.npz --out {tmp_path}/out"
+    command = [sys.executable, str(SCRIPT), *line.split()]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 1
     assert done.stderr.strip().splitlines()[-1].startswith("error: ")
     assert "gone.npz" in done.stderr and "Traceback" not in done.stderr
-
-
-@pytest.mark.slow
-def test_from_a_shell_train_resume_evaluate_and_roll_out(data, tmp_path):
-    folder = tmp_path / "run"
-    for line in (
-        f"train --data {data} --out {folder} {SIZES} --steps 2",
-        f"train --data {data} --out {folder} {SIZES} --steps 4 --override",
-        f"evaluate --run {folder} --rollouts 8 --seconds 6 --evaluator-steps 30",
-        f"rollout --run {folder} --style zombie --seconds 3",
-    ):
-        done = run(line)
-        assert done.returncode == 0, done.stderr
-    assert checkpoint.latest_step(folder / "motion" / "checkpoints") == 4
-    check_evaluation(folder / "evaluation", 8)
-    check_rollout(folder / "rollout", 3.0)

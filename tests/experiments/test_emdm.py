@@ -93,19 +93,6 @@ def test_actions_are_scored_beside_real_motions(call, actions):
 
 
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_scores(call, actions, tmp_path):
-    for name in ("a", "b"):
-        call(
-            f"evaluate --run {actions} --samples 40 --replications 2 --rows emdm "
-            f"--evaluator-steps 20 --out {tmp_path / name}"
-        )
-    first, second = (rows_of(tmp_path / name)["rows"] for name in "ab")
-    for row in ("real (held-out clips)", "emdm"):
-        for column in ("fid", "accuracy", "diversity", "multimodality"):
-            assert first[row][column] == second[row][column]
-
-
-@pytest.mark.slow
 def test_samples_of_actions_are_motions(call, actions, tmp_path):
     call(f"sample --run {actions} --action run walk --frames 12 --out {tmp_path}")
     for name in ("run", "walk"):
@@ -180,7 +167,6 @@ def test_what_was_held_out_is_not_trained_on(texts):
 BAD = {
     "sample --run {actions} --action jump": "unknown action 'jump'",
     "sample --run {actions} --action run --frames 21": "21 frames, the model makes",
-    "sample --run {actions} --action run --frames 0": "--frames is 0, expected a",
     "sample --run {actions} --text walk": "not from 'text'",
     "sample --run {actions}": "expected --action",
     "sample --run {texts} --text TEXT:": "empty",
@@ -199,7 +185,6 @@ BAD = {
     "train --task text --data {data} --out {new} --encoder nowhere": "'nowhere'",
     "train --task text --data {data} --out {new} --unseen walk/x": "'walk/x'",
     "train --out {new} --rows ddim_10": "samples 'ddpm_1000'",
-    "train --out {new} --rows": "--rows is empty, expected names",
     "train --task text --data {data} --out {new} --encoder hashed --text-form "
     "released": "text form is 'released'.*encoder is 'hashed'",
     "evaluate --run {texts} --matcher finest.tar": (

@@ -57,14 +57,7 @@ def shown(text):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "action",
-        "style",
-        "ball",
-    ],
-)
+@pytest.mark.parametrize("kind", TRAIN)
 def test_training_writes_a_file_and_prints_its_fingerprint(
     invoke, frozen, capsys, kind
 ):
@@ -85,8 +78,6 @@ BAD = {
     "train --data {clips} --out {new} --label mood": "field 'mood'",
     "train --data {clips} {clips} --out {new}": "data has 2 files, expected one",
     "train --data {clips} --out {new} --frames 30": "--frames is not for kind 'style'",
-    "train --data {clips} --out {new} --held-out 1.5": "--held-out is 1.5",
-    "train --data {clips} --out {new} --updates 0": "--updates is 0, expected",
     "train --data {clips} --out {clips}": "clips.npz exists; --overwrite",
     "train --data {clips} --out {clips}/below/e.npz": "below",
     "train --kind action --data {clips} --out {new}": "content",

@@ -632,11 +632,6 @@ def test_other_addresses_are_warned_of(script, monkeypatch, capsys, host, local)
     assert ("no authentication" in capsys.readouterr().err) is not local
 
 
-def test_at_least_one_client(script):
-    with pytest.raises(ValueError, match="--max-clients is 0"):
-        script.serve(script.Config(max_clients=0))
-
-
 def test_an_address_is_tried_before_anything_is_loaded(script, monkeypatch):
     monkeypatch.setattr(script, "load", None)
     with pytest.raises(ValueError, match="--port is 70000, expected .* 65535"):

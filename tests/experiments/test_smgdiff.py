@@ -3,16 +3,14 @@
 import json
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
 
-import jaxmotion as jm
-from jaxmotion.control import steering
 from jaxmotion.data import bvh_text, clips_io
 from jaxmotion.data.ball_clips import load_ball_clips, save_ball_clips
 from tests import ball_walker
+from tests.experiments.conftest import check_face_steers
 
 ROOT = Path(__file__).parents[2]
 SIZES = (
@@ -149,14 +147,4 @@ def test_bad_input_is_one_clear_error(invoke, trained, data, tmp_path, line):
 
 @pytest.mark.slow
 def test_a_run_is_steered_by_the_face(trained):
-    """Loaded twice, steered with other values: one program."""
-    found = []
-    for seed in range(2):
-        model = jm.load(trained)
-        states = model.start(2, seed=seed)
-        commands = jm.commands("forward", model, 2, seconds=0.1, speed=0.5 + seed)
-        found.append(jm.rollout(model, jax.random.key(seed), states, commands))
-        counted = counted if seed else steering._rollouts._cache_size()
-    assert steering._rollouts._cache_size() == counted
-    assert np.isfinite(np.asarray(found[1].root_position)).all()
-    assert np.abs(found[0].root_position - found[1].root_position).max() > 1e-4
+    check_face_steers(trained)

@@ -142,20 +142,11 @@ def test_damaged_and_foreign_caches_are_named(cached):
     def read():
         encoder.encode_unique(Counting().encoder, TEXTS, cache=cached)
 
-    whole = cached.read_bytes()
-    for cut in (0, 10, len(whole) // 2, len(whole) - 30):
-        cached.write_bytes(whole[:cut])
-        with pytest.raises(ValueError, match="texts.npz: not a text vector file"):
-            read()
-    with open(cached, "wb") as file:
-        np.save(file, np.zeros(3))
+    cached.write_bytes(cached.read_bytes()[:-30])
     with pytest.raises(ValueError, match="texts.npz: not a text vector file"):
         read()
     np.savez(cached, weights=np.zeros(3))
     with pytest.raises(ValueError, match="texts.npz: not a text vector.*header"):
-        read()
-    np.savez(cached, header=np.array([{}], object), vectors=np.zeros(3))  # a pickle
-    with pytest.raises(ValueError, match="texts.npz: not a text vector file"):
         read()
 
 

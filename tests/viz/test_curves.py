@@ -1,5 +1,8 @@
+import dataclasses
+
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from jaxmotion.viz import plots
@@ -54,3 +57,18 @@ def test_an_unwritable_file_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=r"a\.png"):
         plots.write_curves(tmp_path / "file" / "a.png", (panel(True),), title="")
+
+
+@pytest.mark.parametrize(("number", "within"), [(3, True), (14, False)])
+def test_many_names_stand_below_their_curves(tmp_path, monkeypatch, number, within):
+    made = []
+    keep = lambda *args, **options: made.append(Figure(*args, **options)) or made[-1]  # noqa: E731
+    monkeypatch.setattr(plots, "Figure", keep)
+    (line,) = panel(False).lines.values()
+    lines = {f"a row with a name {i}": line for i in range(number)}
+    full = dataclasses.replace(panel(False), lines=lines)
+    plots.write_curves(tmp_path / "a.png", (full, panel(False)), title="t")
+    axes = made[0].axes[0]
+    names, box = axes.get_legend().get_window_extent(), axes.get_window_extent()
+    assert bool(box.overlaps(names)) == within
+    assert names.y0 > 0 and box.height > 150

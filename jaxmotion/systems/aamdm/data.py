@@ -55,7 +55,6 @@ def balanced_starts(
     the first third of a second and over the last of the second ahead, and the turn of
     the facing. The power is that of `windows.repeat_rare`; 0 lists each once, as
     `starts`.
-
     """
     first = np.asarray(starts(data, length))
     if not power:

@@ -235,7 +235,6 @@ def sampler(
     -> next`: with an objective of the predicted frame so many steps at the chain's end
     are guided down its gradient, by default all (eq. 13). `noise` is that of the
     posteriors, [T, features], for steps that take one.
-
     """
     check_change(config, change)
     table, net = config.table(), network(config)

@@ -114,6 +114,10 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
     )
 
 
+# What has no parameters. Attention to a prefix alone is soon learned anew.
+_FREE = ("attention", "noise_levels", "own_levels", "seam_half_life")
+
+
 def continued(model: Model, path: Path) -> tuple[Model, Params]:
     """A run's or exported model's averaged parameters, to be trained as this model.
 
@@ -121,27 +125,18 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
     names skeleton, styles or sizes that differ.
     """
     first, params = load(path)
-    # What has no parameters. Attention to a prefix alone is soon learned anew.
-    weights = {
-        name: value
-        for name, value in dataclasses.asdict(model.config).items()
-        if name.startswith("weight_")
-        or name in ("attention", "noise_levels", "own_levels", "seam_half_life")
-    }
+    source = dict(source="")
+    model_json.check_start(
+        path,
+        to_json(first) | source,
+        to_json(model) | source,
+        free=(*_FREE, "rotation_mean"),
+    )
     # The mean rotation is part of what the network has learned.
     mean = first.config.rotation_mean
-    wanted = dataclasses.replace(model.config, rotation_mean=mean)
-    found = dataclasses.replace(
-        first, config=dataclasses.replace(first.config, **weights)
-    )
-    expected = to_json(dataclasses.replace(model, config=wanted, source=first.source))
-    differ = model_json.differences(to_json(found), expected)
-    if differ:
-        raise ValueError(
-            f"{path}: expected a model with the skeleton, labels and config of the one "
-            f"to train: {differ}"
-        )
-    return dataclasses.replace(found, source=model.source, steps=model.steps), params
+    config = dataclasses.replace(model.config, rotation_mean=mean)
+    own = dict(config=config, source=model.source, steps=model.steps)
+    return dataclasses.replace(first, **own), params
 
 
 def window_sampler(

@@ -134,19 +134,8 @@ def start_of(path: Path, model: Model, *, row: str = "emdm") -> Params:
     A `ValueError` names sizes, skeleton, labels or units of features that differ.
     """
     first, params = load(path, row=row)
-
-    def part(model: Model) -> dict[str, Any]:
-        value = to_json(dataclasses.replace(model, source=""))
-        value["config"] = {
-            name: found
-            for name, found in value["config"].items()
-            if not name.startswith(("weight_", "discriminator_")) and name not in _FREE
-        }
-        return value
-
-    differ = model_json.differences(part(first), part(model))
-    if differ:
-        raise ValueError(f"{path}: expected a model like the one to train: {differ}")
+    found, wanted = (to_json(dataclasses.replace(x, source="")) for x in (first, model))
+    model_json.check_start(path, found, wanted, free=("discriminator_", *_FREE))
     return params
 
 

@@ -100,19 +100,11 @@ def continued(model: Model, path: Path) -> tuple[Model, dict[str, Params]]:
 
     def part(model: Model) -> dict[str, Any]:
         value = smgdiff_model.to_json(model)
-        for name in ("config", "paths"):
-            value[name] = {
-                field: found
-                for field, found in value[name].items()
-                if not field.startswith("weight_") and field not in _FREE
-            }
         features = ("skeleton", "joints", "fps")
         value["representation"] = {k: value["representation"][k] for k in features}
         return {k: value[k] for k in ("config", "paths", "representation", "labels")}
 
-    differ = model_json.differences(part(first), part(model))
-    if differ:
-        raise ValueError(f"{path}: expected a model like the one to train: {differ}")
+    model_json.check_start(path, part(first), part(model), free=_FREE)
     return dataclasses.replace(model, representation=first.representation), params
 
 
