@@ -427,6 +427,12 @@ def test_a_clip_is_cleaned():
     toes = tiny.positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
     speed = np.linalg.norm(np.diff(toes, axis=0), axis=-1) * FPS
     assert speed.max() < 0.005
+    # What goes backward at 2 m/s swings: it keeps clear of the ground.
+    fast = tiny.positions(
+        SKELETON, foot_lock.clean_motion(SKELETON, drift(-2.0), lock=LOCK)
+    )
+    heights = np.asarray(fast)[:-1, np.array(SKELETON.feet), 1]
+    assert heights.min() > LOCK.toe_height + LOCK.clearance - 2e-3
 
 
 def test_a_samplers_motions_are_cleaned():
@@ -446,7 +452,7 @@ def test_a_samplers_motions_are_cleaned():
         method=method,
     )
     draw = functools.partial(sampling.sample_motions, labels=np.zeros(2, int), chunk=2)
-    found = draw(foot_lock.clean_sampler(plain, LOCK), jax.random.key(0))
+    found = draw(foot_lock.clean_sampler(plain), jax.random.key(0))
     want = foot_lock.clean_motion(SKELETON, motion, lock=LOCK)
     for one in (found[0], found[1]):
         np.testing.assert_allclose(one.joint_rotation, want.joint_rotation, atol=1e-5)
@@ -512,6 +518,31 @@ def test_a_character_is_displayed_with_locked_feet_by_one_program():
     assert len(traces) == 2
 
 
+def test_the_lock_of_a_tuned_character_can_be_switched():
+    tuning = steering.Tuning(
+        method=lambda num_steps, scale: lambda params: (num_steps, scale, params),
+        num_steps=(2, 4),
+        own_steps=4,
+        scale=1.0,
+        scales=(0.0, 2.0),
+        patience=3,
+    )
+    plain = steering.Character(
+        skeleton=SKELETON,
+        labels=(),
+        fps=FPS,
+        source="tests",
+        params={},
+        method=lambda params: None,
+        tuning=tuning,
+        starts=lambda labels, seed: None,
+    )
+    found = foot_lock.lock_feet(plain).tuning
+    assert found.lockable and not tuning.lockable and found.num_steps == (2, 4)
+    method = found.method(2, 0.5, locks=False)
+    assert method.enabled is False and method.method("p") == (2, 0.5, "p")
+
+
 def test_a_skeleton_without_legs_is_refused(skeleton):
     with pytest.raises(ValueError, match="expected hip, knee and ankle"):
         foot_lock.legs(skeleton)
@@ -529,15 +560,32 @@ def test_legs_begin_at_the_hips_whatever_is_above_them():
     assert foot_lock.legs(trunk) == ((2, 3, 4, 5), (6, 7, 8, 9))
 
 
+def test_a_body_that_turns_over_its_feet_does_not_cross_them():
+    angles = np.linspace(0.0, np.deg2rad(120.0), 90)
+    c, s, o = np.cos(angles), np.sin(angles), 0 * angles
+    turned = np.tile(np.asarray(pose()), (90, 1, 1))
+    turned[:, 0] = np.stack([c, o, -s, o, 1 + o, o], axis=1)
+    motion = Motion(
+        root_position=jnp.tile(jnp.asarray(stood()), (90, 1)),
+        joint_rotation=jnp.asarray(turned),
+        fps=FPS,
+    )
+    found = tiny.positions(SKELETON, lock_motion(SKELETON, motion, lock=LOCK))
+    side = np.stack([c, o, -s], axis=1)
+    gap = np.sum((np.asarray(found[:, 4]) - np.asarray(found[:, 8])) * side, axis=-1)
+    assert gap.min() > 0.02  # -0.02 without the rule
+
+
 def test_feet_that_stand_close_together_stay_locked():
     """Less than `crossing` apart, but no lock has brought them there."""
     side = jnp.array([1.0, 0.0, 0.0])
-    state = foot_lock.init_lock(SKELETON)
-    for i in range(6):
-        # The model spreads them slowly by 1 mm a frame.
-        toes = jnp.array([[0.01 + 0.001 * i, 0.02, 0.0], [-0.01, 0.02, 0.0]])
+    state, locked = foot_lock.init_lock(SKELETON), []
+    for i in range(30):
+        # The model spreads them slowly, from 25 to 51 mm.
+        toes = jnp.array([[0.015 + 0.0009 * i, 0.02, 0.0], [-0.01, 0.02, 0.0]])
         state = foot_lock.step_lock(state, toes, fps=FPS, lock=LOCK, side=side)
-    assert bool(state.locked.all())
+        locked.append(state.locked)
+    assert np.all(locked[1:])
 
 
 def test_a_toe_that_swings_is_off_the_ground():
