@@ -21,6 +21,8 @@ from jaxmotion.diffusion.noise import loop_parts, one_equation
 from jaxmotion.export.graph import Batch, Graph, Port
 
 SUFFIX = ".onnx"
+# Of operations; nothing newer is used, and older runtimes, which are smaller, read it.
+OPSET = 21
 # What becomes of a row and what comes to it.
 _CHANGES = {
     "scatter": lambda old, new: new,
@@ -122,6 +124,7 @@ def _converted(graph: Graph, *, inner: bool) -> Any:
                 lambda *arrays: _forward(traced, list(arrays)),
                 structs,
                 model_name=graph.name,
+                opset=OPSET,
                 input_names=[own + port.name for port in graph.inputs],
             )
     except Exception as error:  # whatever the converter raises for what it lacks

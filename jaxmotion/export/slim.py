@@ -22,13 +22,14 @@ LEAST_BYTES = 1024
 class Weights:
     """Constants that several graphs share; each is kept once.
 
-    The packed file has the others first, then the upper bytes of all 16-bit floats,
-    then their lower bytes: sign and exponent repeat themselves, the rest is noise.
+    They are packed as two files: the others followed by the upper bytes of all 16-bit
+    floats, whose signs and exponents repeat themselves, and the lower bytes, which are
+    almost noise.
 
     Attributes:
       name: Name of the file, by which the graphs refer to it.
       parts: In the order of the file that the graphs refer to: whether it is packed as
-        16-bit floats, which are 32-bit ones there, and its bytes in the packed file.
+        16-bit floats, which are 32-bit ones there, and its bytes as it is packed.
     """
 
     def __init__(self, name: str) -> None:
@@ -62,10 +63,10 @@ class Weights:
         """The file that the graphs refer to."""
         return bytes(self._whole)
 
-    def packed(self) -> bytes:
-        """The file that is written; `parts` say how to unpack it."""
+    def packed(self) -> tuple[bytes, bytes]:
+        """The two files that are written; `parts` say how to unpack them."""
         planes = np.concatenate([np.zeros((0, 2), np.uint8), *self._halves])
-        return bytes(self._others) + planes[:, 1].tobytes() + planes[:, 0].tobytes()
+        return bytes(self._others) + planes[:, 1].tobytes(), planes[:, 0].tobytes()
 
 
 def slim(model: bytes, weights: Weights, *, half: bool = False) -> bytes:

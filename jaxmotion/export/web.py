@@ -1,8 +1,10 @@
 """A folder of static files: the page on which characters walk in any browser.
 
     index.html, page.js, worker.js, ort.wasm.packed, models.json
-    <model>/character.bin.packed   skeleton, skinned mesh, starts, names of all arrays
-    <model>/weights.bin.packed     constants that its graphs share
+    body.<digest>.bin.packed       skeleton and skinned mesh; models share it
+    <model>/character.bin.packed   skeleton, starts, names of all arrays
+    <model>/weights.bin.packed     constants that its graphs share, but for the lower
+    <model>/fine.bin.packed        bytes of 16-bit floats, and those
     <model>/<graph>.onnx.packed, <graph>.crowd.onnx.packed    for one character, and for
                                    several at once, of whom a crowd is made
 
@@ -35,7 +37,7 @@ from jaxmotion.typing import Exported
 from jaxmotion.viz import packed
 
 SOURCES = Path(packed.__file__).with_name("web")
-WEIGHTS = "weights.bin"
+WEIGHTS, FINE = "weights.bin", "fine.bin"
 PACKED = ".packed"
 LIST = "models.json"
 # Characters of a crowd that one call moves, and for whom one call plans: a plan's time
@@ -105,6 +107,7 @@ def write_character(
     """Writes a character's files; returns their paths.
 
     Args:
+      folder: Its own; its body's file comes beside it, unless it is there.
       name: What the page calls it.
       character: A `control.steering.Character` with tuning.
       command: Of one tick; only its shapes matter.
@@ -166,16 +169,22 @@ def write_character(
         "patience": character.tuning.patience,
         "plan": _arrays(names, ".plan.", cursor=True),
         "past": _arrays(names, ".past."),
-        "weights": {"file": WEIGHTS, "parts": weights.parts},
+        "weights": {"files": [WEIGHTS, FINE], "parts": weights.parts},
     }
     poses = None
     if about["past"]:
         poses = starts[about["past"]["rotation"]]
         poses = poses.reshape(-1, *poses.shape[-2:])
-    about["wear"] = _wear(character.skeleton, poses)
-    arrays = starts | packed.body_arrays(character.skeleton, poses)
-    written.append(_write(folder / WEIGHTS, weights.packed(), say))
-    content = packed.pack(about, arrays)
+    body = {"skeleton": about["skeleton"], "wear": _wear(character.skeleton, poses)}
+    content = packed.pack(body, packed.body_arrays(character.skeleton, poses))
+    about["body"] = f"body.{hashlib.sha256(content).hexdigest()[:8]}.bin"
+    path = folder.parent / (about["body"] + PACKED)
+    written.append(path)
+    if not path.exists():
+        _write(folder.parent / about["body"], content, say)
+    for file, content in zip((WEIGHTS, FINE), weights.packed(), strict=True):
+        written.append(_write(folder / file, content, say))
+    content = packed.pack(about, starts)
     return [*written, _write(folder / "character.bin", content, say)]
 
 
@@ -205,14 +214,14 @@ def _arrays(names: list[str], part: str, **more: bool) -> dict[str, str] | None:
 
 
 def pack(content: bytes) -> bytes:
-    """As gzip, or as LZMA where that is a tenth smaller: weights are not."""
+    """As gzip, or as LZMA where that is a little smaller: it takes longer to unpack."""
     # No time of day in it: the same content is the same file.
     plain = gzip.compress(content, 9, mtime=0)
     chain = [{"id": lzma.FILTER_LZMA1, "preset": 9 | lzma.PRESET_EXTREME}]
     small = lzma.compress(content, format=lzma.FORMAT_ALONE, filters=chain)
     # The page wants the size, which Python leaves open.
     small = small[:5] + len(content).to_bytes(8, "little") + small[13:]
-    return small if len(small) < 0.9 * len(plain) else plain
+    return small if len(small) < 0.98 * len(plain) else plain
 
 
 def _write(path: Path, content: bytes, say: Callable[[str], None]) -> Path:
@@ -259,12 +268,16 @@ def write_page(
     """
     place = packages(cache)
     folder.mkdir(parents=True, exist_ok=True)
+    runtime = place / "node_modules/onnxruntime-web/dist/ort-wasm-simd-threaded.wasm"
     with tempfile.TemporaryDirectory(dir=place) as build:
         for path in SOURCES.iterdir():
             if path.suffix in (".js", ".html"):
                 shutil.copyfile(path, Path(build) / path.name)
+        shutil.copyfile(runtime.with_suffix(".mjs"), Path(build) / "loader.mjs")
         for source, made in (("local.js", "page.js"), ("worker.js", "worker.js")):
             options = ["--bundle", "--minify", "--format=esm", "--target=es2022"]
+            # Of Node, if the runtime finds itself there.
+            options += ["--external:module", "--external:worker_threads"]
             bundler = str(place / "node_modules" / ".bin" / "esbuild")
             out = [f"--outfile={made}.out", "--log-level=error"]
             _run([bundler, source, *options, *out], Path(build))
@@ -273,7 +286,6 @@ def write_page(
     written = [folder / made for made in ("index.html", "page.js", "worker.js")]
     for path in written:
         say(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
-    runtime = place / "node_modules/onnxruntime-web/dist/ort-wasm-simd-threaded.wasm"
     return [*written, _write(folder / "ort.wasm", runtime.read_bytes(), say)]
 
 
@@ -313,7 +325,7 @@ def finish(folder: Path, models: list[str], written: list[Path]) -> None:
         path.unlink()
         if path.parent != folder and not any(path.parent.iterdir()):
             path.parent.rmdir()
-    names = sorted(path.relative_to(folder).as_posix() for path in written)
+    names = sorted({path.relative_to(folder).as_posix() for path in written})
     listed = {"models": models, "files": names}
     files.write_text(folder / LIST, json.dumps(listed, indent=1) + "\n")
 

@@ -228,7 +228,8 @@ def test_slim_graphs_are_what_they_were():
     one = graph.make("run", Exported(run, ("x",), ("y", "path")), {"x": jnp.ones(40)})
     content, weights = onnx.content(one), slim.Weights("weights.bin")
     small = slim.slim(content, weights)
-    assert len(weights.packed()) == 40 * 40 * (2 + 4) and len(small) < 10_000
+    size = lambda: sum(map(len, weights.packed()))  # noqa: E731
+    assert size() == 40 * 40 * (2 + 4) and len(small) < 10_000
     assert sorted(weights.parts) == [(False, 6400), (True, 3200)]
     options = runtime.SessionOptions()
     options.add_external_initializers_from_files_in_memory(
@@ -240,24 +241,28 @@ def test_slim_graphs_are_what_they_were():
         np.testing.assert_allclose(a, b, atol=1e-5)
     # The same constant of another graph is not kept twice.
     slim.slim(content, weights)
-    assert len(weights.packed()) == 40 * 40 * (2 + 4)
+    assert size() == 40 * 40 * (2 + 4)
 
 
 @NODE
 @pytest.mark.slow
 def test_a_character_plays_in_the_browsers_runtime(packages, tmp_path):
     """One without a network, with a damaged, a missing and an unknown part as well."""
-    character = strider(ball=True)[0]
-    web.write_character(tmp_path, "strider", character, tick(character), steps=(2,))
-    said = plays_as_jax_does(packages, tmp_path, character, locks=False)
+    character, folder = strider(ball=True)[0], tmp_path / "strider"
+    web.write_character(folder, "strider", character, tick(character), steps=(2,))
+    said = plays_as_jax_does(packages, folder, character, locks=False)
     assert said["graphs"] == ["plan_level", "plan@2", "advance", "plan@8"]
-    moves_a_crowd_as_one_by_one(packages, tmp_path, character, locks=False)
-    path = tmp_path / "advance.onnx.packed"
+    # Another model of this skeleton adds no body.
+    (body,) = tmp_path.glob("body.*")
+    more = web.write_character(tmp_path / "b", "b", character, tick(character))
+    assert body in more and [body] == [*tmp_path.glob("body.*")]
+    moves_a_crowd_as_one_by_one(packages, folder, character, locks=False)
+    path = folder / "advance.onnx.packed"
     path.write_bytes(web.pack(lzma.decompress(path.read_bytes())[:-400]))
-    error = play(packages, tmp_path)["error"]
+    error = play(packages, folder)["error"]
     assert error.startswith("character/advance.onnx is no graph") and "\n" not in error
     path.unlink()
-    assert "advance.onnx" in play(packages, tmp_path)["error"]
+    assert "advance.onnx" in play(packages, folder)["error"]
 
 
 @NODE
@@ -265,10 +270,10 @@ def test_a_character_plays_in_the_browsers_runtime(packages, tmp_path):
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["locomotion", "locomotion_fast", "dribble"])
 def test_a_shipped_model_plays_as_in_jax(packages, tmp_path, name):
-    character = shipped(name)
-    web.write_character(tmp_path, name, character, tick(character))
-    plays_as_jax_does(packages, tmp_path, character, locks=True)
-    moves_a_crowd_as_one_by_one(packages, tmp_path, character, locks=True)
+    character, folder = shipped(name), tmp_path / name
+    web.write_character(folder, name, character, tick(character))
+    plays_as_jax_does(packages, folder, character, locks=True)
+    moves_a_crowd_as_one_by_one(packages, folder, character, locks=True)
 
 
 @NODE
@@ -286,9 +291,11 @@ def test_a_sampler_of_emdm_opens_in_the_browsers_runtime(packages, tmp_path):
         (tmp_path / f"{name}.onnx.packed").write_bytes(web.pack(small))
         graphs[name] = {"file": f"{name}.onnx", "inputs": [], "outputs": []}
     about = {"graphs": graphs, "runs": {1: list(graphs)}, "steps": [1]}
-    about |= {"weights": {"file": web.WEIGHTS, "parts": weights.parts}}
+    names = [web.WEIGHTS, web.FINE]
+    about |= {"weights": {"files": names, "parts": weights.parts}}
     content = web.packed.pack(about, {})
     (tmp_path / "character.bin.packed").write_bytes(web.pack(content))
-    (tmp_path / "weights.bin.packed").write_bytes(web.pack(weights.packed()))
+    for file, content in zip(names, weights.packed(), strict=True):
+        (tmp_path / f"{file}.packed").write_bytes(web.pack(content))
     said = play(packages, tmp_path, several=False)
     assert said["graphs"] == list(graphs) and "error" not in said

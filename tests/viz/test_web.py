@@ -208,13 +208,13 @@ def test_a_crowd_walks_the_same_on_several_cores():
         },
         "runs": {2: list(graphs)},
         "plan": None,
-        "weights": {"file": "weights", "parts": []},
+        "weights": {"files": ["weights", "fine"], "parts": []},
     }
     starts = {f"state.{x}": np.zeros((1, 1), np.float32) for x in ("age", "z")}
     kinds = {x: x.split("@")[0] for x in graphs}
     files = {name: kind.encode() for name, kind in kinds.items()}
     files |= {f"{name}.crowd": f"{kind}.crowd".encode() for name, kind in kinds.items()}
-    files |= {"character.bin": packed.pack(about, starts), "weights": b""}
+    files |= {"character.bin": packed.pack(about, starts), "weights": b"", "fine": b""}
     done = subprocess.run(
         ["node", str(Path(__file__).with_name("crowd.mjs")), str(WEB)],
         input=json.dumps({k: base64.b64encode(v).decode() for k, v in files.items()}),
@@ -226,6 +226,10 @@ def test_a_crowd_walks_the_same_on_several_cores():
     for way in ("together", "helped"):
         for one, other in zip(found["alone"], found[way], strict=True):
             np.testing.assert_allclose(one["roots"], other["roots"], atol=1e-6)
+    # Due every third tick; without time for plans, when none can wait any longer.
+    eager, late = found["plans"]
+    assert eager["plans"] == 5 * 26 and late["plans"] == 5 * 2
+    np.testing.assert_allclose(eager["roots"], late["roots"], atol=1e-6)
     # Nine are two calls of four and one of one; two are moved one by one.
     assert set(found["single"]["advance"]) == {1}
     several = found["several"]["advance"]
@@ -372,8 +376,8 @@ def test_half_precision_constants_are_widened():
     weights = slim.Weights("weights.bin")
     weights.add(others, half=False)
     weights.add(halves.astype(np.float32), half=True)
-    given = data(weights.packed())
-    calls = ({"bytes": given["base64"]}, weights.parts)
+    given = [{"bytes": data(part)["base64"]} for part in weights.packed()]
+    calls = (*given, weights.parts)
     (found,) = run("player.js", "widen", calls)
     assert base64.b64decode(found["base64"]) == weights.content()
 

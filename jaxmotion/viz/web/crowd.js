@@ -35,7 +35,7 @@ export class Crowd {
     for (const group of this.groups) group.resize(0);
   }
 
-  get planMs() { return Math.max(...this.groups.map(group => group.planMs)); }
+  get callMs() { return Math.max(...this.groups.map(group => group.callMs)); }
   get tickMs() { return Math.max(...this.groups.map(group => group.tickMs)); }
   // How many characters one core moves in real time.
   get each() {

@@ -4,7 +4,7 @@ import { Model } from "./player.js";
 
 export class Group {
   constructor(model) {
-    this.model = model; this.people = []; this.planMs = 30; this.tickMs = 4;
+    this.model = model; this.people = []; this.planMs = 30; this.tickMs = 4; this.planned = 1;
   }
 
   // So many people; who is there goes on, others start with a label.
@@ -27,6 +27,9 @@ export class Group {
     return 900 / fps / (this.tickMs / n + (patience ? this.planMs / patience : 0));
   }
 
+  // What the last call for plans took.
+  get callMs() { return this.planMs * this.planned; }
+
   // One tick of all.
   //   told: command and settings, as `Model.told` takes them, and the number of steps
   //   slack: milliseconds that plans may take before frames run out
@@ -41,7 +44,9 @@ export class Group {
       one.level = levels[i]; one.waited = levels[i] ? one.waited + 1 : 0;
       if (!one.level) one.told = command;
     });
-    // Who has waited longest comes first; who cannot wait any longer plans in any case.
+    // Who has waited longest comes first; who cannot wait any longer plans in any case,
+    // the others where there are frames enough to make meanwhile: so a slow device gets
+    // fewer plans, in real time.
     let asked = people.filter(one => one.level).sort((a, b) => b.waited - a.waited);
     const must = one => !one.told || one.waited > Math.max(patience - 2, 0);
     while (asked.length) {
@@ -49,19 +54,19 @@ export class Group {
       const most = model.share(model.planner(level, steps), same.length);
       const now = same.slice(0, most), hurry = now.some(must);
       asked = asked.filter(one => !now.includes(one));
-      const late = performance.now() - began + this.planMs * most > slack;
-      if (!hurry && (planned || people.length === 1) && late) continue;
+      if (!hurry && performance.now() - began + this.planMs * most > slack) continue;
       const from = performance.now();
       await model.plan(level, steps, now.map(one => one.state), now.map(() => command));
       this.planMs += 0.2 * ((performance.now() - from) / most - this.planMs);
+      this.planned = most;
       for (const one of now) { one.told = command; one.waited = 0; }
       planned += most;
     }
     const shown = await model.show(states, people.map(one => one.told || command), steps);
     if (!planned && people.length) this.tickMs += 0.2 * (performance.now() - began - this.tickMs);
-    const { planMs, tickMs, bears } = this;
+    const { callMs, tickMs, bears } = this;
     const rest = plan ? model.rest(people[0].state) : null;
-    return { shown, planned, rest, planMs, tickMs, bears };
+    return { shown, planned, rest, callMs, tickMs, bears };
   }
 }
 
@@ -70,7 +75,7 @@ export class Helper {
   // base: the page's address; model: whose files it reads here; binary: the runtime.
   constructor(base, model, binary) {
     this.model = model; this.asked = new Map(); this.count = 0;
-    Object.assign(this, { planMs: 0, tickMs: 0, bears: 0 });
+    Object.assign(this, { callMs: 0, tickMs: 0, bears: 0 });
     this.worker = new Worker(new URL("worker.js", base), { type: "module" });
     this.worker.onmessage = ({ data }) => this.hear(data);
     this.worker.onerror = event => {
@@ -102,8 +107,8 @@ export class Helper {
   prepare(steps, number = 1) { return this.call("prepare", steps, number); }
   resize(number, label) { return this.call("resize", number, label); }
   async next(tick) {
-    const made = await this.call("next", tick), { planMs, tickMs, bears } = made;
-    Object.assign(this, { planMs, tickMs, bears });
+    const made = await this.call("next", tick), { callMs, tickMs, bears } = made;
+    Object.assign(this, { callMs, tickMs, bears });
     return made;
   }
 

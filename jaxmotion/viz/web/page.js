@@ -55,6 +55,7 @@ export function start(source) {
   // body: the character's; drawn: what is shown, a dropped file or the body itself.
   let body = null, drawn = null, file = null, number = 0, told = "", trail = [], remembering = 0;
   let frame = null;  // shown: from, to, when it was due
+  const flat = new Figures();
   const due = [], history = [], arrivals = [], kept = [];
   const spent = window.spent = [];
   const say = message => source.say(message);
@@ -187,14 +188,20 @@ export function start(source) {
     mix(frame.from, frame.to, Math.min(1, (now - frame.time) * frame.to.fps / 1000));
 
   let before = performance.now(), lastPlot = 0, fitted = 0, world = null, people = null;
-  let rolled = [], finer = 1, pace = 0, since = 0;
-  // Fewer pixels where pictures come too slowly, more where they come easily.
+  let rolled = [], finer = 1, pace = 0, since = 0, rest = 0, ticks = 0;
+  // Fewer pixels where pictures come too slowly, more where they come easily. Where the
+  // cores draw, too, and frames come too slowly, fewer pictures: motion goes before them.
   function adapt(began, interval) {
     pace += 0.1 * (Math.min(interval, 500) - pace);
     if (began - since < 1500) return;
+    const least = scene.slow ? 0.7 : 0.5;  // pixels are little of what the cores do
+    if (pace > 45 + rest && finer > least) finer *= 0.8;
+    else if (pace < 20 + rest && finer < 1) finer = Math.min(1, 1.25 * finer);
+    const came = frame ? frame.to.tick - ticks : 0;
+    const late = scene.slow && came > 0 && came < 0.97 * (began - since) * frame.to.fps / 1000;
+    rest = late ? Math.min(rest + 30, 90) : Math.max(rest - 10, 0);
     since = began;
-    if (pace > 45 && finer > 0.5) finer *= 0.8;
-    else if (pace < 20 && finer < 1) finer = Math.min(1, 1.25 * finer);
+    if (frame) ticks = frame.to.tick;
   }
   function draw(now) {
     requestAnimationFrame(draw);
@@ -202,7 +209,7 @@ export function start(source) {
     input.readPad();
     advance(began);
     // A still picture is drawn once.
-    if (began - lastNews > 1000 && !due.length) return;
+    if (began - lastNews > 1000 && !due.length || now - before < rest) return;
     const seconds = Math.min(1, (now - before) / 1000);
     adapt(began, now - before); before = now;
     input.turn(seconds);
@@ -284,7 +291,7 @@ export function start(source) {
   }
 
   function figuresOf(pose) {
-    const made = new Figures(), { to } = frame, [x, , z] = pose.roots;
+    const made = flat.clear(), { to } = frame, [x, , z] = pose.roots;
     made.ribbon(trail, 0.035, ORANGE);
     const [vx, vz, fx, fz] = to.told, still = Math.hypot(vx, vz) < 0.02;
     if (to.path.length) {

@@ -26,20 +26,18 @@ const QUICK = 700;
 const KINDS = { float32: Float32Array, int32: Int32Array, bool: Uint8Array };
 const size = shape => shape.reduce((a, b) => a * b, 1);
 
-// Constants as the graphs refer to them, of a file of `jaxmotion.export.slim`: 16-bit
+// Constants as the graphs refer to them, of the files of `jaxmotion.export.slim`: 16-bit
 // floats become 32-bit ones, of which each begins at a multiple of four bytes, as the
-// others do.
-export function widen(packed, parts) {
+// others do. `packed` has the others and the floats' upper bytes, `fine` their lower ones.
+export function widen(packed, fine, parts) {
   const sizes = parts.map(([half, bytes]) => (half ? 2 * bytes : bytes));
   const sum = values => values.reduce((a, b) => a + b, 0);
   const made = new Uint8Array(sum(sizes)), wide = new Float32Array(made.buffer);
-  const halves = sum(parts.map(([half, bytes]) => (half ? bytes : 0))) / 2;
-  // Others, then the floats' upper bytes, then their lower ones.
-  let other = 0, upper = packed.length - 2 * halves, to = 0;
+  let other = 0, upper = packed.length - fine.length, lower = 0, to = 0;
   parts.forEach(([half, bytes], i) => {
     if (half)
-      for (let k = 0; k < bytes / 2; k++, upper++)
-        wide[to / 4 + k] = float(packed[upper] << 8 | packed[upper + halves]);
+      for (let k = 0; k < bytes / 2; k++)
+        wide[to / 4 + k] = float(packed[upper++] << 8 | fine[lower++]);
     else { made.set(packed.subarray(other, other + bytes), to); other += bytes; }
     to += sizes[i];
   });
@@ -65,8 +63,8 @@ export class Model {
   async open(name) {
     this.name = name;
     this.about = unpack((await this.read("character.bin")).buffer);
-    const { file, parts } = this.about.weights;
-    this.weights = widen(await this.read(file), parts);
+    const { files, parts } = this.about.weights;
+    this.weights = widen(...await Promise.all(files.map(this.read)), parts);
     return this;
   }
 
@@ -113,7 +111,7 @@ export class Model {
         executionProviders: ["wasm"], logSeverityLevel: 4,
         // It was optimized when it was written.
         graphOptimizationLevel: "disabled",
-        externalData: [{ path: this.about.weights.file, data: this.weights }],
+        externalData: [{ path: this.about.weights.files[0], data: this.weights }],
       });
     } catch (error) {
       throw new Error(`${this.name}/${file} is no graph that runs here: ${oneLine(error)}`);

@@ -7,6 +7,7 @@ import { Crowd } from "./crowd.js";
 import { Helper, help } from "./group.js";
 import { unpacked } from "./packing.js";
 import { Model } from "./player.js";
+import loader from "./loader.mjs";
 
 // Ticks to be ahead: at least so many, and never more.
 const LEAST = 2, MOST = 15, AHEAD = 30, MOST_CHARACTERS = 64, SPEEDS = [0.3, 4.0];
@@ -21,6 +22,12 @@ let base = "", crowd = null, model = null, single = 0, inputs = null, due = 0, b
 const nothing = { held: [], azimuth: 0, target: null };
 inputs = nothing;
 const opened = new Map();
+// Bodies lie beside the models' folders, since models share them.
+const bodies = kept(file => fetched(`${file}.packed`));
+// The runtime imports its own loader by an address; it is in this file already.
+globalThis.loader = loader;
+const source = new Blob(["export default globalThis.loader"], { type: "text/javascript" });
+ort.env.wasm.wasmPaths = { mjs: URL.createObjectURL(source) };
 // Groups of characters that there may be: the page draws on one of the cores.
 let most = Math.max((navigator.hardwareConcurrency || 2) - 1, 1);
 const helper = model => new Helper(base, model, ort.env.wasm.wasmBinary);
@@ -97,7 +104,7 @@ async function choose(name, wish = {}, runtime = null) {
   // Somebody stands there before anything can walk.
   const waiting = new Crowd(next, state);
   waiting.resize(state.characters);
-  postMessage({ body: await next.read("character.bin"), engine: state.engine });
+  postMessage({ body: await bodies(about.body), engine: state.engine });
   const standing = waiting.standing();
   if (standing) show(standing, performance.now());
   for (const name of about.runs[state.num_steps])  // all at once, not one by one
@@ -200,7 +207,7 @@ async function work() {
     while (queue.length) await obey(queue.shift()).catch(fail);
     if (!crowd || (state.paused && !single) || state.note.startsWith("error")) break;
     const tick = 1000 / state.fps, now = performance.now();
-    const slow = Math.ceil((crowd.planMs + 2 * crowd.tickMs) / tick);
+    const slow = Math.ceil((crowd.callMs + 2 * crowd.tickMs) / tick);
     const depth = model.left.length ? AHEAD : Math.min(Math.max(LEAST, slow + 1), MOST);
     if (due < now) due = now;  // too slow: time stands still rather than jumps
     const early = due - now - (depth - 1) * tick;
