@@ -98,19 +98,7 @@ def test_safetensors_hold_the_same(state, tmp_path):
     )
 
 
-def test_one_error_names_every_misfit(state, tmp_path):
-    arrays = flat(state)
-    del arrays["motion_encoder.hidden"]
-    arrays["text_encoder.extra"] = np.zeros(2, np.float32)
-    arrays["text_encoder.pos_emb.bias"] = np.zeros(299, np.float32)
-    path = tmp_path / "evaluator.safetensors"
-    safetensors.save_file(arrays, path)
-    message = (
-        r"missing: motion_encoder\.hidden; unknown: text_encoder\.extra; "
-        r"of another shape: text_encoder\.pos_emb\.bias \(299,\) instead of \(300,\)"
-    )
-    with pytest.raises(ValueError, match=message):
-        published.load_matcher(path, config=CONFIG)
+def test_weights_of_another_size_are_named(state, tmp_path):
     with pytest.raises(ValueError, match=r"main\.0\.weight \(8, 7, 4\) instead of"):
         published.load_matcher(save(state, tmp_path))
 
@@ -118,30 +106,11 @@ def test_one_error_names_every_misfit(state, tmp_path):
 def test_foreign_files_are_refused(state, tmp_path):
     with pytest.raises(FileNotFoundError, match="no weights file"):
         published.load_matcher(tmp_path / "none.tar")
-    for name in ("damaged.tar", "damaged.safetensors"):
-        (tmp_path / name).write_bytes(b"not weights")
-        with pytest.raises(ValueError, match="damaged"):
-            published.load_matcher(tmp_path / name)
     del state["text_encoder"]
     with pytest.raises(ValueError, match="text_encoder, found.*'motion_encoder'"):
         published.load_matcher(save(state, tmp_path), config=CONFIG)
     with pytest.raises(ValueError, match="found list"):
         published.load_matcher(save([1], tmp_path), config=CONFIG)
-
-
-class Code:
-    """Unpickling it would print."""
-
-    def __reduce__(self):
-        return print, ("run",)
-
-
-def test_code_in_a_file_is_not_run(state, tmp_path, capsys):
-    path = save(state | {"epoch": Code()}, tmp_path)
-    torch.load(path, weights_only=False)
-    assert capsys.readouterr().out == "run\n"
-    published.load_matcher(path, config=CONFIG)
-    assert capsys.readouterr().out == ""
 
 
 def style_classifier(path, **changes):

@@ -362,12 +362,6 @@ BAD = [
         ValueError,
         "learning_rate is 0.001, given 0.1; seed is 0, given 7",
     ),
-    ("train --data {data} --out {run} {sizes} --steps 4", ValueError, "steps is 2, gi"),
-    (
-        "train --data {data} --out {run} {sizes} --steps 1",
-        ValueError,
-        "has 2 steps, expected at most the 1 to train",
-    ),
     (
         "train --data {data} --out {run} {sizes} --steps 1 --override",
         ValueError,
@@ -424,16 +418,6 @@ def test_what_is_wrong_is_named_before_any_work(
     with pytest.raises(error, match=message.format()):
         call(line.format(**places))
     assert (contents(trained), contents(tmp_path)) == before
-
-
-@pytest.mark.slow
-def test_an_unknown_course_lists_the_known_ones(call, trained, capsys):
-    with pytest.raises(SystemExit) as stop:
-        call(f"rollout --run {trained} --style zombie --course waltz")
-    assert stop.value.code == 2
-    text = capsys.readouterr()
-    for word in ("waltz", "forward", "strafe", "stop_and_go"):
-        assert word in text.out + text.err
 
 
 def test_from_a_shell_an_error_is_one_line(tmp_path):

@@ -115,9 +115,7 @@ BAD = {
     "train --data {none} --out {new}": "no clips file .*none.npz.*dribble.py",
     f"train --data {{data}} --out {{run}} {SIZES} --width 24": "width is 16, given 24",
     f"train --data {{data}} --out {{run}} {SIZES} --held-out 0.2": "held_out is 0.3, g",
-    f"train --data {__file__} --out {{run}} {SIZES}": "other data; use another",
     f"train --data {{data}} --out {{run}} {SIZES} --seed 3": "seed is 0, given 3",
-    f"train --data {{data}} --out {{run}} {SIZES} --path-steps 5": "has 10 steps, exp",
     f"train --data {{data}} --out {{run}} {SIZES} --stages motion_8 --draft-steps 0": (
         "motion_8: .*draft_steps is 10, given 0"
     ),

@@ -12,6 +12,7 @@ from jaxmotion.motion.skeleton import (
     Motion,
     Skeleton,
     check_parents,
+    check_skeleton,
     forward_kinematics,
     from_root,
     global_transforms,
@@ -326,3 +327,30 @@ def test_errors_name_what_is_wrong(skeleton):
     ]:
         with pytest.raises(ValueError, match=message):
             check_parents(parents)
+
+
+NAN, FAR = float("nan"), 1e39
+ZEROS = [[0.0] * 3] * 3
+FIELDS = dict(parents=(-1, 0, 1), offsets=ZEROS, names=("a", "b", "c"), feet=(2,))
+BAD_FIELDS = [
+    ("parents", (), "expected at least one joint"),
+    ("parents", (-1, 2, 0), "parent of joint 1"),
+    ("parents", (-1, 0.0, 1), "parents should be whole numbers, found 0.0"),
+    ("offsets", [*ZEROS[:2], [0, NAN, 0]], "offset of joint 2 is .0.0, nan, 0.0."),
+    ("offsets", [[FAR] * 3, *ZEROS[1:]], r"joint 0 is .1e\+39.*within 1e\+06 m"),
+    ("offsets", [*ZEROS[:2], [0.0] * 4], "offsets should be 3 rows of 3"),
+    ("offsets", ZEROS[:2], r"offsets have shape \(2, 3\), expected \(3, 3\)"),
+    ("names", ("a", "b"), "2 names for 3 joints"),
+    ("names", ("a", "", "c"), "name of joint 1 should be text, found ''"),
+    ("names", ("a", "b", "a"), "two joints have the name 'a'"),
+    ("feet", (1, 3), r"feet .1, 3.: expected different joints in 0\.\.2"),
+    ("feet", (2, 2), r"feet .2, 2.: expected different joints"),
+    ("feet", ("toe",), "feet should be whole numbers, found 'toe'"),
+]
+
+
+@pytest.mark.parametrize(("field", "value", "message"), BAD_FIELDS)
+def test_fields_of_a_file_that_make_no_skeleton_are_named(field, value, message):
+    check_skeleton(**FIELDS)
+    with pytest.raises(ValueError, match=message):
+        check_skeleton(**FIELDS | {field: value})
