@@ -427,7 +427,7 @@ def read_robot(
 ) -> Robot:
     """A humanoid of an MJCF or URDF file.
 
-    Roles are bodies of some, or a JSON file of them; see `roles.find_roles`.
+    Bodies of some roles may be given, or a JSON file of them; see `roles.find_roles`.
     `ModuleNotFoundError` without the extra [robot]; a `ValueError` names a file that
     MuJoCo cannot read, that has no free joint, or whose bodies are no person's that
     stands in the zero pose.

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def require(package: str) -> ModuleType:
-    """Imports a package that only texts need; if it lacks, says how to install it."""
+    """Imports a package that only texts need; says how to install one that lacks."""
     try:
         return importlib.import_module(package)
     except ModuleNotFoundError as error:

@@ -102,8 +102,8 @@ def prepare(
     """Makes a student's run folder, or loads it, and the teacher's averaged parameters.
 
     The teacher is a run folder, a shipped model or an exported file; without `data` the
-    student gets the clips that it was trained on, else those of them that are not held
-    out, which a shipped or exported teacher never saw. `steps` of the schedule are what
+    student gets the teacher's clips, else those that are not named in `held_out_clips`,
+    which a shipped or exported teacher never saw. `steps` of the schedule are what
     its plans visit; `balance` is as in `windows.balance`. `ValueError` if the steps are
     not the teacher's, the clips do not fit it, or the folder was made otherwise.
     """

@@ -148,9 +148,9 @@ def scorer(
 
     The reference is moments of the real features; `ground` is the height, meters, of
     the lowest joint of a person who stands. In `score(key, positions, actions) ->
-    scores` the actions are in ascending order,
-      each as often as the others. "deviation": of joints from where they are in the
-      mean motion of an action, root mean square, cm, with the hips above the origin.
+    scores` the actions are in ascending order, each as often as the others.
+    "deviation": of joints from where they are in the mean motion of an action, root
+    mean square, cm, with the hips above the origin.
     """
     config, skeleton = evaluator_config(run), run.clips.skeleton
     feet = jnp.asarray(skeleton.feet)
