@@ -61,14 +61,14 @@ def view_axes(*, azimuth: float, elevation: float) -> np.ndarray:
 
 
 def toward(walked: np.ndarray) -> float:
-    """Degrees of a view toward which paths [characters, F, 2] (x, z) come, all in all."""
+    """Azimuth, degrees, toward which paths [characters, F, 2], (x, z), come in all."""
     way = (walked[:, -1] - walked[:, 0]).mean(axis=0)
     moved = np.linalg.norm(way) > 0.3
     return 35.0 + (float(np.rad2deg(np.arctan2(*way))) if moved else 0.0)
 
 
 def smooth(values: np.ndarray, frames: float) -> np.ndarray:
-    """Gaussian mean [F, D], of so many frames' deviation, straight on beyond the ends."""
+    """Gaussian mean [F, D] of that deviation, frames; straight on beyond both ends."""
     reach = max(int(3 * frames), 1)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(frames, 1e-3)) ** 2)
     mode: dict[str, Any] = {"reflect_type": "odd"} if len(values) > 1 else {}
