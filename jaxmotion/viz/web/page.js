@@ -199,7 +199,7 @@ export function start(source) {
     else if (pace < 20 + rest && finer < 1) finer = Math.min(1, 1.25 * finer);
     const came = frame ? frame.to.tick - ticks : 0;
     const late = scene.slow && came > 0 && came < 0.97 * (began - since) * frame.to.fps / 1000;
-    rest = late ? Math.min(rest + 30, 90) : Math.max(rest - 10, 0);
+    rest = late ? Math.min(rest + 30, 150) : Math.max(rest - 10, 0);
     since = began;
     if (frame) ticks = frame.to.tick;
   }
