@@ -66,6 +66,7 @@ class Train:
       attention: "full", or "prefix": computed once per plan.
       noise_levels: Of each window in a step.
       own_levels: Probability of noise on own predictions at lower levels.
+      cubic_wishes: Probability of wanted paths without sway.
       seam_half_life: Half-life, frames, of the offset with which plans go on from the
         past; 0: none.
       frame_kernel: Frames of a last convolution.
@@ -105,6 +106,7 @@ class Train:
     attention: cli.Optional[Literal["full", "prefix"]] = None
     noise_levels: cli.Optional[int] = None
     own_levels: cli.Optional[float] = None
+    cubic_wishes: cli.Optional[float] = None
     seam_half_life: cli.Optional[float] = None
     frame_kernel: cli.Optional[int] = None
     weight_foot: cli.Optional[float] = None

@@ -66,7 +66,7 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("dropout", "ema", "alone"), Range(0, 1, (1,))),
     **dict.fromkeys(("fps", "cut_fps"), _FPS),
     **dict.fromkeys(("seconds", "minutes", "limit", "longest"), _SPAN),
-    **dict.fromkeys(("rate", "off_ball", "own_levels"), Range(0, 1)),
+    **dict.fromkeys(("rate", "off_ball", "own_levels", "cubic_wishes"), Range(0, 1)),
     **dict.fromkeys(("last_sigma", "max_distance", "tolerance"), _METERS),
     **dict.fromkeys(("scale", "amdm_scale", "recon"), Range(0, 10**6)),
     **dict.fromkeys(("max_norm", "previous_noise"), Range(0, 10**6)),

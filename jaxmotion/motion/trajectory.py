@@ -233,23 +233,36 @@ def smoothing_matrices(
     return jnp.asarray(np.stack(matrices), jnp.float32)
 
 
-def smooth_course(key: Key, course: Trajectory, *, last: int) -> Trajectory:
+def smooth_course(
+    key: Key, course: Trajectory, *, last: int, cubic: float = 0.0
+) -> Trajectory:
     """A recorded path as a user might have asked for it.
 
     The path is raw, or smoothed with sigma 5 or 10 frames (probabilities 1/2, 1/4, 1/4)
     such that it stays where it was in frame `last`; the facings are smoothed with sigma
-    5 or 10.
+    5 or 10. Ours: with probability `cubic` either is, instead, the cubic of time that
+    fits it best, which has no sway and no slower ends, as the springs' paths have not.
 
     Source: released code of CAMDM. Differs: facings are smoothed within the window,
     there within the whole clip.
     """
+    frames = course.position.shape[0]
     key_path, key_facing = jax.random.split(key)
-    filters = smoothing_matrices(course.position.shape[0], (0.0, 5.0, 10.0))
+    filters = smoothing_matrices(frames, (0.0, 5.0, 10.0))
     weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
-    path = filters[jax.random.categorical(key_path, weights)] @ course.position
+    matrix = filters[jax.random.categorical(key_path, weights)]
+    turn = filters[1 + jax.random.bernoulli(key_facing).astype(int)]
+    if cubic:
+        powers = np.vander(np.linspace(-1.0, 1.0, frames), 4)
+        fit = jnp.asarray(powers @ np.linalg.pinv(powers), jnp.float32)
+        fitted = jax.random.bernoulli(jax.random.fold_in(key, 0), cubic, (2,))
+        matrix, turn = (
+            jnp.where(chosen, fit, other)
+            for chosen, other in zip(fitted, (matrix, turn), strict=True)
+        )
+    path = matrix @ course.position
     path = path + (course.position[last] - path[last])[None]
-    facings = filters[1 + jax.random.bernoulli(key_facing).astype(int)] @ course.facing
-    facings = safe_normalize(facings, jnp.array([0.0, 1.0]))
+    facings = safe_normalize(turn @ course.facing, jnp.array([0.0, 1.0]))
     return Trajectory(position=path, facing=facings)
 
 

@@ -262,3 +262,47 @@ def test_everything_is_finite_at_zero_vectors():
 
     value, grads = jax.value_and_grad(total, (0, 1, 2))(zero, zero, jnp.zeros(3))
     assert np.isfinite(value) and all(np.isfinite(g).all() for g in grads)
+
+
+def swaying_course():
+    """Two seconds of a turning walk with a step's sway and swinging facings."""
+    t = np.linspace(0.0, 2.0, 55)
+    sway = 0.03 * np.sin(2 * np.pi * t)
+    angle = 0.8 * t + 0.1 * np.sin(2 * np.pi * t)
+    return trajectory.Trajectory(
+        position=jnp.asarray(np.stack([0.4 * t**2 + sway, 1.2 * t], -1), jnp.float32),
+        facing=jnp.asarray(np.stack([np.sin(angle), np.cos(angle)], -1), jnp.float32),
+    )
+
+
+def test_cubic_wishes_are_least_squares():
+    course = swaying_course()
+    found = trajectory.smooth_course(jax.random.key(0), course, last=9, cubic=1.0)
+    t = np.arange(55.0)
+
+    def fitted(values):
+        return np.stack([np.polyval(np.polyfit(t, x, 3), t) for x in values.T], -1)
+
+    path = fitted(np.float64(course.position))
+    path += np.float64(course.position)[9] - path[9]
+    np.testing.assert_allclose(found.position, path, atol=1e-4)
+    facing = fitted(np.float64(course.facing))
+    facing /= np.linalg.norm(facing, axis=-1, keepdims=True)
+    np.testing.assert_allclose(found.facing, facing, atol=1e-4)
+
+
+def test_so_many_wishes_are_cubic_and_others_as_published():
+    course, keys = swaying_course(), jax.random.split(jax.random.key(1), 400)
+
+    def wishes(cubic):
+        make = lambda k: trajectory.smooth_course(k, course, last=9, cubic=cubic)  # noqa: E731
+        return jax.jit(jax.vmap(make))(keys)
+
+    published, some, every = wishes(0.0), wishes(0.3), wishes(1.0)
+    for name in ("position", "facing"):
+        given, other, fit = (
+            np.asarray(getattr(x, name)) for x in (some, published, every)
+        )
+        same, cubic = (np.isclose(given, x).all((1, 2)) for x in (other, fit))
+        assert (same ^ cubic).all()
+        assert abs(cubic.mean() - 0.3) < 0.08  # 3.5 deviations of a share of 400

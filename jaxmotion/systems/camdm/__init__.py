@@ -61,6 +61,9 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
   of the windows are noised, at lower levels, on the network's own predictions, as in
   sampling. `locomotion` was trained so last; it plans in 2 calls as well as in 8 when
   it goes straight on, and more roughly in curves.
+* `cubic_wishes=0.5`: half of the wanted paths in training are cubics fitted to the
+  recorded ones. Recorded paths sway with each step and a command's do not: turning
+  around, feet then slide half as fast.
 * `frame_kernel`: a convolution over frames after the tokens; `weight_acceleration`:
   second differences of positions (in `--preset planted`).
 * `Control(follow=...)`: the wanted path returns to the commanded one.

@@ -72,7 +72,9 @@ def example(
         facing = jnp.stack([jnp.sin(yaw), jnp.cos(yaw)])
     frame = trajectory.PlanarFrame(origin=course.position[last], facing=facing)
 
-    smoothed = trajectory.smooth_course(key_course, course, last=last)
+    smoothed = trajectory.smooth_course(
+        key_course, course, last=last, cubic=config.cubic_wishes
+    )
     wanted = trajectory.to_local(smoothed, frame)
     poses = to_features(features.to_frame(window, frame), config=config)
     keep = jax.random.bernoulli(key_keep, 1.0 - config.drop_past)

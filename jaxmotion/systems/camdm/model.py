@@ -54,6 +54,8 @@ class Config:
       own_levels: Probability that the lower half of a window's noise levels is noise on
         predictions from the upper half, as in sampling, instead of noise on the
         recording; ours, 0 in the paper.
+      cubic_wishes: Probability that the wanted path of a training window is the cubic
+        that fits the recorded one, as smooth as a command's; ours, 0 in the paper.
       rotation_layout: 6D as two rows (released code) or two columns.
       heading: Frame of a sample. "random": axes turned by a random yaw (released
         code). "facing": +z is where the character faces in the last past pose (ours:
@@ -95,6 +97,7 @@ class Config:
     seam_half_life: float = 0.0
     noise_levels: int = 1
     own_levels: float = 0.0
+    cubic_wishes: float = 0.0
     rotation_layout: Literal["rows", "columns"] = "rows"
     heading: Literal["random", "facing"] = "random"
     rotation_scale: float = 1.0

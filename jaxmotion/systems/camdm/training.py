@@ -115,7 +115,13 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
 
 
 # What has no parameters. Attention to a prefix alone is soon learned anew.
-_FREE = ("attention", "noise_levels", "own_levels", "seam_half_life")
+_FREE = (
+    "attention",
+    "noise_levels",
+    "own_levels",
+    "cubic_wishes",
+    "seam_half_life",
+)
 
 
 def continued(model: Model, path: Path) -> tuple[Model, Params]:
