@@ -63,7 +63,7 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
   it goes straight on, and more roughly in curves.
 * `cubic_wishes=0.5`: half of the wanted paths in training are cubics fitted to the
   recorded ones. Recorded paths sway with each step and a command's do not: turning
-  around, feet then slide half as fast.
+  around, feet then slide half as fast. The last part of `locomotion` was trained so.
 * `frame_kernel`: a convolution over frames after the tokens; `weight_acceleration`:
   second differences of positions (in `--preset planted`).
 * `Control(follow=...)`: the wanted path returns to the commanded one.
