@@ -304,14 +304,14 @@ def check_start(
     Both are JSON, `found` that of the file `path`. In "config" and "paths" what begins
     with a weight's name or a `free` one may differ, since it has no parameters.
     """
+    loose = ("weight_", *free)
 
     def part(value: dict[str, Any]) -> dict[str, Any]:
-        free_ = ("weight_", *free)
-        return value | {
-            name: {k: x for k, x in value[name].items() if not k.startswith(free_)}
-            for name in ("config", "paths")
-            if name in value
-        }
+        kept = dict(value)
+        for name in {"config", "paths"} & value.keys():
+            fields = value[name].items()
+            kept[name] = {k: x for k, x in fields if not k.startswith(loose)}
+        return kept
 
     differ = differences(part(found), part(wanted))
     if differ:

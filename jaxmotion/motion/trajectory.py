@@ -247,7 +247,7 @@ def smooth_course(
     there within the whole clip.
     """
     frames = course.position.shape[0]
-    key_path, key_facing = jax.random.split(key)
+    key_path, key_facing, key_cubic = jax.random.split(key, 3)
     filters = smoothing_matrices(frames, (0.0, 5.0, 10.0))
     weights = jnp.log(jnp.array([0.5, 0.25, 0.25]))
     matrix = filters[jax.random.categorical(key_path, weights)]
@@ -255,7 +255,7 @@ def smooth_course(
     if cubic:
         powers = np.vander(np.linspace(-1.0, 1.0, frames), 4)
         fit = jnp.asarray(powers @ np.linalg.pinv(powers), jnp.float32)
-        fitted = jax.random.bernoulli(jax.random.fold_in(key, 0), cubic, (2,))
+        fitted = jax.random.bernoulli(key_cubic, cubic, (2,))
         matrix, turn = (
             jnp.where(chosen, fit, other)
             for chosen, other in zip(fitted, (matrix, turn), strict=True)
