@@ -35,7 +35,7 @@ PACKAGES = (
 _MATH = re.compile(r"\$\$(.+?)\$\$|(?<![\\$`])\$(?!\s)([^$\n]+?)\$", re.DOTALL)
 
 _NUMBER = r"-?[\d,]*\.?\d+"
-_INTERVAL = re.compile(rf"(?<=>){_NUMBER} \[{_NUMBER}, {_NUMBER}\](?=<)")
+_INTERVAL = re.compile(rf"(?<= )\[{_NUMBER}, {_NUMBER}\](?=<)")
 
 _VERBATIM = re.compile(r"(<(pre|code|script|style|svg|textarea)\b.*?</\2>)", re.DOTALL)
 

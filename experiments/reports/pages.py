@@ -102,16 +102,18 @@ def text_of(cells: list[Cell], column: columns.Column, *, interval: bool = True)
     cell = cells[0]
     if not math.isfinite(cell.value):
         return _NOTHING
-    text = markdown.number(cell.value)
-    if interval and cell.low is not None and cell.high is not None:
-        half = (cell.high - cell.low) / 2
-        # As many digits as show the width of the interval to a twentieth.
-        enough = (d for d in range(7) if abs(round(half, d) - half) <= half / 20)
-        digits = max(_decimals(cell.value), next(enough, 6))
-        if abs(cell.value) >= 1000:
-            digits = 0
-        text += f" [{cell.low:,.{digits}f}, {cell.high:,.{digits}f}]"
-    return text
+    if not interval or cell.low is None or cell.high is None:
+        return markdown.number(cell.value)
+    # As many decimals as show the ends to a tenth of the interval's width, but of the
+    # value at most four digits.
+    near = (cell.high - cell.low) / 10
+    ends = (cell.low, cell.high)
+    enough = (d for d in range(7) if all(abs(round(x, d) - x) <= near for x in ends))
+    digits = max(_decimals(cell.value), next(enough, 6))
+    if cell.value:
+        digits = max(0, min(digits, 3 - math.floor(math.log10(abs(cell.value)))))
+    text, low, high = (f"{x:,.{digits}f}" for x in (cell.value, *ends))
+    return f"{text} [{low}, {high}]"
 
 
 @dataclasses.dataclass(frozen=True)
