@@ -43,7 +43,8 @@ class Train:
       data: Clips with a ball, from dribble.py or prepare_data.py.
       stages: motion_<T> is the motion model of T steps, paths_<T> the trajectory
         generator (the paper's: T = 1).
-      preset: "small" for a CPU or a short run, or "paper".
+      preset: "small" for a CPU or a short run, "planted" for a second training of such
+        a model in which feet weigh more, or "paper".
       width: Channels of the motion model's tokens; None for the preset's.
       depth: Its layers; None for the preset's.
       token_margin: Frames that its neighboring output tokens share; None for the
@@ -51,6 +52,7 @@ class Train:
       attention: "full", or "prefix": computed once per plan; None for the preset's.
       noise_levels: Of each window in an update; None for the preset's.
       own_levels: Probability of noise on own predictions at lower levels.
+      cubic_wishes: Probability of wanted paths without sway.
       seam_half_life: Half-life, frames, of the offset with which plans go on from the
         past; 0: none.
       weight_foot: Weight of planted feet; None for the preset's.
@@ -70,13 +72,14 @@ class Train:
     data: Path = Path("data/dribble.npz")
     out: Path = Path("runs/smgdiff")
     stages: tuple[str, ...] = ("paths_1", "motion_8")
-    preset: Literal["small", "paper"] = "small"
+    preset: Literal["small", "planted", "paper"] = "small"
     width: int | None = None
     depth: int | None = None
     token_margin: int | None = None
     attention: Literal["full", "prefix"] | None = None
     noise_levels: int | None = None
     own_levels: float | None = None
+    cubic_wishes: float | None = None
     seam_half_life: float | None = None
     weight_foot: float | None = None
     init: cli.Optional[Path] = None

@@ -11,6 +11,8 @@ means differ where the samples of a batch have different lengths:
 frame: the losses of MDM and CAMDM are written so, with weight 1.
 """
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -98,6 +100,40 @@ def foot_slide_loss(
     moved = jnp.where(stands, displacement(flat), 0.0)
     pairs = mask[..., 1:] & mask[..., :-1]
     return masked_mse(moved, jnp.zeros_like(moved), pairs, average=average)
+
+
+def pose_terms(
+    predicted: Float[Array, "*batch frames joints 3"],
+    wanted: Float[Array, "*batch frames joints 3"],
+    stands: Bool[Array, "*batch frames feet"],
+    mask: Bool[Array, "*#batch frames"],
+    *,
+    feet: tuple[int, ...],
+) -> dict[str, Float[Array, ""]]:
+    """Of positions in the world: position, position_velocity, acceleration, foot.
+
+    As in MDM, the means run over x, y and z as well. `stands` is as `foot_slide_loss`
+    takes it.
+    """
+    flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
+    guess, truth = flat(predicted), flat(wanted)
+    return {
+        "position": masked_mse(guess, truth, mask),
+        "position_velocity": velocity_loss(guess, truth, mask),
+        "acceleration": velocity_loss(
+            displacement(guess), displacement(truth), mask[..., 1:] & mask[..., :-1]
+        ),
+        "foot": foot_slide_loss(predicted[..., jnp.array(feet), :], stands, mask),
+    }
+
+
+def weighted(
+    terms: dict[str, Array], config: Any
+) -> tuple[Float[Array, ""], dict[str, Array]]:
+    """The sum of the terms' means, each times `config.weight_<name>`, and the means."""
+    terms = jax.tree.map(jnp.mean, terms)
+    parts = [getattr(config, f"weight_{name}") * x for name, x in terms.items()]
+    return functools.reduce(operator.add, parts), terms
 
 
 def predict_clean(

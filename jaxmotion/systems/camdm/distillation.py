@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.data import clips_io
 from jaxmotion.diffusion import distillation, schedule
-from jaxmotion.learning import runs
+from jaxmotion.learning import losses, runs
 from jaxmotion.learning.fingerprint import fingerprint
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.networks import blocks
@@ -85,7 +85,7 @@ def loss(
         condition,
         config=config,
     )
-    return camdm_loss.weighted(each, config=config)
+    return losses.weighted(each, config)
 
 
 def prepare(

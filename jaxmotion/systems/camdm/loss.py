@@ -115,7 +115,7 @@ def loss(
         own=config.own_levels,
     )
     each = seam_terms(skeleton, predictions, x_0, condition, config=config)
-    return weighted(each, config=config)
+    return losses.weighted(each, config)
 
 
 def seam_terms(
@@ -156,23 +156,6 @@ def examples(
     )
 
 
-def weighted(
-    terms: dict[str, Array], *, config: Config
-) -> tuple[Float[Array, ""], dict[str, Array]]:
-    """The weighted sum of `loss_terms` of several levels, and their means by name."""
-    terms = jax.tree.map(jnp.mean, terms)
-    weights = {
-        "data": config.weight_data,
-        "velocity": config.weight_velocity,
-        "position": config.weight_position,
-        "position_velocity": config.weight_position_velocity,
-        "acceleration": config.weight_acceleration,
-        "foot": config.weight_foot,
-    }
-    total = sum(weights[name] * value for name, value in terms.items())
-    return total, terms  # pyright: ignore[reportReturnType]
-
-
 def loss_terms(
     skeleton: Skeleton,
     prediction: Float[Array, "*batch frames features"],
@@ -195,7 +178,6 @@ def loss_terms(
     unit = jnp.full(config.num_features, 1.0 / config.rotation_scale)
     unit = jnp.broadcast_to(unit.at[-6:].set(1.0), target.shape)
     prediction, target = prediction * unit, target * unit
-    flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
     feet = jnp.array(skeleton.feet)
     speed = jnp.linalg.norm(joint_velocities(wanted[..., feet, :], config.fps), axis=-1)
     stands = jnp.pad(
@@ -207,12 +189,4 @@ def loss_terms(
         "velocity": losses.velocity_loss(
             prediction[..., without_root], target[..., without_root], every
         ),
-        # As in MDM, the mean runs over x, y and z as well.
-        "position": losses.masked_mse(flat(predicted), flat(wanted), every),
-        "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
-        "acceleration": losses.velocity_loss(
-            *(losses.displacement(flat(x)) for x in (predicted, wanted)),
-            every[..., 1:] & every[..., :-1],
-        ),
-        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands, every),
-    }
+    } | losses.pose_terms(predicted, wanted, stands, every, feet=skeleton.feet)

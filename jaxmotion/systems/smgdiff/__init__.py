@@ -13,7 +13,7 @@ standardized; the ball's weight is clamped to 0..1; the path is blended at every
 not only when the control changes. The last guided step is as long as in DSG's released
 code (`Guidance(last_sigma=...)` shortens it). What `experiments/smgdiff.py` uses by
 default since trainings here are short: `--preset small`, with losses of the ball and
-other weights (`--preset paper` is without), and `smgdiff_guidance.TUNED` (rate 0.9,
-touches from 12 m/s² on, within 18 cm) where the paper has 0.5, 2 m/s² and 10 cm
-(`Guidance()`).
+other weights (`--preset paper` is without; `planted` is for a second training), and
+`smgdiff_guidance.TUNED` (rate 0.9, touches from 12 m/s² on, within 18 cm) where the
+paper has 0.5, 2 m/s² and 10 cm (`Guidance()`).
 """

@@ -4,7 +4,6 @@ Source: SMGDiff, section 3.2, eq. 4-9; what it leaves open is as in CAMDM.
 """
 
 import functools
-import operator
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +61,7 @@ def example(
 ) -> tuple[Condition, Float[Array, "future features"]]:
     """One training example from one window (world), as a user might have asked."""
     course = trajectory.root_trajectory(representation.skeleton, window.motion)
-    wanted = smooth_course(key, course, last=config.past - 1)
+    wanted = smooth_course(key, course, last=config.past - 1, cubic=config.cubic_wishes)
     return situation(
         window, wanted, label, representation=representation, config=config
     )
@@ -109,18 +108,7 @@ def loss(
     each = jax.vmap(
         lambda x: loss_terms(joined(x), joined(x_0), representation=representation)
     )(predictions)
-    terms = jax.tree.map(jnp.mean, each)
-    weights = {
-        "data": config.weight_data,
-        "velocity": config.weight_velocity,
-        "position": config.weight_position,
-        "position_velocity": config.weight_position_velocity,
-        "foot": config.weight_foot,
-        "ball": config.weight_ball,
-        "ball_acceleration": config.weight_ball_acceleration,
-    }
-    parts = [weights[name] * value for name, value in terms.items()]
-    return functools.reduce(operator.add, parts), terms
+    return losses.weighted(each, config)
 
 
 def loss_terms(
@@ -129,12 +117,13 @@ def loss_terms(
     *,
     representation: Representation,
 ) -> dict[str, Float[Array, ""]]:
-    """Unweighted means: data, velocity, position, position_velocity, foot, of the ball.
+    """Unweighted means: data, velocity, those of `losses.pose_terms`, of the ball.
 
     A foot stands where the data say so. The ball's place is a quotient whose error
     grows without bound at the reach: it counts while the ball is nearer than that.
 
-    Source: SMGDiff, eq. 6-9; position_velocity from CAMDM; those of the ball are ours.
+    Source: SMGDiff, eq. 6-9; position_velocity from CAMDM; acceleration and those of
+    the ball are ours.
     """
     every = jnp.ones(target.shape[:-1], bool)
     skeleton = representation.skeleton
@@ -152,21 +141,16 @@ def loss_terms(
     is_near = truth["ball"][..., -1] >= NEAR
     ball_error = _ball_place(guess) - _ball_place(truth)
     none = jnp.zeros_like(ball_error)
-    flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
-    feet = jnp.array(skeleton.feet)
     return {
         "data": losses.masked_mse(prediction, target, every),
         "velocity": losses.velocity_loss(prediction, target, every),
-        "position": losses.masked_mse(flat(predicted), flat(wanted), every),
-        "position_velocity": losses.velocity_loss(flat(predicted), flat(wanted), every),
-        "foot": losses.foot_slide_loss(predicted[..., feet, :], stands, every),
         "ball": losses.masked_mse(ball_error, none, is_near),
         "ball_acceleration": losses.velocity_loss(
             losses.displacement(ball_error),
             none[..., 1:, :],
             is_near[..., 1:] & is_near[..., :-1],
         ),
-    }
+    } | losses.pose_terms(predicted, wanted, stands, every, feet=skeleton.feet)
 
 
 def _ball_place(parts: dict[str, Array]) -> Float[Array, "*batch frames 3"]:

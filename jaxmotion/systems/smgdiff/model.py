@@ -45,10 +45,11 @@ class Config:
         displacements and feet reach over the seam.
       seam_features: Channels of root and rotations, which come first; 0 without.
       noise_levels: Noise levels of one window in training; ours, 1 in the paper.
-      own_levels: As in `camdm.Config`; ours, 0 in the paper.
+      own_levels, cubic_wishes: As in `camdm.Config`; ours, 0 in the paper.
       weight_velocity: Weight of the displacements of features.
       weight_position_velocity: Weight of the displacements of joint positions (CAMDM's;
         not in the paper).
+      weight_acceleration: Weight of their second differences (not in the paper).
       weight_foot: Weight of feet that slide while they stand.
       weight_ball: Weight of the ball's place while it is near (not in the paper).
       weight_ball_acceleration: Weight of the second differences of its place, by which
@@ -76,10 +77,12 @@ class Config:
     seam_features: int = 0
     noise_levels: int = 1
     own_levels: float = 0.0
+    cubic_wishes: float = 0.0
     weight_data: float = 1.0
     weight_velocity: float = 1.0
     weight_position: float = 1.0
     weight_position_velocity: float = 0.0
+    weight_acceleration: float = 0.0
     weight_foot: float = 1.0
     weight_ball: float = 0.0
     weight_ball_acceleration: float = 0.0

@@ -237,8 +237,8 @@ def test_the_truth_costs_nothing_but_its_own_slide(scenes, representation):
     x = smgdiff_scene.to_features(scenes, representation)
     terms = smgdiff_loss.loss_terms(x, x, representation=representation)
     assert set(terms) == {
-        *("data", "velocity", "position", "position_velocity", "foot"),
-        *("ball", "ball_acceleration"),
+        *("data", "velocity", "position", "position_velocity", "acceleration"),
+        *("foot", "ball", "ball_acceleration"),
     }
     for name in set(terms) - {"foot"}:
         assert float(terms[name]) == pytest.approx(0.0, abs=1e-9)
@@ -300,6 +300,17 @@ def test_a_shifted_person_costs_its_shift(
         (0.1 / float(std)) ** 2 / x.shape[-1], rel=1e-3
     )
     assert float(terms["velocity"]) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_person_who_trembles_costs_second_differences(
+    scenes, representation, loss_terms, to_features
+):
+    """Every other frame a centimeter aside: differences of 2 cm in each triple."""
+    x = to_features(scenes)
+    std = representation.normalizer.std[0]
+    terms = loss_terms(x.at[:, 1::2, 0].add(0.01 / std), x)
+    assert float(terms["acceleration"]) == pytest.approx(4e-4 / 3, rel=1e-3)
+    assert float(terms["position_velocity"]) == pytest.approx(1e-4 / 3, rel=1e-3)
 
 
 def test_losses_reach_over_the_seam(scenes, representation, config, monkeypatch):
@@ -389,3 +400,27 @@ def test_an_example_is_the_window_itself(scenes, representation, config):
     np.testing.assert_allclose(condition.ball, scene.ball[3], atol=1e-5)
     assert int(condition.label) == 1
     assert condition.trajectory.position.shape == (12, 2)
+
+
+def test_wanted_paths_may_be_cubics(scenes, representation, config):
+    """NumPy's fit to the recorded path, through the last past place."""
+    scene: Scene = jax.tree.map(lambda x: x[2], scenes)
+    sway = 0.05 * (np.sin(np.arange(16.0)) - np.sin(3.0))
+    sway = jnp.pad(jnp.asarray(sway, jnp.float32)[:, None], ((0, 0), (0, 2)))
+    motion = dataclasses.replace(
+        scene.motion, root_position=scene.motion.root_position + sway
+    )
+    scene = dataclasses.replace(scene, motion=motion)
+    condition, _ = smgdiff_loss.example(
+        jax.random.key(0),
+        scene,
+        jnp.int32(1),
+        representation=representation,
+        config=dataclasses.replace(config, cubic_wishes=1.0),
+    )
+    course = trajectory.root_trajectory(tiny.skeleton(), scene.motion)
+    path, t = np.float64(course.position), np.arange(16.0)
+    cubic = np.stack([np.polyval(np.polyfit(t, x, 3), t) for x in path.T], -1)
+    cubic += path[3] - cubic[3]
+    np.testing.assert_allclose(condition.trajectory.position, cubic[4:], atol=1e-5)
+    assert np.abs(cubic - path).max() > 0.02

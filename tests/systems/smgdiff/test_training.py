@@ -160,7 +160,7 @@ def test_training_goes_on_from_an_exported_model(run, tmp_path):
         "paths": tiny.random_params(smgdiff_trajectory.init, first.paths),
     }
     checkpoint.export_params(file, params, smgdiff_model.to_json(first))
-    sizes = SIZES | dict(seam_half_life=5.0, weight_foot=9.0)
+    sizes = SIZES | dict(seam_half_life=5.0, weight_foot=9.0, cubic_wishes=0.5)
     data = run.record.folder.parent / "clips.npz"
     common = dict(held_out=0.3, paths=PATHS)
     made = smgdiff_training.prepare(folder, data, sizes=sizes, init=file, **common)
