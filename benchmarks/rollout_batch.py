@@ -38,6 +38,7 @@ COLUMNS = {
     "runs": "runs",
     "plans": "plans each",
     "frames_per_second": "frames/s",
+    "per_cpu_second": "frames/CPU s",
     "realtime": "x real time",
     "per_core": "frames/s/core",
     "characters_per_core": "characters/core",
@@ -76,7 +77,7 @@ class Config(suite.Settings):
       frames_per_token: CAMDM, of the network with random parameters; 1 is the paper's.
       width: Width of random networks: channels of a token (CAMDM) or of a hidden layer
         (AAMDM); None for 256.
-      runs: Timed rollouts of each size.
+      runs: Timed rollouts of each size; where it is one, none before warms up.
       limit: Seconds of timed rollouts of each size, at most, but one rollout.
       memory_gib: Limit for the program of each size.
     """
@@ -212,15 +213,21 @@ def case(
     program = fitting(args, load, number, chunk)
     calls, part = program.calls, number // program.calls
 
-    def run() -> Any:
-        for i in range(calls):
-            frames = jax.block_until_ready(program.run(i * part))[1]
-        return frames
+    made: list[Any] = []
 
-    times = timing.time_calls(
-        run, rounds=args.runs, limit_s=args.limit, warmup=1, least=1
-    )
-    plans = load.plans(program.run(0)[1]) / part
+    def run() -> None:
+        for i in range(calls):
+            made.clear()
+            made.append(jax.block_until_ready(program.run(i * part))[1])
+
+    times, cpu = timing.time_in_turn(
+        {"": run},
+        rounds=args.runs,
+        limit_s=args.limit,
+        warmup=min(args.runs - 1, 1),
+        least=1,
+    )[""].T
+    plans = load.plans(made[0]) / part
     p50, p95 = np.percentile(times, [50, 95])
     rate = 1000 * number * program.ticks / p50
     cores, seconds = processors(), program.ticks / load.fps
@@ -235,6 +242,7 @@ def case(
         "runs": len(times),
         "plans": plans,
         "frames_per_second": float(rate),
+        "per_cpu_second": float(1000 * number * program.ticks / np.median(cpu)),
         "realtime": float(rate / number / load.fps),
         "per_core": float(rate / cores),
         "characters_per_core": float(rate / load.fps / cores),

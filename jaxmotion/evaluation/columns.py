@@ -138,6 +138,14 @@ COLUMNS: dict[str, Column] = {
             title="orientation error (release)",
             unit="°",
         ),
+        # A training.
+        Column(id="held_out_25", title="held-out loss, 25 % of the updates"),
+        Column(id="held_out_50", title="50 %"),
+        Column(id="held_out_75", title="75 %"),
+        Column(id="held_out_100", title="all updates"),
+        Column(id="update_time", title="an update", unit="processor ms"),
+        Column(id="updates_needed", title="updates to the worst row's last loss"),
+        Column(id="seconds_needed", title="to that loss", unit="processor s"),
         # Health.
         Column(id="diverged", title="diverged", kind="count"),
         Column(id="diverged_uc", title="diverged under control", kind="count"),

@@ -23,6 +23,7 @@ WRONG = {
     "goals": ("--model {gone} --out {out}", "gone"),
     "few_steps": ("--run {gone} --out {out}", "gone"),
     "next_frame": ("--run {gone} --out {out}", "gone"),
+    "optimizers": ("--run {gone} --out {out}", "gone"),
     "prepare_data": ("lafan1 --manual-dir {gone} --out {out}.npz", "gone"),
     "quickstart": ("--out {file}/below", "file/below"),
     "report": ("--runs {gone}", "gone"),
