@@ -105,9 +105,10 @@ def loss(
     def joined(x: Array) -> Array:
         return jnp.concatenate([past, x], axis=-2)
 
-    each = jax.vmap(
-        lambda x: loss_terms(joined(x), joined(x_0), representation=representation)
-    )(predictions)
+    terms = functools.partial(
+        loss_terms, representation=representation, rotation=config.weight_rotation
+    )
+    each = jax.vmap(lambda x: terms(joined(x), joined(x_0)))(predictions)
     return losses.weighted(each, config)
 
 
@@ -116,11 +117,13 @@ def loss_terms(
     target: Float[Array, "*batch frames features"],
     *,
     representation: Representation,
+    rotation: float = 1.0,
 ) -> dict[str, Float[Array, ""]]:
     """Unweighted means: data, velocity, those of `losses.pose_terms`, of the ball.
 
-    A foot stands where the data say so. The ball's place is a quotient whose error
-    grows without bound at the reach: it counts while the ball is nearer than that.
+    In data and velocity, squared errors of rotations count `rotation` times. A foot
+    stands where the data say so. The ball's place is a quotient whose error grows
+    without bound at the reach: it counts while the ball is nearer than that.
 
     Source: SMGDiff, eq. 6-9; position_velocity from CAMDM; acceleration and those of
     the ball are ours.
@@ -141,6 +144,12 @@ def loss_terms(
     is_near = truth["ball"][..., -1] >= NEAR
     ball_error = _ball_place(guess) - _ball_place(truth)
     none = jnp.zeros_like(ball_error)
+    units = {name: 1.0 for name, _, _ in names.fields} | {"rotations": rotation**0.5}
+    unit = jnp.concatenate(
+        [jnp.full(stop - start, units[name]) for name, start, stop in names.fields]
+    )
+    unit = jnp.broadcast_to(unit, target.shape)
+    prediction, target = prediction * unit, target * unit
     return {
         "data": losses.masked_mse(prediction, target, every),
         "velocity": losses.velocity_loss(prediction, target, every),

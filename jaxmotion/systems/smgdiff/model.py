@@ -47,6 +47,8 @@ class Config:
       noise_levels: Noise levels of one window in training; ours, 1 in the paper.
       own_levels, cubic_wishes: As in `camdm.Config`; ours, 0 in the paper.
       weight_velocity: Weight of the displacements of features.
+      weight_rotation: Factor of the rotations' errors in both of these; ours, 1 in the
+        paper.
       weight_position_velocity: Weight of the displacements of joint positions (CAMDM's;
         not in the paper).
       weight_acceleration: Weight of their second differences (not in the paper).
@@ -80,6 +82,7 @@ class Config:
     cubic_wishes: float = 0.0
     weight_data: float = 1.0
     weight_velocity: float = 1.0
+    weight_rotation: float = 1.0
     weight_position: float = 1.0
     weight_position_velocity: float = 0.0
     weight_acceleration: float = 0.0

@@ -243,16 +243,13 @@ PRESETS: dict[str, dict[str, Any]] = {
         weight_ball_acceleration=300.0,
     ),
 }
-# A second training of a "small" model. Standardized rotations make nine tenths of its
-# loss and planted feet a fiftieth; here feet make two fifths, as in CAMDM's preset of
-# this name.
+# A second training of a "small" model. Standardized rotations make four fifths of the
+# loss and planted feet a fiftieth; here feet make a quarter. The ball weighs the same.
 PRESETS["planted"] = PRESETS["small"] | dict(
-    weight_data=0.1,
-    weight_velocity=0.3,
-    weight_position=10.0,
+    weight_rotation=0.1,
     weight_position_velocity=150.0,
-    weight_acceleration=150.0,
-    weight_foot=3000.0,
+    weight_acceleration=100.0,
+    weight_foot=2000.0,
 )
 # The same of `trajectory.Config`. Tokens that do not overlap make paths leap by
 # centimeters every five frames, and beside places displacements count next to nothing.

@@ -302,6 +302,20 @@ def test_a_shifted_person_costs_its_shift(
     assert float(terms["velocity"]) == pytest.approx(0.0, abs=1e-9)
 
 
+def test_errors_of_rotations_may_count_less(representation, to_features, scenes):
+    x = np.asarray(to_features(scenes))
+    error = np.random.default_rng(0).normal(size=x.shape) / 10
+    terms = jax.jit(
+        functools.partial(
+            smgdiff_loss.loss_terms, representation=representation, rotation=0.25
+        )
+    )
+    found = terms(jnp.asarray(x + error, jnp.float32), jnp.asarray(x))
+    share = np.repeat([1.0, 0.25, 1.0], [3, 30, x.shape[-1] - 33])
+    for name, off in (("data", error), ("velocity", np.diff(error, axis=1))):
+        assert float(found[name]) == pytest.approx(np.mean(share * off**2), rel=1e-4)
+
+
 def test_a_person_who_trembles_costs_second_differences(
     scenes, representation, loss_terms, to_features
 ):
