@@ -243,8 +243,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         weight_ball_acceleration=300.0,
     ),
 }
-# A second training of a "small" model. Standardized rotations make four fifths of the
-# loss and planted feet a fiftieth; here feet make a quarter. The ball weighs the same.
+# A second training of a "small" model. Standardized rotations make four fifths of its
+# loss and planted feet a fiftieth; here feet make a quarter. What the ball weighs
+# stays, and yet a sprinter loses it.
 PRESETS["planted"] = PRESETS["small"] | dict(
     weight_rotation=0.1,
     weight_position_velocity=150.0,
