@@ -71,6 +71,8 @@ class Train:
         weighs the discriminator's verdict.
       weight_position: Of joint positions; with actions.
       weight_velocity: Of frame differences; with actions.
+      weight_position_velocity: Of their displacements; with actions (ours).
+      weight_acceleration: Of their second differences; with actions (ours).
       weight_foot: Of standing feet that slide; with actions.
       optimizer: Of generators: muon, or adam at a constant rate (published: 2e-5).
       learning_rate: Of generators.
@@ -122,6 +124,8 @@ class Train:
     weigh_levels: Literal["alike", "posterior"] = "alike"
     weight_position: float = 1.0
     weight_velocity: float = 1.0
+    weight_position_velocity: float = 0.0
+    weight_acceleration: float = 0.0
     weight_foot: float = 1.0
     optimizer: Literal["muon", "adam"] = "muon"
     learning_rate: float = 2e-3

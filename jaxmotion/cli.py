@@ -71,6 +71,8 @@ LIMITS: dict[str, Range] = {
     **dict.fromkeys(("scale", "amdm_scale", "recon"), Range(0, 10**6)),
     **dict.fromkeys(("max_norm", "previous_noise"), Range(0, 10**6)),
     **dict.fromkeys(("weight_position", "weight_velocity"), Range(0, 10**6)),
+    "weight_position_velocity": Range(0, 10**6),
+    "weight_acceleration": Range(0, 10**6),
     **dict.fromkeys(("weight_foot", "weight_pose"), Range(0, 10**6)),
     **dict.fromkeys(("speed", "speeds"), Range(0, 100)),
     "noise_half_life": Range(0, 86400),

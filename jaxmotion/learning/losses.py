@@ -109,6 +109,7 @@ def pose_terms(
     mask: Bool[Array, "*#batch frames"],
     *,
     feet: tuple[int, ...],
+    average: Average = "frames",
 ) -> dict[str, Float[Array, ""]]:
     """Of positions in the world: position, position_velocity, acceleration, foot.
 
@@ -117,13 +118,17 @@ def pose_terms(
     """
     flat = lambda x: x.reshape(*x.shape[:-2], -1)  # noqa: E731
     guess, truth = flat(predicted), flat(wanted)
+    feet_at = predicted[..., jnp.array(feet), :]
     return {
-        "position": masked_mse(guess, truth, mask),
-        "position_velocity": velocity_loss(guess, truth, mask),
+        "position": masked_mse(guess, truth, mask, average=average),
+        "position_velocity": velocity_loss(guess, truth, mask, average=average),
         "acceleration": velocity_loss(
-            displacement(guess), displacement(truth), mask[..., 1:] & mask[..., :-1]
+            displacement(guess),
+            displacement(truth),
+            mask[..., 1:] & mask[..., :-1],
+            average=average,
         ),
-        "foot": foot_slide_loss(predicted[..., jnp.array(feet), :], stands, mask),
+        "foot": foot_slide_loss(feet_at, stands, mask, average=average),
     }
 
 

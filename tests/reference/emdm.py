@@ -192,7 +192,7 @@ def masked_l2(a, b, mask):
             if keep[frame]:
                 total += np.sum((np.asarray(x[frame], np.float64) - y[frame]) ** 2)
                 count += np.size(x[frame])
-        losses.append(total / count)
+        losses.append(total / max(count, 1))  # too short for a difference: 0
     return np.mean(losses)
 
 
@@ -215,7 +215,7 @@ def foot_loss(found, wanted, feet, mask, speed=0.01):
 def geometric_terms(
     prediction, target, found, wanted, mask, feet, *, speed=0.01, translation=None
 ):
-    """The four terms of a batch, unweighted.
+    """The four terms of a batch, unweighted, and differences of positions (ours).
 
     prediction, target [batch, frames, features]; found, wanted are the joint positions
     of the two. The columns `translation` (a slice) of the features are left out of the
@@ -229,13 +229,16 @@ def geometric_terms(
         "reconstruction": masked_l2(prediction, target, mask),
         "position": masked_l2(found, wanted, mask),
         "velocity": masked_l2(*steps, mask[:, 1:]),
+        "position_velocity": masked_l2(
+            np.diff(found, axis=1), np.diff(wanted, axis=1), mask[:, 1:]
+        ),
+        "acceleration": masked_l2(
+            np.diff(found, 2, axis=1), np.diff(wanted, 2, axis=1), mask[:, 2:]
+        ),
         "foot": foot_loss(found, wanted, feet, mask, speed),
     }
 
 
-def geometric_loss(terms, *, reconstruction=1.0, position=1.0, velocity=1.0, foot=1.0):
-    """R times the reconstruction plus the weighted other terms."""
-    weights = dict(
-        reconstruction=reconstruction, position=position, velocity=velocity, foot=foot
-    )
-    return sum(weights[name] * terms[name] for name in terms)
+def geometric_loss(terms, **weights):
+    """R times the reconstruction plus the weighted other terms; those not named: 1."""
+    return sum(weights.get(name, 1.0) * value for name, value in terms.items())

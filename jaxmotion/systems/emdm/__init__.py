@@ -20,7 +20,8 @@ players). Ours, on in `experiments/emdm.py` because trainings here take minutes:
 * `token_margin=3`: tokens of four frames share three with their neighbors; published:
   tokens of one frame.
 * `weigh_levels="posterior"` and `fade_geometry` are options: errors count less at noisy
-  steps; published: alike at all.
+  steps; published: alike at all. So are errors of joints' displacements and their
+  differences (`weight_position_velocity`, `weight_acceleration`); published: none.
 * one forward pass for both losses of the generator: the same expected gradient, a pass
   less; published: two passes.
 * `norm="pre"` and no dropout: learn faster; published: post-norm, 0.1.

@@ -14,8 +14,6 @@ Source: Zhou et al. 2024 (EMDM), eq. 5-12; released code.
 """
 
 import dataclasses
-import functools
-import operator
 from collections.abc import Callable
 
 import jax
@@ -78,10 +76,11 @@ def geometric_loss(
     config: Config,
     geometry: Geometry | None,
 ) -> tuple[Float[Array, ""], Info]:
-    """Weighted errors of features, joint positions, frame differences and feet, of x_0.
+    """Weighted errors of features, their differences, joint positions and feet, of x_0.
 
-    Without geometry the three last weights are 0; t is the steps that it is predicted
-    from. Terms are unweighted but for `config.fade_geometry` and `config.weigh_levels`.
+    Without geometry only the first counts; t is the steps that it is predicted from.
+    First and second differences of positions are ours (weight 0 as published). Terms
+    are unweighted but for `config.fade_geometry` and `config.weigh_levels`.
 
     Source: EMDM, eq. 11-12; MDM, eq. 3-5.
     """
@@ -93,15 +92,12 @@ def geometric_loss(
         prediction, features = count * prediction, count * features
     error = losses.masked_mse(prediction, features, mask, average=average)
     terms = {"recon": error}
-    weights = {"recon": config.weight_recon}
     if geometry is not None:
-        weights["position"] = config.weight_position
-        weights["velocity"] = config.weight_velocity
-        weights["foot"] = config.weight_foot
         found, truth = map(geometry.positions, geometric)
-        feet = jnp.asarray(geometry.feet)
         stands = contact.foot_contacts(
-            truth[..., feet, :], geometry.fps, max_speed=geometry.contact_speed
+            truth[..., jnp.asarray(geometry.feet), :],
+            geometry.fps,
+            max_speed=geometry.contact_speed,
         )
         if config.weigh_levels == "posterior":
             found, truth = count[..., None] * found, count[..., None] * truth
@@ -109,21 +105,16 @@ def geometric_loss(
             fade = jnp.sqrt(config.table().alpha_bar[t])[:, None, None]
             prediction, features = fade * prediction, fade * features
             found, truth = fade[..., None] * found, fade[..., None] * truth
-        flat = lambda p: p.reshape(*p.shape[:-2], -1)  # noqa: E731
-        terms["position"] = losses.masked_mse(
-            flat(found), flat(truth), mask, average=average
-        )
         terms["velocity"] = losses.velocity_loss(
             prediction[..., geometry.channels],
             features[..., geometry.channels],
             mask,
             average=average,
         )
-        terms["foot"] = losses.foot_slide_loss(
-            found[..., feet, :], stands, mask, average=average
+        terms |= losses.pose_terms(
+            found, truth, stands, mask, feet=geometry.feet, average=average
         )
-    parts = [weights[name] * value for name, value in terms.items()]
-    return functools.reduce(operator.add, parts), terms
+    return losses.weighted(terms, config)
 
 
 def _visible(x: Array, batch: Batch, config: Config) -> Array:

@@ -59,6 +59,8 @@ class Config:
       weight_recon: R, of the mean squared error of features (100 for texts).
       weight_position: Weight of joint positions (0 for texts).
       weight_velocity: Weight of frame differences of features (0 for texts).
+      weight_position_velocity: Weight of the displacements of joint positions (ours).
+      weight_acceleration: Weight of their second differences (ours).
       weight_foot: Weight of sliding feet (0 for texts).
       geometry: Joint positions of those losses relative to the "root" (released code)
         or in the "world" (ours: else a standing foot seems to slide under a moving
@@ -98,6 +100,8 @@ class Config:
     weight_recon: float = 1.0
     weight_position: float = 1.0
     weight_velocity: float = 1.0
+    weight_position_velocity: float = 0.0
+    weight_acceleration: float = 0.0
     weight_foot: float = 1.0
     geometry: Literal["root", "world"] = "root"
     fade_geometry: bool = False

@@ -20,7 +20,8 @@ from jaxmotion.systems.emdm.model import Config
 from jaxmotion.typing import Key, Params
 
 SYSTEM = "emdm"
-_FLAT = dict(weight_position=0.0, weight_velocity=0.0, weight_foot=0.0)
+_GEOMETRY = ("velocity", "position", "position_velocity", "acceleration", "foot")
+_FLAT = {f"weight_{name}": 0.0 for name in _GEOMETRY}
 _DDPM = dict(latent=0, schedule="cosine", weight_recon=1.0)
 # Changes of the base configuration, by row.
 ROWS: dict[str, dict[str, Any]] = {
@@ -185,8 +186,8 @@ def train_row(
     is not finite.
     """
     config = row_config(task.base, row)
-    flat = not (config.weight_position or config.weight_velocity or config.weight_foot)
-    geometry = None if flat else task.geometry
+    is_flat = not any(getattr(config, name) for name in _FLAT)
+    geometry = None if is_flat else task.geometry
     params = emdm_model.init(jax.random.key(generator.seed), config)
     if start is not None:
         params |= {"generator": start}

@@ -34,15 +34,20 @@ CONFIG = emdm_model.Config(
     weight_recon=2.0,
     weight_position=3.0,
     weight_velocity=5.0,
+    weight_position_velocity=11.0,
+    weight_acceleration=13.0,
     weight_foot=7.0,
 )
 DDPM = dataclasses.replace(CONFIG, latent=0, schedule="cosine")
 WEIGHTS = dict(reconstruction=2.0, position=3.0, velocity=5.0, foot=7.0)
+WEIGHTS |= dict(position_velocity=11.0, acceleration=13.0)
 # The oracle's names of the terms.
 NAMES = {
     "recon": "reconstruction",
     "position": "position",
     "velocity": "velocity",
+    "position_velocity": "position_velocity",
+    "acceleration": "acceleration",
     "foot": "foot",
 }
 
@@ -424,7 +429,8 @@ def test_every_frame_of_unequal_lengths_counts_the_same():
     cut = lambda x, i: jax.tree.map(lambda a: a[i : i + 1], x)  # noqa: E731
     alone = [oracle_terms(prediction[i : i + 1], cut(data, i)) for i in range(3)]
     for name, own in NAMES.items():
-        counts = np.array(lengths) - (name in ("velocity", "foot"))
+        order = {"recon": 0, "position": 0, "acceleration": 2}.get(name, 1)
+        counts = np.array(lengths) - order
         expected = np.average([terms[own] for terms in alone], weights=counts)
         np.testing.assert_allclose(found[name], expected, rtol=1e-5)
 
@@ -464,7 +470,7 @@ def test_losses_of_joints_fade_with_the_noise():
         part = float(config.table().alpha_bar[t])
         np.testing.assert_allclose(found["recon"], plain["recon"], rtol=1e-6)
         expected = 2.0 * plain["recon"]
-        for name, weight in (("position", 3.0), ("velocity", 5.0), ("foot", 7.0)):
+        for name, weight in list(WEIGHTS.items())[1:]:
             np.testing.assert_allclose(found[name], part * plain[name], rtol=1e-4)
             expected += weight * part * plain[name]
         np.testing.assert_allclose(total, expected, rtol=1e-4)

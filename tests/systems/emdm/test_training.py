@@ -113,6 +113,7 @@ def test_rows_are_changes_of_the_base():
     base = emdm_model.Config(features=150, weight_recon=100.0)
     make = functools.partial(emdm_training.row_config, base)
     flat = dict(weight_position=0.0, weight_velocity=0.0, weight_foot=0.0)
+    flat |= dict(weight_position_velocity=0.0, weight_acceleration=0.0)
     mdm = dict(latent=0, schedule="cosine", weight_recon=1.0)
     expected = {
         "emdm": {},
