@@ -152,11 +152,9 @@ def rows_of(curves: dict[str, list[Curve]], chunk: int) -> table.Rows:
         }
         steps = [np.diff(x.seconds) / chunk * 1000 for x in own]
         values["update_time"] = [np.median(x) for x in steps]
-        for column, axis in (("updates_needed", None), ("seconds_needed", "seconds")):
-            values[column] = [
-                crossing(updates if axis is None else x.seconds, x.losses, y)
-                for x, y in zip(own, level, strict=True)
-            ]
+        pairs = list(zip(own, level, strict=True))
+        values["updates_needed"] = [crossing(updates, x.losses, y) for x, y in pairs]
+        values["seconds_needed"] = [crossing(x.seconds, x.losses, y) for x, y in pairs]
         rows[name] = {k: table.cell(jnp.asarray(x)) for k, x in values.items()}
     return rows
 
@@ -187,6 +185,10 @@ def main() -> None:
     """Writes table and picture."""
     args = cli.check(tyro.cli(Config, description=__doc__))
     loop.check_writable(args.out)
+    if args.steps % args.chunk:
+        raise ValueError(
+            f"--steps is {args.steps}, expected a multiple of --chunk, {args.chunk}"
+        )
     chosen = {text: optimizer_of(text, args.steps) for text in args.optimizers}
     run = runs.load(args.run, system=camdm_model.SYSTEM)
     model = camdm_model.from_json(run.model, where=str(run.config))
@@ -234,8 +236,8 @@ def main() -> None:
     rows = rows_of(curves, args.chunk)
     about = {"source": run.source} | reporting.provenance(args)
     about |= {"seeds": {"training": list(range(args.seeds))}}
-    for field in ("training", "minutes"):  # of the run, which is not continued
-        about.pop(field, None)
+    for name in ("training", "minutes"):  # of the run, which is not continued
+        about.pop(name, None)
     about["curves"] = {
         name: [
             {"losses": x.losses.tolist(), "seconds": x.seconds.tolist()} for x in own

@@ -78,3 +78,10 @@ def test_rows_share_start_and_batches(script):
 def test_an_optimizer_that_is_none_is_named(script, text):
     with pytest.raises(ValueError, match=f"--optimizers: '{text}'.*muon, adamw"):
         script.optimizer_of(text, 10)
+
+
+def test_updates_come_in_whole_chunks(script, tmp_path, monkeypatch):
+    line = f"optimizers.py --run {tmp_path} --steps 70 --chunk 50 --out {tmp_path}"
+    monkeypatch.setattr("sys.argv", line.split())
+    with pytest.raises(ValueError, match="--steps is 70, expected a multiple of.*50"):
+        script.main()
