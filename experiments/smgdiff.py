@@ -53,6 +53,8 @@ class Train:
       noise_levels: Of each window in an update; None for the preset's.
       own_levels: Probability of noise on own predictions at lower levels.
       cubic_wishes: Probability of wanted paths without sway.
+      balance: How much more often rare speeds and turns are drawn: 0 as recorded, 1 all
+        alike.
       seam_half_life: Half-life, frames, of the offset with which plans go on from the
         past; 0: none.
       weight_foot: Weight of planted feet; None for the preset's.
@@ -80,6 +82,7 @@ class Train:
     noise_levels: int | None = None
     own_levels: float | None = None
     cubic_wishes: float | None = None
+    balance: float = 0.0
     seam_half_life: float | None = None
     weight_foot: float | None = None
     init: cli.Optional[Path] = None
@@ -211,6 +214,7 @@ def train(args: Train) -> None:
             stage,
             budget=budget,
             draft_steps=args.draft_steps,
+            balance=args.balance,
             init=args.init,
         )
         print(f"{stage}: {time.perf_counter() - begun:.0f} s", flush=True)

@@ -151,7 +151,7 @@ def repeat_rare(
     numbers comes each class's share before and after.
     """
     _, kind, count = np.unique(kinds, return_inverse=True, return_counts=True)
-    weight = count[kind] ** -power
+    weight = count[kind] ** -float(power)
     times = 2.0 * kinds.size * weight / weight.sum()
     # Rounded so that the sum is right: the n-th entry lies where the sum passes n.
     edges = np.round(np.concatenate([[0.0], np.cumsum(times)])).astype(int)

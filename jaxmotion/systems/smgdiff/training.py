@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 
+from jaxmotion.data import windows
 from jaxmotion.data.ball_clips import BallClips, load_ball_clips, save_ball_clips
 from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.systems.smgdiff import data as smgdiff_data
@@ -269,30 +270,36 @@ def train_stage(
     *,
     budget: runs.Budget,
     draft_steps: int = 0,
+    balance: float = 0.0,
     init: Path | None = None,
 ) -> None:
     """Trains a stage such as "motion_8", from its newest checkpoint if there is one.
 
-    A motion model first gets `draft_steps` updates with the weights `DRAFT`. A new
-    stage starts with the parameters of `init`, and then has no draft; None for random
-    ones.
+    A motion model first gets `draft_steps` updates with the weights `DRAFT`. `balance`
+    is as in `windows.balance`. A new stage starts with the parameters of `init`, and
+    then has no draft; None for random ones.
 
     `ValueError` if there is no such stage, its checkpoint has other settings, or the
     model of `init` does not fit; `TrainingDiverged` if a loss is not finite.
     """
     model = with_steps(run.model, stage)
     arrays = smgdiff_data.scene_arrays(run.train, model.config.window)
+    if balance:
+        index, _ = windows.balance(
+            run.train.clips, arrays.index, last=model.config.past - 1, power=balance
+        )
+        arrays = dataclasses.replace(arrays, index=index)
     params = jax.jit(lambda key: init_stage(key, model, stage))(
         jax.random.key(budget.seed)
     )
     kind, _ = check_stage_name(stage)
-    settings: dict[str, Any] | None = None
+    settings: dict[str, Any] = {"balance": balance} if balance else {}
     if init is not None:
-        settings, draft_steps = {"init": str(init)}, 0
+        settings, draft_steps = settings | {"init": str(init)}, 0
         if checkpoint.latest_step(run.record.checkpoints(stage)) is None:
             params = continued(model, init)[1][kind]
     if kind == "motion":
-        settings = (settings or {}) | {"draft_steps": draft_steps}
+        settings |= {"draft_steps": draft_steps}
         if draft_steps:
             draft = dataclasses.replace(model.config, **DRAFT)
             params = _fit(
