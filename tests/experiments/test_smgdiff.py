@@ -15,7 +15,7 @@ from tests.experiments.conftest import check_face_steers
 ROOT = Path(__file__).parents[2]
 SIZES = (
     "--width 16 --depth 1 --steps 10 --draft-steps 10 --path-steps 10 --batch 4 "
-    "--held-out 0.3"
+    "--held-out 0.3 --balance 0.5"
 )
 SHORT = "--windows 8 --replications 2 --evaluator-steps 20 --starts 2 --repeats 2"
 

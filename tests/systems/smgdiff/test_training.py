@@ -184,6 +184,24 @@ def test_training_goes_on_from_an_exported_model(run, tmp_path):
         )
 
 
+def test_a_balanced_stage_learns_from_other_windows(run, tmp_path):
+    found = {}
+    for power in (0.0, 1.0):
+        own = smgdiff_training.prepare(
+            tmp_path / str(power),
+            run.record.folder.parent / "clips.npz",
+            held_out=0.3,
+            sizes=SIZES,
+            paths=PATHS,
+        )
+        smgdiff_training.train_stage(own, "paths_1", budget=BUDGET, balance=power)
+        found[power] = smgdiff_training.load_stage(own, "paths_1")[1]
+    gaps = jax.tree.map(lambda x, y: np.abs(x - y).max(), *found.values())
+    assert max(jax.tree.leaves(gaps)) > 1e-6
+    with pytest.raises(ValueError, match="other settings"):
+        smgdiff_training.train_stage(own, "paths_1", budget=BUDGET, balance=0.5)
+
+
 def test_stages_are_named_by_kind_and_steps(run):
     assert smgdiff_training.with_steps(run.model, "paths_3").paths.num_steps == 3
     for name in ("motion", "motion_0", "motion_x", "dance_8"):
