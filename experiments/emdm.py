@@ -1,4 +1,4 @@
-"""EMDM and what it is compared with: train, evaluate, sample, export.
+"""EMDM and what it is compared with: train, evaluate, sample, export, levels.
 
 Examples:
   python experiments/prepare_data.py bandai_namco/1 --manual-dir path/to/zips --out data/bandai1.npz
@@ -25,6 +25,7 @@ from jaxmotion.evaluators.text_motion import Padding
 from jaxmotion.learning import checkpoint, loop, runs
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.emdm import evaluation as emdm_evaluation
+from jaxmotion.systems.emdm import levels as emdm_levels
 from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm import sampler as emdm_sampler
 from jaxmotion.systems.emdm import scoring as emdm_scoring
@@ -367,6 +368,41 @@ def sample(args: Sample) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
+class Levels:
+    """What a row of actions predicts at each step of its chain; writes a table.
+
+    Example: python experiments/emdm.py levels --run runs/emdm_action --row emdm
+
+    Attributes:
+      run: Run folder of actions, for its training motions.
+      row: Which model.
+      model: Exported file to measure instead; None for the run's row.
+      out: Folder; None for <run>/levels.
+      samples: Training motions, given to every step.
+      seed: Seeds motions, noise and latents.
+    """
+
+    run: Path = Path("runs/emdm_action")
+    row: str = "emdm"
+    model: Path | None = None
+    out: Path | None = None
+    samples: int = 256
+    seed: int = 0
+
+
+def levels(args: Levels) -> None:
+    """Writes the table."""
+    out = cli.out_folder(args, "levels")
+    run = emdm_data.load_run(args.run)
+    model, params = emdm_sampler.load(args.model or args.run, row=args.row)
+    rows = emdm_levels.level_table(
+        run, model, params, number=args.samples, seed=args.seed
+    )
+    report = {"source": model.source} | reporting.provenance(args)
+    reporting.write_table(out, rows, report, (model.source,))
+
+
+@dataclasses.dataclass(frozen=True)
 class Import:
     """Put the authors' weights into a run folder of texts; no code of theirs is run.
 
@@ -437,6 +473,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Sample, tyro.conf.subcommand("sample")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Levels, tyro.conf.subcommand("levels")]
     | Annotated[Import, tyro.conf.subcommand("import")]
 )
 
@@ -445,7 +482,7 @@ def main() -> None:
     """Parses the command line and runs the command."""
     args = cli.check(tyro.cli(Command, description=__doc__))
     run = {Train: train, Evaluate: evaluate, Sample: sample, Export: export}
-    (run | {Import: import_weights})[type(args)](args)
+    (run | {Levels: levels, Import: import_weights})[type(args)](args)
 
 
 if __name__ == "__main__":

@@ -80,6 +80,9 @@ COLUMNS: dict[str, Column] = {
         ),
         _share("told_apart", "accuracy of a classifier of samples and data"),
         Column(id="discriminator", title="loss of the discriminator", better=""),
+        Column(id="error", title="error of features, deviations"),
+        Column(id="over_latents", title="deviation over latents", better=""),
+        Column(id="spread", title="deviation of poses over the data's", better="real"),
         Column(id="div", title="diversity of poses", better="real"),
         Column(id="pose_variance", title="diversity", unit="m²", better="higher"),
         # Following commands.
@@ -111,6 +114,7 @@ COLUMNS: dict[str, Column] = {
         Column(id="penetration", title="penetration", unit="mm"),
         Column(id="floating", title="floating", unit="mm"),
         Column(id="skate", title="skate", unit="mm"),
+        Column(id="skate_recorded", title="recorded", unit="mm", better=""),
         Column(id="toe_sink", title="lowest toe below rest", unit="cm"),
         Column(id="toe_depth", title="mean toe below rest", unit="cm"),
         Column(id="toe_swing", title="swinging toe", unit="cm", better=""),

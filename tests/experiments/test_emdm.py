@@ -13,7 +13,10 @@ from PIL import Image
 
 from jaxmotion.data import bvh_text, clips_io, procedural
 from jaxmotion.learning import runs
+from jaxmotion.systems.emdm import data as emdm_data
+from jaxmotion.systems.emdm import levels
 from jaxmotion.systems.emdm import published as emdm_published
+from jaxmotion.systems.emdm import sampler as emdm_sampler
 from jaxmotion.systems.emdm import training as emdm_training
 
 SIZES = (
@@ -66,6 +69,35 @@ def texts(call, data, tmp_path_factory):
 
 def rows_of(folder):
     return json.loads((folder / "metrics.json").read_text())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("row", "steps"), [("emdm", 10), ("ddpm_50", 10)])
+def test_levels_have_a_row_each(call, actions, tmp_path, row, steps):
+    call(f"levels --run {actions} --row {row} --samples 16 --out {tmp_path}")
+    rows = rows_of(tmp_path)["rows"]
+    assert len(rows) == steps
+    for cells in rows.values():
+        assert 0 < cells["error"]["value"] < 10 and cells["spread"]["value"] > 0
+        assert (cells["over_latents"]["value"] > 0) == (row == "emdm")
+
+
+@pytest.mark.slow
+def test_levels_of_a_network_that_says_nothing_are_those_of_the_mean(actions):
+    run = emdm_data.load_run(actions)
+    model, params = emdm_sampler.load(actions, row="emdm")
+    params = dict(params) | {"out": jax.tree.map(jnp.zeros_like, params["out"])}
+    rows = levels.level_table(run, model, params, number=64, seed=3)
+    motions = emdm_data.make_task(run, model.config, conditional=True)
+    x_0 = motions.batch(jax.random.split(jax.random.key(3))[0], motions.data, 64).x_0
+    for cells in rows.values():
+        wanted = np.sqrt(np.mean(np.square(np.asarray(x_0, np.float64))))
+        np.testing.assert_allclose(cells["error"].value, wanted, rtol=1e-5)
+        assert cells["over_latents"].value == 0
+        np.testing.assert_allclose(cells["spread"].value, 0, atol=1e-5)
+    other = dataclasses.replace(model, labels=("jump", *model.labels[1:]))
+    with pytest.raises(ValueError, match="actions are"):
+        levels.level_table(run, other, params, number=8, seed=0)
 
 
 @pytest.mark.slow
