@@ -246,7 +246,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 # A second training of a "small" model. Standardized rotations make four fifths of its
 # loss and planted feet a fiftieth; here feet make a quarter. What the ball weighs
-# stays, and yet a sprinter loses it.
+# stays, and yet a sprinter loses it unless fast runs are drawn more often (`balance`).
 PRESETS["planted"] = PRESETS["small"] | dict(
     weight_rotation=0.1,
     weight_position_velocity=150.0,
