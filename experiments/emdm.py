@@ -396,7 +396,7 @@ def levels(args: Levels) -> None:
     run = emdm_data.load_run(args.run)
     model, params = emdm_sampler.load(args.model or args.run, row=args.row)
     rows = emdm_levels.level_table(
-        run, model, params, number=args.samples, seed=args.seed
+        params, run, model, number=args.samples, seed=args.seed
     )
     report = {"source": model.source} | reporting.provenance(args)
     reporting.write_table(out, rows, report, (model.source,))

@@ -80,7 +80,7 @@ COLUMNS: dict[str, Column] = {
         ),
         _share("told_apart", "accuracy of a classifier of samples and data"),
         Column(id="discriminator", title="loss of the discriminator", better=""),
-        Column(id="error", title="error of features, deviations"),
+        Column(id="prediction_error", title="error of features, deviations"),
         Column(id="over_latents", title="deviation over latents", better=""),
         Column(id="spread", title="deviation of poses over the data's", better="real"),
         Column(id="div", title="diversity of poses", better="real"),

@@ -78,7 +78,9 @@ def test_levels_have_a_row_each(call, actions, tmp_path, row, steps):
     rows = rows_of(tmp_path)["rows"]
     assert len(rows) == steps
     for cells in rows.values():
-        assert 0 < cells["error"]["value"] < 10 and cells["spread"]["value"] > 0
+        assert (
+            0 < cells["prediction_error"]["value"] < 10 and cells["spread"]["value"] > 0
+        )
         assert (cells["over_latents"]["value"] > 0) == (row == "emdm")
 
 
@@ -87,17 +89,17 @@ def test_levels_of_a_network_that_says_nothing_are_those_of_the_mean(actions):
     run = emdm_data.load_run(actions)
     model, params = emdm_sampler.load(actions, row="emdm")
     params = dict(params) | {"out": jax.tree.map(jnp.zeros_like, params["out"])}
-    rows = levels.level_table(run, model, params, number=64, seed=3)
+    rows = levels.level_table(params, run, model, number=64, seed=3)
     motions = emdm_data.make_task(run, model.config, conditional=True)
     x_0 = motions.batch(jax.random.split(jax.random.key(3))[0], motions.data, 64).x_0
     for cells in rows.values():
         wanted = np.sqrt(np.mean(np.square(np.asarray(x_0, np.float64))))
-        np.testing.assert_allclose(cells["error"].value, wanted, rtol=1e-5)
+        np.testing.assert_allclose(cells["prediction_error"].value, wanted, rtol=1e-5)
         assert cells["over_latents"].value == 0
         np.testing.assert_allclose(cells["spread"].value, 0, atol=1e-5)
     other = dataclasses.replace(model, labels=("jump", *model.labels[1:]))
     with pytest.raises(ValueError, match="actions are"):
-        levels.level_table(run, other, params, number=8, seed=0)
+        levels.level_table(params, run, other, number=8, seed=0)
 
 
 @pytest.mark.slow

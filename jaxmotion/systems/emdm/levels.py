@@ -29,9 +29,9 @@ _ROWS = 10
 
 
 def level_table(
+    params: Params,
     run: emdm_data.ActionRun,
     model: Model,
-    params: Params,
     *,
     number: int,
     seed: int,
@@ -62,7 +62,7 @@ def level_table(
     batch = task.batch(key_data, task.data, number)
     geometry = emdm_features.geometry(model.representation, relative=False)
     measure = jax.jit(
-        functools.partial(_level, config=model.config, geometry=geometry, params=params)
+        functools.partial(_level, params, config=model.config, geometry=geometry)
     )
     rows = {}
     steps = model.config.num_steps
@@ -75,13 +75,13 @@ def level_table(
 
 
 def _level(
+    params: Params,
     key: Key,
     batch: emdm_loss.Batch,
     t: Array,
     *,
     config: emdm_model.Config,
     geometry: emdm_loss.Geometry,
-    params: Params,
 ) -> dict[str, Array]:
     key_pair, *keys = jax.random.split(key, 3)
     _, x_t = gan.q_pair(config.table(), key_pair, batch.x_0, t)
@@ -108,7 +108,7 @@ def _level(
     still = steps(real) < _STILL
     slide = lambda x: 1000.0 * jnp.sum(steps(x) * still) / jnp.sum(still)  # noqa: E731
     return {
-        "error": jnp.sqrt(jnp.mean((one - batch.x_0) ** 2)),
+        "prediction_error": jnp.sqrt(jnp.mean((one - batch.x_0) ** 2)),
         "over_latents": jnp.sqrt(jnp.mean((one - other) ** 2) / 2.0),
         "spread": deviation(joints) / deviation(real),
         "skate": slide(joints),
