@@ -22,9 +22,6 @@ from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.emdm.sampler import Model
 from jaxmotion.typing import Key, Params
 
-# A recorded foot that moves less in a frame stands, meters (as `plausibility.skating`
-# counts them, feet near the ground do not move more).
-_STILL = 0.01
 _ROWS = 10
 
 
@@ -41,8 +38,8 @@ def level_table(
     Chains of more than ten steps have ten rows.
 
     Columns: error of features and deviation over latents, in deviations of features;
-    deviation of poses over motions, of the data's; and how far feet move in a frame in
-    which the recorded ones move less than 1 cm, with the recorded ones', mm.
+    deviation of poses over motions, of the data's; and how far feet move in a frame,
+    mm, where the recorded ones are slower than `Geometry.contact_speed`, with theirs.
 
     `ValueError` if the model was made for other actions or another skeleton.
     """
@@ -105,7 +102,7 @@ def _level(
         feet = joints[..., jnp.asarray(geometry.feet), ::2]
         return jnp.linalg.norm(jnp.diff(feet, axis=1), axis=-1)
 
-    still = steps(real) < _STILL
+    still = steps(real) < geometry.contact_speed / geometry.fps
     slide = lambda x: 1000.0 * jnp.sum(steps(x) * still) / jnp.sum(still)  # noqa: E731
     return {
         "prediction_error": jnp.sqrt(jnp.mean((one - batch.x_0) ** 2)),
