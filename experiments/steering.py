@@ -41,7 +41,8 @@ class Config:
       speeds: What characters are commanded that go straight on, meters per second; 0
         to stand.
       courses: Courses that they follow besides.
-      speed: What they are commanded there, meters per second.
+      course_speeds: What they are commanded there, meters per second; each course at
+        each.
       rollouts: Characters per speed and per course.
       seconds: Length of each rollout, seconds; 13 or more to measure who stands.
       foot_lock: Measure what is displayed with locked feet, too.
@@ -62,7 +63,7 @@ class Config:
         "turn_on_the_spot",
         "turn_around",
     )
-    speed: float = 1.4
+    course_speeds: tuple[float, ...] = (1.4,)
     rollouts: int = 16
     seconds: float = 20.0
     foot_lock: bool = True
@@ -107,7 +108,7 @@ def main() -> None:
         label=args.label or (*model.labels, "")[0],
         speeds=args.speeds,
         names=args.courses,
-        course_speed=args.speed,
+        course_speeds=args.course_speeds,
         rollouts=args.rollouts,
         seconds=args.seconds,
         foot_lock=FootLock() if args.foot_lock else None,

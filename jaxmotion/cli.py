@@ -74,7 +74,7 @@ LIMITS: dict[str, Range] = {
     "weight_position_velocity": Range(0, 10**6),
     "weight_acceleration": Range(0, 10**6),
     **dict.fromkeys(("weight_foot", "weight_pose"), Range(0, 10**6)),
-    **dict.fromkeys(("speed", "speeds"), Range(0, 100)),
+    **dict.fromkeys(("speed", "speeds", "course_speeds"), Range(0, 100)),
     "noise_half_life": Range(0, 86400),
     "min_acceleration": Range(0, 10**4),
     "before": Range(1, 86400),

@@ -13,6 +13,7 @@ trigger re-plans whenever the command changes.
 * "stop_and_go": travels, stands, travels on.
 * "figure_eight": one circle to either side, in steps of half a second.
 * "turn_around": travels, turns by 180 degrees at once, travels back.
+* "reversals": the same every one and a half seconds, hardly turned.
 * "turn_on_the_spot": stands and turns by 90 degrees every two seconds, first to one
   side, then to the other.
 
@@ -79,6 +80,10 @@ def _turn_around() -> list[_Segment]:
     return [(4.0, 0.0, 0.0, 1.0), (4.0, 180.0, 180.0, 1.0)]
 
 
+def _reversals() -> list[_Segment]:
+    return [(1.5, 0.0, 0.0, 1.0), (1.5, 180.0, 180.0, 1.0)]
+
+
 def _turn_on_the_spot() -> list[_Segment]:
     facings = (0.0, 90.0, 180.0, 270.0, 360.0, 270.0, 180.0, 90.0)
     return [(2.0, facing, facing, 0.0) for facing in facings]
@@ -92,6 +97,7 @@ Course = Literal[
     "stop_and_go",
     "figure_eight",
     "turn_around",
+    "reversals",
     "turn_on_the_spot",
 ]
 COURSES: dict[Course, Callable[[], list[_Segment]]] = {
@@ -102,6 +108,7 @@ COURSES: dict[Course, Callable[[], list[_Segment]]] = {
     "stop_and_go": _stop_and_go,
     "figure_eight": _figure_eight,
     "turn_around": _turn_around,
+    "reversals": _reversals,
     "turn_on_the_spot": _turn_on_the_spot,
 }
 

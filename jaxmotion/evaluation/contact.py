@@ -107,6 +107,26 @@ def skating_frame_ratio(
     return jnp.mean(jnp.any(skates, axis=-1), axis=-1)
 
 
+@jax.jit
+def leg_crossings(
+    foot_positions: Float[Array, "*batch frames 2 3"],
+    facing: Float[Array, "*batch frames 2"],
+    fps: Scalar,
+    *,
+    margin: Scalar = 0.02,
+) -> Float[Array, "*batch"]:
+    """How often per minute the left foot comes to the right of the right one.
+
+    By more than `margin`, meters, seen along the facing (x, z; unit length). Feet are
+    world positions, meters, left before right.
+    """
+    gap = foot_positions[..., 0, ::2] - foot_positions[..., 1, ::2]
+    left = jnp.stack([facing[..., 1], -facing[..., 0]], axis=-1)
+    crossed = jnp.sum(gap * left, axis=-1) < -margin
+    begun = crossed[..., 1:] & ~crossed[..., :-1]
+    return 60.0 * fps * jnp.mean(begun, axis=-1)
+
+
 class Swing(NamedTuple):
     """How high swinging feet are, by window.
 

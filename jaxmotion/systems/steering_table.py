@@ -13,7 +13,7 @@ import functools
 import itertools
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -49,6 +49,8 @@ from jaxmotion.motion.trajectory import Command
 SKIP = 3.0
 # Real windows count for a told speed if their own is within 15 %, or 0.1 m/s.
 _NEAR, _STILL = 0.15, 0.1
+# Real windows turn if they end facing this far, degrees, from where they began.
+_TURNING = 90.0
 # A stop, a start and a turn are done below 0.1 m/s, at 90 % of the told speed, within
 # 10 degrees; those that another command follows too soon are not measured.
 _STOPPED, _STARTED, _TURNED = 0.1, 0.9, 10.0
@@ -64,11 +66,15 @@ KINDS = ("stop", "start", "turn")
 
 
 class Change(NamedTuple):
-    """A new command: which of `KINDS`, its first tick, and the first one without it."""
+    """A new command: which of `KINDS`, its first tick, and the first one without it.
+
+    Besides, by how many degrees the facing is to change.
+    """
 
     kind: str
     begin: int
     end: int
+    degrees: float
 
 
 def changes(commands: Command) -> list[Change]:
@@ -85,10 +91,10 @@ def changes(commands: Command) -> list[Change]:
     for begin, end in itertools.pairwise([*begins, len(speed)]):
         cosine = float(np.sum(facing[begin] * facing[begin - 1]))
         moves, moved = speed[begin] > 0, speed[begin - 1] > 0
-        turned = np.rad2deg(np.arccos(np.clip(cosine, -1, 1))) > _TURNED
+        degrees = float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
         kind = "stop" if moved and not moves else "start" if moves > moved else "turn"
-        if kind != "turn" or turned:
-            found.append(Change(kind, int(begin), int(end)))
+        if kind != "turn" or degrees > _TURNED:
+            found.append(Change(kind, int(begin), int(end), degrees))
     return found
 
 
@@ -97,7 +103,7 @@ def since_changes(
 ) -> Int[np.ndarray, "kinds ticks"]:
     """Steps of 0.2 s since the last change, if it was of that of `KINDS`, else -1."""
     since, step = np.full((len(KINDS), ticks), -1), round(_STEP_SECONDS * fps)
-    for kind, begin, end in new:
+    for kind, begin, end, _ in new:
         since[KINDS.index(kind), begin:end] = np.arange(end - begin) // step
     return since
 
@@ -132,7 +138,11 @@ def _window_metrics(
     )
     swing = contact.swing_height(feet, speed, fps, ground=ground.rest)
     names = ("slide_speed", "slide_seconds", "skate_ratio", "jerk", "orientation_error")
+    facing = trajectory.root_trajectory(skeleton, x.motion).facing
+    turn = alignment.heading_error(facing[..., 0, :], facing[..., -1, :])
     return {name: metrics[name] for name in names} | {
+        "turn": jnp.rad2deg(jnp.abs(turn)),
+        "crossings": contact.leg_crossings(feet, facing, fps),
         "speed": jnp.mean(speed[..., reach:-reach], axis=-1),
         "sink": ground.rest - jnp.min(toes, axis=(-2, -1)),
         "swing": swing.median,
@@ -241,6 +251,7 @@ _OF_WINDOWS = {
     "foot_slide": ("slide_speed", "slide_seconds", 1.0),
     "skate_ratio": ("skate_ratio", None, 1.0),
     "jerk": ("jerk", None, 1.0),
+    "crossings": ("crossings", None, 1.0),
     "toe_sink": ("sink", None, 100.0),
     "toe_depth": ("depth", None, 100.0),
     "toe_swing": ("swing", "swing_seconds", 100.0),
@@ -248,7 +259,7 @@ _OF_WINDOWS = {
     "orientation_error": ("orientation_error", None, float(np.rad2deg(1.0))),
 }
 _OF_ROLLOUTS = ("speed_error", "path_error", "path_error_max", "creep")
-_REACTIONS = ("stop_time", "start_time", "turn_time", "disobeyed")
+_REACTIONS = ("stop_time", "start_time", "half_turn_time", "turn_time", "disobeyed")
 _COUNTS = ("diverged", "frozen", "minutes")
 _NONE = Cell(value=float("nan"), samples=0)
 
@@ -281,15 +292,21 @@ def _reaction_cells(
         "stop": values["speed"] < _STOPPED,
         "start": values["speed"] >= _STARTED * wanted,
         "turn": values["facing_error"] <= _TURNED,
+        "half_turn": np.zeros_like(values["facing_error"], bool),
     }
+    for _, begin, end, degrees in told:
+        half = values["facing_error"][..., begin:end] <= degrees / 2.0
+        reached["half_turn"][..., begin:end] = half
     row, failed = {}, []
-    for kind in KINDS:
+    for name, is_reached in reached.items():
+        kind = name.removeprefix("half_")
         some = [c for c in told if c.kind == kind and c.end - c.begin >= least]
         if some:
             spans = [c.begin for c in some], [c.end for c in some]
-            found = alignment.reaction(reached[kind], *spans, fps)
-            row[f"{kind}_time"] = table.cell(jnp.asarray(found.seconds.mean(axis=-1)))
-            failed.append(~found.obeyed)
+            found = alignment.reaction(is_reached, *spans, fps)
+            row[f"{name}_time"] = table.cell(jnp.asarray(found.seconds.mean(axis=-1)))
+            if name in KINDS:
+                failed.append(~found.obeyed)
     if failed:
         share = np.concatenate(failed, axis=-1).mean(axis=-1)
         row["disobeyed"] = table.cell(jnp.asarray(share), bounds=(0.0, 1.0))
@@ -372,12 +389,23 @@ class _Real:
 
     def rows(self, speed: float) -> Rows:
         """A row for each clips' windows whose own speed is about that, m/s."""
+        width = _NEAR * speed if speed else _STILL
+        return self._some(
+            f"about {speed:g} m/s", lambda x: np.abs(x["speed"] - speed) < width
+        )
+
+    def turning(self) -> Rows:
+        """A row for each clips' windows in which it turns, at whatever speed."""
+        return self._some("turning", lambda x: x["turn"] > _TURNING)
+
+    def _some(
+        self, what: str, which: Callable[[dict[str, np.ndarray]], np.ndarray]
+    ) -> Rows:
         rows = {}
         for name, (values, groups) in self.values.items():
-            off = np.abs(values["speed"] - speed)
-            near = off < (_NEAR * speed if speed else _STILL)
-            part = {k: v[near] for k, v in values.items()}
-            rows[f"{name}, about {speed:g} m/s"] = _window_cells(part, groups[near])
+            chosen = which(values)
+            part = {k: v[chosen] for k, v in values.items()}
+            rows[f"{name}, {what}"] = _window_cells(part, groups[chosen])
         return rows
 
 
@@ -426,7 +454,7 @@ def steering_table(
     label: str,
     speeds: Sequence[float],
     names: Sequence[str] = (),
-    course_speed: float = 1.4,
+    course_speeds: Sequence[float] = (1.4,),
     places: int = 15,
     rollouts: int = 16,
     seconds: float = 20.0,
@@ -439,11 +467,12 @@ def steering_table(
     Held-out clips, which it never saw, and training clips give rows of real motion, the
     ground, and poses to start from if it starts from clips. All characters have the
     label, as have the real windows if the clips know it. They go straight on at
-    `speeds`, m/s (0 to stand), and follow the courses `names` at `course_speed`; so
-    many rollouts per speed and course, which all begin with the same poses and noise,
-    and whose first three seconds are left out. `places` frames of a plan are played; at
-    most `chunk` characters run at a time. With settings of the lock there are second
-    rows.
+    `speeds`, m/s (0 to stand), and follow the courses `names` at each of
+    `course_speeds`; so many rollouts per speed and course, which all begin with the
+    same poses and noise, and whose first three seconds are left out. `places` frames of
+    a plan are played; at most `chunk` characters run at a time. With settings of the
+    lock there are second rows. Where there are courses, real windows that turn by more
+    than 90 degrees have rows, too.
 
     `ValueError` if rollouts are too short to measure, there is no such label or course,
     or the skeleton has no feet to lock.
@@ -452,13 +481,14 @@ def steering_table(
     index = character.label(label) if character.labels else 0
     skip, ticks = round(SKIP * fps), round(seconds * fps)
     windows.check_ticks(ticks, fps=fps, skip=skip)
-    courses_ = [("straight", speed) for speed in speeds]
-    courses_ += [(name, course_speed) for name in names]
+    pairs = [("straight", speed) for speed in speeds]
+    pairs += itertools.product(names, course_speeds)
+    courses_ = {_title(name, speed): (name, speed) for name, speed in pairs}
     told = {
-        _title(name, speed): courses.course_commands(
+        title: courses.course_commands(
             name, seconds=seconds, fps=fps, speed=speed, label=index
         )
-        for name, speed in courses_
+        for title, (name, speed) in courses_.items()
     }
     characters = {"": character}
     if foot_lock is not None:
@@ -497,8 +527,8 @@ def steering_table(
     rows: Rows = {}
     by_plan: dict[str, ByFrame] = {}
     by_time: dict[str, ByFrame] = {}
-    for (course, speed), (title, commands) in zip(courses_, told.items(), strict=True):
-        new = changes(commands)
+    for title, commands in told.items():
+        (course, speed), new = courses_[title], changes(commands)
         for feet, one in kept(commands, since_changes(new, ticks, fps)).items():
             rows[title + feet] = _rollout_row(one, new, commands, fps=fps, skip=skip)
             by_plan[title + feet] = by_frame.means(one["by_plan"])
@@ -510,6 +540,7 @@ def steering_table(
         springs = {name: one[f"wanted_{name}"] for name in ("speed", "facing_error")}
         if row := _reaction_cells(springs, new, commands, fps):
             rows[f"{title}, the springs themselves"] = row
+    rows |= real.turning() if names else {}
     report = {
         "source": character.source,
         "label": label,

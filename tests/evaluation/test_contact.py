@@ -52,6 +52,31 @@ def test_skate_ratio_counts_frames_with_any_low_fast_foot():
     np.testing.assert_allclose(both, [2 / 5, 0.0])
 
 
+def test_legs_cross_as_often_as_the_left_foot_passes_the_right_one():
+    """A left foot that goes 10 cm to either side of the right one, twice a second."""
+    seconds = np.arange(60) / 30.0 + 0.01
+    for turn in (0.0, 1.0, 2.5):
+        facing = np.array([np.sin(turn), np.cos(turn)])
+        left = np.array([facing[1], 0.0, -facing[0]])
+        feet = np.zeros((60, 2, 3))
+        feet[:, 0] = 0.1 * np.cos(4 * np.pi * seconds)[:, None] * left
+        feet = jnp.asarray(feet + [1.0, 0.0, 2.0], jnp.float32)
+        facings = jnp.asarray(np.tile(facing, (60, 1)), jnp.float32)
+        times = contact.leg_crossings(feet, facings, 30.0)
+        np.testing.assert_allclose(times, 4 / (59 / 30) * 60, rtol=1e-5)
+        assert contact.leg_crossings(feet, facings, 30.0, margin=0.11) == 0
+
+
+def test_feet_side_by_side_do_not_cross_whichever_way_they_face():
+    """Hips' own rule: ahead is the way across from right to left, turned by up."""
+    feet = jnp.zeros((5, 2, 3)).at[:, 0, 0].set(0.2)  # the left one toward +x
+    ahead = jnp.tile(jnp.array([0.0, 1.0]), (5, 1))
+    steps = feet.at[2:4, 0, 0].set(-0.2)
+    assert contact.leg_crossings(feet, ahead, 30.0) == 0
+    assert contact.leg_crossings(steps, ahead, 30.0) == 60 * 30 / 4
+    assert contact.leg_crossings(steps, -ahead, 30.0) == 60 * 30 / 4
+
+
 def sliding(speed, height, frames=5):
     """Two feet: one slides along the ground at a height, one stands still beside it."""
     along = speed * np.arange(frames) / 60.0

@@ -10,7 +10,8 @@ import pytest
 
 from jaxmotion.control import courses, rollout, steering
 from jaxmotion.control.frame import Frame
-from jaxmotion.motion import spring
+from jaxmotion.data import windows
+from jaxmotion.motion import spring, trajectory
 from jaxmotion.systems import steering_table
 from tests import tiny
 
@@ -103,7 +104,7 @@ def clips():
     return tiny.clips(120)
 
 
-def table(*names, speeds=(), rollouts=2, speed=1.0, chunk=2, **faults):
+def table(*names, speeds=(), rollouts=2, speed=(1.0,), chunk=2, **faults):
     faults = jax.tree.map(jnp.float32, HONEST | faults)
     character = steering.Character(
         skeleton=clips().skeleton,
@@ -122,7 +123,7 @@ def table(*names, speeds=(), rollouts=2, speed=1.0, chunk=2, **faults):
         label="calm",
         speeds=speeds,
         names=names,
-        course_speed=speed,
+        course_speeds=speed,
         rollouts=rollouts,
         seconds=SECONDS,
         chunk=chunk,
@@ -191,12 +192,41 @@ def test_who_turns_late_takes_that_long(late):
     assert value(found, "turn on the spot", "turn_time") == pytest.approx(
         expected, abs=0.01
     )
+    # All at once: half of the turn takes no less.
+    half = value(found, "turn on the spot", "half_turn_time")
+    assert half == value(found, "turn on the spot", "turn_time")
     assert value(found, "turn on the spot", "disobeyed") == 0
     turning = found.by_time["turn on the spot, turn"]["facing_error"]
     np.testing.assert_allclose(turning[:5], 90.0 if late else 0.0, atol=0.1)
     np.testing.assert_allclose(turning[6:10], 0.0, atol=0.1)
     # Commands come every two seconds.
     assert np.isnan(turning[10:]).all()
+
+
+def test_half_of_a_turn_takes_the_springs_less_time():
+    found = table("reversals", "turn_around", speeds=(1.0,))
+    row = "reversals at 1 m/s, the springs themselves"
+    rate = 2 * np.log(2) / 0.27
+    seconds = np.arange(0.0, 1.5, 1e-3)
+    left = 180.0 * (1 + rate * seconds) * np.exp(-rate * seconds)
+    for column, degrees in (("half_turn_time", 90.0), ("turn_time", 10.0)):
+        expected = seconds[np.argmax(left < degrees)]
+        # A tick later at most; a turn that the next one cuts short is no slower.
+        assert value(found, row, column) == pytest.approx(expected, abs=2 / FPS)
+
+
+def test_courses_go_at_each_speed_and_turns_have_rows_of_real_motion():
+    found = table("turn_around", "turn_on_the_spot", speed=(0.5, 1.0))
+    courses_ = {"turn around at 0.5 m/s", "turn around at 1 m/s", "turn on the spot"}
+    assert set(found.by_plan) == courses_
+    cut = windows.eval_windows(clips(), stride=30, field="style")
+    calm = np.asarray(cut.label) == tiny.STYLES.index("calm")
+    facing = trajectory.root_trajectory(clips().skeleton, cut.motion).facing
+    x, z = np.moveaxis(np.asarray(facing)[calm], -1, 0)
+    heading = np.unwrap(np.arctan2(x, z))
+    turned = np.abs(np.rad2deg(heading[:, -1] - heading[:, 0]))
+    assert 0 < (turned > 90).sum() < len(turned) and turned.max() < 180
+    assert value(found, "held-out, turning", "windows") == (turned > 90).sum()
 
 
 def test_who_never_turns_disobeys():
@@ -256,9 +286,9 @@ def test_changes_are_stops_starts_and_turns():
         "stop_and_go", seconds=9.0, fps=FPS, speed=1.0, label=0
     )
     assert steering_table.changes(commands) == [
-        ("stop", 90, 150),
-        ("start", 150, 240),
-        ("stop", 240, 270),
+        ("stop", 90, 150, pytest.approx(0.0, abs=0.1)),
+        ("start", 150, 240, pytest.approx(60.0, abs=0.1)),
+        ("stop", 240, 270, pytest.approx(0.0, abs=0.1)),
     ]
     since = steering_table.since_changes(steering_table.changes(commands), 270, FPS)
     assert (since[:, :90] == -1).all() and (since[2] == -1).all()
