@@ -196,6 +196,16 @@ def start(job: Job, core: int) -> Running | None:
     return Running(job, process, minutes, time.monotonic())
 
 
+def keep(job: Job, sources: list[Source]) -> list[Path]:
+    """Stores what a training measured; the first of a table has its source's title."""
+    kept = []
+    for source, (name, path) in zip(sources, job.files.items(), strict=True):
+        is_new = not (stored.FOLDER / f"{source.name}.json").is_file()
+        title = source.title if is_new else ""
+        kept.append(stored.keep(stored.FOLDER, path, name, title))
+    return kept
+
+
 def last_line(path: Path) -> str:
     """The last line of a log that says something."""
     lines = [x for x in path.read_text(errors="replace").splitlines() if x.strip()]
@@ -259,8 +269,8 @@ def work(args: Config, show: Callable[[str], None] = print) -> list[Job]:
                 if code == 0 and job.done:
                     show(f"{job.folder}: done")
                     if args.keep:
-                        for name, path in job.files.items():
-                            show(f"wrote {stored.keep(stored.FOLDER, path, name)}")
+                        for path in keep(job, sources[job.run]):
+                            show(f"wrote {path}")
                     wanted[job.run] = needed(args, sources[job.run])
                 else:
                     left[job.folder] = job

@@ -25,6 +25,7 @@ class Source:
       run: Name of the run folder, and of the option that moves it.
       file: Path below that folder.
       commands: "{run}" stands for the folder.
+      title: What it answers, for a first training that is stored.
       name: "system/table": its part of experiments/papers, and its file in
         experiments/results.
     """
@@ -32,6 +33,7 @@ class Source:
     run: str
     file: str
     commands: tuple[str, ...]
+    title: str = ""
     name: str = ""
 
 

@@ -49,7 +49,7 @@ if not old.exists():
     old.write_text('{"title": "t", "transcribed": "", "rows": {}}')
 def make(name, gap, pause):
     source = claims.Source(
-        run=name, file="metrics.json", name=f"x/{name}",
+        run=name, file="metrics.json", name=f"x/{name}", title=f"Of {name}",
         commands=(
             f"python {sys.argv[2]} --out {stored.FOLDER}/shared 1 0 0",
             f"python {sys.argv[2]} --out {{run}} 6 {pause} {gap}",
@@ -162,6 +162,14 @@ def test_an_unknown_run_is_named(load):
         module.sources_of(module.Config(only=("emd",)))
 
 
+def test_whatever_is_trained_first_has_a_title(load):
+    module = load("train_queue")
+    for sources in module.sources_of(module.Config()).values():
+        for one in sources:
+            place = module.stored.FOLDER / f"{one.name}.json"
+            assert one.title or place.is_file(), one.name
+
+
 def test_a_job_has_the_commands_of_its_run_with_its_seed(load, tmp_path):
     module = load("train_queue")
     args = module.Config(runs=tmp_path, only=("smgdiff",))
@@ -196,6 +204,12 @@ def test_what_is_stored_is_not_made_again_and_what_runs_share_is_made_once(
     before = kept[0].read_text()
     code, shown = finish(queue(f"{options} --runs {tmp_path}/others", "clear,9,0"))
     assert code == 0 and "started" not in shown, shown
+    titles = [json.loads(path.read_text())["title"] for path in kept]
+    assert titles == ["t"] * 3
+    # A table that is new has its source's title.
+    code, shown = finish(queue(f"--only new --keep --runs {tmp_path}/runs", "new,9,0"))
+    assert code == 0, shown
+    assert json.loads((results / "x/new_seed1.json").read_text())["title"] == "Of new"
     # One more is wanted: only that one is made.
     line = f"{options} --least 4 --runs {tmp_path}/others"
     code, shown = finish(queue(line, "clear,9,0"))
