@@ -139,10 +139,12 @@ def _window_metrics(
     swing = contact.swing_height(feet, speed, fps, ground=ground.rest)
     names = ("slide_speed", "slide_seconds", "skate_ratio", "jerk", "orientation_error")
     facing = trajectory.root_trajectory(skeleton, x.motion).facing
+    raised = feet.at[..., 1].add(-ground.rest)
     turn = alignment.heading_error(facing[..., 0, :], facing[..., -1, :])
     return {name: metrics[name] for name in names} | {
         "turn": jnp.rad2deg(jnp.abs(turn)),
         "crossings": contact.leg_crossings(feet, facing, fps),
+        "ffr_mann": contact.skating_frame_ratio(raised, fps),
         "speed": jnp.mean(speed[..., reach:-reach], axis=-1),
         "sink": ground.rest - jnp.min(toes, axis=(-2, -1)),
         "swing": swing.median,
@@ -250,6 +252,7 @@ _OF_WINDOWS = {
     "speed": ("speed", None, 1.0),
     "foot_slide": ("slide_speed", "slide_seconds", 1.0),
     "skate_ratio": ("skate_ratio", None, 1.0),
+    "ffr_mann": ("ffr_mann", None, 1.0),
     "jerk": ("jerk", None, 1.0),
     "crossings": ("crossings", None, 1.0),
     "toe_sink": ("sink", None, 100.0),

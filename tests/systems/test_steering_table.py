@@ -273,6 +273,20 @@ def test_sunk_toes_are_that_deep():
     assert plain["toe_depth"].value == pytest.approx(max(rest, 0.0), abs=0.01)
 
 
+def test_toes_that_drift_on_the_ground_skate_in_all_frames():
+    """Creeping at .3 m/s; frames count from .2 m/s on, of feet that are low."""
+
+    def skating(creep, sink):
+        row = table(speeds=(0.0,), swing=0.0, creep=creep, sink=sink)
+        return row.rows["straight at 0 m/s"]["ffr_mann"].value
+
+    still = table(speeds=(0.0,), swing=0.0).rows["straight at 0 m/s"]
+    low = -still["toe_sink"].value / 100.0  # how far the toes are above their rest
+    assert skating(0.3, low) == 1.0
+    assert skating(0.1, low) == 0.0
+    assert skating(0.3, low - 0.1) == 0.0
+
+
 @pytest.mark.parametrize("away", [0.0, 3.0])
 def test_touches_are_counted_and_missed_where_no_foot_is(away):
     row = table(speeds=(0.0,), swing=0.0, ball=away).rows["straight at 0 m/s"]
