@@ -26,15 +26,7 @@ import numpy as np
 import tyro
 
 from jaxmotion import cli
-from jaxmotion.data import (
-    actions,
-    clips_io,
-    hasten,
-    mirror,
-    resample,
-    selection,
-    text_motion,
-)
+from jaxmotion.data import actions, clips_io, mirror, resample, selection, text_motion
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips
 from jaxmotion.data.builders import REGISTRY
 from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
@@ -62,9 +54,6 @@ class Config:
     mirror: bool = False
     """Add the left-right mirror image of every clip (style100: of symmetric styles,
     under the same label; the others swap left and right in their labels)."""
-    hasten: bool = False
-    """Add turns played 1.25 and 1.5 times as fast and runs 1.25 times: a steered
-    character is asked for more of both than people do."""
     tfds_dir: Path | None = None
     """Folder of the tensorflow-datasets files; by default tfds beside --out."""
     overwrite: bool = False
@@ -138,8 +127,6 @@ def check_config(config: Config) -> None:
         raise ValueError(
             f"{config.source} has no takes to cut: --actions does not apply"
         )
-    if config.hasten and (kind != "clips" or config.actions):
-        raise ValueError("--hasten is for clips, and without --actions")
     if kind != "clips" and (config.mirror or config.fps is not None):
         reason = {
             "texts": "is published with mirror images and at its own rate",
@@ -310,8 +297,6 @@ def prepare(config: Config) -> None:
         print(describe_ball(data, config.out))
     else:
         clips = at_rate(data, config.fps or set_fps or data.fps)
-        if config.hasten and (faster := hasten.hastened(data, clips.fps)) is not None:
-            clips = selection.concatenate([clips, faster])
         if config.actions:
             clips = actions.cut_actions(clips)
         if config.mirror and not mirrored:

@@ -1,7 +1,6 @@
 """Parts of clips and clips put together: by label, by chance, one set after another."""
 
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
@@ -9,9 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmotion.data.clips import Clips, check_skeletons, stretches, take_clips
-
-# As `hasten` names what was played faster, after its clip.
-_HASTENED = re.compile(r"@\d+\+\d+_x[0-9.]+")
 
 
 def _indices(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
@@ -89,24 +85,6 @@ def frequent_labels(clips: Clips, field: str, *, least: int) -> tuple[str, ...]:
     return tuple(w for w, n in zip(words, counts, strict=True) if n >= least)
 
 
-def _faster(clips: Clips) -> np.ndarray:
-    """Of each stretch that was played faster the name of its clip, else ""."""
-    found = [_HASTENED.subn("", name) for name in clips.clip_names]
-    names = [name if number else "" for name, number in found]
-    return np.array(names or [""] * clips.num_clips, object)
-
-
-def _parts(clips: Clips, out: np.ndarray) -> tuple[Clips, Clips]:
-    """Clips to train on and those held out, in order; nothing faster of the latter."""
-    names = [
-        name for name, is_out in zip(clips.clip_names, out, strict=False) if is_out
-    ]
-    train = ~out & ~np.isin(_faster(clips), names)
-    return take_clips(clips, np.flatnonzero(train)), take_clips(
-        clips, np.flatnonzero(out)
-    )
-
-
 def split_clips(
     clips: Clips, *, fraction: float, seed: int, field: str = "style"
 ) -> tuple[Clips, Clips]:
@@ -115,8 +93,6 @@ def split_clips(
     Of each label (of `field`) with n clips, round(n * fraction) are held out, but at
     least one stays in the training part and, where n > 1, at least one is held out.
     Both parts keep the original order; the same seed splits the same clips alike.
-    Stretches that were played faster (`hasten`) are never held out, and those of clips
-    that are go with neither part.
 
     `ValueError` if the fraction is out of range, or no label has two clips.
     """
@@ -125,19 +101,18 @@ def split_clips(
     clips.names(field)
     generator = np.random.default_rng(seed)
     labels = np.asarray(clips.labels[field])
-    recorded = _faster(clips) == ""
-    out = np.zeros(clips.num_clips, bool)
+    held_out: list[int] = []
     for label in np.unique(labels):
-        members = np.flatnonzero((labels == label) & recorded)
+        members = np.flatnonzero(labels == label)
         count = int(np.clip(round(members.size * fraction), 1, members.size - 1))
-        out[generator.permutation(members)[:count]] = True
-    return _parts(clips, out)
+        held_out += generator.permutation(members)[:count].tolist()
+    train = np.setdiff1d(np.arange(clips.num_clips), held_out)
+    return take_clips(clips, train), take_clips(clips, sorted(held_out))
 
 
 def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
     """Training clips and those held out by name, both in the original order.
 
-    Stretches of the latter that were played faster (`hasten`) go with neither.
     `ValueError` if a name is unknown, or no clip would be left to train on.
     """
     unknown = [name for name in held_out if name not in clips.clip_names]
@@ -149,7 +124,8 @@ def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
     out = np.isin(np.asarray(clips.clip_names), held_out)
     if out.all():
         raise ValueError("all clips are held out, expected some to train on")
-    return _parts(clips, out)
+    train, rest = np.flatnonzero(~out), np.flatnonzero(out)
+    return take_clips(clips, train), take_clips(clips, rest)
 
 
 def cut(clips: Clips, spans: Sequence[tuple[int, int, int]]) -> Clips:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxmotion.data import ball_clips, clips_io, procedural, text_motion
-from tests.data import test_builders, test_hasten, test_text_builders
+from jaxmotion.data import ball_clips, clips_io, text_motion
+from tests.data import test_builders, test_text_builders
 from tests.data.builders import test_ballplay, test_soccer_x
 
 SCRIPT = Path(__file__).parents[2] / "experiments" / "prepare_data.py"
@@ -52,17 +52,6 @@ def test_published_clips_are_written_mirrored_and_resampled(
         path.unlink()
     script.prepare(script.Config(**options, overwrite=True))
     assert clips_io.load_clips(out).clip_names == ("dataset-2_walk_elderly_001",)
-
-
-def test_turns_are_added_faster(script, tmp_path, monkeypatch):
-    made = test_hasten.clips(turn=(20, 1.0, 270), walk=(5, 1.0, 0))
-    monkeypatch.setattr(procedural, "make_clips", lambda seed: made)
-    out = tmp_path / "hastened.npz"
-    script.prepare(script.Config(source="procedural", out=out, hasten=True))
-    found = clips_io.load_clips(out)
-    assert found.fps == 30.0 and found.clip_names[:2] == ("turn", "walk")
-    ends = [name.rsplit("_", 1)[1] for name in found.clip_names[2:]]
-    assert ends == ["x1.25", "x1.5"]
 
 
 def test_sets_with_captions_are_written(script, tmp_path, capsys):
@@ -139,7 +128,6 @@ def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
         ({"out": tmp_path}, IsADirectoryError, "is a folder"),
         ({"fps": 1e300}, ValueError, "--fps should be in 0.001..100000, found 1e.300"),
         ({"seed": -1}, ValueError, "--seed should be in 0..2"),
-        ({"hasten": True, "actions": True}, ValueError, "--hasten is for clips"),
     ]
     for change, error, message in cases:
         with pytest.raises(error, match=message):
