@@ -46,6 +46,8 @@ class Config:
       rollouts: Characters per speed and per course.
       seconds: Length of each rollout, seconds; 13 or more to measure who stands.
       foot_lock: Measure what is displayed with locked feet, too.
+      toe_height: Height at which the skeleton's toes rest, for the lock, meters; None
+        for that of the shipped models'.
       visit: Steps of the schedule that a plan visits (CAMDM); none: the model's own.
       chunk: Characters to run at a time, at most.
       seed: Seeds poses and noise.
@@ -67,6 +69,7 @@ class Config:
     rollouts: int = 16
     seconds: float = 20.0
     foot_lock: bool = True
+    toe_height: cli.Optional[float] = None
     visit: tuple[int, ...] = ()
     chunk: int = 4
     seed: int = 0
@@ -111,7 +114,7 @@ def main() -> None:
         course_speeds=args.course_speeds,
         rollouts=args.rollouts,
         seconds=args.seconds,
-        foot_lock=FootLock() if args.foot_lock else None,
+        foot_lock=FootLock(**cli.given(FootLock, args)) if args.foot_lock else None,
         chunk=args.chunk,
         seed=args.seed,
     )

@@ -75,6 +75,7 @@ LIMITS: dict[str, Range] = {
     "weight_acceleration": Range(0, 10**6),
     **dict.fromkeys(("weight_foot", "weight_pose"), Range(0, 10**6)),
     **dict.fromkeys(("speed", "speeds", "course_speeds"), Range(0, 100)),
+    "toe_height": Range(-1000, 1000),
     "noise_half_life": Range(0, 86400),
     "min_acceleration": Range(0, 10**4),
     "before": Range(1, 86400),

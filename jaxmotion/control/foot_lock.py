@@ -68,10 +68,11 @@ class FootLock:
     """Settings of the lock.
 
     Attributes:
-      toe_height: Height below which no displayed toe goes, meters.
+      toe_height: Height at which a standing toe rests, below which no displayed one
+        goes, meters; other skeletons than the shipped models' have their own.
       ankle_height: Height below which no displayed ankle goes, meters.
       begin_speed: A contact begins below this speed, meters per second,
-      begin_height: and below this height of the toe, meters.
+      begin_height: and below this height of the toe over its rest, meters.
       end_speed: It ends above this speed,
       end_height: or above this height.
       clearance: Height above `toe_height` that a swinging toe keeps, meters.
@@ -91,9 +92,9 @@ class FootLock:
     toe_height: float = 0.02
     ankle_height: float = 0.04
     begin_speed: float = 0.5
-    begin_height: float = 0.05
+    begin_height: float = 0.03
     end_speed: float = 0.6
-    end_height: float = 0.10
+    end_height: float = 0.08
     clearance: float = 0.02
     radius: float = 0.2
     crossing: float = 0.03
@@ -178,8 +179,9 @@ def contacts(
     lock: FootLock,
 ) -> Bool[Array, " feet"]:
     """Which toes are in contact now, given which were: thresholds with hysteresis."""
-    begins = (speed < lock.begin_speed) & (height < lock.begin_height)
-    goes_on = (speed < lock.end_speed) & (height < lock.end_height)
+    up = height - lock.toe_height
+    begins = (speed < lock.begin_speed) & (up < lock.begin_height)
+    goes_on = (speed < lock.end_speed) & (up < lock.end_height)
     # No `jnp.where`: onnxruntime has none of booleans.
     return (was & goes_on) | (~was & begins)
 

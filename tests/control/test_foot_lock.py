@@ -285,8 +285,12 @@ def test_contacts_have_hysteresis():
     between = jnp.array([(LOCK.begin_speed + LOCK.end_speed) / 2])
     low, no, yes = jnp.array([0.0]), jnp.array([False]), jnp.array([True])
     assert not ask(no, between, low)[0] and ask(yes, between, low)[0]
-    high = jnp.array([(LOCK.begin_height + LOCK.end_height) / 2])
+    high = jnp.array([LOCK.toe_height + (LOCK.begin_height + LOCK.end_height) / 2])
     assert not ask(no, low, high)[0] and ask(yes, low, high)[0]
+    # Of a skeleton whose toes rest higher, heights are over theirs.
+    other = dataclasses.replace(LOCK, toe_height=LOCK.toe_height + 0.03)
+    assert foot_lock.contacts(no, low, high, lock=other)[0]
+    assert not foot_lock.contacts(no, low, high + 0.03, lock=other)[0]
     assert not ask(yes, jnp.array([LOCK.end_speed]), low)[0]
 
 
