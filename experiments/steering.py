@@ -19,7 +19,7 @@ import jaxmotion as jm
 from jaxmotion import cli, reporting
 from jaxmotion.control import steering
 from jaxmotion.control.courses import Course
-from jaxmotion.control.foot_lock import FootLock
+from jaxmotion.control.foot_lock import FootLock, lock_of
 from jaxmotion.data import clips_io, selection
 from jaxmotion.data.clips import Clips
 from jaxmotion.evaluation import by_frame
@@ -47,7 +47,7 @@ class Config:
       seconds: Length of each rollout, seconds; 13 or more to measure who stands.
       foot_lock: Measure what is displayed with locked feet, too.
       toe_height: Height at which the skeleton's toes rest, for the lock, meters; None
-        for that of the shipped models'.
+        for that of the model, or of the shipped ones.
       visit: Steps of the schedule that a plan visits (CAMDM); none: the model's own.
       chunk: Characters to run at a time, at most.
       seed: Seeds poses and noise.
@@ -103,6 +103,7 @@ def main() -> None:
     model = jm.load(args.model, foot_lock=False, **options)
     model = steering.steered(model, what=args.model)
     train, held_out = load_clips(args, model)
+    lock = dataclasses.replace(lock_of(model), **cli.given(FootLock, args))
     cli.announce("compiling the rollouts", 40)
     found = steering_table.steering_table(
         model,
@@ -114,7 +115,7 @@ def main() -> None:
         course_speeds=args.course_speeds,
         rollouts=args.rollouts,
         seconds=args.seconds,
-        foot_lock=FootLock(**cli.given(FootLock, args)) if args.foot_lock else None,
+        foot_lock=lock if args.foot_lock else None,
         chunk=args.chunk,
         seed=args.seed,
     )

@@ -625,12 +625,19 @@ def _tuning(inner: Tuning, fps: float, lock: FootLock) -> Tuning:
     return dataclasses.replace(inner, method=tuned, lockable=True)
 
 
+def lock_of(character: Character) -> FootLock:
+    """Default settings, with toes that rest where the character's do."""
+    if character.toe_height is None:
+        return FootLock()
+    return FootLock(toe_height=character.toe_height)
+
+
 def lock_feet(character: Character, lock: FootLock | None = None) -> Character:
     """A character that is displayed with locked feet; its states are `LockedState`s.
 
-    lock None: default settings. `ValueError` unless the skeleton has feet with legs.
+    lock None: that of `lock_of`. `ValueError` unless the skeleton has feet with legs.
     """
-    lock = FootLock() if lock is None else lock
+    lock = lock_of(character) if lock is None else lock
     feet = init_lock(character.skeleton)
 
     def with_feet(states: Any) -> LockedState:

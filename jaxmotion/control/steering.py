@@ -83,6 +83,7 @@ class Character:
         where a system has no such start.
       exports: `(controller) -> functions by name` that can leave Python, and together
         are a tick; all on "state" and "command".
+      toe_height: Where toes rest, meters; None where nobody measured it.
     """
 
     skeleton: Skeleton
@@ -96,6 +97,7 @@ class Character:
     clip_starts: Callable[[Any, np.ndarray, int], Any] | None = None
     exports: Callable[[rollout.Controller], dict[str, Exported]] = rollout.exports
     tuning: Tuning | None = None
+    toe_height: float | None = None
 
     def label(self, name: str) -> int:
         """Index of a label; raises `ValueError` that names those there are."""

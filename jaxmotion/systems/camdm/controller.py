@@ -504,6 +504,7 @@ def character(
         tuning=_tuning(method, all_steps=model.all_steps),
         starts=lambda labels, seed: own_states(model, labels, seed=seed),
         clip_starts=clip_starts,
+        toe_height=model.toe_height,
     )
 
 

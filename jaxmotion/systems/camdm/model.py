@@ -28,7 +28,7 @@ from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.motion import features, rotation, trajectory
-from jaxmotion.motion.skeleton import Motion, Skeleton
+from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton
 from jaxmotion.networks import blocks, transformer
 from jaxmotion.systems.camdm import network as camdm_network
 from jaxmotion.typing import Key, Params
@@ -307,6 +307,7 @@ class Model:
         all. A student was distilled for its few.
       all_steps: Whether the network learned all steps of its schedule, so that plans
         may visit others than `steps`; a student learned its own alone.
+      toe_height: Where toes rest in its data, meters; None where nobody measured it.
     """
 
     config: Config
@@ -316,6 +317,7 @@ class Model:
     starts: Motion | None = None
     steps: tuple[int, ...] | None = None
     all_steps: bool = True
+    toe_height: float | None = None
 
 
 def with_steps(model: Model, steps: tuple[int, ...]) -> Model:
@@ -337,6 +339,8 @@ def to_json(model: Model) -> dict[str, Any]:
     if model.steps is not None:
         value["steps"] = list(model.steps)
         value["all_steps"] = model.all_steps
+    if model.toe_height is not None:
+        value["toe_height"] = model.toe_height
     if model.starts is not None:
         value["starts"] = model_json.arrays_to_json(
             {
@@ -389,7 +393,15 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         raise ValueError(
             f"{where}: field 'all_steps' is {all_steps!r:.60}, expected true or false"
         )
-    return dataclasses.replace(model, starts=starts, steps=steps, all_steps=all_steps)
+    height = value.get("toe_height")
+    number = isinstance(height, int | float) and not isinstance(height, bool)
+    if height is not None and not (number and abs(height) <= MAX_METERS):
+        raise ValueError(
+            f"{where}: field 'toe_height' is {height!r:.60}, expected meters"
+        )
+    return dataclasses.replace(
+        model, starts=starts, steps=steps, all_steps=all_steps, toe_height=height
+    )
 
 
 def _shapes(model: Model, where: Path) -> Params:

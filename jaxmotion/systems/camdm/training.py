@@ -88,8 +88,8 @@ FITTING["planted"] = FITTING["small"]
 def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
     """A model for clips; where rotations are scaled, with the mean of their rotations.
 
-    Skeleton, rate, styles (labels of `field`) and source are those of the clips;
-    `sizes` are the other fields of `camdm.Config`.
+    Skeleton, rate, styles (labels of `field`), source and where toes rest are those of
+    the clips; `sizes` are the other fields of `camdm.Config`.
     """
     config = camdm_model.Config(
         num_joints=clips.skeleton.num_joints,
@@ -97,13 +97,13 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
         fps=clips.fps,
         **sizes,
     )
+    every = max(clips.num_frames // 10_000, 1)
+    frames = skeleton.Motion(
+        root_position=clips.root_position[::every],
+        joint_rotation=clips.joint_rotation[::every],
+        fps=clips.fps,
+    )
     if config.rotation_scale != 1.0:
-        every = max(clips.num_frames // 10_000, 1)
-        frames = skeleton.Motion(
-            root_position=clips.root_position[::every],
-            joint_rotation=clips.joint_rotation[::every],
-            fps=clips.fps,
-        )
         mean = camdm_loss.mean_rotations(clips.skeleton, frames, config=config)
         config = dataclasses.replace(config, rotation_mean=mean)
     return Model(
@@ -111,7 +111,17 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
         skeleton=clips.skeleton,
         labels=clips.names(field),
         source=clips.source,
+        toe_height=toe_height(clips.skeleton, frames),
     )
+
+
+def toe_height(skeleton_: Skeleton, frames: skeleton.Motion) -> float | None:
+    """Where toes rest, meters: the first percentile of their heights; None without."""
+    if not skeleton_.feet:
+        return None
+    feet = jnp.array(skeleton_.feet)
+    positions = jax.jit(skeleton.joint_positions)(skeleton_, frames)
+    return round(float(np.percentile(positions[..., feet, 1], 1)), 4)
 
 
 # What has no parameters. Attention to a prefix alone is soon learned anew.
@@ -131,7 +141,7 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
     names skeleton, styles or sizes that differ.
     """
     first, params = load(path)
-    source = dict(source="")
+    source = dict(source="", toe_height=None)
     model_json.check_start(
         path,
         to_json(first) | source,
@@ -142,6 +152,7 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
     mean = first.config.rotation_mean
     config = dataclasses.replace(model.config, rotation_mean=mean)
     own = dict(config=config, source=model.source, steps=model.steps)
+    own |= dict(toe_height=model.toe_height)
     return dataclasses.replace(first, **own), params
 
 

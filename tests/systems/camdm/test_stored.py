@@ -11,10 +11,13 @@ import numpy as np
 import optax
 import pytest
 
+from jaxmotion.control import foot_lock
+from jaxmotion.data import walker
 from jaxmotion.learning import checkpoint, runs, training
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
-from tests import tiny
+from jaxmotion.systems.camdm import training as camdm_training
+from tests import samples, tiny
 
 
 @pytest.fixture
@@ -175,6 +178,34 @@ def test_a_file_may_visit_few_steps_and_offer_all(tmp_path, model, params):
     value = camdm_model.to_json(few) | {"all_steps": 1}
     with pytest.raises(ValueError, match="here: field 'all_steps' is 1, expected true"):
         camdm_model.from_json(value, where="here")
+
+
+def test_feet_are_locked_where_the_toes_of_its_data_rest(tmp_path):
+    """The generated walker's toes rest at the height that its steps are made with."""
+    raised = samples.clips()
+    up = raised.root_position.at[:, 1].add(0.05)
+    raised = dataclasses.replace(raised, root_position=up)
+    found = [
+        camdm_training.make_model(x, field="style").toe_height
+        for x in (samples.clips(), raised)
+    ]
+    assert found == pytest.approx(
+        [walker.TOE_HEIGHT, walker.TOE_HEIGHT + 0.05], abs=2e-3
+    )
+    model = dataclasses.replace(samples.run().model, toe_height=found[1])
+    path = tmp_path / "model.npz"
+    checkpoint.export_params(path, samples.run().params, camdm_model.to_json(model))
+    character = camdm_controller.load_character(path)
+    assert character.toe_height == found[1]
+    assert foot_lock.lock_feet(character).method.lock.toe_height == found[1]
+    # A file of before says nothing of it.
+    old = {k: x for k, x in camdm_model.to_json(model).items() if k != "toe_height"}
+    assert camdm_model.from_json(old, where="here").toe_height is None
+    for wrong in (True, "high", float("nan"), 1e9):
+        with pytest.raises(
+            ValueError, match="here: field 'toe_height' is .*, expected"
+        ):
+            camdm_model.from_json(old | {"toe_height": wrong}, where="here")
 
 
 def test_parameters_of_another_size_are_refused(tmp_path, model, params):
