@@ -55,7 +55,8 @@ def load(
       source: Name of a shipped model (one of `files.SHIPPED`), a run folder, or a file
         of a system's `export`.
       foot_lock: Settings of the lock that keeps planted feet in place; True for the
-        defaults, False for none. None: on for shipped models, off for runs and files,
+        defaults, with toes that rest as high as in the data (CAMDM's models know; else
+        2 cm), False for none. None: on for shipped models, off for runs and files,
         whose frames are then what the network makes. Motions that are sampled whole
         are cleaned with foresight (`control.foot_lock.clean_motion`).
       **options: For the system's `load_character` or `load_sampler`: `step` makes
