@@ -271,3 +271,19 @@ def all_joints(clips: Clips) -> Float[np.ndarray, "frames joints 3"]:
         for a in range(0, len(root), _BLOCK)
     ]
     return np.concatenate(found)[: clips.num_frames].astype(np.float64)
+
+
+def toe_height(clips: Clips, *, every: int = 1) -> float:
+    """Where toes rest, meters: the first percentile of the feet's heights.
+
+    Of one in `every` frames. `ValueError` if the skeleton names no feet.
+    """
+    if not clips.skeleton.feet:
+        raise ValueError("the skeleton names no feet")
+    some = Motion(
+        root_position=clips.root_position[::every],
+        joint_rotation=clips.joint_rotation[::every],
+        fps=clips.fps,
+    )
+    places = jax.jit(joint_positions)(clips.skeleton, some)
+    return float(np.percentile(places[:, jnp.array(clips.skeleton.feet), 1], 1))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxmotion.motion.ground import into_frame
 from jaxmotion.motion.spring import Scalar
 
 
@@ -121,8 +122,7 @@ def leg_crossings(
     world positions, meters, left before right.
     """
     gap = foot_positions[..., 0, ::2] - foot_positions[..., 1, ::2]
-    left = jnp.stack([facing[..., 1], -facing[..., 0]], axis=-1)
-    crossed = jnp.sum(gap * left, axis=-1) < -margin
+    crossed = into_frame(gap, facing)[..., 0] < -margin
     begun = crossed[..., 1:] & ~crossed[..., :-1]
     return 60.0 * fps * jnp.mean(begun, axis=-1)
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.data import bvh, bvh_text, clips_io, mirror, selection, windows
-from jaxmotion.data.clips import Clips
+from jaxmotion.data.clips import Clips, toe_height
 from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.motion import skeleton
 from jaxmotion.motion.skeleton import Skeleton
@@ -98,12 +98,12 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
         **sizes,
     )
     every = max(clips.num_frames // 10_000, 1)
-    frames = skeleton.Motion(
-        root_position=clips.root_position[::every],
-        joint_rotation=clips.joint_rotation[::every],
-        fps=clips.fps,
-    )
     if config.rotation_scale != 1.0:
+        frames = skeleton.Motion(
+            root_position=clips.root_position[::every],
+            joint_rotation=clips.joint_rotation[::every],
+            fps=clips.fps,
+        )
         mean = camdm_loss.mean_rotations(clips.skeleton, frames, config=config)
         config = dataclasses.replace(config, rotation_mean=mean)
     return Model(
@@ -111,17 +111,8 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
         skeleton=clips.skeleton,
         labels=clips.names(field),
         source=clips.source,
-        toe_height=toe_height(clips.skeleton, frames),
+        toe_height=toe_height(clips, every=every) if clips.skeleton.feet else None,
     )
-
-
-def toe_height(skeleton_: Skeleton, frames: skeleton.Motion) -> float | None:
-    """Where toes rest, meters: the first percentile of their heights; None without."""
-    if not skeleton_.feet:
-        return None
-    feet = jnp.array(skeleton_.feet)
-    positions = jax.jit(skeleton.joint_positions)(skeleton_, frames)
-    return round(float(np.percentile(positions[..., feet, 1], 1)), 4)
 
 
 # What has no parameters. Attention to a prefix alone is soon learned anew.
@@ -151,8 +142,12 @@ def continued(model: Model, path: Path) -> tuple[Model, Params]:
     # The mean rotation is part of what the network has learned.
     mean = first.config.rotation_mean
     config = dataclasses.replace(model.config, rotation_mean=mean)
-    own = dict(config=config, source=model.source, steps=model.steps)
-    own |= dict(toe_height=model.toe_height)
+    own = dict(
+        config=config,
+        source=model.source,
+        steps=model.steps,
+        toe_height=model.toe_height,
+    )
     return dataclasses.replace(first, **own), params
 
 

@@ -121,7 +121,7 @@ def make_setting(
     known = smgdiff_scoring.eval_windows(held_out, model, number=number, seed=seed + 1)
     return Setting(
         evaluator=chosen,
-        score=smgdiff_scoring.scorer(chosen, smgdiff_scoring.limits(train, model)),
+        score=smgdiff_scoring.scorer(chosen, smgdiff_scoring.limits(train)),
         known=known,
         replications=replications,
         seed=seed,
@@ -257,7 +257,7 @@ def _plan_row(
         jnp.broadcast_to(at, positions.shape[:2]),
         model.config.fps,
         num_places=model.config.frames_per_token,
-        contact_height=smgdiff_scoring.limits(run.train, model).foot_height,
+        contact_height=smgdiff_scoring.limits(run.train).foot_height,
     )
     return found | {"plan_time": bench.call_time(_timed(plan, setting))}, places
 

@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.ball_clips import BallClips
+from jaxmotion.data.clips import toe_height
 from jaxmotion.evaluation import ball, frechet, locomotion
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.motion import ground, rotation, trajectory
 from jaxmotion.motion.ball import Scene
-from jaxmotion.motion.skeleton import Motion, joint_positions
+from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
@@ -251,23 +252,15 @@ def _eval_windows(scenes: Scene, labels: Array, representation, config) -> EvalW
     return one(scenes, labels)
 
 
-def limits(data: BallClips, model: Model) -> Thresholds:
+def limits(data: BallClips) -> Thresholds:
     """Thresholds of the figures, from real clips.
 
     Feet: where toes rest (their first percentile) and one centimeter more. Touches: the
     ball's radius and 7 cm (half a foot, and 2 cm); and an acceleration of 12 meters per
     second squared, a change of 0.4 m/s within a frame of 1/30 s.
     """
-    feet = jnp.array(model.representation.skeleton.feet)
-    motion = Motion(
-        root_position=data.clips.root_position[::10],
-        joint_rotation=data.clips.joint_rotation[::10],
-        fps=data.clips.fps,
-    )
-    places = jax.jit(joint_positions)(data.clips.skeleton, motion)
-    heights = np.asarray(places[:, feet, 1])
     return Thresholds(
         acceleration=12.0,
         distance=data.radius + 0.07,
-        foot_height=float(np.percentile(heights, 1)) + 0.01,
+        foot_height=toe_height(data.clips, every=10) + 0.01,
     )
