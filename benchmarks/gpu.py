@@ -2,7 +2,8 @@
 
 Needs no data: shipped models and random parameters. Every part is a benchmark of this
 folder in a process of its own, with its report in a folder of its own; one that fails
-or takes too long is named in the table, and the others go on.
+or takes too long is named in the table, keeps the rows it had made, and the others go
+on.
 
 Examples:
   pip install -e ".[cuda]" && python benchmarks/gpu.py --out runs/gpu
@@ -92,7 +93,7 @@ def run_part(args: Config, name: str) -> dict[str, Any]:
     script, full, tiny = PARTS[name]
     path, out = Path(__file__).with_name(f"{script}.py"), args.out / name
     words = [sys.executable, str(path), *(tiny if args.tiny else full).split()]
-    begun, why = time.perf_counter(), "ran"
+    started, begun, why = time.time(), time.perf_counter(), "ran"
     try:
         done = subprocess.run(
             [*words, "--out", str(out)],
@@ -106,8 +107,8 @@ def run_part(args: Config, name: str) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         why = f"not done in --limit {args.limit:g} s"
     seconds = time.perf_counter() - begun
-    reports = sorted(out.glob(f"{script}*.json")) if why == "ran" else []
-    found = [json.loads(report.read_text()) for report in reports]
+    reports = [x for x in out.glob(f"{script}*.json") if x.stat().st_mtime >= started]
+    found = [json.loads(report.read_text()) for report in sorted(reports)]
     return {
         "part": name,
         "seconds": seconds,

@@ -305,6 +305,7 @@ def main() -> None:
             suite.Metric(f"{name} traces", row["traces"], "traces", tolerance=0.0)
         )
         print(f"{number} characters: {row['frames_per_second']:,.0f} frames/s")
+        suite.save("rollout_batch", metrics, args, rows=rows)
     suite.print_table(rows, COLUMNS)
     suite.write_table(args.out / "rollout_batch", rows, COLUMNS)
     steep = slope(rows)

@@ -437,6 +437,7 @@ def main() -> None:
             about = f"{line} steps={steps}"
             print(f"{about}: {own[-1]['p50_ms']:.4g} ms", flush=True)
             metrics += metrics_of(about, own[-1])
+            suite.save("step_counts", metrics, args, rows=rows + own)
         drawn[str(line)] = tuple(
             np.array([row[name] for row in own])
             for name in ("steps", "p50_ms", "p95_ms")

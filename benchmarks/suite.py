@@ -21,7 +21,7 @@ import jax
 import numpy as np
 import tyro
 
-from jaxmotion import reporting
+from jaxmotion import files, reporting
 from jaxmotion.learning.loop import check_writable
 
 GIB = float(2**30)
@@ -221,10 +221,10 @@ def print_table(rows: list[dict[str, Any]], columns: dict[str, str]) -> None:
         print("  ".join(x.rjust(w) for x, w in zip(line, widths, strict=True)))
 
 
-def report(
+def save(
     name: str, metrics: list[Metric], args: Settings, *, rows: Any, **more: Any
-) -> None:
-    """Writes <out>/<name>.json, and applies the gate.
+) -> dict[str, Any]:
+    """Writes <out>/<name>.json; again after each row, so that a kill loses one row.
 
     Args:
       name: Name of the benchmark.
@@ -233,8 +233,8 @@ def report(
       rows: The table.
       **more: Further entries of the file.
 
-    Raises:
-      SystemExit: with status 1, if the gate finds something worse.
+    Returns:
+      What the file says of the machine.
     """
     args.out.mkdir(parents=True, exist_ok=True)
     here = environment() | {"git_commit": reporting.git_commit()}
@@ -246,8 +246,20 @@ def report(
         "settings": settings(args),
         **more,
     }
+    files.write_text(args.out / f"{name}.json", json.dumps(value, indent=1))
+    return here
+
+
+def report(
+    name: str, metrics: list[Metric], args: Settings, *, rows: Any, **more: Any
+) -> None:
+    """Writes what `save` does, says where, and applies the gate.
+
+    Raises:
+      SystemExit: with status 1, if the gate finds something worse.
+    """
+    here = save(name, metrics, args, rows=rows, **more)
     path = args.out / f"{name}.json"
-    path.write_text(json.dumps(value, indent=1))
     print(f"{here['cpu']}, {here['cores']} cores, jax {here['jax']}")
     # Memory is what it is on a busy machine, too.
     timed = any(metric.unit not in ("GiB", "MiB") for metric in metrics)

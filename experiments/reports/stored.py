@@ -4,7 +4,8 @@ A file is what an evaluation left behind (metrics.json, or a sweep's table.json)
 to what tables and verdicts need. Beside its rows it declares its columns and says where
 its numbers come from: `measured` (command, commit, date, hardware, versions) or, for
 numbers whose file was not kept, `transcribed` (from which text). Files of further
-trainings have the seed at the end of their name: x.json, x_seed1.json, ...
+trainings have the seed at the end of their name: x.json, x_seed1.json, ...; where one's
+clips were rounded to be carried to another machine, `rounded` says how.
 """
 
 import dataclasses
@@ -28,7 +29,10 @@ _MEASURED = (
     *("command", "git_commit", "date", "cpu", "machine", "cores", "devices"),
     *("python", "jax", "jaxlib", "flax", "numpy"),
 )
-_KEPT = ("source", "arguments", "seeds", "data", "training", "minutes", "evaluator")
+_KEPT = (
+    *("source", "arguments", "seeds", "data", "rounded"),
+    *("training", "minutes", "evaluator"),
+)
 _EITHER = ("measured", "transcribed")
 _FIELDS = {*_KEPT, *_EITHER, "title", "interval", "columns", "rows", "names"}
 _FIELDS |= {"command", "hardware", "notes"}

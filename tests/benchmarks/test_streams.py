@@ -1,6 +1,7 @@
 """Streams that are stopped, and what a crowd's cost is fitted by."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -64,3 +65,24 @@ def test_gpu_names_what_failed_and_goes_on(load, monkeypatch, tmp_path, capsys):
         gpu.main()
     assert stop.value.code == 1 and "late" in capsys.readouterr().out
     assert json.loads((tmp_path / "gpu.json").read_text())["rows"][0]["end"] == "late"
+
+
+def test_a_part_that_takes_too_long_keeps_the_rows_it_made(load, monkeypatch, tmp_path):
+    gpu = load("gpu")
+    report = {"metrics": [{"name": "m"}], "rows": [{"characters": 1}]}
+    (tmp_path / "slow.py").write_text(
+        "import json, pathlib, sys, time\n"
+        "out = pathlib.Path(sys.argv[-1])\n"
+        "out.mkdir(parents=True, exist_ok=True)\n"
+        f"(out / 'slow.json').write_text({json.dumps(json.dumps(report))})\n"
+        "time.sleep(60)\n"
+    )
+    monkeypatch.setattr(gpu, "__file__", str(tmp_path / "gpu.py"))
+    monkeypatch.setattr(gpu, "PARTS", {"crowd": ("slow", "", "")})
+    stale = tmp_path / "out" / "crowd" / "slow_before.json"
+    stale.parent.mkdir(parents=True)
+    stale.write_text("{}")
+    os.utime(stale, (0, 0))
+    made = gpu.run_part(gpu.Config(out=tmp_path / "out", limit=2.0), "crowd")
+    assert made["end"] == "not done in --limit 2 s"
+    assert made["rows"] == report["rows"] and made["metrics"] == report["metrics"]

@@ -370,6 +370,24 @@ def test_what_is_no_further_training_is_named(load, tmp_path):
         assert "\n" not in str(error.value)
 
 
+def test_rounded_clips_are_the_same_clips(load, tmp_path):
+    read = load("reports.results").read_trainings
+    paths = [tmp_path / f"{i}.json" for i in range(2)]
+    for seed, (path, print_) in enumerate(zip(paths, "ab", strict=True)):
+        stage = {"steps": 9, "files": {"train.npz": print_}}
+        about = dict(seeds={"training": [seed]}, training={"motion": stage})
+        about |= dict(data=stage["files"])
+        measured(load, path, {"a": 1.0}, **about)
+    with pytest.raises(ValueError, match="motion.files.train.npz is 'a', given 'b'"):
+        read(paths)
+    measured(load, paths[1], {"a": 1.0}, **about, rounded="to 1e-6")
+    assert all(x is not None for x in read(paths).trainings)
+    about["training"]["motion"]["steps"] = 8
+    measured(load, paths[1], {"a": 1.0}, **about, rounded="to 1e-6")
+    with pytest.raises(ValueError, match="motion.steps is 9, given 8"):
+        read(paths)
+
+
 def test_rows_of_two_runs_pair_by_seed_and_data(load, tmp_path):
     claims, verdicts = load("reports.claims"), load("reports.verdicts")
     results = load("reports.results")
