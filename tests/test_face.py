@@ -155,6 +155,8 @@ def test_shipped_models_say_what_they_are(name):
     card = path.with_suffix(".md").read_text()
     assert card.startswith(f"# {path.name}") and "Apache-2.0" in card
     assert path.stat().st_size <= 6e6
+    # What a notebook prints of it: a line, not its parameters.
+    assert model.source in repr(model) and len(repr(model)) < 400
 
 
 def test_goals_are_told_in_a_line(monkeypatch):

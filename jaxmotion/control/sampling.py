@@ -35,14 +35,14 @@ class Sampler:
       method: Makes the motions of one character.
     """
 
-    skeleton: Skeleton
+    skeleton: Skeleton = dataclasses.field(repr=False)
     labels: tuple[str, ...]
     fps: float
     frames: int
     source: str
     license: str | None = None
-    params: Params
-    method: Method
+    params: Params = dataclasses.field(repr=False)
+    method: Method = dataclasses.field(repr=False)
 
     def label(self, name: str) -> int:
         """Index of a label; raises `ValueError` that names those there are."""

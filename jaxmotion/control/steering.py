@@ -86,17 +86,21 @@ class Character:
       toe_height: Where toes rest, meters; None where nobody measured it.
     """
 
-    skeleton: Skeleton
+    skeleton: Skeleton = dataclasses.field(repr=False)
     labels: tuple[str, ...]
     fps: float
     source: str
     license: str | None = None
-    params: Params
-    method: Method
-    starts: Callable[[np.ndarray, int], Any]
-    clip_starts: Callable[[Any, np.ndarray, int], Any] | None = None
-    exports: Callable[[rollout.Controller], dict[str, Exported]] = rollout.exports
-    tuning: Tuning | None = None
+    params: Params = dataclasses.field(repr=False)
+    method: Method = dataclasses.field(repr=False)
+    starts: Callable[[np.ndarray, int], Any] = dataclasses.field(repr=False)
+    clip_starts: Callable[[Any, np.ndarray, int], Any] | None = dataclasses.field(
+        default=None, repr=False
+    )
+    exports: Callable[[rollout.Controller], dict[str, Exported]] = dataclasses.field(
+        default=rollout.exports, repr=False
+    )
+    tuning: Tuning | None = dataclasses.field(default=None, repr=False)
     toe_height: float | None = None
 
     def label(self, name: str) -> int:
