@@ -32,7 +32,7 @@ import tyro
 from reports import results, stored, verdicts, writing
 from reports.claims import Source
 
-from jaxmotion import cli, files
+from jaxmotion import cli, files, reporting
 from jaxmotion.learning import loop
 
 POLL = 1.0  # seconds between looks at running trainings
@@ -282,6 +282,11 @@ def work(args: Config, show: Callable[[str], None] = print) -> list[Job]:
 def main() -> None:
     """Parses the command line and works the queue off."""
     args = cli.check(tyro.cli(Config, description=__doc__))
+    if args.keep and reporting.git_commit() is None:
+        raise ValueError(
+            "--keep: this is no git checkout, expected one: what is stored names the "
+            "commit that made it"
+        )
     loop.check_writable(args.runs)
     if failed := work(args, show=tqdm.tqdm.write):
         raise ValueError(f"{len(failed)} trainings failed, see their queue.log")

@@ -271,6 +271,19 @@ def starts_from_json(
         raise ValueError(f"{where}: field 'starts' {error}") from None
 
 
+def toe_height_from_json(value: Any, *, where: str) -> float | None:
+    """A model's `toe_height`, meters; None for none.
+
+    A `ValueError` names the file (`where`) and the field.
+    """
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if value is not None and not (number and abs(value) <= MAX_METERS):
+        raise ValueError(
+            f"{where}: field 'toe_height' is {value!r:.60}, expected meters"
+        )
+    return value
+
+
 def differences(
     found: dict[str, Any], given: dict[str, Any], *, prefix: str = ""
 ) -> str:

@@ -162,6 +162,16 @@ def test_an_unknown_run_is_named(load):
         module.sources_of(module.Config(only=("emd",)))
 
 
+def test_nothing_is_trained_that_could_not_be_stored(load, monkeypatch, tmp_path):
+    queue = load("train_queue")
+    monkeypatch.setattr(queue.reporting, "git_commit", lambda: None)
+    options = ["train_queue.py", "--keep", "--runs", str(tmp_path / "runs")]
+    monkeypatch.setattr("sys.argv", options)
+    with pytest.raises(ValueError, match="--keep: this is no git checkout, expected"):
+        queue.main()
+    assert not (tmp_path / "runs").exists()
+
+
 def test_whatever_is_trained_first_has_a_title(load):
     module = load("train_queue")
     for sources in module.sources_of(module.Config()).values():

@@ -409,6 +409,7 @@ def load_run(
         space=space,
         source=run.source,
         noise_half_life=noise_half_life,
+        toe_height=run.toe_height,
     )
     return run, model, networks
 
@@ -485,4 +486,5 @@ def load_character(
             number=len(labels), seed=seed, memory=memory
         ),
         exports=exports,
+        toe_height=model.toe_height,
     )

@@ -34,6 +34,7 @@ class Model:
       noise_half_life: Seconds in which the noise of the posteriors is forgotten; 0
         where it is drawn anew in every frame.
       starts: Frames of the space that characters start in; None in a run folder.
+      toe_height: Where toes rest in its data, meters; None where nobody measured it.
     """
 
     config: aamdm_model.Config
@@ -42,6 +43,7 @@ class Model:
     source: str
     noise_half_life: float = 0.0
     starts: Float[Array, "number channels"] | None = None
+    toe_height: float | None = None
 
     @property
     def autoencoder(self) -> Autoencoder:
@@ -76,6 +78,7 @@ def export(path: Path, model: Model, networks: Params) -> None:
         # JSON has no infinity: this many seconds are as good.
         "noise_half_life": min(model.noise_half_life, 1e6),
         "starts": model_json.arrays_to_json({"frames": model.starts}),
+        "toe_height": model.toe_height,
     }
     params = {name: networks[name] for name in _NETWORKS}
     params["decoder"] = own.params["decoder"]
@@ -128,7 +131,14 @@ def load(path: Path) -> tuple[Model, Params]:
             ),
         },
     )
-    model = Model(**made, space=more["space"], starts=more["starts"]["frames"])
+    model = Model(
+        **made,
+        space=more["space"],
+        starts=more["starts"]["frames"],
+        toe_height=model_json.toe_height_from_json(
+            value.get("toe_height"), where=where
+        ),
+    )
     return model, params
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion import files
 from jaxmotion.data import clips_io, mirror, selection
+from jaxmotion.data.clips import measured_toes
 from jaxmotion.learning import adversarial, checkpoint, model_json, runs, training
 from jaxmotion.learning.runs import Budget
 from jaxmotion.motion import pose
@@ -59,13 +60,18 @@ def frame_windows(
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Run:
-    """A run folder and its data; no network saw frames that are held out."""
+    """A run folder and its data; no network saw frames that are held out.
+
+    Attributes:
+      toe_height: Where toes rest in its clips, meters; None where nobody measured it.
+    """
 
     record: runs.Run
     skeleton: Skeleton
     embedding: aamdm_embedding.Config
     train: PoseData
     held_out: PoseData
+    toe_height: float | None = None
 
     @property
     def balance(self) -> float:
@@ -111,6 +117,7 @@ def prepare(
             model={
                 "config": dataclasses.asdict(config),
                 "skeleton": model_json.skeleton_to_json(clips.skeleton),
+                "toe_height": measured_toes(clips),
             },
             source=clips.source,
             # The end of each clip is held out.
@@ -164,6 +171,9 @@ def _decode(record: runs.Run) -> Run:
         embedding=config,
         train=train,
         held_out=held_out,
+        toe_height=model_json.toe_height_from_json(
+            record.model.get("toe_height"), where=str(record.config)
+        ),
     )
 
 

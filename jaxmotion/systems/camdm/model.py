@@ -28,7 +28,7 @@ from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, guidance, schedule
 from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.motion import features, rotation, trajectory
-from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton
+from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.networks import blocks, transformer
 from jaxmotion.systems.camdm import network as camdm_network
 from jaxmotion.typing import Key, Params
@@ -393,12 +393,7 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         raise ValueError(
             f"{where}: field 'all_steps' is {all_steps!r:.60}, expected true or false"
         )
-    height = value.get("toe_height")
-    number = isinstance(height, int | float) and not isinstance(height, bool)
-    if height is not None and not (number and abs(height) <= MAX_METERS):
-        raise ValueError(
-            f"{where}: field 'toe_height' is {height!r:.60}, expected meters"
-        )
+    height = model_json.toe_height_from_json(value.get("toe_height"), where=where)
     return dataclasses.replace(
         model, starts=starts, steps=steps, all_steps=all_steps, toe_height=height
     )

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.data import bvh, bvh_text, clips_io, mirror, selection, windows
-from jaxmotion.data.clips import Clips, toe_height
+from jaxmotion.data.clips import Clips, measured_toes
 from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.motion import skeleton
 from jaxmotion.motion.skeleton import Skeleton
@@ -97,8 +97,8 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
         fps=clips.fps,
         **sizes,
     )
-    every = max(clips.num_frames // 10_000, 1)
     if config.rotation_scale != 1.0:
+        every = max(clips.num_frames // 10_000, 1)
         frames = skeleton.Motion(
             root_position=clips.root_position[::every],
             joint_rotation=clips.joint_rotation[::every],
@@ -111,7 +111,7 @@ def make_model(clips: Clips, *, field: str, **sizes: Any) -> Model:
         skeleton=clips.skeleton,
         labels=clips.names(field),
         source=clips.source,
-        toe_height=toe_height(clips, every=every) if clips.skeleton.feet else None,
+        toe_height=measured_toes(clips),
     )
 
 

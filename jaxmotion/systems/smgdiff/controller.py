@@ -468,4 +468,5 @@ def load_character(
         method=method,
         tuning=_tuning(method),
         starts=lambda labels, seed: starts(labels, seed=seed),
+        toe_height=model.toe_height,
     )

@@ -158,6 +158,7 @@ class Model:
       starts: Frames to start from, [labels, number, past, ...], of players at the
         origin that face +z; None where they start from clips. A shipped model has its
         own, which it made itself.
+      toe_height: Where toes rest in its data, meters; None where nobody measured it.
     """
 
     config: Config
@@ -167,6 +168,7 @@ class Model:
     speeds: tuple[float, ...]
     source: str
     starts: Scene | None = None
+    toe_height: float | None = None
 
 
 def to_json(model: Model) -> dict[str, Any]:
@@ -189,6 +191,8 @@ def to_json(model: Model) -> dict[str, Any]:
         "speeds": list(model.speeds),
         "source": model.source,
     }
+    if model.toe_height is not None:
+        value["toe_height"] = model.toe_height
     if model.starts is not None:
         motion = model.starts.motion
         value["starts"] = model_json.arrays_to_json(
@@ -268,7 +272,8 @@ def from_json(value: dict[str, Any], *, where: str) -> Model:
         if found != expected:
             raise ValueError(f"{where}: field {name!r} is {found}, expected {expected}")
     starts = _starts_from_json(value.get("starts"), model, where)
-    return dataclasses.replace(model, starts=starts)
+    height = model_json.toe_height_from_json(value.get("toe_height"), where=where)
+    return dataclasses.replace(model, starts=starts, toe_height=height)
 
 
 def import_file(path: Path) -> tuple[Model, dict[str, Params]]:

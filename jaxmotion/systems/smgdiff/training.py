@@ -13,6 +13,7 @@ import jax
 
 from jaxmotion.data import windows
 from jaxmotion.data.ball_clips import BallClips, load_ball_clips, save_ball_clips
+from jaxmotion.data.clips import measured_toes
 from jaxmotion.learning import checkpoint, model_json, runs
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import loss as smgdiff_loss
@@ -63,6 +64,7 @@ def make_model(
         labels=labels,
         speeds=tuple(round(float(v), 4) for v in smgdiff_data.skill_speeds(data)),
         source=clips.source,
+        toe_height=measured_toes(clips),
     )
 
 

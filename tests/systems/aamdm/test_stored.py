@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.control import foot_lock
 from jaxmotion.learning import checkpoint
 from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm import model as aamdm_model
@@ -26,6 +27,7 @@ def model():
         source="made in the tests (no license)",
         noise_half_life=0.5,
         starts=jnp.asarray(frames_of("embedded")[:3], jnp.float32),
+        toe_height=0.04,
     )
 
 
@@ -65,6 +67,7 @@ def test_a_file_gives_the_character_back(model, networks, file):
 def test_characters_start_in_its_frames(model, file):
     character = aamdm_controller.load_character(file)
     states = character.start(5)
+    assert foot_lock.lock_of(character).toe_height == 0.04
     assert character.method.memory.half_life == 0.5
     assert states.noise.shape[:2] == (5, 5)
     rows = np.asarray(model.starts)
@@ -78,6 +81,7 @@ def test_characters_start_in_its_frames(model, file):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda v: v.update(toe_height=True), "'toe_height' is True, expected meters"),
         (lambda v: v.update(system="camdm"), "'system' is 'camdm', expected 'aamdm'"),
         (lambda v: v["space"]["low"].pop(), "'space': low has"),
         (lambda v: v["space"].pop("mean"), "'space': 'mean' is missing"),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.data import clips_io
+from jaxmotion.data import clips, clips_io, selection
 from jaxmotion.learning import checkpoint, runs
 from jaxmotion.systems.aamdm import data as aamdm_data
 from jaxmotion.systems.aamdm import embedding as aamdm_embedding
@@ -51,6 +51,8 @@ def test_clips_are_chosen_mirrored_described_and_split(run, data):
     assert run.held_out.offsets.tolist() == [0, 32, 64, 96, 128]
     assert run.skeleton.names == person.NAMES and run.source == "made in the tests"
     assert run.embedding.num_joints == 6 and run.embedding.fps == 60.0
+    chosen = selection.select(clips_io.load_clips(data), "theme", ("walk",))
+    assert run.toe_height == pytest.approx(clips.toe_height(chosen), abs=2e-3)
     record = run.record
     assert record.settings["mirrored"] is True and record.settings["labels"] == ["walk"]
     assert len(record.split["train"]) == len(record.split["held_out"]) == 4

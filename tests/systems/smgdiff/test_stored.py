@@ -45,7 +45,9 @@ def test_a_model_comes_back(model):
             getattr(found.representation.normalizer, name),
             getattr(model.representation.normalizer, name),
         )
-    assert found.representation.joints == (2, 4)
+    assert found.representation.joints == (2, 4) and found.toe_height is None
+    value["toe_height"] = 0.04
+    assert smgdiff_model.from_json(value, where="here").toe_height == 0.04
     assert found.representation.skeleton.names == tiny.NAMES
 
 
@@ -69,6 +71,7 @@ def test_starts_come_back(model):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
+        (("toe_height",), "low", "field 'toe_height' is 'low', expected meters"),
         (("system",), "camdm", "field 'system' is 'camdm', expected 'smgdiff'"),
         (("labels",), ["dribble"], "field 'config.num_labels' is 2, expected 1"),
         (("speeds",), [1.0], "field 'speeds' is 1, expected 2"),

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.data import clips
 from jaxmotion.data.ball_clips import save_ball_clips
 from jaxmotion.learning import checkpoint, runs
 from jaxmotion.learning.checkpoint import CheckpointError, latest_step, load_config
@@ -122,6 +123,8 @@ def test_a_run_comes_back_from_its_folder(run):
     assert run.model.config.num_features == 30 + 3 + 7 + 2 + 2
     # Two speeds of the walker, as often: the median lies between.
     assert all(0.6 < speed < 1.5 for speed in run.model.speeds)
+    lowest = clips.toe_height(run.train.clips)
+    assert run.model.toe_height == pytest.approx(lowest, abs=1e-6)
 
 
 @pytest.mark.slow
