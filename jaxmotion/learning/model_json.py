@@ -281,7 +281,7 @@ def toe_height_from_json(value: Any, *, where: str) -> float | None:
         raise ValueError(
             f"{where}: field 'toe_height' is {value!r:.60}, expected meters"
         )
-    return value
+    return None if value is None else float(value)
 
 
 def differences(
