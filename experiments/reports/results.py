@@ -146,18 +146,12 @@ def differ(one: Measured, other: Measured) -> str:
     """In what two files differ that should be of equal data and settings; or ""."""
     stages = [x.about.get("training") or {} for x in (one, other)]
     common = stages[0].keys() & stages[1].keys()
+    found = [{name: x[name] for name in sorted(common)} for x in stages]
     data = [x.about.get("data") for x in (one, other)]
-    skip: tuple[str, ...] = ()
     if any("rounded" in x.about for x in (one, other)):
         # The same clips but for their last digits: checksums cannot tell.
-        data, skip = [None, None], ("files",)
-    found = [
-        {
-            stage: {name: v for name, v in x[stage].items() if name not in skip}
-            for stage in sorted(common)
-        }
-        for x in stages
-    ]
+        data = [None, None]
+        found = [{k: v | {"files": None} for k, v in x.items()} for x in found]
     if trained := model_json.differences(*found):
         return trained
     if None not in data and data[0] != data[1]:
