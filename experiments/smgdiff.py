@@ -4,6 +4,7 @@ Examples:
   python experiments/dribble.py --data data/bandai1.npz data/bandai2.npz --out data/dribble.npz
   python experiments/smgdiff.py train --data data/dribble.npz --out runs/smgdiff
   python experiments/smgdiff.py train --data data/dribble.npz --out runs/smgdiff --stages motion_2 motion_32
+  python experiments/smgdiff.py train --data data/dribble.npz --out runs/varied --stages paths_4 motion_8 --path-noise bridge
   python experiments/smgdiff.py evaluate --run runs/smgdiff
   python experiments/smgdiff.py rollout --run runs/smgdiff --seconds 60
 """  # noqa: E501
@@ -50,6 +51,8 @@ class Train:
       token_margin: Frames that its neighboring output tokens share; None for the
         preset's.
       attention: "full", or "prefix": computed once per plan; None for the preset's.
+      path_noise: Of a trajectory generator: "bridge", as smooth as paths, for more
+        steps than one, or "white" (paper); None for the preset's.
       noise_levels: Of each window in an update; None for the preset's.
       own_levels: Probability of noise on own predictions at lower levels.
       cubic_wishes: Probability of wanted paths without sway.
@@ -79,6 +82,7 @@ class Train:
     depth: int | None = None
     token_margin: int | None = None
     attention: Literal["full", "prefix"] | None = None
+    path_noise: Literal["white", "bridge"] | None = None
     noise_levels: int | None = None
     own_levels: float | None = None
     cubic_wishes: float | None = None
@@ -186,6 +190,12 @@ def sizes_of(args: Train) -> dict[str, Any]:
     return smgdiff_training.PRESETS[args.preset] | given | hidden
 
 
+def paths_of(args: Train) -> dict[str, Any]:
+    """Sizes and noise of the trajectory generator that the arguments describe."""
+    noise = {} if args.path_noise is None else {"noise": args.path_noise}
+    return smgdiff_training.PATHS[args.preset] | noise
+
+
 def train(args: Train) -> None:
     """Trains stage by stage."""
     cli.join_processes(args.distributed)
@@ -197,7 +207,7 @@ def train(args: Train) -> None:
         args.data,
         held_out=args.held_out,
         sizes=sizes_of(args),
-        paths=smgdiff_training.PATHS[args.preset],
+        paths=paths_of(args),
         init=args.init,
     )
     clips = run.train.clips
@@ -329,7 +339,7 @@ class Export:
     Example: python experiments/smgdiff.py export --run runs/smgdiff --out dribble.npz
 
     Attributes:
-      run: Run folder of `train` with the stages motion_8 and paths_1.
+      run: Run folder of `train` with the stage motion_8 and one of paths.
       out: File to write, for `jaxmotion.load`.
       starts: Starts per skill, in which the model itself stands.
     """

@@ -405,7 +405,7 @@ def own_states(model: Model, labels: np.ndarray, *, seed: int) -> PlayerState:
 
 
 def load_run(path: Path) -> tuple[smgdiff_training.Run, Model, dict[str, Params]]:
-    """A run folder, and its model of 8 steps of motion and 1 of paths.
+    """A run folder, and its model of 8 steps of motion and the most of paths.
 
     `CheckpointError` if a stage was not trained.
     """

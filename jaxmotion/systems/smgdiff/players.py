@@ -240,8 +240,8 @@ def straight(model: Model) -> SamplePath:
 def _generators(run: Run) -> dict[str, SamplePath]:
     """Trained trajectory generators by name."""
     found = {}
-    for folder in sorted(run.record.folder.glob("paths_*")):
-        model, params = smgdiff_training.load_stage(run, folder.name)
+    for stage in smgdiff_training.path_stages(run):
+        model, params = smgdiff_training.load_stage(run, stage)
         found[f"generator, T = {model.paths.num_steps}"] = smgdiff_trajectory.sampler(
             params, config=model.paths
         )

@@ -58,6 +58,7 @@ def make_model(
             num_labels=len(labels),
             past=config.past,
             future=config.future,
+            seconds=config.future / config.fps,
             **(paths or {}),
         ),
         representation=smgdiff_data.fit_representation(arrays, past=config.past),
@@ -87,10 +88,13 @@ def with_steps(model: Model, stage: str) -> Model:
     return dataclasses.replace(model, **{field: changed})
 
 
-# Fields of `smgdiff.Config` that change no parameter's shape.
+# Fields of both configs that change no parameter's shape; "noise" also begins
+# "noise_levels".
 _FREE = (
+    "num_steps",
+    "noise",
+    "seconds",
     "attention",
-    "noise_levels",
     "own_levels",
     "cubic_wishes",
     "seam_half_life",
@@ -207,7 +211,7 @@ def load_stage(run: Run, stage: str) -> tuple[Model, Params]:
 
 
 def load(path: Path) -> tuple[Model, dict[str, Params]]:
-    """Model and parameters of a file, or of a folder's "motion_8" and "paths_1".
+    """Model and parameters of a file, or of a folder as `load_networks` reads it.
 
     `CheckpointError` if a stage was not trained or the file is damaged.
     """
@@ -216,10 +220,16 @@ def load(path: Path) -> tuple[Model, dict[str, Params]]:
     return load_networks(load_run(path))
 
 
+def path_stages(run: Run) -> list[str]:
+    """The run's trajectory generators, that of most steps last."""
+    found = (folder.name for folder in run.record.folder.glob("paths_*"))
+    return sorted(found, key=lambda stage: check_stage_name(stage)[1])
+
+
 def load_networks(run: Run) -> tuple[Model, dict[str, Params]]:
-    """The model of 8 steps of motion and 1 of paths, and its parameters."""
+    """The model of 8 steps of motion, paths of the most steps, and its parameters."""
     model, motion = load_stage(run, "motion_8")
-    paths, path_params = load_stage(run, "paths_1")
+    paths, path_params = load_stage(run, (path_stages(run) or ["paths_1"])[-1])
     model = dataclasses.replace(model, paths=paths.paths)
     return model, {"motion": motion, "paths": path_params}
 

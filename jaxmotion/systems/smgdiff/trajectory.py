@@ -17,6 +17,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.diffusion import chain, schedule
@@ -35,6 +36,9 @@ class Config:
     Attributes:
       num_steps: T (paper 1).
       token_margin, token_window: As in `transformer.CamdmTransformer`.
+      noise: "white", of each frame on its own (paper), or "bridge": as smooth as paths
+        are, and as large as what a target leaves open of them (`_sines`).
+      seconds: Length of a path.
       meters: Unit of the network's positions.
       weight_velocity: Weight of the displacements, beside the data's 1.
     """
@@ -50,6 +54,8 @@ class Config:
     frames_per_token: int = 5
     token_margin: int = 0
     token_window: Literal["hann", "trapezoid"] = "hann"
+    noise: Literal["white", "bridge"] = "white"
+    seconds: float = 1.5
     meters: float = 1.0
     weight_velocity: float = 1.0
 
@@ -85,6 +91,52 @@ def init(key: Key, config: Config) -> Params:
 
 def _pack(path: trajectory.Trajectory, config: Config) -> Array:
     return jnp.concatenate([path.position / config.meters, path.facing], axis=-1)
+
+
+# Deviation of the first sine of positions, meters, and of facings, in 1.5 s of
+# locomotion; the n-th one's falls with n^2.
+_SWAY, _TURN = 0.25, 0.5
+
+
+@functools.cache
+def _sines(future: int, meters: float) -> tuple[np.ndarray, np.ndarray]:
+    """What unit noise stands for, [channel, frame, sine], and its inverse.
+
+    Positions end at the target, facings may end anywhere.
+    """
+    number = np.arange(1, future + 1)
+    odd, times = 2 * number - 1, number / future
+    sway = _SWAY * np.sin(np.pi * np.outer(times, number[:-1])) / number[:-1] ** 2
+    sway = np.pad(sway, ((0, 0), (0, 1)))  # the last sine is zero in every frame
+    sway[-1] = 0.0
+    turn = _TURN * np.sin(np.pi / 2 * np.outer(times, odd)) / odd**2
+    sines = np.stack([sway / meters, sway / meters, turn, turn])
+    return sines.astype(np.float32), np.linalg.pinv(sines).astype(np.float32)
+
+
+def noise_space(
+    wish: Wish, config: Config
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """From what the chain denoises to a packed path, and back.
+
+    With `noise="bridge"` the chain has what differs from the straight path in its own
+    deviations: in meters a few steps of a chain leave a mean of it.
+    """
+    if config.noise == "white":
+        return lambda x: x, lambda x: x
+    sines, inverse = map(jnp.asarray, _sines(config.future, config.meters))
+    times = jnp.arange(1, config.future + 1, dtype=jnp.float32) / config.future
+    end = wish.velocity * (config.seconds / config.meters)
+    facing = jnp.broadcast_to(wish.past.facing[-1:], (config.future, 2))
+    middle = jnp.concatenate([times[:, None] * end[None], facing], axis=-1)
+
+    def decode(z: Array) -> Array:
+        return middle + jnp.einsum("cfn,nc->fc", sines, z)
+
+    def encode(x: Array) -> Array:
+        return jnp.einsum("cnf,fc->nc", inverse, x - middle)
+
+    return decode, encode
 
 
 def _apply(params: Params, x_t: Array, t: Array, wish: Wish, config: Config) -> Array:
@@ -143,7 +195,12 @@ def loss(
     table = schedule.cosine_schedule(config.num_steps)
     t = jax.random.randint(key_t, labels.shape, 1, config.num_steps + 1)
     noise = jax.random.normal(key_noise, x_0.shape)
-    x_t = jax.vmap(schedule.q_sample, (None, 0, 0, 0))(table, x_0, t, noise)
+
+    def noised(x_0: Array, t: Array, noise: Array, wish: Wish) -> Array:
+        decode, encode = noise_space(wish, config)
+        return decode(schedule.q_sample(table, encode(x_0), t, noise))
+
+    x_t = jax.vmap(noised)(x_0, t, noise, wish)
     prediction = _apply(params, x_t, t, wish, config)
     every = jnp.ones(x_0.shape[:-1], bool)
     terms = {
@@ -159,13 +216,16 @@ def sampler(
     """The sampler of paths, in the frame of the last displayed pose."""
 
     def sample(key: Key, wish: Wish) -> trajectory.Trajectory:
-        def denoise(key: Key, x_t: Array, t: Array) -> Array:
+        decode, encode = noise_space(wish, config)
+
+        def denoise(key: Key, z_t: Array, t: Array) -> Array:
             del key  # deterministic
-            return _apply(params, x_t, t, wish, config)
+            return encode(_apply(params, decode(z_t), t, wish, config))
 
         table = schedule.cosine_schedule(config.num_steps)
         shape = (config.future, CHANNELS)
-        x = chain.sample(step(table, denoise), key, shape, num_steps=config.num_steps)
+        z = chain.sample(step(table, denoise), key, shape, num_steps=config.num_steps)
+        x = decode(z)
         return trajectory.Trajectory(
             position=x[:, :2] * config.meters, facing=ground.unit(x[:, 2:])
         )

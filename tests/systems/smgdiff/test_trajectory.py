@@ -90,6 +90,45 @@ def test_generated_paths_have_unit_facings(params, steps):
     np.testing.assert_allclose(np.hypot(*path.facing.T), 1.0, atol=1e-5)
 
 
+def test_smooth_noise_is_a_walk_to_the_target_of_known_deviation():
+    """Frames' deviations over draws are the series' in float64; the end stays."""
+    config = dataclasses.replace(CONFIG, noise="bridge", num_steps=4, seconds=0.4)
+    wanted = wish()
+    decode, encode = smgdiff_trajectory.noise_space(wanted, config)
+    z = jax.random.normal(jax.random.key(2), (20_000, 12, 4))
+    x = np.asarray(jax.vmap(decode)(z), np.float64)
+    part, n = np.arange(1, 13)[:, None] / 12, np.arange(1, 13)[None]
+    sway = 0.25 * np.sqrt(
+        (np.sin(np.pi * n * part)[:, :11] ** 2 / n[:, :11] ** 4).sum(1)
+    )
+    odd = 2 * n - 1
+    turn = 0.5 * np.sqrt((np.sin(np.pi / 2 * odd * part) ** 2 / odd**4).sum(1))
+    expected = np.stack([sway, sway, turn, turn], axis=-1)
+    np.testing.assert_allclose(x.std(0)[:-1], expected[:-1], rtol=0.03)
+    np.testing.assert_allclose(
+        x[:, -1, :2], np.tile([0.12, 0.4], (20_000, 1)), atol=1e-5
+    )
+    straight = smgdiff_trajectory.straight(
+        jax.random.key(0), wanted, future=12, fps=30.0
+    )
+    np.testing.assert_allclose(x.mean(0)[:, :2], straight.position, atol=0.01)
+    back = np.asarray(jax.vmap(encode)(jnp.asarray(x, jnp.float32)))
+    np.testing.assert_allclose(back[:, :11], z[:, :11], atol=2e-3)
+    np.testing.assert_allclose(back[:, 11, 2:], z[:, 11, 2:], atol=2e-3)
+
+
+def test_paths_from_smooth_noise_vary_and_end_at_the_target(params):
+    config = dataclasses.replace(CONFIG, noise="bridge", num_steps=4, seconds=0.4)
+    generate = smgdiff_trajectory.sampler(params, config=config)
+    keys = jax.random.split(jax.random.key(0), 64)
+    paths = jax.jit(jax.vmap(generate, (0, None)))(keys, wish())
+    np.testing.assert_allclose(
+        paths.position[:, -1], np.tile([0.12, 0.4], (64, 1)), atol=1e-5
+    )
+    assert np.asarray(paths.position[:, 5]).std(0).min() > 1e-4
+    np.testing.assert_allclose(jnp.linalg.norm(paths.facing, axis=-1), 1.0, atol=1e-5)
+
+
 @pytest.mark.slow
 def test_training_makes_paths_of_what_was_seen():
     """Straight walks at two speeds: the error falls to a part of the first."""
