@@ -10,7 +10,6 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -111,7 +110,7 @@ class Evaluate:
 
     Attributes:
       tables: "schedules" (the paper's table 4), "steps" (table 3: every motion model
-        that was trained), "paths" (table 2).
+        that was trained), "paths" (table 2), "spread" (of paths, beside people's).
       out: Folder; None for <run>/evaluation.
       steps: Motion model of the tables "schedules" and "paths".
       schedules: Rows of table 4.
@@ -132,7 +131,7 @@ class Evaluate:
     """
 
     run: Path = Path("runs/smgdiff")
-    tables: tuple[Literal["schedules", "steps", "paths"], ...] = (
+    tables: tuple[Literal["schedules", "steps", "paths", "spread"], ...] = (
         "schedules",
         "steps",
         "paths",
@@ -238,6 +237,12 @@ def evaluate(args: Evaluate) -> None:
     evaluator = None if args.evaluator is None else frozen.load(args.evaluator)
     run = smgdiff_training.load_run(args.run)
     out = cli.out_folder(args, "evaluation")
+    if "spread" in args.tables:
+        found = smgdiff_players.spread_table(run, windows=args.windows, seed=args.seed)
+        report = {"source": run.model.source} | reporting.provenance(args)
+        reporting.write_table(out / "spread", found, report)
+    if args.tables == ("spread",):
+        return
     cli.announce("compiling the evaluator and each row's plans", 40)
     setting = smgdiff_evaluation.make_setting(
         run.train,
@@ -277,7 +282,7 @@ def evaluate(args: Evaluate) -> None:
         rows, places = smgdiff_evaluation.step_table(run, setting, chunk=args.chunk)
         write_places("steps", rows, places)
     if "paths" in args.tables:
-        rows, more = smgdiff_players.path_table(
+        rows = smgdiff_players.path_table(
             run,
             setting,
             steps=args.steps,
@@ -286,8 +291,7 @@ def evaluate(args: Evaluate) -> None:
             repeats=args.repeats,
             chunk=args.chunk,
         )
-        write("paths", rows, more)
-        print(json.dumps(more, indent=1))
+        write("paths", rows, {})
 
 
 def rollout(args: Rollout) -> None:

@@ -52,6 +52,16 @@ def test_schedules_stand_beside_real_clips(invoke, trained):
 
 
 @pytest.mark.slow
+def test_paths_vary_beside_peoples(invoke, trained):
+    invoke("smgdiff", f"evaluate --run {trained} --tables spread --windows 8")
+    report = json.loads((trained / "evaluation/spread/metrics.json").read_text())
+    straight, made = (
+        report["rows"][name] for name in ("straight paths", "generator, T = 1")
+    )
+    assert straight["generated, 0.5 s"]["value"] == 0 < made["energy, 1 s"]["value"]
+
+
+@pytest.mark.slow
 def test_a_rollout_is_a_motion_with_a_ball(invoke, trained, capsys):
     invoke("smgdiff", f"rollout --run {trained} --seconds 2 --schedule none")
     out = trained / "rollout"

@@ -9,7 +9,6 @@ Source: SMGDiff, section 5.2 and table 2.
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -193,8 +192,11 @@ def path_spread(
       their wish ("generated"); of what people did after the most similar inputs of that
       skill from its mean ("recorded"), the same once the generator's mean for each
       input is taken off, so that inputs need not be alike ("recorded, own mean"); and
-      of the mean from what was recorded ("error") and of the straight path from it
-      ("straight"). "input": how far similar inputs are, m/s.
+      of the mean from what was recorded ("error"). "energy": the energy score of the
+      paths, cm, which is least for those that vary as people do. "input": how far
+      similar inputs are, m/s.
+
+    Source: Gneiting and Raftery 2007, eq. 20, for the energy score.
     """
     wish, others = wishes(known, model), wishes(seen, model)
 
@@ -216,13 +218,14 @@ def path_spread(
         chosen, away = _nearest(wish, others, repeats, model.config.fps)
         # Of few draws the deviation from their own mean is too small.
         fair = jnp.sqrt(repeats / (repeats - 1))
-        times = jnp.arange(1, real.shape[1] + 1) / model.config.fps
+        away_from = lambda x, axes: 100 * jnp.mean(jnp.linalg.norm(x, axis=-1), axes)  # noqa: E731
+        apart = away_from(paths[:, :, None] - paths[:, None], (0, 1, 2)) * fair**2
         return {
             "generated": fair * rms(about(paths), (0, 1)),
             "recorded": fair * rms(about(after[chosen]), (0, 1)),
             "recorded, own mean": fair * rms(about(rest[chosen]), (0, 1)),
             "error": rms(mean - real, 0),
-            "straight": rms(jnp.einsum("f,bc->bfc", times, wish.velocity) - real, 0),
+            "energy": away_from(paths - real[:, None], (0, 1)) - 0.5 * apart,
             "input": jnp.mean(away),
         }
 
@@ -238,8 +241,8 @@ def straight(model: Model) -> SamplePath:
 
 
 def _generators(run: Run) -> dict[str, SamplePath]:
-    """Trained trajectory generators by name."""
-    found = {}
+    """Straight paths, and the run's trajectory generators, by name."""
+    found = {"straight paths": straight(run.model)}
     for stage in smgdiff_training.path_stages(run):
         model, params = smgdiff_training.load_stage(run, stage)
         found[f"generator, T = {model.paths.num_steps}"] = smgdiff_trajectory.sampler(
@@ -257,30 +260,15 @@ def path_table(
     starts: int,
     repeats: int,
     chunk: int,
-) -> tuple[Rows, dict[str, Any]]:
+) -> Rows:
     """Table 2: steered players with and without generated paths and guidance.
 
     The motion model has T = `steps`; `starts` of players are those of a replication,
-    with `repeats` players each. Beside the rows stands how much each generator's paths
-    vary (`path_spread`).
+    with `repeats` players each.
     """
     model, params = smgdiff_training.load_stage(run, f"motion_{steps}")
-    generators = _generators(run)
-    seen = smgdiff_scoring.eval_windows(
-        run.train, model, number=_SIMILAR, seed=setting.seed + 6
-    )
-    key = jax.random.key(setting.seed)
-    spreads = {
-        name: {
-            part: np.round(np.asarray(value), 3).tolist()
-            for part, value in path_spread(
-                key, generate, setting.known, seen, model, repeats=8
-            ).items()
-        }
-        for name, generate in generators.items()
-    }
     rows = smgdiff_evaluation.real_rows(run, setting)
-    for name, generate in ({"straight paths": straight(model)} | generators).items():
+    for name, generate in _generators(run).items():
         for schedule in ("none", "end 2"):
             plan = smgdiff_guidance.sampler(
                 params,
@@ -300,7 +288,35 @@ def path_table(
             row = table.row(scores)
             rows[f"{name}, guidance {schedule}"] = row
             print(f"{name}, guidance {schedule}: done", flush=True)
-    return rows, {"spread of the paths": spreads}
+    return rows
+
+
+# When paths are looked at, seconds after the last displayed pose.
+_LOOKS = (0.25, 0.5, 1.0)
+
+
+def spread_table(run: Run, *, windows: int, seed: int) -> Rows:
+    """How much each generator's paths vary beside people's (`path_spread`)."""
+    model = run.model
+    known = smgdiff_scoring.eval_windows(run.held_out, model, number=windows, seed=seed)
+    seen = smgdiff_scoring.eval_windows(
+        run.train, model, number=_SIMILAR, seed=seed + 6
+    )
+    rows = {}
+    for name, generate in _generators(run).items():
+        found = path_spread(
+            jax.random.key(seed), generate, known, seen, model, repeats=8
+        )
+        found.pop("input")
+        rows[name] = {
+            f"{part}, {look:g} s": table.Cell(
+                value=float(curve[round(look * model.config.fps) - 1]),
+                samples=int(known.label.shape[0]),
+            )
+            for part, curve in found.items()
+            for look in _LOOKS
+        }
+    return rows
 
 
 # The direction of the command turns by so much, every so many seconds.

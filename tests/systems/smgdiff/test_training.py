@@ -311,7 +311,14 @@ def test_a_straight_path_owes_nothing_to_noise(run, setting):
         repeats=3,
     )
     np.testing.assert_allclose(found["generated"], 0.0, atol=1e-4)
-    np.testing.assert_allclose(found["error"], found["straight"], rtol=1e-3, atol=1e-3)
+    end = setting.known.future.motion.root_position[..., ::2]
+    part = jnp.arange(1, end.shape[1] + 1)[:, None] / end.shape[1]
+    away = jnp.linalg.norm(part[None] * end[:, -1:] - end, axis=-1)
+    np.testing.assert_allclose(
+        found["energy"], 100 * away.mean(0), rtol=1e-3, atol=1e-3
+    )
+    error = 100 * jnp.sqrt(jnp.mean(away**2, axis=0))
+    np.testing.assert_allclose(found["error"], error, rtol=1e-3, atol=1e-3)
     assert found["recorded"].shape == (model.config.future,)
     assert float(found["recorded"][-1]) > 0.0
 
@@ -326,7 +333,12 @@ def test_paths_of_noise_alone_vary_by_their_noise(run, setting):
     found = smgdiff_players.path_spread(
         jax.random.key(0), generate, setting.known, setting.known, model, repeats=8
     )
-    # 10 cm in each of two directions.
+    # 10 cm in each of two directions, draws 10 sqrt(pi) cm apart.
+    real = np.asarray(setting.known.future.motion.root_position)[..., ::2]
+    drawn = 0.1 * np.random.default_rng(0).normal(size=(500, *real.shape))
+    away = np.linalg.norm(drawn - real, axis=-1).mean((0, 1))
+    energy = 100 * (away - 0.05 * np.sqrt(np.pi))
+    assert float(jnp.mean(found["energy"])) == pytest.approx(energy.mean(), rel=0.05)
     assert float(jnp.mean(found["generated"])) == pytest.approx(14.1, rel=0.05)
 
 
