@@ -100,9 +100,9 @@ _SWAY, _TURN = 0.25, 0.5
 
 @functools.cache
 def _sines(future: int, meters: float) -> tuple[np.ndarray, np.ndarray]:
-    """What unit noise stands for, [channel, frame, sine], and its inverse.
+    """What unit noise stands for, [kind, frame, sine], and its inverse.
 
-    Positions end at the target, facings may end anywhere.
+    Positions end at the target, facings, the second kind, anywhere.
     """
     number = np.arange(1, future + 1)
     odd, times = 2 * number - 1, number / future
@@ -110,7 +110,7 @@ def _sines(future: int, meters: float) -> tuple[np.ndarray, np.ndarray]:
     sway = np.pad(sway, ((0, 0), (0, 1)))  # the last sine is zero in every frame
     sway[-1] = 0.0
     turn = _TURN * np.sin(np.pi / 2 * np.outer(times, odd)) / odd**2
-    sines = np.stack([sway / meters, sway / meters, turn, turn])
+    sines = np.stack([sway / meters, turn])
     return sines.astype(np.float32), np.linalg.pinv(sines).astype(np.float32)
 
 
@@ -130,11 +130,14 @@ def noise_space(
     facing = jnp.broadcast_to(wish.past.facing[-1:], (config.future, 2))
     middle = jnp.concatenate([times[:, None] * end[None], facing], axis=-1)
 
+    kinds = lambda x: x.reshape(config.future, 2, 2)  # noqa: E731
+
     def decode(z: Array) -> Array:
-        return middle + jnp.einsum("cfn,nc->fc", sines, z)
+        away = jnp.einsum("kfn,nkc->fkc", sines, kinds(z))
+        return middle + away.reshape(middle.shape)
 
     def encode(x: Array) -> Array:
-        return jnp.einsum("cnf,fc->nc", inverse, x - middle)
+        return jnp.einsum("knf,fkc->nkc", inverse, kinds(x - middle)).reshape(x.shape)
 
     return decode, encode
 
