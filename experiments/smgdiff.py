@@ -344,11 +344,13 @@ class Export:
 
     Attributes:
       run: Run folder of `train` with the stage motion_8 and one of paths.
+      paths: Run folder whose trajectory generator to take; None for the run's own.
       out: File to write, for `jaxmotion.load`.
       starts: Starts per skill, in which the model itself stands.
     """
 
     run: Path = Path("runs/smgdiff")
+    paths: cli.Optional[Path] = None
     out: Path = Path("dribble.npz")
     starts: int = 4
 
@@ -358,6 +360,9 @@ def export(args: Export) -> None:
     cli.announce("compiling the rollouts that starts are taken from", 60)
     _, model, params = smgdiff_controller.load_run(args.run)
     starts = smgdiff_controller.own_starts(args.run, number=args.starts)
+    if args.paths is not None:
+        own = smgdiff_training.load_run(args.paths)
+        model, params = smgdiff_training.with_paths(model, params, own)
     model = dataclasses.replace(model, starts=starts)
     checkpoint.export_params(args.out, params, smgdiff_model.to_json(model))
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")

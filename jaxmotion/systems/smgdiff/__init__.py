@@ -15,5 +15,6 @@ code (`Guidance(last_sigma=...)` shortens it). What `experiments/smgdiff.py` use
 default since trainings here are short: `--preset small`, with losses of the ball and
 other weights (`--preset paper` is without; `planted` is for a second training), and
 `smgdiff_guidance.TUNED` (rate 0.9, touches from 12 m/s² on, within 18 cm) where the
-paper has 0.5, 2 m/s² and 10 cm (`Guidance()`).
+paper has 0.5, 2 m/s² and 10 cm (`Guidance()`). The shipped `dribble` draws its paths in
+four steps from noise as smooth as paths (`trajectory.Config(noise="bridge")`).
 """

@@ -229,9 +229,24 @@ def path_stages(run: Run) -> list[str]:
 def load_networks(run: Run) -> tuple[Model, dict[str, Params]]:
     """The model of 8 steps of motion, paths of the most steps, and its parameters."""
     model, motion = load_stage(run, "motion_8")
-    paths, path_params = load_stage(run, (path_stages(run) or ["paths_1"])[-1])
-    model = dataclasses.replace(model, paths=paths.paths)
-    return model, {"motion": motion, "paths": path_params}
+    return with_paths(model, {"motion": motion}, run)
+
+
+def with_paths(
+    model: Model, params: dict[str, Params], run: Run
+) -> tuple[Model, dict[str, Params]]:
+    """The same, with the trajectory generator of a run, that of its most steps.
+
+    `CheckpointError` if it has none; `ValueError` if skills or lengths differ.
+    """
+    other, paths = load_stage(run, (path_stages(run) or ["paths_1"])[-1])
+    part = lambda m: (m.labels, m.paths.past, m.paths.future, m.config.fps)  # noqa: E731
+    if part(other) != part(model):
+        raise ValueError(
+            f"{run.record.folder}: skills, frames and rate are {part(other)}, expected "
+            f"{part(model)}"
+        )
+    return dataclasses.replace(model, paths=other.paths), params | {"paths": paths}
 
 
 # Sizes and weights of `smgdiff.Config`, by name.

@@ -5,7 +5,9 @@ of the path, so its loss is a regression and the best answer does not depend on 
 noise. T >= 2 is the same chain, and can draw different paths.
 
 Paths are seen from the last displayed pose and divided by `Config.meters`; so noise of
-unit deviation is as large as a path.
+unit deviation is as large as a path. What a target leaves open is a tenth of that and
+smooth, and a few steps over white noise leave a mean of it. Noise as smooth and as
+small (`noise="bridge"`, ours) keeps half.
 
 Source: SMGDiff, section 3.1, eq. 3.
 """

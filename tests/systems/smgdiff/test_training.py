@@ -1,6 +1,7 @@
 """SMGDiff's runs: splits, stages, folders, and what plans and players score."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -203,6 +204,29 @@ def test_a_balanced_stage_learns_from_other_windows(run, tmp_path):
     assert max(jax.tree.leaves(gaps)) > 1e-6
     with pytest.raises(ValueError, match="other settings"):
         smgdiff_training.train_stage(own, "paths_1", budget=BUDGET, balance=0.5)
+
+
+def test_a_model_takes_the_paths_of_another_run(run, tmp_path):
+    """Those of most steps."""
+    data = run.record.folder.parent / "clips.npz"
+    make = functools.partial(smgdiff_training.prepare, data=data, held_out=0.3)
+    paths = PATHS | {"noise": "bridge"}
+    other = make(tmp_path / "other", sizes=SIZES, paths=paths)
+    assert other.model.paths.seconds == 12 / 30
+    for stage in ("paths_1", "paths_2"):
+        smgdiff_training.train_stage(other, stage, budget=BUDGET)
+    given = {"motion": jnp.zeros(1), "paths": jnp.zeros(1)}
+    model, params = smgdiff_training.with_paths(run.model, given, other)
+    assert (model.paths.num_steps, model.paths.noise) == (2, "bridge")
+    assert params["motion"] is given["motion"] and model.config == run.model.config
+    wanted = smgdiff_training.load_stage(other, "paths_2")[1]
+    jax.tree.map(np.testing.assert_array_equal, params["paths"], wanted)
+    long = make(tmp_path / "long", sizes=SIZES | dict(future=14), paths=paths)
+    with pytest.raises(CheckpointError):
+        smgdiff_training.with_paths(run.model, given, long)
+    smgdiff_training.train_stage(long, "paths_1", budget=BUDGET)
+    with pytest.raises(ValueError, match=r"long: skills, frames and rate are .* 14"):
+        smgdiff_training.with_paths(run.model, given, long)
 
 
 def test_stages_are_named_by_kind_and_steps(run):
