@@ -291,8 +291,14 @@ def path_table(
     return rows
 
 
-# When paths are looked at, seconds after the last displayed pose.
+# When paths are looked at, seconds after the last displayed pose, and for what.
 _LOOKS = (0.25, 0.5, 1.0)
+_CURVES = {
+    "spread": "generated",
+    "people's": "recorded, own mean",
+    "error of the mean": "error",
+    "energy score": "energy",
+}
 
 
 def spread_table(run: Run, *, windows: int, seed: int) -> Rows:
@@ -307,13 +313,12 @@ def spread_table(run: Run, *, windows: int, seed: int) -> Rows:
         found = path_spread(
             jax.random.key(seed), generate, known, seen, model, repeats=8
         )
-        found.pop("input")
         rows[name] = {
-            f"{part}, {look:g} s": table.Cell(
-                value=float(curve[round(look * model.config.fps) - 1]),
+            f"{title} after {look:g} s, cm": table.Cell(
+                value=float(found[part][round(look * model.config.fps) - 1]),
                 samples=int(known.label.shape[0]),
             )
-            for part, curve in found.items()
+            for title, part in _CURVES.items()
             for look in _LOOKS
         }
     return rows
