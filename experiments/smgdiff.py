@@ -362,7 +362,7 @@ def export(args: Export) -> None:
     starts = smgdiff_controller.own_starts(args.run, number=args.starts)
     if args.paths is not None:
         own = smgdiff_training.load_run(args.paths)
-        model, params = smgdiff_training.with_paths(model, params, own)
+        model, params = smgdiff_training.with_paths(params, model, own)
     model = dataclasses.replace(model, starts=starts)
     checkpoint.export_params(args.out, params, smgdiff_model.to_json(model))
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")

@@ -229,13 +229,13 @@ def path_stages(run: Run) -> list[str]:
 def load_networks(run: Run) -> tuple[Model, dict[str, Params]]:
     """The model of 8 steps of motion, paths of the most steps, and its parameters."""
     model, motion = load_stage(run, "motion_8")
-    return with_paths(model, {"motion": motion}, run)
+    return with_paths({"motion": motion}, model, run)
 
 
 def with_paths(
-    model: Model, params: dict[str, Params], run: Run
+    params: dict[str, Params], model: Model, run: Run
 ) -> tuple[Model, dict[str, Params]]:
-    """The same, with the trajectory generator of a run, that of its most steps.
+    """Model and parameters with the trajectory generator of a run, of its most steps.
 
     `CheckpointError` if it has none; `ValueError` if skills or lengths differ.
     """

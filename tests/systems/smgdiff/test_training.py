@@ -216,17 +216,17 @@ def test_a_model_takes_the_paths_of_another_run(run, tmp_path):
     for stage in ("paths_1", "paths_2"):
         smgdiff_training.train_stage(other, stage, budget=BUDGET)
     given = {"motion": jnp.zeros(1), "paths": jnp.zeros(1)}
-    model, params = smgdiff_training.with_paths(run.model, given, other)
+    model, params = smgdiff_training.with_paths(given, run.model, other)
     assert (model.paths.num_steps, model.paths.noise) == (2, "bridge")
     assert params["motion"] is given["motion"] and model.config == run.model.config
     wanted = smgdiff_training.load_stage(other, "paths_2")[1]
     jax.tree.map(np.testing.assert_array_equal, params["paths"], wanted)
     long = make(tmp_path / "long", sizes=SIZES | dict(future=14), paths=paths)
     with pytest.raises(CheckpointError):
-        smgdiff_training.with_paths(run.model, given, long)
+        smgdiff_training.with_paths(given, run.model, long)
     smgdiff_training.train_stage(long, "paths_1", budget=BUDGET)
     with pytest.raises(ValueError, match=r"long: skills, frames and rate are .* 14"):
-        smgdiff_training.with_paths(run.model, given, long)
+        smgdiff_training.with_paths(given, run.model, long)
 
 
 def test_stages_are_named_by_kind_and_steps(run):
