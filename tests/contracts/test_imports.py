@@ -2,6 +2,7 @@
 
 import ast
 import builtins
+import functools
 import symtable
 import sys
 from pathlib import Path
@@ -90,24 +91,25 @@ DOORS = {
 }
 
 
+@functools.cache
 def imports(path):
     """Every imported module with the line, and whether it is loaded with the file."""
-    tree = ast.parse(path.read_text())
-    inside = {
-        id(node)
-        for function in ast.walk(tree)
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef)
-        for node in ast.walk(function)
-    }
-    for node in ast.walk(tree):
-        at_top = id(node) not in inside
+    found = []
+
+    def visit(node, at_top):
         if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield alias.name, node.lineno, at_top
+            found.extend((alias.name, node.lineno, at_top) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}:{node.lineno}: relative import"
             for alias in node.names:
-                yield f"{node.module}.{alias.name}", node.lineno, at_top
+                found.append((f"{node.module}.{alias.name}", node.lineno, at_top))
+        at_top = at_top and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        for child in ast.iter_child_nodes(node):
+            if not isinstance(child, ast.expr):
+                visit(child, at_top)
+
+    visit(ast.parse(path.read_text()), True)
+    return found
 
 
 def files(*folders):

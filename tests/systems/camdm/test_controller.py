@@ -86,45 +86,69 @@ def states_of(skeleton, characters, config=CONFIG, **walk):
     return jax.tree.map(lambda x: jnp.stack([x] * characters), state)
 
 
-def roll(skeleton, commands, control=CONTROL, config=CONFIG, params=None, **walk):
+def roll(skeleton, commands, control=CONTROL, config=CONFIG, **walk):
     states = states_of(skeleton, commands.label.shape[0], config, **walk)
 
-    def run(params, key, states, commands):
+    def run(key, states, commands):
         made = camdm_controller.controller(
-            params, skeleton, config=config, control=control
+            None, skeleton, config=config, control=control
         )
         return rollout.rollout(made, key, states, commands)
 
-    return jax.jit(run)(params, jax.random.key(0), states, commands)
-
-
-def planned_ticks(frames, character=0):
-    return np.flatnonzero(frames.planned[character]).tolist()
+    return jax.jit(run)(jax.random.key(0), states, commands)
 
 
 # When it plans
 
+MOST = 4, 25  # characters and ticks of the tests that share a program
 
-def test_it_plans_when_told_or_after_m_frames(skeleton, use):
+
+@functools.cache
+def guided_program(control):
+    def run(skeleton, key, states, commands):
+        made = camdm_controller.controller(
+            None, skeleton, config=CONFIG, control=control
+        )
+        return rollout.rollout(made, key, states, commands)[1]
+
+    return jax.jit(run)
+
+
+@pytest.fixture
+def guided(skeleton, use):
+    """Ticks at which characters plan, and their heights: with what scale, -1 for none.
+
+    Whatever their number, as many go for as long: the programs are the same.
+    """
     use(scale_as_height)
+
+    def find(velocity, facing, label, control=CONTROL):
+        less = [(0, most - own) for most, own in zip(MOST, label.shape, strict=True)]
+        given = [
+            np.pad(x, [*less, (0, 0)][: x.ndim], mode="edge")
+            for x in (velocity, facing, label)
+        ]
+        states, key = states_of(skeleton, MOST[0]), jax.random.key(0)
+        frames = guided_program(control)(skeleton, key, states, commands_of(*given))
+        characters, ticks = label.shape
+        planned = np.asarray(frames.planned)[:characters, :ticks]
+        heights = np.asarray(frames.root_position)[:characters, :ticks, 1].round(5)
+        return [np.flatnonzero(x).tolist() for x in planned], heights.tolist()
+
+    return find
+
+
+def test_it_plans_when_told_or_after_m_frames(guided):
     velocity, facing, label = steady(4, 17)
     velocity[1, 3:] = [0.5, 1.0]
     facing[2, 7:] = [1.0, 0.0]
     label[3, 10:] = 1
-    frames = roll(skeleton, commands_of(velocity, facing, label))[1]
-    assert planned_ticks(frames, 0) == [0, 5, 10, 15]
-    assert planned_ticks(frames, 1) == [0, 3, 8, 13]
-    assert planned_ticks(frames, 2) == [0, 5, 7, 12]
-    assert planned_ticks(frames, 3) == [0, 5, 10, 15]
-
+    planned, _ = guided(velocity, facing, label)
+    each = [0, 5, 10, 15]
+    assert planned == [each, [0, 3, 8, 13], [0, 5, 7, 12], each]
     eager = dataclasses.replace(CONTROL, replan_on_change=False)
-    frames = roll(skeleton, commands_of(velocity, facing, label), eager)[1]
-    for character in range(4):
-        assert planned_ticks(frames, character) == [0, 5, 10, 15]
-
-
-def heights(frames, character):
-    return np.asarray(frames.root_position[character, :, 1]).round(5).tolist()
+    planned, _ = guided(velocity, facing, label, eager)
+    assert planned == [each] * 4
 
 
 @pytest.mark.parametrize(
@@ -132,13 +156,12 @@ def heights(frames, character):
     mostly_slow([(0, True), (1, True), (1, False), (2, False)], [(1, True)]),
 )
 def test_guidance_only_in_the_first_plans_after_a_style_change(
-    skeleton, use, guided_plans, replan_on_change
+    guided, guided_plans, replan_on_change
 ):
     """Character 0 changes its style at tick 7; 1 never; 2 changes with its first plan.
 
     The height of a frame is the scale that its plan was made with, -1 for none.
     """
-    use(scale_as_height)
     velocity, facing, label = steady(3, 25)
     label[0, 7:] = 1
     label[2] = 1
@@ -148,39 +171,35 @@ def test_guidance_only_in_the_first_plans_after_a_style_change(
         replan_on_change=replan_on_change,
         guidance_scale=0.7,
     )
-    frames = roll(skeleton, commands_of(velocity, facing, label), control)[1]
+    _, heights = guided(velocity, facing, label, control)
     first = 7 if replan_on_change else 10
-    guided = range(first, first + 5 * guided_plans)
-    found = heights(frames, 0)
-    assert found == [np.float32(0.7).round(5) if i in guided else -1 for i in range(25)]
+    ticks = range(first, first + 5 * guided_plans)
+    want = [np.float32(0.7).round(5) if i in ticks else -1 for i in range(25)]
+    assert heights[0] == want
     # The others plan by themselves: at most with the scale that changes nothing.
     for other in (1, 2):
-        assert set(heights(frames, other)) <= {-1.0, 1.0}
+        assert set(heights[other]) <= {-1.0, 1.0}
 
 
 @pytest.mark.slow
-def test_a_released_character_starts_with_guided_plans(skeleton, use):
+def test_a_released_character_starts_with_guided_plans(guided):
     """Two of them; the first style is then no change of style without the option."""
-    use(scale_as_height)
     released = camdm_controller.RELEASED
     assert released.guide_start and released.guided_plans == 2
     for start, ticks in ((True, range(10)), (False, ())):
         control = dataclasses.replace(
             released, apply=5, reuse=6, seam=0.0, guide_start=start
         )
-        frames = roll(skeleton, commands_of(*steady(1, 15)), control)[1]
+        _, heights = guided(*steady(1, 15), control)
         want = [np.float32(0.5) if i in ticks else -1 for i in range(15)]
-        assert heights(frames, 0) == want
+        assert heights[0] == want
 
 
-def test_a_second_change_guides_again(skeleton, use):
-    use(scale_as_height)
+def test_a_second_change_guides_again(guided):
     velocity, facing, label = steady(1, 20)
     label[0, 4:9] = 1
-    frames = roll(skeleton, commands_of(velocity, facing, label))[1]
-    guided = {*range(4, 9), *range(9, 14)}
-    found = np.asarray(heights(frames, 0))
-    assert np.flatnonzero(found != -1).tolist() == sorted(guided)
+    _, heights = guided(velocity, facing, label)
+    assert np.flatnonzero(np.array(heights[0]) != -1).tolist() == [*range(4, 14)]
 
 
 # What it is fed
