@@ -8,6 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "jaxmotion").rglob("*.py"))
+TREES = {path: ast.parse(path.read_text()) for path in FILES}
 
 # What may stand before `key`: parameters and states, and what a function composes.
 BEFORE_KEY = {
@@ -36,7 +37,7 @@ def relative(path):
 
 def functions(path):
     """Public functions of a module and public methods of its public classes."""
-    for node in ast.parse(path.read_text()).body:
+    for node in TREES[path].body:
         if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
             yield node, node.name
         if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
@@ -92,8 +93,9 @@ def test_hyperparameters_are_keywords():
 
 
 def test_modules_say_what_they_are_for():
-    trees = {relative(path): ast.parse(path.read_text()) for path in FILES}
-    wrong = [p for p, t in trees.items() if t.body and not ast.get_docstring(t)]
+    wrong = [
+        relative(p) for p, t in TREES.items() if t.body and not ast.get_docstring(t)
+    ]
     assert not wrong, "\n".join(wrong)
 
 
