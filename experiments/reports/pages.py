@@ -174,7 +174,7 @@ def _where_from(one: Stored, page: Path, folder: Path) -> list[str]:
     told += [about["interval"]] if "interval" in about else []
     trainings = [x.about.get("minutes", {}) for x in one.measured.trainings if x]
     if "measured" in about and all(trainings):
-        taken = {k: [x.get(k, math.nan) for x in trainings] for k in trainings[0]}
+        taken = {k: [x[k] for x in trainings if k in x] for k in trainings[0]}
         each = (f"{k} {np.mean(x):.3g}" for k, x in taken.items())
         told += [f"minutes of training: {', '.join(each)}"]
     return ["", f"<sub>{'; '.join(told)}</sub>"]
