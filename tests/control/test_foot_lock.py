@@ -20,6 +20,7 @@ from tests import tiny
 
 FPS = 30.0
 LOCK = foot_lock.FootLock()
+MOST = 120  # frames of the motions that share a program
 NAMES = ("Hips", "LHip", "LKnee", "LFoot", "LToe", "RHip", "RKnee", "RFoot", "RToe")
 SKELETON = Skeleton(
     offsets=jnp.array(
@@ -87,7 +88,8 @@ def lock_motion(skeleton, motion, *, lock):
     Shorter ones stand at their end, so that one program does for all.
     """
     count = len(motion.root_position)
-    index = np.minimum(np.arange(120), count - 1)
+    assert count <= MOST
+    index = np.minimum(np.arange(MOST), count - 1)
     frames = motion.root_position[index], motion.joint_rotation[index]
     found = lock_frames(skeleton, frames, fps=motion.fps, lock=lock)
     root, rotations = (x[:count] for x in found)

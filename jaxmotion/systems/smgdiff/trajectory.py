@@ -108,9 +108,8 @@ def _sines(future: int, meters: float) -> tuple[np.ndarray, np.ndarray]:
     """
     number = np.arange(1, future + 1)
     odd, times = 2 * number - 1, number / future
-    sway = _SWAY * np.sin(np.pi * np.outer(times, number[:-1])) / number[:-1] ** 2
-    sway = np.pad(sway, ((0, 0), (0, 1)))  # the last sine is zero in every frame
-    sway[-1] = 0.0
+    sway = _SWAY * np.sin(np.pi * np.outer(times, number)) / number**2
+    sway[-1] = sway[:, -1] = 0.0  # sines of multiples of pi
     turn = _TURN * np.sin(np.pi / 2 * np.outer(times, odd)) / odd**2
     sines = np.stack([sway / meters, turn])
     return sines.astype(np.float32), np.linalg.pinv(sines).astype(np.float32)
