@@ -19,7 +19,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.motion import ground
 from jaxmotion.motion.facing import hip_facing, hip_joints
@@ -71,6 +71,15 @@ class Command:
     velocity: Float[Array, "*batch 2"]
     facing: Float[Array, "*batch 2"]
     label: Int[Array, "*batch"]
+
+
+# A wanted velocity below this one is a stop, meters per second.
+STILL = 0.02
+
+
+def is_still(velocity: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
+    """Whether who wants this velocity wants to stand."""
+    return jnp.sum(velocity**2, axis=-1) < STILL**2
 
 
 def root_trajectory(

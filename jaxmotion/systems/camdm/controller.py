@@ -102,9 +102,6 @@ RELEASED = Control(
 )
 
 
-# A desired velocity below this one is a stop, meters per second.
-STILL = 0.02
-
 # For models that ship: the walked path is the commanded one, which soon outweighs the
 # path of the last plan. With the paper's exponents it would follow 0.2 s later: 27 cm
 # off a figure eight, not 5.
@@ -314,10 +311,6 @@ def replan(
     )
 
 
-def _is_still(velocity: Float[Array, "2"]) -> Bool[Array, ""]:
-    return jnp.sum(velocity**2) < STILL**2
-
-
 def advance(
     state: CharacterState,
     command: trajectory.Command,
@@ -339,7 +332,7 @@ def advance(
     facing, turn_rate = spring.facing_spring(
         state.facing, state.turn_rate, command.facing, **times
     )
-    stops = _is_still(command.velocity) & ~_is_still(state.velocity)
+    stops = trajectory.is_still(command.velocity) & ~trajectory.is_still(state.velocity)
     anchor = jnp.where(stops, pose.root_position[0, ::2], anchor)
     frame = Frame(
         root_position=pose.root_position[0],

@@ -4,6 +4,8 @@ One tick (1/30 s) of one player:
 
 1. If the command changed, or M frames of the plan have been played, plan anew:
    a. the trajectory generator turns the wish (a target point and a skill) into a path;
+      with `Control.follow` the point leads back to where the commands should have
+      taken the player (ours);
    b. the rest of the plan's own path, extended by HFTE, is blended into it;
    c. the motion model makes 45 frames of body, ball and contacts for that path, with
       contact guidance in some of its steps;
@@ -28,7 +30,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame, as_displayed
@@ -43,7 +45,7 @@ from jaxmotion.control.steering import (
 from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.diffusion import chain
 from jaxmotion.diffusion.schedule import spread_steps
-from jaxmotion.motion import ground, trajectory
+from jaxmotion.motion import ground, spring, trajectory
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.systems.smgdiff import data as smgdiff_data
@@ -75,6 +77,15 @@ class Control:
         the ball either.
       ball_seam: Duration of the ball's. A ball that is drawn to its new place within
         the body's 0.2 s is pushed by nobody: 10 cm are 14 m/s^2.
+      follow: Half-life, seconds, in which a wish returns to the commanded path, the
+        integral of the commanded velocity; 0 to wish for a velocity alone, as the
+        paper does. Ours: without it every player drifts off his course. Whoever is told
+        to stand wants to stand where he is. Paths are played `in_time` then.
+      leash: The commanded path's end is no farther away, meters: who had to turn around
+        does not race after it.
+      hurry: Nor does he wish to go faster than so many times the commanded speed.
+      turn: Half-life, seconds, of the spring by which who stands turns to the
+        commanded facing; 0 for as the path faces, which knows no wish for it (paper).
     """
 
     apply: int = 15
@@ -83,6 +94,15 @@ class Control:
     bias_facing: float = 2.2
     seam: float = 0.2
     ball_seam: float = 0.5
+    follow: float = 0.0
+    leash: float = 1.0
+    hurry: float = 1.1
+    turn: float = 0.0
+
+
+# For models that ship: the walked path is the commanded one, which soon outweighs that
+# of the last plan (CAMDM's too), and who stands faces as he is told.
+OWN_STARTS = Control(follow=1.0, turn=0.27, bias_position=3.0, bias_facing=3.0)
 
 
 @jax.tree_util.register_dataclass
@@ -94,12 +114,14 @@ class PlayerState:
       past: The last displayed frames.
       plan: The frames being played.
       cursor: Next frame of the plan.
+      anchor: Where the commands should have taken him, (x, z) meters.
       command: The last command; its label is -1 before the first.
     """
 
     past: Scene
     plan: Scene
     cursor: Int[Array, "*batch"]
+    anchor: Float[Array, "*batch 2"]
     command: trajectory.Command
 
 
@@ -124,6 +146,7 @@ def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerStat
         past=past,
         plan=dataclasses.replace(held, motion=motion),
         cursor=jnp.zeros((), jnp.int32),
+        anchor=root[-1, ::2],
         command=trajectory.Command(
             velocity=step[::2] * config.fps,
             facing=trajectory.root_trajectory(skeleton, past.motion).facing[-1],
@@ -138,8 +161,30 @@ def plan_level(
     """Whether a tick needs a plan: 0 for no, 1 for yes."""
     old = state.command
     changed = jnp.any(jnp.abs(old.velocity - command.velocity) > 1e-3)
+    if control.turn > 0:
+        turned = jnp.any(jnp.abs(old.facing - command.facing) > 1e-3)
+        changed = changed | (turned & trajectory.is_still(command.velocity))
     changed = changed | (old.label != command.label)
     return (changed | (state.cursor >= control.apply)).astype(jnp.int32)
+
+
+def in_time(
+    path: trajectory.Trajectory, wish: Wish, *, num_frames: int, fps: float
+) -> trajectory.Trajectory:
+    """A path that is made shorter if its first frames, which are played, are too long.
+
+    They may be as long as the wish asks; who is faster slows down evenly meanwhile, and
+    who wants to stand stops as the path says. People who come as far as a sprinter in
+    1.5 s slow down at the end of it, so paths begin faster than they are on the mean:
+    played in thirds, those of 3.5 m/s make 3.8.
+    """
+    moved = wish.past.position[-1] - wish.past.position[-2]
+    now, asked = jnp.linalg.norm(moved) * fps, jnp.linalg.norm(wish.velocity)
+    most = (asked + jnp.maximum(asked, now)) / 2 * num_frames / fps
+    length = jnp.linalg.norm(path.position[num_frames - 1])
+    part = jnp.minimum(most / jnp.maximum(length, 1e-6), 1.0)
+    part = jnp.where(trajectory.is_still(wish.velocity), 1.0, part)
+    return dataclasses.replace(path, position=part * path.position)
 
 
 def wanted_trajectory(
@@ -158,12 +203,35 @@ def wanted_trajectory(
     """
     frame = smgdiff_scene.plan_frame(skeleton, state.past.motion)
     past = trajectory.root_trajectory(skeleton, state.past.motion)
+    velocity = command.velocity
+    if control.follow > 0:
+        seconds = config.future / config.fps
+        returned = 1.0 - 0.5 ** (seconds / control.follow)
+        velocity += returned / seconds * (state.anchor - frame.origin)
+        most = control.hurry * jnp.linalg.norm(command.velocity)
+        speed = jnp.linalg.norm(velocity)
+        velocity *= jnp.minimum(most / jnp.maximum(speed, 1e-6), 1.0)
     wish = Wish(
         past=trajectory.to_local(past, frame),
-        velocity=ground.into_frame(command.velocity, frame.facing),
+        velocity=ground.into_frame(velocity, frame.facing),
         label=command.label,
     )
     wanted = generate(key, wish)
+    if control.follow > 0:
+        wanted = in_time(wanted, wish, num_frames=control.apply, fps=config.fps)
+    if control.turn > 0:
+        every = lambda x: jnp.broadcast_to(x, wanted.facing.shape)  # noqa: E731
+        times = jnp.arange(1, config.future + 1) / config.fps
+        turned, _ = spring.facing_spring(
+            every(wish.past.facing[-1]),
+            jnp.zeros_like(times),
+            every(ground.into_frame(command.facing, frame.facing)),
+            half_life=control.turn,
+            dt=times,
+        )
+        still = trajectory.is_still(command.velocity)
+        facing = jnp.where(still, turned, wanted.facing)
+        wanted = dataclasses.replace(wanted, facing=facing)
     own = trajectory.extend(
         trajectory.root_trajectory(skeleton, state.plan.motion),
         control.apply,
@@ -239,15 +307,23 @@ def join(
 
 
 def advance(
-    state: PlayerState, command: trajectory.Command
+    state: PlayerState,
+    command: trajectory.Command,
+    *,
+    config: Config,
+    control: Control,
 ) -> tuple[PlayerState, Frame]:
-    """Step 2: displays the next frame."""
+    """Step 2: displays the next frame, and moves the commanded path on."""
     now = jax.tree.map(
         lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, 1), state.plan
     )
     past = jax.tree.map(
         lambda old, new: jnp.concatenate([old[1:], new]), state.past, now
     )
+    here = now.motion.root_position[0, ::2]
+    away = state.anchor + command.velocity / config.fps - here
+    away /= jnp.maximum(jnp.linalg.norm(away) / control.leash, 1.0)
+    anchor = jnp.where(trajectory.is_still(command.velocity), here, here + away)
     frame = Frame(
         root_position=now.motion.root_position[0],
         joint_rotation=now.motion.joint_rotation[0],
@@ -258,7 +334,11 @@ def advance(
         fps=now.motion.fps,
     )
     return dataclasses.replace(
-        state, past=past, cursor=state.cursor + 1, command=command
+        state,
+        past=past,
+        cursor=state.cursor + 1,
+        anchor=anchor,
+        command=command,
     ), frame
 
 
@@ -300,7 +380,7 @@ def controller(
     return Controller(
         plan_level=functools.partial(plan_level, control=control),
         plans=(plan,),
-        advance=advance,
+        advance=functools.partial(advance, config=config, control=control),
         shown=shown,
     )
 
@@ -458,7 +538,12 @@ def load_character(
     else:
         run, model, params = load_run(path)
         starts = functools.partial(start_states, run.train, model)
-    method = Method(config=model.config, paths=model.paths, step=step)
+    method = Method(
+        config=model.config,
+        paths=model.paths,
+        control=None if model.starts is None else OWN_STARTS,
+        step=step,
+    )
     return Character(
         skeleton=model.representation.skeleton,
         labels=model.labels,

@@ -539,7 +539,7 @@ def test_whoever_comes_to_a_stop_stays_there(skeleton):
         anchors.append(state.anchor)
         roots.append(frame.root_position[::2])
         speeds.append(float(jnp.linalg.norm(state.velocity)))
-    stop = next(i for i, x in enumerate(speeds) if x < camdm_controller.STILL)
+    stop = next(i for i, x in enumerate(speeds) if x < trajectory.STILL)
     assert 0 < stop < 30
     for anchor, root in zip(anchors[: stop + 1], roots, strict=False):
         np.testing.assert_array_equal(anchor, root)

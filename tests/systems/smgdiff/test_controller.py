@@ -9,6 +9,7 @@ import pytest
 
 from jaxmotion.control import rollout
 from jaxmotion.diffusion import chain
+from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import joint_positions
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.systems.smgdiff import controller as smgdiff_controller
@@ -195,6 +196,110 @@ def test_urgency_is_a_matter_of_command_and_cursor(parts):
     other = dataclasses.replace(wanted, label=jnp.int32(1))
     assert need(state, other) == 1
     assert need(dataclasses.replace(state, cursor=jnp.int32(5)), wanted) == 1
+
+
+@pytest.mark.parametrize("behind, expected", [(0.0, 0.001), (0.4, 0.401), (3.0, 1.0)])
+def test_who_follows_wishes_to_be_where_the_command_should_have_taken_him(
+    parts, behind, expected
+):
+    """Half of what he is behind within `follow`; what leads him is on a leash."""
+    _, config, _ = parts
+    control = dataclasses.replace(CONTROL, follow=config.future / config.fps, hurry=9.0)
+    stands = jax.tree.map(lambda x: jnp.repeat(x[-1:], 6, axis=0), past())
+    state = smgdiff_controller.init_state(tiny.skeleton(), stands, config=config)
+    here = state.anchor
+    state = dataclasses.replace(state, anchor=here + jnp.array([0.0, behind]))
+    wanted = jax.tree.map(lambda x: x[0], commands(1))
+    slow = dataclasses.replace(wanted, velocity=jnp.array([0.0, 0.03]))
+    state, _ = smgdiff_controller.advance(state, slow, config=config, control=control)
+    np.testing.assert_allclose(
+        state.anchor - here, [0.0, expected], rtol=1e-5, atol=1e-6
+    )
+    seen = []
+
+    def generate(key, wish):
+        seen.append(wish.velocity)
+        return smgdiff_trajectory.straight(
+            key, wish, future=config.future, fps=config.fps
+        )
+
+    changes = ({"follow": 0.0}, {}, {"hurry": 1.1})
+    for own in (dataclasses.replace(control, **change) for change in changes):
+        smgdiff_controller.wanted_trajectory(
+            generate,
+            jax.random.key(0),
+            tiny.skeleton(),
+            state,
+            wanted,
+            config=config,
+            control=own,
+        )
+    gained = 0.5 * expected * config.fps / config.future
+    np.testing.assert_allclose(
+        jnp.linalg.norm(seen[1] - seen[0]), gained, rtol=1e-4, atol=1e-6
+    )
+    asked, freely, bounded = (float(jnp.linalg.norm(x)) for x in seen)
+    np.testing.assert_allclose(bounded, min(freely, 1.1 * asked), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "now, asked, expected",
+    [
+        (3.0, 3.0, 3.0),
+        (1.0, 3.0, 3.0),
+        (5.0, 3.0, 4.0),
+        (3.0, 5.0, 4.5),
+        (3.0, 0.0, 4.5),
+    ],
+)
+def test_the_part_of_a_path_that_is_played_is_as_long_as_asked(now, asked, expected):
+    """A path that begins at 4.5 m/s, by the speed that he has and the one he wants."""
+    frames = np.arange(1.0, 31.0)[:, None]
+    line = lambda speed, at: trajectory.Trajectory(  # noqa: E731
+        position=jnp.asarray(speed / 30.0 * at * [0.0, 1.0], jnp.float32),
+        facing=jnp.tile(jnp.array([0.0, 1.0]), (len(at), 1)),
+    )
+    wish = smgdiff_trajectory.Wish(
+        past=line(now, frames[:5] - 5.0),
+        velocity=jnp.array([0.0, float(asked)]),
+        label=jnp.int32(0),
+    )
+    path = smgdiff_controller.in_time(line(4.5, frames), wish, num_frames=15, fps=30.0)
+    np.testing.assert_allclose(
+        path.position, line(expected, frames).position, rtol=1e-5
+    )
+
+
+@pytest.mark.parametrize("speed, turns", [(0.0, True), (0.5, False)])
+def test_who_stands_turns_as_commanded(parts, speed, turns):
+    """Without a wish to go; a command that turns alone then is a new one."""
+    _, config, _ = parts
+    control = dataclasses.replace(CONTROL, turn=0.1)
+    state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
+    old = state.command.facing
+    wanted = Command(
+        velocity=jnp.array([0.0, speed]),
+        facing=jnp.array([old[1], -old[0]]),
+        label=jnp.int32(0),
+    )
+    told = dataclasses.replace(wanted, facing=old)
+    shown = dataclasses.replace(state, command=told)
+    need = smgdiff_controller.plan_level(shown, wanted, control=control)
+    assert int(need) == turns
+    path = smgdiff_controller.wanted_trajectory(
+        lambda key, wish: smgdiff_trajectory.straight(
+            key, wish, future=config.future, fps=config.fps
+        ),
+        jax.random.key(0),
+        tiny.skeleton(),
+        state,
+        wanted,
+        config=config,
+        control=control,
+    )
+    # A quarter turn from where he faces, which is +z of the path's frame.
+    end = path.facing[-1]
+    assert (abs(float(end[1])) < 0.3) == turns
 
 
 def test_bad_input_is_named(parts):
