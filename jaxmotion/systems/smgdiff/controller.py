@@ -100,9 +100,9 @@ class Control:
     turn: float = 0.0
 
 
-# For models that ship: the walked path is the commanded one, which outweighs that of the
-# last plan sooner, and who stands faces as he is told. With exponents of 3, as CAMDM
-# ships with, he turns as fast but misses twice as many touches while he does.
+# For models that ship: the walked path is the commanded one, which outweighs the last
+# plan's sooner, and who stands faces as he is told. With exponents of 3, as CAMDM ships
+# with, he turns as fast but misses twice as many touches while he does.
 OWN_STARTS = Control(follow=1.0, turn=0.27, bias_position=1.5)
 
 
