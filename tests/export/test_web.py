@@ -192,9 +192,7 @@ def moves_a_crowd_as_one_by_one(packages, folder, character, *, locks, people=11
     print(f"root {away} m, rotations {turned} degrees, {said}")
     assert not said[0]["crowds"] and set(said[1]["crowds"]) == set(said[1]["graphs"])
     assert np.ptp(alone[..., 2]) > 3
-    # What rounding tips, as whether a joint touches the ball, may move one of them.
-    assert np.sort(away)[-2] < 1e-3 and np.sort(turned)[-2] < 0.5
-    assert away.max() < 1e-2 and turned.max() < 5.0
+    assert away.max() < 1e-3 and turned.max() < 0.5
 
 
 def test_an_unknown_number_of_steps_is_one_line():

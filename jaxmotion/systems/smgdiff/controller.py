@@ -45,7 +45,7 @@ from jaxmotion.control.steering import (
 from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.diffusion import chain
 from jaxmotion.diffusion.schedule import spread_steps
-from jaxmotion.motion import ground, spring, trajectory
+from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.systems.smgdiff import data as smgdiff_data
@@ -221,15 +221,15 @@ def wanted_trajectory(
     if control.follow > 0:
         wanted = in_time(wanted, wish, num_frames=control.apply, fps=config.fps)
     if control.turn > 0:
-        every = lambda x: jnp.broadcast_to(x, wanted.facing.shape)  # noqa: E731
-        times = jnp.arange(1, config.future + 1) / config.fps
-        turned, _ = spring.facing_spring(
-            every(wish.past.facing[-1]),
-            jnp.zeros_like(times),
-            every(ground.into_frame(command.facing, frame.facing)),
+        turning = trajectory.desired_trajectory(
+            frame,
+            command.velocity,
+            command,
+            num_frames=config.future,
+            fps=config.fps,
             half_life=control.turn,
-            dt=times,
         )
+        turned = trajectory.to_local(turning, frame).facing
         still = trajectory.is_still(command.velocity)
         facing = jnp.where(still, turned, wanted.facing)
         wanted = dataclasses.replace(wanted, facing=facing)

@@ -198,6 +198,28 @@ def test_urgency_is_a_matter_of_command_and_cursor(parts):
     assert need(dataclasses.replace(state, cursor=jnp.int32(5)), wanted) == 1
 
 
+def path_and_wish(state, wanted, config, control):
+    """Of who goes straight to where he wishes, and the velocity of that wish."""
+    seen = []
+
+    def generate(key, wish):
+        seen.append(wish.velocity)
+        return smgdiff_trajectory.straight(
+            key, wish, future=config.future, fps=config.fps
+        )
+
+    path = smgdiff_controller.wanted_trajectory(
+        generate,
+        jax.random.key(0),
+        tiny.skeleton(),
+        state,
+        wanted,
+        config=config,
+        control=control,
+    )
+    return path, seen[0]
+
+
 @pytest.mark.parametrize("behind, expected", [(0.0, 0.001), (0.4, 0.401), (3.0, 1.0)])
 def test_who_follows_wishes_to_be_where_the_command_should_have_taken_him(
     parts, behind, expected
@@ -215,25 +237,11 @@ def test_who_follows_wishes_to_be_where_the_command_should_have_taken_him(
     np.testing.assert_allclose(
         state.anchor - here, [0.0, expected], rtol=1e-5, atol=1e-6
     )
-    seen = []
-
-    def generate(key, wish):
-        seen.append(wish.velocity)
-        return smgdiff_trajectory.straight(
-            key, wish, future=config.future, fps=config.fps
-        )
-
     changes = ({"follow": 0.0}, {}, {"hurry": 1.1})
-    for own in (dataclasses.replace(control, **change) for change in changes):
-        smgdiff_controller.wanted_trajectory(
-            generate,
-            jax.random.key(0),
-            tiny.skeleton(),
-            state,
-            wanted,
-            config=config,
-            control=own,
-        )
+    seen = [
+        path_and_wish(state, wanted, config, dataclasses.replace(control, **change))[1]
+        for change in changes
+    ]
     gained = 0.5 * expected * config.fps / config.future
     np.testing.assert_allclose(
         jnp.linalg.norm(seen[1] - seen[0]), gained, rtol=1e-4, atol=1e-6
@@ -286,17 +294,7 @@ def test_who_stands_turns_as_commanded(parts, speed, turns):
     shown = dataclasses.replace(state, command=told)
     need = smgdiff_controller.plan_level(shown, wanted, control=control)
     assert int(need) == turns
-    path = smgdiff_controller.wanted_trajectory(
-        lambda key, wish: smgdiff_trajectory.straight(
-            key, wish, future=config.future, fps=config.fps
-        ),
-        jax.random.key(0),
-        tiny.skeleton(),
-        state,
-        wanted,
-        config=config,
-        control=control,
-    )
+    path, _ = path_and_wish(state, wanted, config, control)
     # A quarter turn from where he faces, which is +z of the path's frame.
     end = path.facing[-1]
     assert (abs(float(end[1])) < 0.3) == turns
