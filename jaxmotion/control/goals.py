@@ -29,14 +29,20 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.control import rollout, steering
 from jaxmotion.control.frame import Frame
-from jaxmotion.control.steering import ARRIVE, HEADING_STEP, SPEED_STEP, Character
+from jaxmotion.control.steering import (
+    AHEAD,
+    ARRIVE,
+    HEADING_STEP,
+    SPEED_STEP,
+    Character,
+)
 from jaxmotion.motion import ground
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.typing import Key, Params
 
-# A path is looked at so many seconds ahead, and so many meters at least; the nearest
-# point of it is sought within so many meters of the last one.
-AHEAD, NEAREST, REACH = 0.35, 0.25, 1.0
+# A path is looked at so many meters ahead at least; the nearest point of it is sought
+# within so many meters of the last one.
+NEAREST, REACH = 0.25, 1.0
 # Nobody is asked to go slower or faster, m/s, but to stop; nor to be nearer than this
 # to a place, where he stands, meters. Times count to the last distance. What is asked
 # for shows after so many seconds: decisions are made for where walkers will be then.
@@ -119,11 +125,12 @@ def _along(path: Path, way: Array) -> tuple[Array, Array, Array]:
 
 
 def pursue(
-    path: Path, walker: Walker, way: Float[Array, ""]
+    path: Path, walker: Walker, way: Float[Array, ""], *, ahead: float = AHEAD
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
     """Velocity along a path, and how far along it the walker now is.
 
-    He has come `way` meters and never goes back, so that a path may cross itself.
+    He has come `way` meters and never goes back, so that a path may cross itself. He
+    looks so many seconds ahead.
     """
     here = walker.position + LAG * walker.velocity
     ways = way + jnp.linspace(0.0, REACH, 41)
@@ -131,7 +138,7 @@ def pursue(
     near = jnp.argmin(_length(points - here[None]))
     way = jnp.minimum(ways[near], length)
     _, speed, _ = _along(path, way)
-    goal, _, _ = _along(path, way + jnp.maximum(AHEAD * speed, NEAREST))
+    goal, _, _ = _along(path, way + jnp.maximum(ahead * speed, NEAREST))
     # Slower to the end.
     left = length - way + _length(path.points[-1] - here) * (way >= length)
     speed = jnp.minimum(speed, left / ARRIVE)
@@ -260,11 +267,18 @@ def averaged(velocity: Any, moved: Any, fps: float) -> Any:
 
 
 def _wish(
-    goal: Goal, walkers: Walker, memory: Array, seconds: Array, told: Command | None
+    goal: Goal,
+    walkers: Walker,
+    memory: Array,
+    seconds: Array,
+    told: Command | None,
+    *,
+    ahead: float,
 ) -> tuple[Array, Array, Array]:
     """Velocity, facing and memory of each walker; leaders do as they are told."""
     if isinstance(goal, Path):
-        velocity, memory = jax.vmap(pursue)(goal, walkers, memory)
+        look = functools.partial(pursue, ahead=ahead)
+        velocity, memory = jax.vmap(look)(goal, walkers, memory)
     elif isinstance(goal, Place):
         now = jnp.broadcast_to(seconds, memory.shape)
         velocity, facing = jax.vmap(arrive)(goal, walkers, now)
@@ -365,11 +379,14 @@ def goal_rollouts(
         method=character.method,
         ticks=ticks,
         fps=character.fps,
+        ahead=character.ahead,
         avoiding=avoiding or circles is not None,
     )
 
 
-@functools.partial(jax.jit, static_argnames=("method", "ticks", "fps", "avoiding"))
+@functools.partial(
+    jax.jit, static_argnames=("method", "ticks", "fps", "ahead", "avoiding")
+)
 def _rollouts(
     params: Params,
     key: Key,
@@ -383,19 +400,22 @@ def _rollouts(
     method: steering.Method,
     ticks: int,
     fps: float,
+    ahead: float,
     avoiding: bool,
 ) -> Frame:
     controller, number = method(params), len(places)
     keys = jax.vmap(lambda c: jax.random.fold_in(key, c))(jnp.arange(number))
-    ahead = jnp.broadcast_to(jnp.array([0.0, 1.0]), (number, 2))
+    forward = jnp.broadcast_to(jnp.array([0.0, 1.0]), (number, 2))
     rest = jnp.zeros((number, 2))
-    walkers = Walker(position=places, velocity=rest, facing=ahead)
-    told = Command(velocity=rest, facing=ahead, label=labels)
+    walkers = Walker(position=places, velocity=rest, facing=forward)
+    told = Command(velocity=rest, facing=forward, label=labels)
 
     def body(carry: tuple, tick: Array) -> tuple[tuple, Frame]:
         states, walkers, told, memory = carry
         led = jax.tree.map(lambda x: x[:, tick], commands)
-        velocity, facing, memory = _wish(goal, walkers, memory, tick / fps, led)
+        velocity, facing, memory = _wish(
+            goal, walkers, memory, tick / fps, led, ahead=ahead
+        )
         if avoiding:
             clear = avoid(velocity, walkers, circles)
             moved = _length(clear - velocity)[:, None] > 1e-3

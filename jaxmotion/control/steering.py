@@ -37,6 +37,8 @@ RUN, TURN = 2.0, math.radians(150.0)
 ARRIVE, NEAR, FAR = 0.7, 0.2, 0.45
 # What is told stays as it is until what is wanted differs by more, radians and m/s.
 HEADING_STEP, SPEED_STEP = math.radians(8.0), 0.15
+# Seconds of a path that who goes along it looks ahead.
+AHEAD = 0.35
 # A stick that is pushed less far is in its middle.
 STICK = 0.12
 
@@ -84,6 +86,8 @@ class Character:
       exports: `(controller) -> functions by name` that can leave Python, and together
         are a tick; all on "state" and "command".
       toe_height: Where toes rest, meters; None where nobody measured it.
+      ahead: Seconds of a path that he looks ahead. Who answers a command late weaves
+        about a path unless he looks farther, and who looks far cuts its corners.
     """
 
     skeleton: Skeleton = dataclasses.field(repr=False)
@@ -102,6 +106,7 @@ class Character:
     )
     tuning: Tuning | None = dataclasses.field(default=None, repr=False)
     toe_height: float | None = None
+    ahead: float = AHEAD
 
     def label(self, name: str) -> int:
         """Index of a label; raises `ValueError` that names those there are."""

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.control import goals
-from jaxmotion.control.steering import NEAR, Wish
+from jaxmotion.control.steering import AHEAD, NEAR, Wish
 
 MOST = 32
 
@@ -46,18 +46,24 @@ def routed(route: Route, waypoints: tuple[Point, ...], position: Point) -> Route
 
 
 def along(
-    route: Route, last: Wish, *, position: Point, velocity: Point, speed: float
+    route: Route,
+    last: Wish,
+    *,
+    position: Point,
+    velocity: Point,
+    speed: float,
+    ahead: float = AHEAD,
 ) -> tuple[Wish, Route]:
     """What a route asks for, and the route from there.
 
     Who has stopped near its end stays, until it is lengthened.
 
     The velocity is the character's own, m/s (see `goals.averaged`), `speed` that on the
-    way. Places are (x, z), meters.
+    way, of which he looks `ahead` seconds ahead. Places are (x, z), meters.
     """
     # Of one length, so that waypoints compile nothing.
     points = route.points + route.points[-1:] * (MOST + 1 - len(route.points))
-    given = (points, speed, position, velocity, last.facing, route.way)
+    given = (points, speed, position, velocity, last.facing, route.way, ahead)
     arrays = [np.asarray(x, np.float32) for x in given]
     found, way = map(np.asarray, _pursue(*arrays))
     route = dataclasses.replace(route, way=float(way))
@@ -72,8 +78,14 @@ def along(
 
 @jax.jit
 def _pursue(
-    points: Array, speed: Array, position: Array, velocity: Array, facing: Array, way
+    points: Array,
+    speed: Array,
+    position: Array,
+    velocity: Array,
+    facing: Array,
+    way: Array,
+    ahead: Array,
 ) -> tuple[Array, Array]:
     path = goals.Path(points=points, speed=jnp.full(len(points), speed))
     walker = goals.Walker(position=position, velocity=velocity, facing=facing)
-    return goals.pursue(path, walker, way)
+    return goals.pursue(path, walker, way, ahead=ahead)

@@ -156,6 +156,7 @@ def write_character(
         "format": 1,
         "model": name,
         "fps": character.fps,
+        "ahead": character.ahead,
         "source": character.source,
         "labels": list(character.labels),
         "skeleton": packed.skeleton_json(character.skeleton),

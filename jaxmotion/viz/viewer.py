@@ -425,7 +425,7 @@ class Session:
             self._steps = max(self._steps - 1, 0)
             if self._resets:
                 self._begin(engine, keep=False)
-        wish = self._wanted(inputs, settings.speed, engine.character.fps)
+        wish = self._wanted(inputs, settings.speed, engine.character)
         self._told = settled(self._told, wish, steady=wish == self._wish)
         self._wish = wish
         assert self._crowd is not None  # made with the engine
@@ -497,14 +497,18 @@ class Session:
         self._wish, self._told, self._route = Wish(), Wish(), waypoints.Route()
         self._leader = self._velocity = (0.0, 0.0)
 
-    def _wanted(self, inputs: Inputs, speed: float, fps: float) -> Wish:
+    def _wanted(self, inputs: Inputs, speed: float, character: Character) -> Wish:
         """What all are told: the first one goes along waypoints, the others beside."""
         self._route = waypoints.routed(self._route, inputs.path, self._leader)
         where: dict[str, Any] = dict(position=self._leader, speed=speed)
         if not self._route.points:
-            return wanted(inputs, self._wish, seconds=1.0 / fps, **where)
+            return wanted(inputs, self._wish, seconds=1.0 / character.fps, **where)
         wish, self._route = waypoints.along(
-            self._route, self._wish, velocity=self._velocity, **where
+            self._route,
+            self._wish,
+            velocity=self._velocity,
+            ahead=character.ahead,
+            **where,
         )
         return wish
 

@@ -119,6 +119,7 @@ def test_the_page_goes_along_waypoints_as_the_library_does():
                 position=tuple(place.tolist()),
                 velocity=tuple(velocity.tolist()),
                 speed=1.4,
+                ahead=0.35 if number == 1 else 0.8,
             )
             given = {"points": route.points, "way": route.way}
             calls.append((given, wish_json(last), where))

@@ -88,8 +88,8 @@ export class Crowd {
     this.route = routed(this.route, inputs.path || [], position);
     if (!this.route)
       return wanted(inputs, this.wish, { position, speed, seconds: 1 / model.about.fps });
-    const { velocity } = this;
-    const [wish, route] = along(this.route, this.wish, { position, velocity, speed });
+    const { velocity } = this, { ahead } = model.about;
+    const [wish, route] = along(this.route, this.wish, { position, velocity, speed, ahead });
     this.route = route;
     return wish;
   }

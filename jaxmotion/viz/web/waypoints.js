@@ -4,7 +4,7 @@
 import { ARRIVE, NEAR, speedOf } from "./steer.js";
 
 export const MOST = 32;
-const AHEAD = 0.35, NEAREST = 0.25, REACH = 1, PARTS = 40, THERE = 0.05, LAG = 0.25;
+const NEAREST = 0.25, REACH = 1, PARTS = 40, THERE = 0.05, LAG = 0.25;
 const away = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1]);
 
 // The velocity of who moved so in a tick, m/s; hips sway, so over .2 s.
@@ -23,7 +23,7 @@ export function routed(route, waypoints, position) {
 }
 
 // The wish of a tick and the route from there; `last` is the wish of the tick before.
-export function along({ points, way }, last, { position, velocity, speed }) {
+export function along({ points, way }, last, { position, velocity, speed, ahead }) {
   const marks = [0], end = points[points.length - 1];
   for (let i = 1; i < points.length; i++) marks.push(marks[i - 1] + away(points[i], points[i - 1]));
   const length = marks[marks.length - 1];
@@ -39,7 +39,7 @@ export function along({ points, way }, last, { position, velocity, speed }) {
   way = Math.min(ways[gaps.indexOf(Math.min(...gaps))], length);
   const left = length - way + (way >= length ? away(end, here) : 0);
   const ends = length - way < NEAR && away(end, position) < NEAR && !speedOf(last);
-  const goal = at(way + Math.max(AHEAD * speed, NEAREST)), far = away(goal, here);
+  const goal = at(way + Math.max(ahead * speed, NEAREST)), far = away(goal, here);
   const route = { points, way };
   if (left < THERE || ends) return [{ velocity: [0, 0], facing: last.facing }, route];
   const facing = far < 1e-6 ? last.facing : goal.map((x, i) => (x - here[i]) / far);

@@ -198,6 +198,27 @@ def test_urgency_is_a_matter_of_command_and_cursor(parts):
     assert need(dataclasses.replace(state, cursor=jnp.int32(5)), wanted) == 1
 
 
+@pytest.mark.parametrize(
+    "turned, cursor, plans",
+    [(0.1, 1, False), (0.1, 2, False), (0.1, 3, True), (0.6, 1, True), (0.0, 3, False)],
+)
+def test_small_changes_of_the_command_wait(parts, turned, cursor, plans):
+    """Of the plan's own command, however often it changed since."""
+    _, config, _ = parts
+    control = dataclasses.replace(CONTROL, least=3)
+    state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
+    told = jax.tree.map(lambda x: x[0], commands(1))
+    state = dataclasses.replace(state, command=told)
+    for part in range(cursor):
+        velocity = told.velocity + jnp.array([turned * (part + 1) / cursor, 0.0])
+        wanted = dataclasses.replace(told, velocity=velocity)
+        state, _ = smgdiff_controller.advance(
+            state, wanted, config=config, control=control
+        )
+    need = smgdiff_controller.plan_level(state, wanted, control=control)
+    assert int(need) == plans
+
+
 def path_and_wish(state, wanted, config, control):
     """Of who goes straight to where he wishes, and the velocity of that wish."""
     seen = []
