@@ -39,7 +39,10 @@ TABLE_2 = tuple(
 # The most expensive last.
 ALL = (*TABLE_1, *TABLE_2, "full_pose", "amdm200")
 # Rows that the paper does not have.
-MORE = ("frame", "full_pose_frame", "amdm5_embedded", "amdm200_embedded")
+MORE = (
+    *("frame", *(f"{name}_frame" for name in TABLE_2), "full_pose_frame"),
+    *("polish5_draft0", "polish5_draft0_frame", "amdm5_embedded", "amdm200_embedded"),
+)
 _CHAIN = re.compile(r"polish(\d+)_draft(\d+)(_frame)?$")
 _AMDM = ("amdm5", "amdm200", "amdm5_embedded", "amdm200_embedded")
 _BASELINES = dict.fromkeys(_AMDM, amdm) | {"lmm": lmm, "mvae": mvae}

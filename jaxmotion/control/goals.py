@@ -37,6 +37,7 @@ from jaxmotion.control.steering import (
     Character,
 )
 from jaxmotion.motion import ground
+from jaxmotion.motion.spring import Scalar
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.typing import Key, Params
 
@@ -125,7 +126,7 @@ def _along(path: Path, way: Array) -> tuple[Array, Array, Array]:
 
 
 def pursue(
-    path: Path, walker: Walker, way: Float[Array, ""], *, ahead: float = AHEAD
+    path: Path, walker: Walker, way: Float[Array, ""], *, ahead: Scalar = AHEAD
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
     """Velocity along a path, and how far along it the walker now is.
 

@@ -16,6 +16,7 @@ from jaxtyping import Array
 
 from jaxmotion.control import goals
 from jaxmotion.control.steering import AHEAD, NEAR, Wish
+from jaxmotion.motion.spring import Scalar
 
 MOST = 32
 
@@ -84,7 +85,7 @@ def _pursue(
     velocity: Array,
     facing: Array,
     way: Array,
-    ahead: Array,
+    ahead: Scalar,
 ) -> tuple[Array, Array]:
     path = goals.Path(points=points, speed=jnp.full(len(points), speed))
     walker = goals.Walker(position=position, velocity=velocity, facing=facing)
