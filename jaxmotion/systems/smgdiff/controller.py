@@ -73,7 +73,8 @@ class Control:
       least: Frames of a plan to play before a small change of the command, of less than
         `sharp`, counts: plans begin as the last one goes on, so that of one in every
         tick nothing that is wished for is ever displayed. 1 for at once (paper).
-      sharp: A change of the commanded velocity that counts at once, m/s.
+      sharp: A change of the commanded velocity that counts at once, m/s, or of the
+        facing of who stands, as far apart as unit vectors are.
       reuse: K of HFTE, points reflected at a time.
       bias_position: Exponent of the blend of positions (CAMDM's).
       bias_facing: Exponent of the blend of facings (CAMDM's).
@@ -173,11 +174,11 @@ def plan_level(
     """Whether a tick needs a plan: 0 for no, 1 for yes."""
     old = state.command
     change = jnp.linalg.norm(old.velocity - command.velocity)
-    changed = change > 1e-3
     if control.turn > 0:
-        turned = jnp.any(jnp.abs(old.facing - command.facing) > 1e-3)
-        changed = changed | (turned & trajectory.is_still(command.velocity))
-    due = changed & (state.cursor >= control.least)
+        turned = jnp.linalg.norm(old.facing - command.facing)
+        turned = jnp.where(trajectory.is_still(command.velocity), turned, 0.0)
+        change = jnp.maximum(change, turned)
+    due = (change > 1e-3) & (state.cursor >= control.least)
     due = due | (change >= control.sharp) | (old.label != command.label)
     return (due | (state.cursor >= control.apply)).astype(jnp.int32)
 
