@@ -276,8 +276,8 @@ def test_a_shipped_model_plays_as_in_jax(packages, tmp_path, name):
     character, folder = shipped(name), tmp_path / name
     web.write_character(folder, name, character, tick(character))
     plays_as_jax_does(packages, folder, character, locks=True)
-    # Contact guidance counts frames as touches by a threshold, which rounding tips:
-    # with it one of eleven gets a plan 2 mm away, without it all agree to .1 mm.
+    # Contact guidance decides by thresholds, and rounding may tip one: with it, one of
+    # eleven gets a plan that is 2 mm away; without it, all agree to .1 mm.
     scale = 0.0 if name == "dribble" else None
     moves_a_crowd_as_one_by_one(packages, folder, character, locks=True, scale=scale)
 
