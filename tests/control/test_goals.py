@@ -55,6 +55,21 @@ def test_a_path_that_crosses_itself_is_walked_to_its_end():
     assert abs(np.median(speed[60:-120]) - 1.4) < 0.05 and speed[-1] < 0.05
 
 
+@pytest.mark.parametrize(
+    "ahead, meters", [(0.1, goals.NEAREST), (0.35, 0.7), (0.8, 1.6)]
+)
+def test_who_is_beside_a_path_heads_for_it_as_far_ahead_as_he_looks(ahead, meters):
+    path = goals.Path(
+        points=jnp.array([[0.0, 0.0], [0.0, 9.0]]), speed=jnp.full(2, 2.0)
+    )
+    velocity, way = goals.pursue(
+        path, walker((0.5, 2.0)), jnp.float32(2.0), ahead=ahead
+    )
+    assert float(way) == pytest.approx(2.0)
+    heading = np.array([-0.5, meters]) / np.hypot(0.5, meters)
+    np.testing.assert_allclose(velocity, 2.0 * heading, atol=1e-5)
+
+
 @pytest.mark.parametrize("seconds", [4.0, 6.0, 12.0])
 def test_a_place_is_reached_at_its_time(seconds):
     place = goals.Place(

@@ -100,6 +100,17 @@ def test_what_is_trained_is_not_trained_again(call, trained, data):
 
 # --- evaluation --------------------------------------------------------------------
 
+
+def test_an_evaluation_of_all_rows_looks_for_those_of_the_papers_tables(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    known = runpy.run_path(str(SCRIPT))["rows"]
+    text = (ROOT / "experiments" / "papers" / "aamdm.toml").read_text()
+    lists = re.findall(r"--rows ([a-z0-9_ ]+)", text)
+    asked = {name for names in lists for name in names.split()}
+    assert "polish2_draft4_frame" in asked
+    assert asked <= {*known.ALL, *known.MORE}
+
+
 FREE = {"diverged", "div", "fid", "ffr_mann", "ffr_gmd", "speed"}
 STEERED = {"diverged_uc", "te_promised", "te_realized", "trajectory_error"}
 
