@@ -41,7 +41,7 @@ ALL = (*TABLE_1, *TABLE_2, "full_pose", "amdm200")
 # Rows by the paper's recipe, and some that it does not have.
 MORE = (
     *("frame", *(f"{name}_frame" for name in TABLE_2), "full_pose_frame"),
-    *("polish5_draft0", "polish5_draft0_frame", "amdm5_embedded", "amdm200_embedded"),
+    *("amdm5_embedded", "amdm200_embedded"),
 )
 _CHAIN = re.compile(r"polish(\d+)_draft(\d+)(_frame)?$")
 _AMDM = ("amdm5", "amdm200", "amdm5_embedded", "amdm200_embedded")
