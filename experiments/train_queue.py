@@ -34,6 +34,7 @@ from reports.claims import Source
 
 from jaxmotion import cli, files, reporting
 from jaxmotion.learning import loop
+from jaxmotion.learning import runs as learning_runs
 
 POLL = 1.0  # seconds between looks at running trainings
 
@@ -109,7 +110,7 @@ def sources_of(args: Config) -> dict[str, list[Source]]:
 def job_of(args: Config, sources: list[Source], seed: int) -> Job:
     """The training of a seed."""
     run = sources[0].run
-    folder = args.runs / (f"{run}_seed{seed}" if seed else run)
+    folder = learning_runs.of_seed(args.runs / run, seed)
     lines = [line for x in sources for line in report.commands_of(x, folder, seed)]
     end = f"_seed{seed}" if seed else ""
     found = {f"{x.name}{end}": folder / x.file for x in sources}

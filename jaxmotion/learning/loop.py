@@ -7,6 +7,7 @@ and Orbax divides the checkpoints among them.
 """
 
 import contextlib
+import contextvars
 import dataclasses
 import json
 import signal
@@ -14,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,7 @@ def check_finite(info: dict[str, Any], first_step: int, folder: Path) -> None:
     row = int(bad[0])
     values = {name: float(np.asarray(x)[row]) for name, x in info.items()}
     good = checkpoint.latest_step(folder)
-    where = "there is none" if good is None else f"{folder} step {good}"
+    where = f"there is none in {folder}" if good is None else f"{folder} step {good}"
     raise TrainingDiverged(
         f"loss is not finite at step {first_step + row}: {values}; "
         f"last good checkpoint: {where}"
@@ -210,6 +211,28 @@ def _any_process(stop: bool, pieces: int) -> bool:
     return bool(anyone) or multihost_utils.reached_preemption_sync_point(pieces)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Training:
+    """What `train` takes: a training that has not begun, or goes on."""
+
+    run_chunk: Callable[..., tuple[Any, Info]]
+    state: Any
+    key: Key | None  # of several trainings their data have it
+    data: Any
+    loop: Loop
+
+
+# Who trains instead of `train`, in this thread: see `together`.
+_trainer: contextvars.ContextVar[Callable[[Training], Any] | None] = (
+    contextvars.ContextVar("trainer", default=None)
+)
+
+
+def leave_to(trainer: Callable[[Training], Any]) -> None:
+    """Leaves the trainings of this thread to another; it returns their last state."""
+    _trainer.set(trainer)
+
+
 def train(
     run_chunk: Callable[[Any, Key, Any], tuple[Any, Info]],
     state: Any,
@@ -236,19 +259,38 @@ def train(
       OSError: if the folder cannot be written; names the last good checkpoint.
       KeyboardInterrupt: after Ctrl-C, when the state is saved.
     """
-    checkpoints = loop.folder / "checkpoints"
-    check_writable(checkpoints)
+    training = Training(run_chunk=run_chunk, state=state, key=key, data=data, loop=loop)
+    if (trainer := _trainer.get()) is not None:
+        return trainer(training)
+    return train_all(training, (loop,), lambda tree, _: tree)
+
+
+def train_all(
+    training: Training, loops: Sequence[Loop], part: Callable[[Any, int], Any]
+) -> Any:
+    """`train`, of one program that may be several trainings, each with its own folder.
+
+    Args:
+      loops: One per training, with the lengths of `training.loop`. Of several, each
+        value that a chunk reports has an axis of them first.
+      part: `(state, i)` -> state of training i.
+
+    Returns:
+      The state of all.
+    """
+    loop, state = training.loop, training.state
     done = int(state.step)
-    if done > loop.num_steps:
-        raise ValueError(
-            f"{loop.folder}: has {done} steps, expected at most the {loop.num_steps} "
-            "to train"
-        )
-    losses = loop.folder / "losses.jsonl"
-    losses.parent.mkdir(parents=True, exist_ok=True)
     first = jax.process_index() == 0
-    if first:
-        _forget_lost_steps(losses, done)
+    for one in loops:
+        check_writable(one.folder / "checkpoints")
+        if done > one.num_steps:
+            raise ValueError(
+                f"{one.folder}: has {done} steps, expected at most the "
+                f"{one.num_steps} to train"
+            )
+        (one.folder / "losses.jsonl").parent.mkdir(parents=True, exist_ok=True)
+        if first:
+            _forget_lost_steps(one.folder / "losses.jsonl", done)
     if done >= loop.num_steps:
         return state
     stop, asked, pieces = False, 0, _Pieces(loop.chunk)
@@ -264,17 +306,24 @@ def train(
     )
     with bar, _held_interrupt() as interrupts:
         while done < loop.num_steps and not stop:
-            start, made, infos = time.perf_counter(), 0, []
+            start, made = time.perf_counter(), 0
+            infos: list[list[dict[str, Any]]] = [[] for _ in loops]
             # As long as whoever resumes here would make it.
             to_save = loop.save_every - done % loop.save_every
             length = min(loop.chunk, to_save, loop.num_steps - done)
             while made < length:
                 before = time.perf_counter()
                 count = min(pieces.size, length - made)
-                made_now = run_chunk(state, key, data, count)  # pyright: ignore[reportCallIssue]
+                made_now = training.run_chunk(state, training.key, training.data, count)
                 state, info = jax.block_until_ready(made_now)
-                infos.append({name: np.asarray(x)[:count] for name, x in info.items()})
-                check_finite(infos[-1], done + made + 1, checkpoints)
+                info = {name: np.asarray(x) for name, x in info.items()}
+                for i, one in enumerate(loops):
+                    own = {
+                        name: (x if len(loops) == 1 else x[i])[:count]
+                        for name, x in info.items()
+                    }
+                    check_finite(own, done + made + 1, one.folder / "checkpoints")
+                    infos[i].append(own)
                 made += count
                 bar.update(count)
                 if pieces.first and first:
@@ -282,18 +331,28 @@ def train(
                     bar.write(f"first step after {seconds:.0f} s", file=sys.stderr)
                 pieces.note(count, time.perf_counter() - before)
             done += length
-            means = {
-                name: float(np.mean(np.concatenate([x[name] for x in infos])))
-                for name in infos[0]
-            }
             rate = length / (time.perf_counter() - start)
-            if first:
-                _append(losses, {"step": done, **means, "steps_per_second": rate})
-            bar.set_postfix({name: f"{means[name]:.4f}" for name in loop.show})
+            means = [_means(own) for own in infos]
+            for one, mean in zip(loops, means, strict=True):
+                if first:
+                    row = {"step": done, **mean, "steps_per_second": rate}
+                    _append(one.folder / "losses.jsonl", row)
+            shown = {x: float(np.mean([mean[x] for mean in means])) for x in loop.show}
+            bar.set_postfix({name: f"{value:.4f}" for name, value in shown.items()})
             asked += 1
             stop = _any_process(bool(interrupts), asked)
             if done % loop.save_every == 0 or done >= loop.num_steps or stop:
-                _save(checkpoints, done, state, loop.config)
+                for i, one in enumerate(loops):
+                    place = one.folder / "checkpoints"
+                    _save(place, done, part(state, i), one.config)
     if stop and done < loop.num_steps:
-        raise KeyboardInterrupt(f"stopped at step {done}; saved in {checkpoints}")
+        places = ", ".join(str(one.folder / "checkpoints") for one in loops)
+        raise KeyboardInterrupt(f"stopped at step {done}; saved in {places}")
     return state
+
+
+def _means(infos: list[dict[str, Any]]) -> dict[str, float]:
+    return {
+        name: float(np.mean(np.concatenate([info[name] for info in infos])))
+        for name in infos[0]
+    }

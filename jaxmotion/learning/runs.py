@@ -100,6 +100,11 @@ class Run:
         return self.folder / stage / "checkpoints"
 
 
+def of_seed(folder: Path, seed: int) -> Path:
+    """The run folder of a seed, beside that of seed 0."""
+    return folder.with_name(f"{folder.name}_seed{seed}") if seed else folder
+
+
 def begin(
     folder: Path,
     *,

@@ -67,6 +67,11 @@ def test_programs_run_as_they_stand(tmp_path):
 def test_commands_parse(words, monkeypatch):
     """The script exists and knows the arguments."""
     _, script, *arguments = words
+    if "--" in arguments:  # another script's command
+        at = arguments.index("--")
+        name, *theirs = arguments[at + 1 :]
+        test_commands_parse(("python", f"experiments/{name}.py", *theirs), monkeypatch)
+        arguments = arguments[:at]
     path = ROOT / script
     monkeypatch.syspath_prepend(str(path.parent))
     spec = importlib.util.spec_from_file_location(f"readme_{path.stem}", path)

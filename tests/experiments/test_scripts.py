@@ -29,6 +29,7 @@ WRONG = {
     "report": ("--runs {gone}", "gone"),
     "robot": ("--robot {gone}.xml --out {out}", "gone"),
     "samplers": ("--data {gone} --held-out-clips a --out {out}", "gone"),
+    "seeds": ("-- camdm train --data {gone} --out {out}", "gone"),
     "serve": ("--run {gone} --port 0", "gone"),
     "steer": ("--run {gone} --port 0 --no-open", "gone"),
     "steering": ("--data {gone} --held-out-clips a --out {out}", "gone"),
