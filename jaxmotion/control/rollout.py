@@ -25,7 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.typing import Exported, Key
 
@@ -68,6 +68,23 @@ def exports(controller: Controller) -> dict[str, Exported]:
         **plans,
         "advance": Exported(controller.advance, takes, ("state", "frame")),
     }
+
+
+def is_due(
+    change: Float[Array, ""], played: Int[Array, ""], *, least: int, sharp: float
+) -> Bool[Array, ""]:
+    """Whether a change of the command is worth a new plan.
+
+    A plan begins as the last one goes on, so that of one in every tick nothing that is
+    wished for is ever displayed: small changes wait until `least` frames were played.
+
+    Args:
+      change: How far the command is from the plan's.
+      played: Frames of the plan that were displayed.
+      least: Frames to play before a change of less than `sharp` counts.
+      sharp: A change that counts at once.
+    """
+    return ((change > 1e-3) & (played >= least)) | (change >= sharp)
 
 
 def tick(

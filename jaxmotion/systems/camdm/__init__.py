@@ -68,7 +68,8 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
   second differences of positions (in `--preset planted`).
 * `Control(follow=...)`: the wanted path returns to the commanded one.
 * `controller.OWN_STARTS`: exponents of 3 in the blend with the path of the last plan;
-  the shipped models answer a command 0.2 s earlier than with the paper's.
+  the shipped models answer a command 0.2 s earlier than with the paper's. Small changes
+  of a command count once 8 frames of the plan were played (`Control.least`).
 * A student of one or two network calls (`distillation.py`, `experiments/camdm.py
   distill`); `Model.steps` are the steps that a plan visits, `jm.load(..., steps=(8,))`
   or `steps=1` cuts any model short.

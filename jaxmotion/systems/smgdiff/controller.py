@@ -34,7 +34,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame, as_displayed
-from jaxmotion.control.rollout import Controller
+from jaxmotion.control.rollout import Controller, is_due
 from jaxmotion.control.steering import (
     Character,
     Tuning,
@@ -70,9 +70,8 @@ class Control:
 
     Attributes:
       apply: M, frames of a plan to play while the command stays (CAMDM's 15).
-      least: Frames of a plan to play before a small change of the command, of less than
-        `sharp`, counts: plans begin as the last one goes on, so that of one in every
-        tick nothing that is wished for is ever displayed. 1 for at once (paper).
+      least: Frames of a plan to play before a small change of the command counts: as
+        of `rollout.is_due`; 1 for at once (paper).
       sharp: A change of the commanded velocity that counts at once, m/s, or of the
         facing of who stands, as far apart as unit vectors are.
       reuse: K of HFTE, points reflected at a time.
@@ -177,9 +176,9 @@ def plan_level(
         turned = jnp.linalg.norm(old.facing - command.facing)
         turned = jnp.where(trajectory.is_still(command.velocity), turned, 0.0)
         change = jnp.maximum(change, turned)
-    due = (change > 1e-3) & (state.cursor >= control.least)
-    due = due | (change >= control.sharp) | (old.label != command.label)
-    return (due | (state.cursor >= control.apply)).astype(jnp.int32)
+    due = is_due(change, state.cursor, least=control.least, sharp=control.sharp)
+    due = due | (old.label != command.label) | (state.cursor >= control.apply)
+    return due.astype(jnp.int32)
 
 
 def in_time(

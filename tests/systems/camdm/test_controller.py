@@ -152,6 +152,37 @@ def test_it_plans_when_told_or_after_m_frames(guided):
 
 
 @pytest.mark.parametrize(
+    "change, cursor, plans",
+    [
+        (dict(velocity=(0.1, 1.0)), 2, 0),
+        (dict(velocity=(0.1, 1.0)), 3, 1),
+        (dict(velocity=(0.6, 1.0)), 1, 1),
+        (dict(facing=(0.1, 1.0)), 2, 0),
+        (dict(facing=(1.0, 0.0)), 1, 1),
+        (dict(label=1), 1, 2),
+        (dict(), 3, 0),
+    ],
+)
+def test_small_changes_of_the_command_wait(skeleton, change, cursor, plans):
+    """Of the plan's own command, though the last tick's was the same."""
+    control = dataclasses.replace(CONTROL, least=3)
+    told = jax.tree.map(lambda x: x[0, 0], commands_of(*steady(1, 1)))
+    changed = {
+        name: jnp.asarray(value, getattr(told, name).dtype)
+        for name, value in change.items()
+    }
+    wanted = dataclasses.replace(told, **changed)
+    state = jax.tree.map(lambda x: x[0], states_of(skeleton, 1))
+    state = dataclasses.replace(state, command=told)
+    for _ in range(cursor):
+        state, _ = camdm_controller.advance(
+            state, wanted, config=CONFIG, control=control
+        )
+    need = camdm_controller.plan_level(state, wanted, control=control)
+    assert int(need) == plans
+
+
+@pytest.mark.parametrize(
     ("guided_plans", "replan_on_change"),
     mostly_slow([(0, True), (1, True), (1, False), (2, False)], [(1, True)]),
 )
