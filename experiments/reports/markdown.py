@@ -97,6 +97,14 @@ def difference(claim: Claim, pair: tuple[str, str], values: np.ndarray) -> str:
     )
 
 
+def left_open(claim: Claim, decision: verdicts.Decision) -> str:
+    """How far apart rows may be that all trainings there are to be left open; or ""."""
+    if decision.trainings < verdicts.MAX_TRAININGS:
+        return ""
+    every = decision.differences
+    return "; ".join(difference(claim, pair, every[pair]) for pair in decision.open)
+
+
 def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
     """Lines of a Markdown table.
 

@@ -173,7 +173,7 @@ def _where_from(one: Stored, page: Path, folder: Path) -> list[str]:
     told += [f"{count} trainings, {shown}"] if count > 1 else []
     told += [about["interval"]] if "interval" in about else []
     trainings = [x.about.get("minutes", {}) for x in one.measured.trainings if x]
-    if "measured" in about and all(trainings):
+    if "measured" in about and trainings[0]:  # a card's are not kept
         taken = {k: [x[k] for x in trainings if k in x] for k in trainings[0]}
         each = (f"{k} {np.mean(x):.3g}" for k, x in taken.items())
         told += [f"minutes of training: {', '.join(each)}"]
@@ -287,7 +287,8 @@ def _verdict(one: Table, claim: Claim, found: stored.Found) -> str:
     if any(len(x.seeds) > 1 for x in files_):
         return f"{decision.verdict}: single trainings were not kept"
     several = "s" * (decision.trainings > 1)
-    return f"{decision.verdict}, {decision.trainings} training{several}"
+    told = f"{decision.verdict}, {decision.trainings} training{several}"
+    return ": ".join(filter(None, [told, markdown.left_open(claim, decision)]))
 
 
 def _claim(one: Table, claim: Claim, found: stored.Found) -> list[str]:

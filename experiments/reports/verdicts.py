@@ -64,6 +64,7 @@ class Decision:
       differences: By how much each comparison holds in each training; negative where it
         fails.
       trainings: Trainings until the verdict, or of the comparison that has fewest.
+      open: Comparisons that several trainings have left open.
     """
 
     verdict: Verdict
@@ -72,6 +73,7 @@ class Decision:
         default_factory=dict
     )
     trainings: int = 0
+    open: tuple[tuple[str, str], ...] = ()
 
 
 def cells_of(
@@ -281,7 +283,7 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
         if when_decided([own], margin=claim.margin)[0] == math.inf
     ]
     reason = f"open after {trainings} trainings: {_pairs(open_pairs)}"
-    return decision(verdict="not decided", reason=reason)
+    return decision(verdict="not decided", reason=reason, open=tuple(open_pairs))
 
 
 def _pairs(pairs: list[tuple[str, str]]) -> str:

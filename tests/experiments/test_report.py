@@ -11,6 +11,7 @@ import pytest
 import scipy.stats
 from PIL import Image
 
+from jaxmotion.evaluation import sequential
 from jaxmotion.systems import registry
 from jaxmotion.systems.camdm import release as camdm_release
 
@@ -293,6 +294,24 @@ def test_nearness_over_trainings_is_of_paired_distances(over):
     expected = np.abs(b - real) - np.abs(a - real)
     np.testing.assert_allclose(made.differences["A", "B"], expected, rtol=1e-9)
     assert made.verdict == "reproduced"
+
+
+def test_what_twelve_trainings_leave_open_has_its_interval(load, over):
+    """Of the comparison that is open alone, and of fewer trainings none."""
+    markdown, claims = load("reports.markdown"), load("reports.claims")
+    a = np.random.default_rng(0).normal(5.0, 0.1, 12)
+    wiggle = np.random.default_rng(1).normal(0.0, 0.3, 12)
+    pairs = (("A", "B"), ("A", "C"))
+    claim = claims.Claim(words="w", column="FID", pairs=pairs, where="here")
+    for count, expected in ((11, ""), (12, "B less A: ")):
+        rows = dict(a=a, b=a + wiggle, c=a + 1.0 + 0.1 * wiggle)
+        made, _ = over({k: v[:count] for k, v in rows.items()}, pairs=pairs)
+        assert (made.verdict, made.open) == ("not decided", (("A", "B"),))
+        text = markdown.left_open(claim, made)
+        assert text.startswith(expected) and bool(text) == bool(expected)
+    mean, low, high = sequential.interval(wiggle)
+    numbers = map(markdown.number, (mean, low, high))
+    assert text == "B less A: {} [{}, {}] of 12 trainings".format(*numbers)
 
 
 def test_likeness_needs_both_sides(over):

@@ -110,8 +110,8 @@ RELEASED = Control(
 
 # For models that ship: the walked path is the commanded one, which soon outweighs the
 # path of the last plan. With the paper's exponents it would follow 0.2 s later: 27 cm
-# off a figure eight, not 5. Small changes wait: who turns at 1.2 rad/s and is told so in
-# every tick makes a sixth of the plans, and walks at 1.37 m/s, not at 1.09, of 1.4.
+# off a figure eight, not 5. Small changes wait: who turns at 1.2 rad/s and is told so
+# in every tick makes a sixth of the plans, and walks at 1.37 m/s, not 1.09, of 1.4.
 OWN_STARTS = Control(follow=1.0, bias_position=3.0, bias_facing=3.0, least=8)
 
 # Seconds. Plans that go on from the last pose differ from it in velocity alone, which
