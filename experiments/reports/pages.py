@@ -287,8 +287,9 @@ def _verdict(one: Table, claim: Claim, found: stored.Found) -> str:
     if any(len(x.seeds) > 1 for x in files_):
         return f"{decision.verdict}: single trainings were not kept"
     several = "s" * (decision.trainings > 1)
-    told = f"{decision.verdict}, {decision.trainings} training{several}"
-    return ": ".join(filter(None, [told, markdown.left_open(claim, decision)]))
+    if text := markdown.left_open(claim, decision):
+        return f"{decision.verdict}: {text}"
+    return f"{decision.verdict}, {decision.trainings} training{several}"
 
 
 def _claim(one: Table, claim: Claim, found: stored.Found) -> list[str]:
