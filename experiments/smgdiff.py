@@ -52,6 +52,7 @@ class Train:
       attention: "full", or "prefix": computed once per plan; None for the preset's.
       path_noise: Of a trajectory generator: "bridge", as smooth as paths, for more
         steps than one, or "white" (paper); None for the preset's.
+      path_soon: Frames to its second target; None for the preset's, 0 for none (paper).
       noise_levels: Of each window in an update; None for the preset's.
       own_levels: Probability of noise on own predictions at lower levels.
       cubic_wishes: Probability of wanted paths without sway.
@@ -82,6 +83,7 @@ class Train:
     token_margin: int | None = None
     attention: Literal["full", "prefix"] | None = None
     path_noise: Literal["white", "bridge"] | None = None
+    path_soon: int | None = None
     noise_levels: int | None = None
     own_levels: float | None = None
     cubic_wishes: float | None = None
@@ -191,8 +193,9 @@ def sizes_of(args: Train) -> dict[str, Any]:
 
 def paths_of(args: Train) -> dict[str, Any]:
     """Sizes and noise of the trajectory generator that the arguments describe."""
-    noise = {} if args.path_noise is None else {"noise": args.path_noise}
-    return smgdiff_training.PATHS[args.preset] | noise
+    given = {"noise": args.path_noise, "soon": args.path_soon}
+    given = {name: value for name, value in given.items() if value is not None}
+    return smgdiff_training.PATHS[args.preset] | given
 
 
 def train(args: Train) -> None:

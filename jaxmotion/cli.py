@@ -82,7 +82,7 @@ LIMITS: dict[str, Range] = {
     "long_minutes": Range(0, 86400),
     "warmup": Range(0, 10**9),
     "draft_steps": Range(0, 10**9),
-    "token_margin": Range(0, 1000),
+    **dict.fromkeys(("token_margin", "path_soon"), Range(0, 1000)),
     "channels": _SIZE,
     "frame_kernel": Range(0, 255),
     "seam_half_life": Range(0, 10**6),

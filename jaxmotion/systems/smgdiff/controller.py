@@ -90,6 +90,11 @@ class Control:
       hurry: Nor does he wish to go faster than so many times the commanded speed.
       turn: Half-life, seconds, of the spring by which who stands turns to the
         commanded facing; 0 for as the path faces, which knows no wish for it (paper).
+      answer: Half-life, seconds, of the spring by which the second target of a path,
+        if the generator takes one, takes up the command.
+      agile: A wish changes the velocity by so much at most, m/s, and half of the
+        present speed more, half of it until the second target: as 95 % of the takes
+        do. 0 for no limit (paper).
     """
 
     apply: int = 15
@@ -104,16 +109,18 @@ class Control:
     leash: float = 1.0
     hurry: float = 1.1
     turn: float = 0.0
+    answer: float = 0.1
+    agile: float = 0.0
 
 
 # For models that ship: the walked path is the commanded one, which outweighs the last
 # plan's sooner, and who stands faces as he is told. With exponents of 3, as CAMDM ships
 # with, he turns as fast but misses twice as many touches while he does.
-OWN_STARTS = Control(least=8, follow=1.0, turn=0.27, bias_position=1.5)
+OWN_STARTS = Control(least=8, follow=1.0, turn=0.27, bias_position=1.5, agile=1.0)
 
 # Seconds of a path that a player looks ahead: what he is told shows after .6 s. Looking
 # .35 s ahead, as CAMDM's characters do, he weaves, 32 cm off it on the mean.
-AHEAD = 0.8
+AHEAD = 0.5
 
 
 @jax.tree_util.register_dataclass
@@ -200,6 +207,39 @@ def in_time(
     return dataclasses.replace(path, position=part * path.position)
 
 
+def walkable(wish: Wish, *, soon: int, fps: float, control: Control) -> Wish:
+    """A wish as people walk, with the second target after so many frames; 0 for none.
+
+    Targets that nobody would reach (turn around, at a run, within a path) are answered
+    at once and with all force: feet slide, and the ball goes on without a foot. And
+    with a target at a path's end alone he may take all of it to turn, of which only the
+    first frames are played: who steers on is answered late.
+    """
+    position = wish.past.position
+    moved = (position[-1] - position[-4]) * (fps / 3)
+
+    def within(velocity: Array, part: float = 1.0) -> Array:
+        if control.agile == 0:
+            return velocity
+        most = part * (control.agile + 0.5 * jnp.linalg.norm(moved))
+        change = velocity - moved
+        size = jnp.maximum(jnp.linalg.norm(change), 1e-6)
+        return moved + jnp.minimum(most / size, 1.0) * change
+
+    wish = dataclasses.replace(wish, velocity=within(wish.velocity))
+    if soon == 0:
+        return wish
+    here = trajectory.PlanarFrame(origin=jnp.zeros(2), facing=wish.past.facing[-1])
+    told = trajectory.Command(
+        velocity=wish.velocity, facing=here.facing, label=wish.label
+    )
+    path = trajectory.desired_trajectory(
+        here, moved, told, num_frames=soon, fps=fps, half_life=control.answer
+    )
+    velocity = path.position[-1] * (fps / soon)
+    return dataclasses.replace(wish, soon=within(velocity, 0.5))
+
+
 def wanted_trajectory(
     generate: SamplePath,
     key: Key,
@@ -209,6 +249,7 @@ def wanted_trajectory(
     *,
     config: Config,
     control: Control,
+    soon: int = 0,
 ) -> trajectory.Trajectory:
     """Steps 1a and 1b: the generated path, blended with the plan's own.
 
@@ -229,6 +270,7 @@ def wanted_trajectory(
         velocity=ground.into_frame(velocity, frame.facing),
         label=command.label,
     )
+    wish = walkable(wish, soon=soon, fps=config.fps, control=control)
     wanted = generate(key, wish)
     if control.follow > 0:
         wanted = in_time(wanted, wish, num_frames=control.apply, fps=config.fps)
@@ -271,12 +313,20 @@ def replan(
     representation: Representation,
     config: Config,
     control: Control,
+    soon: int = 0,
 ) -> PlayerState:
     """Step 1: a new plan, none of it displayed yet."""
     key_path, key_motion = jax.random.split(key)
     skeleton = representation.skeleton
     wanted = wanted_trajectory(
-        generate, key_path, skeleton, state, command, config=config, control=control
+        generate,
+        key_path,
+        skeleton,
+        state,
+        command,
+        config=config,
+        control=control,
+        soon=soon,
     )
     frame = smgdiff_scene.plan_frame(skeleton, state.past.motion)
     past = smgdiff_scene.to_frame(state.past, frame)
@@ -370,11 +420,12 @@ def controller(
     representation: Representation,
     config: Config,
     control: Control | None = None,
+    soon: int = 0,
 ) -> Controller:
     """The run-time of one player, for `rollout.tick` and `rollout.rollout`.
 
-    Paths are `smgdiff_trajectory.sampler`'s or `straight`, plans
-    `smgdiff_guidance.sampler`'s. `ValueError` if `control.apply` is not in
+    Paths are `smgdiff_trajectory.sampler`'s, with its `Config.soon`, or `straight`,
+    plans `smgdiff_guidance.sampler`'s. `ValueError` if `control.apply` is not in
     1..`config.future`.
     """
     control = Control() if control is None else control
@@ -389,6 +440,7 @@ def controller(
         representation=representation,
         config=config,
         control=control,
+        soon=soon,
     )
     return Controller(
         plan_level=functools.partial(plan_level, control=control),
@@ -431,6 +483,7 @@ class Method:
             representation=representation,
             config=self.config,
             control=self.control,
+            soon=self.paths.soon,
         )
 
 

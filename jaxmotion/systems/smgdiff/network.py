@@ -51,12 +51,13 @@ class TrajectoryGenerator(nn.Module):
         x_t: Float[Array, "*batch future 4"],
         t: Int[Array, "*#batch"],
         past: Float[Array, "*batch past 4"],
-        target: Float[Array, "*batch 2"],
+        target: Float[Array, "*batch targets"],
         label: Int[Array, "*batch"],
     ) -> Float[Array, "*batch future 4"]:
         """The clean path, predicted from step t in 1..T.
 
-        `target` is where the user points to: wanted velocity times one second, meters.
+        `target` is where the user points to: wanted velocity times one second, meters;
+        with a second target the mean velocity to that one, too.
         """
         n, batch = self.frames_per_token, x_t.shape[:-2]
         time = jnp.broadcast_to(

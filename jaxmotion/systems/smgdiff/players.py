@@ -47,11 +47,12 @@ def wishes(known: EvalWindows, model: Model) -> Wish:
     skeleton, config = model.representation.skeleton, model.config
 
     def one(known: EvalWindows) -> Wish:
-        end = known.future.motion.root_position[-1, ::2]
+        path, soon = known.future.motion.root_position[:, ::2], model.paths.soon
         return Wish(
             past=trajectory.root_trajectory(skeleton, known.past.motion),
-            velocity=end * config.fps / config.future,
+            velocity=path[-1] * config.fps / config.future,
             label=known.label,
+            soon=path[soon - 1] * config.fps / soon if soon else None,
         )
 
     return jax.vmap(one)(known)
@@ -79,6 +80,7 @@ def player(
         representation=model.representation,
         config=model.config,
         control=control,
+        soon=model.paths.soon,
     )
     skeleton = model.representation.skeleton
 
@@ -383,6 +385,7 @@ def play_one(
         ),
         representation=model.representation,
         config=model.config,
+        soon=model.paths.soon,
     )
     known = smgdiff_scoring.eval_windows(run.train, model, number=2000, seed=seed)
     first = int(np.flatnonzero(np.asarray(known.label) == int(commands.label[0]))[0])

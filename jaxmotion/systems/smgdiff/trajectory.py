@@ -40,6 +40,7 @@ class Config:
       token_margin, token_window: As in `transformer.CamdmTransformer`.
       noise: "white", of each frame on its own (paper), or "bridge": as smooth as paths
         are, and as large as what a target leaves open of them (`_sines`).
+      soon: Frames to a second target, short of the path's end; 0 for none (paper).
       seconds: Length of a path.
       meters: Unit of the network's positions.
       weight_velocity: Weight of the displacements, beside the data's 1.
@@ -57,9 +58,15 @@ class Config:
     token_margin: int = 0
     token_window: Literal["hann", "trapezoid"] = "hann"
     noise: Literal["white", "bridge"] = "white"
+    soon: int = 0
     seconds: float = 1.5
     meters: float = 1.0
     weight_velocity: float = 1.0
+
+    def __post_init__(self):
+        """Checks the second target's place."""
+        if not 0 <= self.soon <= self.future:
+            raise ValueError(f"soon is {self.soon}, expected 0..{self.future}")
 
 
 @jax.tree_util.register_dataclass
@@ -68,11 +75,13 @@ class Wish:
     """What a path is made for, in the frame of the last displayed pose.
 
     The target point is one second of the velocity (x, z; m/s) away; past is displayed.
+    For a generator with a second target, `soon` is the mean velocity until that.
     """
 
     past: trajectory.Trajectory
     velocity: Float[Array, "*batch 2"]
     label: Int[Array, "*batch"]
+    soon: Float[Array, "*batch 2"] | None = None
 
 
 SamplePath = Callable[[Key, Wish], trajectory.Trajectory]
@@ -88,7 +97,8 @@ def init(key: Key, config: Config) -> Params:
     """Initial parameters."""
     x_t, past = (jnp.zeros((n, CHANNELS)) for n in (config.future, config.past))
     t, label = jnp.ones((), jnp.int32), jnp.zeros((), jnp.int32)
-    return network(config).init(key, x_t, t, past, jnp.zeros(2), label)["params"]
+    target = jnp.zeros(4 if config.soon else 2)
+    return network(config).init(key, x_t, t, past, target, label)["params"]
 
 
 def _pack(path: trajectory.Trajectory, config: Config) -> Array:
@@ -144,13 +154,18 @@ def noise_space(
 
 
 def _apply(params: Params, x_t: Array, t: Array, wish: Wish, config: Config) -> Array:
+    target = wish.velocity
+    if config.soon:
+        if wish.soon is None:
+            raise ValueError("a wish without soon, which this generator needs")
+        target = jnp.concatenate([target, wish.soon], axis=-1)
     return blocks.apply(
         params,
         network(config),
         x_t,
         t,
         _pack(wish.past, config),
-        wish.velocity / config.meters,
+        target / config.meters,
         wish.label,
     )
 
@@ -169,13 +184,18 @@ def example(
         origin=course.position[last], facing=course.facing[last]
     )
     local = trajectory.to_local(course, here)
-    seconds = config.future / window.fps
+    path = jax.tree.map(lambda x: x[config.past :], local)
+
+    def mean_velocity(frames: int) -> Array:
+        return path.position[frames - 1] * (window.fps / frames)
+
     wish = Wish(
         past=jax.tree.map(lambda x: x[: config.past], local),
-        velocity=local.position[-1] / seconds,
+        velocity=mean_velocity(config.future),
         label=label,
+        soon=mean_velocity(config.soon) if config.soon else None,
     )
-    return wish, jax.tree.map(lambda x: x[config.past :], local)
+    return wish, path
 
 
 def loss(

@@ -351,3 +351,79 @@ def test_the_step_of_the_chain_reaches_both_samplers(parts, monkeypatch):
     )
     method(({}, {}, parts[0]))
     assert seen == [chain.ddim_step] * 2
+
+
+def asked(now, then=(1.4, 0.0), **control):
+    """What is wished for of who has moved so, and is to move so."""
+    times = jnp.arange(-3, 1) / 30.0
+    wish = smgdiff_trajectory.Wish(
+        past=trajectory.Trajectory(
+            position=times[:, None] * jnp.asarray(now)[None],
+            facing=jnp.tile(jnp.array([0.0, 1.0]), (4, 1)),
+        ),
+        velocity=jnp.asarray(then),
+        label=jnp.int32(0),
+    )
+    control = dataclasses.replace(CONTROL, **control)
+    return smgdiff_controller.walkable(wish, soon=6, fps=30.0, control=control)
+
+
+@pytest.mark.parametrize("half_life", [0.05, 0.1, 0.3])
+def test_the_second_target_is_on_the_way_to_what_is_commanded(half_life):
+    now, then = np.array([1.2, 0.5]), np.array([1.4, 0.0])
+    wish = asked(now, then, answer=half_life)
+    # A critically damped spring of velocities, integrated in small steps.
+    decay, velocity, rate, moved = 2 * np.log(2) / half_life, now.copy(), 0.0, 0.0
+    for _ in range(20_000):
+        moved = moved + velocity * (0.2 / 20_000)
+        pull = decay**2 * (then - velocity) - 2 * decay * rate
+        velocity = velocity + rate * (0.2 / 20_000)
+        rate = rate + pull * (0.2 / 20_000)
+    np.testing.assert_allclose(wish.soon, moved / 0.2, rtol=2e-3)
+    np.testing.assert_array_equal(wish.velocity, np.float32(then))
+
+
+@pytest.mark.parametrize("now", [[0.0, 0.0], [0.0, 2.0], [-2.4, 0.7]])
+@pytest.mark.parametrize("then", [[0.0, 0.3], [3.5, 0.0], [0.0, -2.0]])
+def test_nobody_is_asked_to_change_faster_than_people_do(now, then):
+    wish = asked(now, then, agile=1.0)
+    most = 1.0 + 0.5 * np.hypot(*now)
+    for found, limit in ((wish.velocity, most), (wish.soon, most / 2)):
+        change = np.asarray(found) - now
+        assert np.hypot(*change) <= limit + 1e-5
+        # In the direction of what is commanded.
+        wanted = np.subtract(then, now)
+        across = change[0] * wanted[1] - change[1] * wanted[0]
+        assert abs(across) < 1e-4 * np.hypot(*wanted)
+    whole = min(most, np.hypot(*np.subtract(then, now)))
+    assert np.hypot(*(np.asarray(wish.velocity) - now)) == pytest.approx(whole, 1e-4)
+
+
+def test_without_a_limit_a_wish_is_the_command():
+    wish = asked([2.0, 0.0], [-3.0, 1.0])
+    np.testing.assert_array_equal(wish.velocity, [-3.0, 1.0])
+
+
+def test_paths_are_made_for_the_second_target(parts):
+    representation, config, _ = parts
+    wished = []
+
+    def generate(key, wish):
+        wished.append(wish.soon)
+        return smgdiff_trajectory.straight(key, wish, future=12, fps=config.fps)
+
+    state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
+    one = jax.tree.map(lambda x: x[0], commands(1))
+    for soon in (0, 5):
+        smgdiff_controller.wanted_trajectory(
+            generate,
+            jax.random.key(0),
+            tiny.skeleton(),
+            state,
+            one,
+            config=config,
+            control=CONTROL,
+            soon=soon,
+        )
+    assert wished[0] is None
+    assert wished[1].shape == (2,)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +51,35 @@ def test_the_wish_is_the_mean_velocity_of_what_happened():
     np.testing.assert_allclose(
         path.position[-1], np.asarray(found.velocity) * 12 / 30, atol=1e-5
     )
+
+
+def test_the_second_target_is_where_he_was_by_then():
+    config = dataclasses.replace(CONFIG, soon=5)
+    motion = tiny.walk(16, speed=1.2, turn=0.7, start=2.0)
+    wish, path = smgdiff_trajectory.example(
+        tiny.skeleton(), motion, jnp.int32(1), config=config
+    )
+    np.testing.assert_allclose(wish.soon * 5 / 30, path.position[4], atol=1e-5)
+
+
+def test_a_generator_of_two_targets_asks_for_both():
+    config = dataclasses.replace(CONFIG, soon=5)
+    drawn = tiny.random_params(smgdiff_trajectory.init, config, seed=1)
+    generate = smgdiff_trajectory.sampler(drawn, config=config)
+    with pytest.raises(ValueError, match="a wish without soon"):
+        generate(jax.random.key(0), wish())
+    found = [
+        generate(jax.random.key(0), dataclasses.replace(wish(), soon=jnp.array(soon)))
+        for soon in ([0.0, 0.0], [0.0, 1.0], [1.0, 0.0])
+    ]
+    for one, other in itertools.combinations(found, 2):
+        assert np.abs(one.position - other.position).max() > 1e-3
+
+
+@pytest.mark.parametrize("soon", [-1, 13])
+def test_a_second_target_off_the_path_is_refused(soon):
+    with pytest.raises(ValueError, match=f"soon is {soon}, expected 0..12"):
+        dataclasses.replace(CONFIG, soon=soon)
 
 
 @pytest.mark.parametrize("label", [-1, 2])
