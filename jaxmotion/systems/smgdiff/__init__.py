@@ -16,6 +16,7 @@ default since trainings here are short: `--preset small`, with losses of the bal
 other weights (`--preset paper` is without; `planted` is for a second training), and
 `smgdiff_guidance.TUNED` (rate 0.9, touches from 12 m/s² on, within 18 cm) where the
 paper has 0.5, 2 m/s² and 10 cm (`Guidance()`). The shipped `dribble` draws its paths in
-four steps from noise as smooth as paths (`trajectory.Config(noise="bridge")`), and his
-wishes lead back to the commanded path (`controller.OWN_STARTS`).
+four steps from noise as smooth as paths (`trajectory.Config(noise="bridge")`) and for a
+second target half a second ahead (`soon`); his wishes lead back to the commanded path,
+and ask for no turn that people do not make (`controller.OWN_STARTS`).
 """
