@@ -211,9 +211,10 @@ def walkable(wish: Wish, *, soon: int, fps: float, control: Control) -> Wish:
     """A wish as people walk, with the second target after so many frames; 0 for none.
 
     Targets that nobody would reach (turn around, at a run, within a path) are answered
-    at once and with all force: feet slide, and the ball goes on without a foot. Speeding
-    up has no limit, or he falls behind at every start. And with a target at a path's end alone he may take all of it to turn, of which only the
-    first frames are played: who steers on is answered late.
+    at once and with all force: feet slide, and the ball goes on without a foot.
+    Speeding up has no limit, or he falls behind at every start. And with a target at a
+    path's end alone he may take all of it to turn, of which only the first frames are
+    played: who steers on is answered late.
     """
     position = wish.past.position
     moved = (position[-1] - position[-4]) * (fps / 3)
