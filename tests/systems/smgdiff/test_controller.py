@@ -219,12 +219,12 @@ def test_small_changes_of_the_command_wait(parts, turned, cursor, plans):
     assert int(need) == plans
 
 
-def path_and_wish(state, wanted, config, control):
-    """Of who goes straight to where he wishes, and the velocity of that wish."""
+def path_and_wish(state, wanted, config, control, *, soon=0):
+    """Of who goes straight to where he wishes, and that wish."""
     seen = []
 
     def generate(key, wish):
-        seen.append(wish.velocity)
+        seen.append(wish)
         return smgdiff_trajectory.straight(
             key, wish, future=config.future, fps=config.fps
         )
@@ -237,6 +237,7 @@ def path_and_wish(state, wanted, config, control):
         wanted,
         config=config,
         control=control,
+        soon=soon,
     )
     return path, seen[0]
 
@@ -260,7 +261,9 @@ def test_who_follows_wishes_to_be_where_the_command_should_have_taken_him(
     )
     changes = ({"follow": 0.0}, {}, {"hurry": 1.1})
     seen = [
-        path_and_wish(state, wanted, config, dataclasses.replace(control, **change))[1]
+        path_and_wish(state, wanted, config, dataclasses.replace(control, **change))[
+            1
+        ].velocity
         for change in changes
     ]
     gained = 0.5 * expected * config.fps / config.future
@@ -414,25 +417,9 @@ def test_without_a_limit_a_wish_is_the_command():
 
 
 def test_paths_are_made_for_the_second_target(parts):
-    representation, config, _ = parts
-    wished = []
-
-    def generate(key, wish):
-        wished.append(wish.soon)
-        return smgdiff_trajectory.straight(key, wish, future=12, fps=config.fps)
-
+    _, config, _ = parts
     state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
     one = jax.tree.map(lambda x: x[0], commands(1))
-    for soon in (0, 5):
-        smgdiff_controller.wanted_trajectory(
-            generate,
-            jax.random.key(0),
-            tiny.skeleton(),
-            state,
-            one,
-            config=config,
-            control=CONTROL,
-            soon=soon,
-        )
-    assert wished[0] is None
-    assert wished[1].shape == (2,)
+    wished = [path_and_wish(state, one, config, CONTROL, soon=n)[1] for n in (0, 5)]
+    assert wished[0].soon is None
+    assert wished[1].soon.shape == (2,)
