@@ -29,10 +29,13 @@ bends the leg to reach it.
    about already, so it never flips. As d approaches a + b, it does so exponentially
    (`softness`): a leg that is pulled too far does not snap straight. The foot keeps its
    orientation, but for what the leg cannot reach and a heel that would sink.
-5. **Swing.** A toe that moves is off the ground: from `end_speed` to 1.5 times that,
-   its least height rises by `clearance`, be it animated so or on its way out of a lock.
-   Networks that turn a body at once let the swinging toe graze the ground at 2 m/s,
-   where people lift it by 3 cm and more.
+5. **Swing.** A toe that moves is off the ground, be it animated so or on its way out of
+   a lock: at the speed v its least height over where it rests is
+
+       clearance (1 - exp(-max(v - clear_from, 0) / clear_over))                  (3)
+
+   Networks that turn a body at once drag the toes. Of a person's that move at more than
+   .2 m/s seven in eight are higher (O3DE's takes; ours).
 
 A frame that needs no correction comes back as it was. A controller that can be told
 what was displayed (`Controller.shown`) plans on from there: the next plan begins with
@@ -75,7 +78,9 @@ class FootLock:
       begin_height: and below this height of the toe over its rest, meters.
       end_speed: It ends above this speed,
       end_height: or above this height.
-      clearance: Height above `toe_height` that a swinging toe keeps, meters.
+      clearance: Least height above `toe_height` of a toe that moves fast, meters.
+      clear_from: Speed above which it rises, meters per second,
+      clear_over: and the speed in which it does so but for 1/e.
       radius: Distance of the animated toe from the locked point that ends a lock,
         meters.
       crossing: Distance aside of the first toe from the second one, from hip to hip,
@@ -95,7 +100,9 @@ class FootLock:
     begin_height: float = 0.03
     end_speed: float = 0.6
     end_height: float = 0.08
-    clearance: float = 0.02
+    clearance: float = 0.035
+    clear_from: float = 0.15
+    clear_over: float = 1.0
     radius: float = 0.2
     crossing: float = 0.03
     caught_up: float = 0.01
@@ -190,8 +197,8 @@ def least_heights(
     speed: Float[Array, "*frames feet"], *, lock: FootLock
 ) -> Float[Array, "*frames feet"]:
     """Heights below which toes are not displayed: part 5 of the module's text."""
-    fast = jnp.clip(2.0 * (speed / lock.end_speed - 1.0), 0.0, 1.0)
-    return lock.toe_height + lock.clearance * fast
+    over = jnp.maximum(speed - lock.clear_from, 0.0) / lock.clear_over
+    return lock.toe_height - lock.clearance * jnp.expm1(-over)
 
 
 def _would_cross(
@@ -475,7 +482,7 @@ def toe_offsets(
     With toes p and offsets o it minimizes, over all frames at once,
 
         sum |o_f|^2  +  stand sum_planted |o_{f+1} - o_f + p_{f+1} - p_f|^2
-                     +  smooth sum |o_{f+1} - 2 o_f + o_{f-1}|^2                   (3)
+                     +  smooth sum |o_{f+1} - 2 o_f + o_{f-1}|^2                   (4)
 
     by conjugate gradients: the terms are least squares, so the optimum is a linear
     system.
