@@ -33,6 +33,7 @@ from jaxmotion.control.steering import (
     AHEAD,
     ARRIVE,
     HEADING_STEP,
+    LAG,
     SPEED_STEP,
     Character,
 )
@@ -45,9 +46,8 @@ from jaxmotion.typing import Key, Params
 # within so many meters of the last one.
 NEAREST, REACH = 0.25, 1.0
 # Nobody is asked to go slower or faster, m/s, but to stop; nor to be nearer than this
-# to a place, where he stands, meters. Times count to the last distance. What is asked
-# for shows after so many seconds: decisions are made for where walkers will be then.
-SLOWEST, FASTEST, THERE, TIMELY, LAG = 0.6, 3.5, 0.05, 0.1, 0.25
+# to a place, where he stands, meters. Times count to the last distance.
+SLOWEST, FASTEST, THERE, TIMELY = 0.6, 3.5, 0.05, 0.1
 # Radius of a walker, meters; collisions within so many seconds count; what a collision
 # in one second is worth in m/s.
 RADIUS, HORIZON, FEAR = 0.35, 3.0, 2.0
@@ -156,10 +156,13 @@ def _seconds_to(distance: Array, speed: Array) -> Array:
 
 
 def arrive(
-    place: Place, walker: Walker, seconds: Float[Array, ""]
+    place: Place, walker: Walker, seconds: Float[Array, ""], *, coast: Scalar = LAG
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """Velocity and facing of who is to be at a place at a time; it is `seconds` now."""
-    gap = place.position - walker.position - LAG * walker.velocity
+    """Velocity and facing of who is to be at a place at a time; it is `seconds` now.
+
+    Told to slow down, he goes on as he was for `coast` seconds.
+    """
+    gap = place.position - walker.position - coast * walker.velocity
     distance, left = _length(gap), place.seconds - seconds
     slow, fast = jnp.float32(SLOWEST), jnp.float32(FASTEST)
 
@@ -275,6 +278,7 @@ def _wish(
     told: Command | None,
     *,
     ahead: float,
+    coast: float,
 ) -> tuple[Array, Array, Array]:
     """Velocity, facing and memory of each walker; leaders do as they are told."""
     if isinstance(goal, Path):
@@ -282,7 +286,8 @@ def _wish(
         velocity, memory = jax.vmap(look)(goal, walkers, memory)
     elif isinstance(goal, Place):
         now = jnp.broadcast_to(seconds, memory.shape)
-        velocity, facing = jax.vmap(arrive)(goal, walkers, now)
+        come = functools.partial(arrive, coast=coast)
+        velocity, facing = jax.vmap(come)(goal, walkers, now)
         return velocity, facing, memory
     else:
         leaders = jax.tree.map(lambda x: x[goal.leader], walkers)
@@ -381,12 +386,13 @@ def goal_rollouts(
         ticks=ticks,
         fps=character.fps,
         ahead=character.ahead,
+        coast=character.coast,
         avoiding=avoiding or circles is not None,
     )
 
 
 @functools.partial(
-    jax.jit, static_argnames=("method", "ticks", "fps", "ahead", "avoiding")
+    jax.jit, static_argnames=("method", "ticks", "fps", "ahead", "coast", "avoiding")
 )
 def _rollouts(
     params: Params,
@@ -402,6 +408,7 @@ def _rollouts(
     ticks: int,
     fps: float,
     ahead: float,
+    coast: float,
     avoiding: bool,
 ) -> Frame:
     controller, number = method(params), len(places)
@@ -415,7 +422,7 @@ def _rollouts(
         states, walkers, told, memory = carry
         led = jax.tree.map(lambda x: x[:, tick], commands)
         velocity, facing, memory = _wish(
-            goal, walkers, memory, tick / fps, led, ahead=ahead
+            goal, walkers, memory, tick / fps, led, ahead=ahead, coast=coast
         )
         if avoiding:
             clear = avoid(velocity, walkers, circles)

@@ -39,6 +39,8 @@ ARRIVE, NEAR, FAR = 0.7, 0.2, 0.45
 HEADING_STEP, SPEED_STEP = math.radians(8.0), 0.15
 # Seconds of a path that who goes along it looks ahead.
 AHEAD = 0.35
+# Seconds after which what walkers are asked for shows.
+LAG = 0.25
 # A stick that is pushed less far is in its middle.
 STICK = 0.12
 
@@ -88,6 +90,8 @@ class Character:
       toe_height: Where toes rest, meters; None where nobody measured it.
       ahead: Seconds of a path that he looks ahead. Who answers a command late weaves
         about a path unless he looks farther, and who looks far cuts its corners.
+      coast: Seconds for which he goes on as he was when he is told to slow down: a
+        place is approached from where he will be by then.
     """
 
     skeleton: Skeleton = dataclasses.field(repr=False)
@@ -107,6 +111,7 @@ class Character:
     tuning: Tuning | None = dataclasses.field(default=None, repr=False)
     toe_height: float | None = None
     ahead: float = AHEAD
+    coast: float = LAG
 
     def label(self, name: str) -> int:
         """Index of a label; raises `ValueError` that names those there are."""

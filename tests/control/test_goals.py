@@ -90,6 +90,21 @@ def test_a_place_is_reached_at_its_time(seconds):
     np.testing.assert_allclose(facing, [1.0, 0.0], atol=1e-6)
 
 
+@pytest.mark.parametrize("coast", [0.1, 0.4])
+def test_a_place_is_approached_from_where_a_walker_comes_to(coast):
+    """As by one who stands there."""
+    velocity = np.array([0.9, -0.7])
+    place = goals.Place(
+        position=jnp.array([3.0, -4.0]),
+        facing=jnp.array([1.0, 0.0]),
+        seconds=jnp.float32(5.0),
+    )
+    now, then = walker((0.4, 1.0), velocity), walker((0.4, 1.0) + coast * velocity)
+    found, _ = goals.arrive(place, now, jnp.float32(0.0), coast=coast)
+    expected, _ = goals.arrive(place, then, jnp.float32(0.0))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
 def test_who_cannot_come_in_time_runs():
     place = goals.Place(
         position=jnp.array([0.0, 30.0]),

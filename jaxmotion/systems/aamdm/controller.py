@@ -53,6 +53,8 @@ SCALE = 3.0
 # How many steps at the chain's end are guided; ours. The paper guides all: what earlier
 # ones add is denoised away (experiments/results/findings.md), at a gradient each.
 GUIDED_STEPS = 1
+# `Character.coast`: told to slow down, it does so in the next frame.
+COAST = 0.05
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -487,4 +489,5 @@ def load_character(
         ),
         exports=exports,
         toe_height=model.toe_height,
+        coast=COAST,
     )
