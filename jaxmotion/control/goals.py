@@ -49,8 +49,9 @@ NEAREST, REACH = 0.25, 1.0
 # to a place, where he stands, meters. Times count to the last distance.
 SLOWEST, FASTEST, THERE, TIMELY = 0.6, 3.5, 0.05, 0.1
 # Radius of a walker, meters; collisions within so many seconds count; what a collision
-# in one second is worth in m/s.
-RADIUS, HORIZON, FEAR = 0.35, 3.0, 2.0
+# in one second is worth in m/s. Another velocity shows after so many seconds: with half
+# of them, walkers who cross in a crowd run into each other.
+RADIUS, HORIZON, FEAR, TURNING = 0.35, 3.0, 2.0, 0.5
 _ANGLES, _PARTS = 16, (0.35, 0.7, 1.0)
 
 
@@ -242,7 +243,7 @@ def avoid(
     )
 
     def penalty(i: Array, choices: Array) -> Array:
-        soon_at = walkers.position + LAG * walkers.velocity
+        soon_at = walkers.position + TURNING * walkers.velocity
         gap = soon_at[i][None] - soon_at  # from each other one
         # Each goes half of the way round: the other is taken to do the other half.
         both = walkers.velocity[i][None] + walkers.velocity
