@@ -79,8 +79,9 @@ class FootLock:
       end_speed: It ends above this speed,
       end_height: or above this height.
       clearance: Least height above `toe_height` of a toe that moves fast, meters.
-      clear_from: Speed above which it rises, meters per second,
-      clear_over: and the speed in which it does so but for 1/e.
+      clear_from: A toe that is slower may stay as low as it is, meters per second.
+      clear_over: Speed beyond that at which its least height is all but 1/e of the
+        clearance, meters per second.
       radius: Distance of the animated toe from the locked point that ends a lock,
         meters.
       crossing: Distance aside of the first toe from the second one, from hip to hip,

@@ -49,8 +49,8 @@ NEAREST, REACH = 0.25, 1.0
 # to a place, where he stands, meters. Times count to the last distance.
 SLOWEST, FASTEST, THERE, TIMELY = 0.6, 3.5, 0.05, 0.1
 # Radius of a walker, meters; collisions within so many seconds count; what a collision
-# in one second is worth in m/s. Another velocity shows after so many seconds: with half
-# of them, walkers who cross in a crowd run into each other.
+# in one second is worth in m/s. Another direction shows after so many seconds (of
+# `locomotion`): counting on half of them, walkers in a crowd run into each other.
 RADIUS, HORIZON, FEAR, TURNING = 0.35, 3.0, 2.0, 0.5
 _ANGLES, _PARTS = 16, (0.35, 0.7, 1.0)
 

@@ -39,7 +39,7 @@ ARRIVE, NEAR, FAR = 0.7, 0.2, 0.45
 HEADING_STEP, SPEED_STEP = math.radians(8.0), 0.15
 # Seconds of a path that who goes along it looks ahead.
 AHEAD = 0.35
-# Seconds after which what walkers are asked for shows.
+# Seconds after which what somebody is asked for shows: he decides for where he will be.
 LAG = 0.25
 # A stick that is pushed less far is in its middle.
 STICK = 0.12

@@ -62,6 +62,9 @@ from jaxmotion.typing import Key, Params
 
 # As near the ball's surface a joint may push the ball, meters: half a foot, and 2 cm.
 _TOUCH_MARGIN = 0.07
+# Of the limit on a wish, what may change until its second target: of people who
+# reverse, the change within half a second by that within 1.5 s.
+_SOON_PART = 0.43
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,10 +96,9 @@ class Control:
       answer: Half-life, seconds, of the spring by which the second target of a path,
         if the generator takes one, takes up the command.
       agile: A wish slows down and turns by a change of velocity of so much at most,
-        m/s, and `agile_gain` of the present speed more, .43 of it until the second
-        target. 0 for no limit (paper). With .8 and .8, three quarters of the takes'
-        dribbles that reverse ask for no more, and 96 in 100 that slow down.
-      agile_gain: Part of the present speed that the limit grows by.
+        m/s, and that part of the present speed more, .43 of it until the second
+        target. 0 for no limit (paper). With .8, three quarters of the takes' dribbles
+        that reverse ask for no more, and 96 in 100 that slow down.
     """
 
     apply: int = 15
@@ -113,7 +115,6 @@ class Control:
     turn: float = 0.0
     answer: float = 0.1
     agile: float = 0.0
-    agile_gain: float = 0.8
 
 
 # For models that ship: the walked path is the commanded one, which outweighs the last
@@ -231,7 +232,7 @@ def walkable(wish: Wish, *, soon: int, fps: float, control: Control) -> Wish:
     def within(velocity: Array, part: float = 1.0) -> Array:
         if control.agile == 0:
             return velocity
-        most = part * (control.agile + control.agile_gain * jnp.linalg.norm(moved))
+        most = part * (control.agile + control.agile * jnp.linalg.norm(moved))
         onward = ground.unit(moved + 0.25 * velocity)
         change = velocity - moved
         faster = jnp.maximum(jnp.sum(change * onward), 0.0) * onward
@@ -249,7 +250,7 @@ def walkable(wish: Wish, *, soon: int, fps: float, control: Control) -> Wish:
         here, moved, told, num_frames=soon, fps=fps, half_life=control.answer
     )
     velocity = path.position[-1] * (fps / soon)
-    return dataclasses.replace(wish, soon=within(velocity, 0.43))
+    return dataclasses.replace(wish, soon=within(velocity, _SOON_PART))
 
 
 def wanted_trajectory(
