@@ -75,11 +75,14 @@ def save(
 
 
 def latest_step(folder: str | Path) -> int | None:
-    """Newest whole step of a folder, or None."""
+    """Newest whole step of a folder, or None.
+
+    Only the folder is read: a process may ask while another one saves there, as an
+    orbax manager could not, since it waits for all processes where it is made.
+    """
     if not Path(folder).is_dir():
         return None
-    with _manager(Path(folder)) as manager:
-        return manager.latest_step()
+    return max(ocp.utils.checkpoint_steps(Path(folder).absolute()), default=None)
 
 
 def _newest(folder: Path, step: int | None) -> int:

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from orbax.checkpoint import multihost
 
 from jaxmotion.learning import checkpoint, training
 
@@ -278,6 +279,21 @@ def test_a_torn_step_does_not_count(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, found, state_of(1))
     checkpoint.save(folder, 2, state_of(2), {})
     assert checkpoint.latest_step(folder) == 2
+
+
+def test_the_newest_step_is_read_without_the_other_processes(tmp_path, monkeypatch):
+    """One process asks while another, already ahead, waits within its save."""
+    folder = tmp_path / "checkpoints"
+    checkpoint.save(folder, 1, state_of(1), {})
+    (folder / "2.orbax-checkpoint-tmp-17").mkdir()
+
+    def waits(*args, **kwargs):
+        raise AssertionError("waits for the other processes")
+
+    monkeypatch.setattr(checkpoint, "_manager", waits)
+    monkeypatch.setattr(multihost, "sync_global_processes", waits)
+    assert checkpoint.latest_step(folder) == 1
+    assert checkpoint.latest_step(folder / "2.orbax-checkpoint-tmp-17") is None
 
 
 def test_unwritable(tmp_path):
