@@ -92,6 +92,29 @@ def ball_accelerations(
     return jnp.pad(change, [(0, 0)] * (ball.ndim - 2) + [(1, 1), (0, 0)])
 
 
+@functools.partial(jax.jit, static_argnames=("num_frames",))
+def rolled(
+    ball: Float[Array, "frames 3"],
+    fps: Scalar,
+    *,
+    num_frames: int,
+    deceleration: Scalar,
+) -> Float[Array, "{num_frames} 3"]:
+    """Where a ball (meters) comes that nobody touches, in the frames after those given.
+
+    It goes on as it came between the last two, slows down evenly (m/s^2) to rest, and
+    stays at its height. `ValueError` for fewer than two frames.
+    """
+    came = ball_velocities(ball, fps)[-1, ::2]
+    # That was the speed half a frame ago.
+    speed = jnp.sqrt(jnp.sum(came**2) + _TINY) - 0.5 * deceleration / fps
+    times = jnp.arange(1, num_frames + 1, dtype=ball.dtype) / fps
+    times = jnp.clip(times, 0.0, jnp.maximum(speed, 0.0) / deceleration)
+    way = speed * times - 0.5 * deceleration * times**2
+    place = jnp.repeat(ball[-1:], num_frames, axis=0)
+    return place.at[:, ::2].add(way[:, None] * ground.unit(came)[None])
+
+
 def _check_frames(ball: Array, least: int) -> None:
     if ball.shape[-2] < least:
         raise ValueError(

@@ -1,9 +1,12 @@
 """experiments/goals.py: paths, places, and how far from them somebody is."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxmotion as jm
 from jaxmotion.control.frame import Frame
 
 
@@ -58,3 +61,19 @@ def test_who_comes_near_and_who_arrives_is_counted(load):
     assert row["gap"].value == pytest.approx(30.0, abs=0.01)
     assert row["touching"].value == pytest.approx(2 / 3)
     assert row["arrived"].value == pytest.approx(2 / 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fetches", [True, False])
+def test_shipped_players_fetch_their_ball(load, fetches):
+    """All of eight within six seconds, wherever it went; without the rule not all."""
+    model = jm.load("dribble")
+    if not fetches:
+        inner = model.method.method
+        control = dataclasses.replace(inner.control, fetch=0.0)
+        method = dataclasses.replace(inner, control=control)
+        locked = dataclasses.replace(model.method, method=method)
+        model = dataclasses.replace(model, method=locked)
+    found = load("goals").fetch_errors(model, 8, 0)
+    back = (found["fetch"] < 6.0) & (found["ball_end"] < 80.0)
+    assert back.all() == fetches, found

@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.data import rolling
 from jaxmotion.motion import ball
 
 REACH, FPS = 2.0, 30.0
@@ -211,3 +212,25 @@ def test_too_few_frames_are_refused():
         ball.ball_velocities(jnp.zeros((1, 3)), FPS)
     with pytest.raises(ValueError, match="2 frames of a ball, expected at least 3"):
         ball.ball_accelerations(jnp.zeros((5, 2, 3)), FPS)
+
+
+@pytest.mark.parametrize("velocity", [[0.0, 0.0], [3.0, -1.0], [-0.4, 0.2]])
+def test_a_ball_that_nobody_touches_rolls_to_rest(velocity):
+    """Beside float64 host code that makes the training data's balls."""
+    velocity, step = np.array(velocity), 1 / FPS
+    before = np.array([[0.3, 0.11, -1.0]])
+    place = before + [velocity[0] * step, 0.0, velocity[1] * step]
+    given = float32(np.concatenate([before, place]))
+    found = ball.rolled(given, FPS, num_frames=180, deceleration=0.8)
+    # What it had half a frame before the last one.
+    speed = max(np.hypot(*velocity) - 0.4 * step, 0.0)
+    rest = velocity / max(np.hypot(*velocity), 1e-9) * speed**2 / (2 * 0.8)
+    times = np.arange(1, 181)[None] * step
+    way = rolling.roll(rest[None], np.array([6.0]), 0.8, times)[0]
+    np.testing.assert_allclose(found[:, ::2], place[0, ::2] + way, atol=2e-4)
+    np.testing.assert_array_equal(found[:, 1], np.float32(0.11))
+
+
+def test_the_velocity_of_one_frame_is_unknown():
+    with pytest.raises(ValueError, match="1 frames of a ball, expected at least 2"):
+        ball.rolled(jnp.zeros((1, 3)), FPS, num_frames=3, deceleration=0.8)

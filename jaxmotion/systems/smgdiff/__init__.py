@@ -18,5 +18,6 @@ other weights (`--preset paper` is without; `planted` is for a second training),
 paper has 0.5, 2 m/s² and 10 cm (`Guidance()`). The shipped `dribble` draws its paths in
 four steps from noise as smooth as paths (`trajectory.Config(noise="bridge")`) and for a
 second target half a second ahead (`soon`); his wishes lead back to the commanded path,
-and ask for no turn that people do not make (`controller.OWN_STARTS`).
+and ask for no turn that people do not make (`controller.OWN_STARTS`). He runs after a
+ball that got more than a meter away, which rolls by itself meanwhile (`Control.fetch`).
 """

@@ -10,6 +10,7 @@ One tick (1/30 s) of one player:
    c. the motion model makes 45 frames of body, ball and contacts for that path, with
       contact guidance in some of its steps;
    d. an inertialized seam: body and ball start where they are displayed.
+   With `Control.fetch`, who has lost the ball runs to it first (ours).
 2. Display the next frame of the plan.
 
 The paper blends when the control changes; here at every plan, as CAMDM does, since a
@@ -36,6 +37,7 @@ from jaxmotion.control import inertia
 from jaxmotion.control.frame import Frame, as_displayed
 from jaxmotion.control.rollout import Controller, is_due
 from jaxmotion.control.steering import (
+    ARRIVE,
     Character,
     Tuning,
     calmest,
@@ -46,7 +48,7 @@ from jaxmotion.data.ball_clips import BallClips
 from jaxmotion.diffusion import chain
 from jaxmotion.diffusion.schedule import spread_steps
 from jaxmotion.motion import ground, trajectory
-from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.ball import Scene, rolled
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
@@ -62,6 +64,9 @@ from jaxmotion.typing import Key, Params
 
 # As near the ball's surface a joint may push the ball, meters: half a foot, and 2 cm.
 _TOUCH_MARGIN = 0.07
+# Who fetches a ball runs so fast, m/s, meets one that rolls after a second at most, and
+# has it again within this part of the distance at which he had lost it.
+_RUN, _FORESEEN, _AGAIN = 3.0, 1.0, 0.6
 # Of the limit on a wish, what may change until its second target: of people who
 # reverse, the change within half a second by that within 1.5 s.
 _SOON_PART = 0.43
@@ -115,12 +120,18 @@ class Control:
     turn: float = 0.0
     answer: float = 0.1
     agile: float = 0.0
+    fetch: float = 0.0
+    fetches_as: int = -1
+    deceleration: float = 0.8
 
 
 # For models that ship: the walked path is the commanded one, which outweighs the last
 # plan's sooner, and who stands faces as he is told. With exponents of 3, as CAMDM ships
 # with, he turns as fast but misses twice as many touches while he does.
 OWN_STARTS = Control(least=8, follow=1.0, turn=0.27, bias_position=1.5, agile=0.8)
+
+# The skill of who has no ball, by which whoever lost it fetches it.
+ALONE = "off_ball"
 
 # Seconds of a path that a player looks ahead: what he is told shows after .4 s. With .4
 # and .6 he is no nearer to it.
@@ -175,6 +186,55 @@ def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerStat
             label=jnp.full((), -1, jnp.int32),
         ),
     )
+
+
+def fetching(
+    state: PlayerState, command: trajectory.Command, *, control: Control
+) -> trajectory.Command:
+    """What he is told: the command, or to run to the ball that he has lost.
+
+    He aims at where it will roll, faces there, and slows down in front of it. Who is
+    told to stand, or to go without a ball, does so.
+    """
+    if control.fetch == 0:
+        return command
+    ball, fps = state.past.ball, state.past.motion.fps
+    here = state.past.motion.root_position[-1, ::2]
+    away = jnp.linalg.norm(ball[-1, ::2] - here)
+    alone = command.label == control.fetches_as
+    already = (state.command.label == control.fetches_as) & ~alone
+    lost = away > jnp.where(already, _AGAIN, 1.0) * control.fetch
+    lost &= ~alone & ~trajectory.is_still(command.velocity)
+
+    number = round(_FORESEEN * fps)
+    coming = rolled(ball, fps, num_frames=number, deceleration=control.deceleration)
+    speed = jnp.maximum(jnp.linalg.norm(command.velocity), _RUN)
+    frames = jnp.round(away / speed * fps).astype(jnp.int32)
+    gap = coming[jnp.clip(frames, 1, number) - 1, ::2] - here
+    speed = jnp.minimum(speed, away / ARRIVE)
+    heading = ground.unit(gap, command.facing)
+    fetch = trajectory.Command(
+        velocity=speed * heading,
+        facing=heading,
+        label=jnp.full_like(command.label, control.fetches_as),
+    )
+    return jax.tree.map(lambda a, b: jnp.where(lost, a, b), fetch, command)
+
+
+def kicked(
+    state: PlayerState, place: Float[Array, "2"], velocity: Float[Array, "2"]
+) -> PlayerState:
+    """The state after somebody else brought the ball to a place on the ground, (x, z).
+
+    Meters, m/s. The next tick makes a plan.
+    """
+    ball, fps = state.past.ball, state.past.motion.fps
+    ago = jnp.arange(ball.shape[0] - 1, -1, -1, dtype=ball.dtype)[:, None] / fps
+    past = dataclasses.replace(
+        state.past, ball=ball.at[:, ::2].set(place[None] - ago * velocity[None])
+    )
+    played = jnp.full_like(state.cursor, state.plan.ball.shape[0])
+    return dataclasses.replace(state, past=past, cursor=played)
 
 
 def plan_level(
@@ -353,6 +413,17 @@ def replan(
     chunk = smgdiff_scene.from_frame(scene, frame)
     if control.seam > 0:
         chunk = join(state.past, chunk, representation, control=control)
+    if control.fetch > 0:
+        away = state.past.ball[-1] - state.past.motion.root_position[-1]
+        lost = jnp.linalg.norm(away[::2]) > _AGAIN * control.fetch
+        lost &= command.label == control.fetches_as
+        rolls = rolled(
+            state.past.ball,
+            config.fps,
+            num_frames=config.future,
+            deceleration=control.deceleration,
+        )
+        chunk = dataclasses.replace(chunk, ball=jnp.where(lost, rolls, chunk.ball))
     cursor = jnp.zeros_like(state.cursor)
     return dataclasses.replace(state, plan=chunk, cursor=cursor, command=command)
 
@@ -438,26 +509,35 @@ def controller(
 
     Paths are `smgdiff_trajectory.sampler`'s, with its `Config.soon`, or `straight`,
     plans `smgdiff_guidance.sampler`'s. `ValueError` if `control.apply` is not in
-    1..`config.future`.
+    1..`config.future`, or nobody can fetch as `control.fetches_as`.
     """
     control = Control() if control is None else control
     if not 1 <= control.apply <= config.future:
         raise ValueError(f"apply is {control.apply}, expected 1..{config.future}")
+    if control.fetch > 0 and not 0 <= control.fetches_as < config.num_labels:
+        raise ValueError(
+            f"fetches_as is {control.fetches_as}, expected 0..{config.num_labels - 1}"
+        )
+    told = functools.partial(fetching, control=control)
     plan: Callable = lambda key, state, command: replan(  # noqa: E731
         generate,
         sample,
         key,
         state,
-        command,
+        told(state, command),
         representation=representation,
         config=config,
         control=control,
         soon=soon,
     )
     return Controller(
-        plan_level=functools.partial(plan_level, control=control),
+        plan_level=lambda state, command: plan_level(
+            state, told(state, command), control=control
+        ),
         plans=(plan,),
-        advance=functools.partial(advance, config=config, control=control),
+        advance=lambda state, command: advance(
+            state, told(state, command), config=config, control=control
+        ),
         shown=shown,
     )
 
@@ -616,12 +696,11 @@ def load_character(
     else:
         run, model, params = load_run(path)
         starts = functools.partial(start_states, run.train, model)
-    method = Method(
-        config=model.config,
-        paths=model.paths,
-        control=None if model.starts is None else OWN_STARTS,
-        step=step,
-    )
+    control = None if model.starts is None else OWN_STARTS
+    if control and ALONE in model.labels:
+        alone = model.labels.index(ALONE)
+        control = dataclasses.replace(control, fetch=1.0, fetches_as=alone)
+    method = Method(config=model.config, paths=model.paths, control=control, step=step)
     return Character(
         skeleton=model.representation.skeleton,
         labels=model.labels,

@@ -423,3 +423,97 @@ def test_paths_are_made_for_the_second_target(parts):
     wished = [path_and_wish(state, one, config, CONTROL, soon=n)[1] for n in (0, 5)]
     assert wished[0].soon is None
     assert wished[1].soon.shape == (2,)
+
+
+FETCHES = dataclasses.replace(CONTROL, fetch=1.0, fetches_as=1)
+
+
+def after_a_kick(config, place, velocity=(0.0, 0.0), *, label=0):
+    """A state whose plan was made for a label, and how far he is from `place`."""
+    state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
+    here = state.past.motion.root_position[-1, ::2]
+    state = smgdiff_controller.kicked(
+        state, here + jnp.asarray(place), jnp.asarray(velocity)
+    )
+    told = dataclasses.replace(state.command, label=jnp.int32(label))
+    return dataclasses.replace(state, command=told)
+
+
+@pytest.mark.parametrize(
+    "away, before, speed, label, expected",
+    [
+        (0.9, 0, 1.0, 0, False),
+        (1.1, 0, 1.0, 0, True),
+        (0.65, 1, 1.0, 0, True),
+        (0.55, 1, 1.0, 0, False),
+        (3.0, 0, 0.0, 0, False),
+        (3.0, 1, 1.0, 1, False),
+    ],
+    ids=["at hand", "lost", "not yet back", "back", "stands", "wants no ball"],
+)
+def test_who_has_lost_the_ball_runs_to_it(parts, away, before, speed, label, expected):
+    _, config, _ = parts
+    state = after_a_kick(config, [away, 0.0], label=before)
+    command = Command(
+        velocity=jnp.array([0.0, speed]),
+        facing=jnp.array([0.0, 1.0]),
+        label=jnp.int32(label),
+    )
+    found = smgdiff_controller.fetching(state, command, control=FETCHES)
+    if expected:
+        np.testing.assert_allclose(found.velocity, [min(3.0, away / 0.7), 0], atol=1e-5)
+        np.testing.assert_allclose(found.facing, [1.0, 0.0], atol=1e-5)
+        assert int(found.label) == 1
+    else:
+        for a, b in zip(*map(jax.tree.leaves, (found, command)), strict=True):
+            np.testing.assert_array_equal(a, b)
+    paper = smgdiff_controller.fetching(state, command, control=CONTROL)
+    assert paper is command
+
+
+def test_who_fetches_a_ball_aims_at_where_it_rolls(parts):
+    """It is 2 m ahead and rolls aside at 2 m/s; he would be there in 2/3 s."""
+    _, config, _ = parts
+    state = after_a_kick(config, [0.0, 2.0], [2.0, 0.0])
+    command = jax.tree.map(lambda x: x[0], commands(1))
+    found = smgdiff_controller.fetching(state, command, control=FETCHES)
+    now, seconds = 2.0 - 0.4 / 30, 2.0 / 3.0
+    aim = np.array([now * seconds - 0.4 * seconds**2, 2.0])
+    np.testing.assert_allclose(
+        found.velocity, 2.0 / 0.7 * aim / np.hypot(*aim), rtol=1e-3
+    )
+
+
+def test_a_lost_ball_rolls_and_is_not_planned(parts):
+    representation, config, _ = parts
+    generate, sample = parts_of(representation, config)
+    driver = smgdiff_controller.controller(
+        generate,
+        sample,
+        representation=representation,
+        config=config,
+        control=FETCHES,
+    )
+    state = after_a_kick(config, [0.0, 5.0], [1.5, 0.0])
+    place = np.asarray(state.past.ball[-1])
+    state = jax.tree.map(lambda x: x[None], state)
+    told = jax.tree.map(lambda x: x[None], commands(12))
+    run = jax.jit(lambda *given: rollout.rollout(driver, *given)[1])
+    frames = run(jax.random.key(0), state, told)
+    times = np.arange(1, 13) / 30
+    way = (1.5 - 0.4 / 30) * times - 0.4 * times**2
+    rolls = place + np.stack([way, 0 * times, 0 * times], 1)
+    # Plans of five frames join, as if they were one.
+    np.testing.assert_allclose(frames.extra["ball"][0], rolls, atol=1e-4)
+    assert frames.planned[0, 0]
+
+
+def test_nobody_fetches_as_a_skill_that_is_not_there(parts):
+    representation, config, _ = parts
+    with pytest.raises(ValueError, match=r"fetches_as is 2, expected 0\.\.1"):
+        smgdiff_controller.controller(
+            *parts_of(representation, config),
+            representation=representation,
+            config=config,
+            control=dataclasses.replace(FETCHES, fetches_as=2),
+        )
