@@ -43,5 +43,6 @@ Run-time:
   that use it say so, and give it to AAMDM's own rows alone.
 * guidance (eq. 13) acts in the chain's last step alone, which steers as well as all of
   them and costs less; published, and `guided_steps=None`: in all.
-* the path that is wished for begins no faster than told.
+* the path that is wished for begins no faster than told. Whoever stands is asked to go
+  .5 m/s faster than told until he moves, in the shipped model alone (`start`).
 """

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxmotion as jm
 from jaxmotion.control import rollout
 from jaxmotion.diffusion import chain
 from jaxmotion.motion import features
@@ -129,6 +130,29 @@ def test_a_later_point_is_nearer_to_the_command():
     assert np.all(np.diff(speed) > 0) and 0 < speed[0] and speed[-1] < 1
     yaw = np.arctan2(found[6::2], found[7::2])
     assert np.all(np.diff(yaw) > 0) and 0 < yaw[0] and yaw[-1] < 1
+
+
+@pytest.mark.parametrize(
+    "speed, more", [(0.0, 0.5), (0.25, 0.5), (0.375, 0.25), (0.5, 0.0), (1.0, 0.0)]
+)
+def test_who_stands_is_asked_to_go_faster(speed, more):
+    """Parts of the commanded speed: nothing more from a half of it on."""
+    ahead = person.directions(0.4)
+    state = character(1.2 * speed * ahead, 0.4)
+    found = aamdm_controller.wanted_path(
+        state, command(1.2 * ahead, 0.4), fps=FPS, half_life=0.27, start=0.5
+    )
+    expected = wanted_path(state, command((1.2 + more) * ahead, 0.4))
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+def test_who_is_to_stand_is_asked_for_nothing():
+    state = character([0.0, 0.0], 0.4)
+    told = command([0.0, 0.0], 0.4)
+    found = aamdm_controller.wanted_path(
+        state, told, fps=FPS, half_life=0.27, start=0.5
+    )
+    np.testing.assert_allclose(found[:6], 0.0, atol=1e-6)
 
 
 def test_who_is_too_fast_wants_no_more_than_told():
@@ -363,3 +387,14 @@ def test_the_step_of_the_chain_reaches_the_sampler(monkeypatch):
     method(({}, space())), other(({}, space()))
     assert seen == [chain.ancestral_step, chain.ddim_step]
     assert hash(method) != hash(other)
+
+
+@pytest.mark.slow
+def test_whoever_ships_starts_to_walk():
+    """Told to go at 0.8 m/s, all of 16 walk a meter in the third and fourth second."""
+    model = jm.load("locomotion_fast")
+    told = jm.commands("straight", model, 16, seconds=4.0, speed=0.8)
+    frames = jm.rollout(model, jax.random.key(0), model.start(16, seed=0), told)
+    place = np.asarray(frames.root_position)[..., ::2]
+    moved = np.linalg.norm(place[:, -1] - place[:, 119], axis=-1)
+    assert moved.min() > 1.0, moved
