@@ -46,8 +46,8 @@ from jaxmotion.typing import Key, Params
 # within so many meters of the last one.
 NEAREST, REACH = 0.25, 1.0
 # Nobody is asked to go slower or faster, m/s, but to stop; nor to be nearer than this
-# to a place, where he stands, meters. Times count to the last distance: characters come
-# within 10 cm of a place .15 s sooner than by the law.
+# to a place, where he stands, meters. Times count to the last distance: counted to .1,
+# `locomotion` and `dribble` are within 10 cm a quarter and a third of a second early.
 SLOWEST, FASTEST, THERE, TIMELY = 0.6, 3.5, 0.05, 0.125
 # Radius of a walker, meters; collisions within so many seconds count; what a collision
 # in one second is worth in m/s. Another direction shows after so many seconds (of

@@ -697,6 +697,7 @@ def load_character(
         run, model, params = load_run(path)
         starts = functools.partial(start_states, run.train, model)
     control = None if model.starts is None else OWN_STARTS
+    # Nobody who dribbles or sprints is more than .9 m from his ball.
     if control and ALONE in model.labels:
         alone = model.labels.index(ALONE)
         control = dataclasses.replace(control, fetch=1.0, fetches_as=alone)
