@@ -56,8 +56,9 @@ GUIDED_STEPS = 1
 # `Character.coast`; with .25 s, as others have, it stops 10 cm and more before a place.
 COAST = 0.05
 # What who stands is asked to go faster than told, m/s (`wanted_path`). Without it, told
-# to go at 0.8 m/s, he stands for two seconds, at 0.6 for up to eight.
-START = 0.5
+# to go at 0.8 m/s, he stands for two seconds, at 0.6 for up to eight. He stands whose
+# speed is a small part of the commanded one, or of this, m/s.
+START, _WALK = 0.5, 0.9
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -158,8 +159,9 @@ def wanted_path(
 
     They begin with the character's own velocity, but never faster than told: a wish
     that does would ask him who is too fast to go on so. Whoever has less than a quarter
-    of the speed that he was told is asked for `start` m/s more than that, and who has
-    half of it for no more (ours; 0 for never). The springs' half-life is in seconds.
+    of the speed that he was told (of 0.9 m/s, if that is more) is asked for `start` m/s
+    more than told, and who has half of it for no more (ours; 0 for never). The springs'
+    half-life is in seconds.
 
     Source: Holden et al. 2020, released code (controller), but for this.
     """
@@ -172,7 +174,7 @@ def wanted_path(
     velocity = state.velocity * jnp.minimum(1.0, told / own)
     asked = command.velocity
     if start > 0:
-        stands = jnp.clip(2.0 - 4.0 * own / told, 0.0, 1.0)
+        stands = jnp.clip(2.0 - 4.0 * own / jnp.maximum(told, _WALK), 0.0, 1.0)
         asked = asked + start * stands * ground.unit(asked, jnp.zeros(2))
     position, _, _ = spring.velocity_spring(
         over(state.bone.origin),

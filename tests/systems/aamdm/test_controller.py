@@ -132,17 +132,20 @@ def test_a_later_point_is_nearer_to_the_command():
     assert np.all(np.diff(yaw) > 0) and 0 < yaw[0] and yaw[-1] < 1
 
 
+@pytest.mark.parametrize("told, walk", [(1.2, 1.2), (0.4, 0.9)])
 @pytest.mark.parametrize(
-    "speed, more", [(0.0, 0.5), (0.25, 0.5), (0.375, 0.25), (0.5, 0.0), (1.0, 0.0)]
+    "part, more", [(0.0, 0.5), (0.25, 0.5), (0.375, 0.25), (0.5, 0.0), (1.0, 0.0)]
 )
-def test_who_stands_is_asked_to_go_faster(speed, more):
-    """Parts of the commanded speed: nothing more from a half of it on."""
+def test_who_stands_is_asked_to_go_faster(told, walk, part, more):
+    """Parts of the commanded speed, or of .9 m/s: nothing more from a half of it on."""
     ahead = person.directions(0.4)
-    state = character(1.2 * speed * ahead, 0.4)
+    state = character(part * walk * ahead, 0.4)
     found = aamdm_controller.wanted_path(
-        state, command(1.2 * ahead, 0.4), fps=FPS, half_life=0.27, start=0.5
+        state, command(told * ahead, 0.4), fps=FPS, half_life=0.27, start=0.5
     )
-    expected = wanted_path(state, command((1.2 + more) * ahead, 0.4))
+    # Both begin no faster than told.
+    begins = character(min(part * walk, told) * ahead, 0.4)
+    expected = wanted_path(begins, command((told + more) * ahead, 0.4))
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
