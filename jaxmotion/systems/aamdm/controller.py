@@ -37,7 +37,7 @@ from jaxmotion.control.steering import Character, Tuning, calmest
 from jaxmotion.diffusion import chain
 from jaxmotion.motion import features, ground, path_features, pose, spring
 from jaxmotion.motion.features import unpack
-from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory
+from jaxmotion.motion.trajectory import Command, PlanarFrame, Trajectory, is_still
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
 from jaxmotion.systems.aamdm import stored as aamdm_stored
@@ -174,7 +174,8 @@ def wanted_path(
     velocity = state.velocity * jnp.minimum(1.0, told / own)
     asked = command.velocity
     if start > 0:
-        stands = jnp.clip(2.0 - 4.0 * own / jnp.maximum(told, _WALK), 0.0, 1.0)
+        goes = ~is_still(command.velocity)
+        stands = goes * jnp.clip(2.0 - 4.0 * own / jnp.maximum(told, _WALK), 0.0, 1.0)
         asked = asked + start * stands * ground.unit(asked, jnp.zeros(2))
     position, _, _ = spring.velocity_spring(
         over(state.bone.origin),
