@@ -160,8 +160,8 @@ def wanted_path(
     They begin with the character's own velocity, but never faster than told: a wish
     that does would ask him who is too fast to go on so. Whoever has less than a quarter
     of the speed that he was told (of 0.9 m/s, if that is more) is asked for `start` m/s
-    more than told, and who has half of it for no more (ours; 0 for never). The springs'
-    half-life is in seconds.
+    more than told as he faces that way, and who has half of it for no more (ours; 0 for
+    never). The springs' half-life is in seconds.
 
     Source: Holden et al. 2020, released code (controller), but for this.
     """
@@ -174,9 +174,10 @@ def wanted_path(
     velocity = state.velocity * jnp.minimum(1.0, told / own)
     asked = command.velocity
     if start > 0:
-        goes = ~is_still(command.velocity)
-        stands = goes * jnp.clip(2.0 - 4.0 * own / jnp.maximum(told, _WALK), 0.0, 1.0)
-        asked = asked + start * stands * ground.unit(asked, jnp.zeros(2))
+        way = ground.unit(asked, jnp.zeros(2))
+        ahead = jnp.clip(way @ state.bone.facing, 0.0, 1.0) * ~is_still(asked)
+        stands = jnp.clip(2.0 - 4.0 * own / jnp.maximum(told, _WALK), 0.0, 1.0)
+        asked = asked + start * ahead * stands * way
     position, _, _ = spring.velocity_spring(
         over(state.bone.origin),
         over(velocity),

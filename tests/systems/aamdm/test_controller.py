@@ -149,6 +149,17 @@ def test_who_stands_is_asked_to_go_faster(told, walk, part, more):
     np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
+@pytest.mark.parametrize("angle, more", [(np.pi / 3, 0.25), (2.5, 0.0)])
+def test_who_has_yet_to_turn_is_asked_for_less(angle, more):
+    way = person.directions(0.4 + angle)
+    state = character([0.0, 0.0], 0.4)
+    found = aamdm_controller.wanted_path(
+        state, command(1.2 * way, 0.4), fps=FPS, half_life=0.27, start=0.5
+    )
+    expected = wanted_path(state, command((1.2 + more) * way, 0.4))
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
 @pytest.mark.parametrize("told", [0.0, 0.01])
 def test_who_is_to_stand_is_asked_for_nothing(told):
     state = character([0.0, 0.0], 0.4)
