@@ -175,7 +175,7 @@ def wanted_path(
     asked = command.velocity
     if start > 0:
         way = ground.unit(asked, jnp.zeros(2))
-        ahead = jnp.clip(way @ state.bone.facing, 0.0, 1.0) * ~is_still(asked)
+        ahead = jnp.clip(jnp.sum(way * state.bone.facing), 0.0, 1.0) * ~is_still(asked)
         stands = jnp.clip(2.0 - 4.0 * own / jnp.maximum(told, _WALK), 0.0, 1.0)
         asked = asked + start * ahead * stands * way
     position, _, _ = spring.velocity_spring(
