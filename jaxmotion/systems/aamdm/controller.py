@@ -56,8 +56,8 @@ GUIDED_STEPS = 1
 # `Character.coast`; with .25 s, as others have, it stops 10 cm and more before a place.
 COAST = 0.05
 # What who stands is asked to go faster than told, m/s (`wanted_path`). Without it, told
-# to go at 0.8 m/s, he stands for two seconds, at 0.6 for up to eight. He stands whose
-# speed is a small part of the commanded one, or of this, m/s.
+# to go at 0.8 m/s, two of 16 stand for two seconds. He stands whose speed is a small
+# part of the commanded one, or of this, m/s.
 START, _WALK = 0.5, 0.9
 
 
