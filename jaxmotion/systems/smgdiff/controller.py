@@ -104,6 +104,12 @@ class Control:
         m/s, and that part of the present speed more, .43 of it until the second
         target. 0 for no limit (paper). With .8, three quarters of the takes' dribbles
         that reverse ask for no more, and 96 in 100 that slow down.
+      fetch: Who is farther than this from the ball, meters, has lost it: told to go
+        anywhere with it, he runs to it first. 0 for never (paper).
+      fetches_as: Index of the skill, of who has no ball, by which he does.
+      deceleration: Of a ball that is lost, or as far from who goes without one, m/s^2;
+        it rolls to rest. Ours: that of the balls in the training data
+        (`jaxmotion.data.dribble`).
     """
 
     apply: int = 15
@@ -188,6 +194,12 @@ def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerStat
     )
 
 
+def _away(state: PlayerState) -> Float[Array, ""]:
+    """How far he is from the ball, on the ground."""
+    gap = state.past.ball[-1] - state.past.motion.root_position[-1]
+    return jnp.linalg.norm(gap[::2])
+
+
 def fetching(
     state: PlayerState, command: trajectory.Command, *, control: Control
 ) -> trajectory.Command:
@@ -200,7 +212,7 @@ def fetching(
         return command
     ball, fps = state.past.ball, state.past.motion.fps
     here = state.past.motion.root_position[-1, ::2]
-    away = jnp.linalg.norm(ball[-1, ::2] - here)
+    away = _away(state)
     alone = command.label == control.fetches_as
     already = (state.command.label == control.fetches_as) & ~alone
     lost = away > jnp.where(already, _AGAIN, 1.0) * control.fetch
@@ -414,8 +426,7 @@ def replan(
     if control.seam > 0:
         chunk = join(state.past, chunk, representation, control=control)
     if control.fetch > 0:
-        away = state.past.ball[-1] - state.past.motion.root_position[-1]
-        lost = jnp.linalg.norm(away[::2]) > _AGAIN * control.fetch
+        lost = _away(state) > _AGAIN * control.fetch
         lost &= command.label == control.fetches_as
         rolls = rolled(
             state.past.ball,

@@ -43,15 +43,17 @@ def parts():
         heads=2,
         hidden=32,
     )
-    generate, sample = parts_of(representation, config)
-    driver = smgdiff_controller.controller(
-        generate,
-        sample,
+    return representation, config, driver_of(representation, config, CONTROL)
+
+
+def driver_of(representation, config, control):
+    """A controller of random networks."""
+    return smgdiff_controller.controller(
+        *parts_of(representation, config),
         representation=representation,
         config=config,
-        control=CONTROL,
+        control=control,
     )
-    return representation, config, driver
 
 
 def parts_of(representation, config):
@@ -486,14 +488,7 @@ def test_who_fetches_a_ball_aims_at_where_it_rolls(parts):
 
 def test_a_lost_ball_rolls_and_is_not_planned(parts):
     representation, config, _ = parts
-    generate, sample = parts_of(representation, config)
-    driver = smgdiff_controller.controller(
-        generate,
-        sample,
-        representation=representation,
-        config=config,
-        control=FETCHES,
-    )
+    driver = driver_of(representation, config, FETCHES)
     state = after_a_kick(config, [0.0, 5.0], [1.5, 0.0])
     place = np.asarray(state.past.ball[-1])
     state = jax.tree.map(lambda x: x[None], state)
@@ -511,9 +506,4 @@ def test_a_lost_ball_rolls_and_is_not_planned(parts):
 def test_nobody_fetches_as_a_skill_that_is_not_there(parts):
     representation, config, _ = parts
     with pytest.raises(ValueError, match=r"fetches_as is 2, expected 0\.\.1"):
-        smgdiff_controller.controller(
-            *parts_of(representation, config),
-            representation=representation,
-            config=config,
-            control=dataclasses.replace(FETCHES, fetches_as=2),
-        )
+        driver_of(representation, config, dataclasses.replace(FETCHES, fetches_as=2))
