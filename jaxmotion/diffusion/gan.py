@@ -9,8 +9,13 @@ its latent from its key.
     L_D = E softplus(-D(x_{t-1}, x_t)) + E softplus(D(x'_{t-1}, x_t))
     L_G = E softplus(-D(x'_{t-1}, x_t))
 
+Relativistic players judge a pair of the data beside a generated one instead:
+
+    L_D = E softplus(D(x'_{t-1}, x_t) - D(x_{t-1}, x_t)),  L_G with the two exchanged
+
 Source: Xiao et al. 2022, "Tackling the Generative Learning Trilemma with Denoising
-Diffusion GANs"; Li et al. 2024 (AAMDM), eq. 10-12; Zhou et al. 2024 (EMDM), alg. 1.
+Diffusion GANs"; Li et al. 2024 (AAMDM), eq. 10-12; Zhou et al. 2024 (EMDM), alg. 1;
+Huang et al. 2024, "The GAN is dead; long live the GAN!", eq. 2 (relativistic).
 """
 
 from collections.abc import Callable
@@ -73,6 +78,18 @@ def generator_loss(fake_logits: Float[Array, "*batch"]) -> Float[Array, ""]:
     return jnp.mean(jax.nn.softplus(-fake_logits))
 
 
+@jax.jit
+def relativistic_loss(
+    won: Float[Array, "*batch"], lost: Float[Array, "*batch"]
+) -> Float[Array, ""]:
+    """Mean softplus(lost - won); ln 2 where the discriminator is undecided.
+
+    The discriminator's loss where real logits are to win over generated ones of the
+    same place, the generator's where they are to lose.
+    """
+    return jnp.mean(jax.nn.softplus(lost - won))
+
+
 def r1_penalty(
     discriminate: Callable[[Float[Array, "batch *shape"]], Float[Array, " batch"]],
     x: Float[Array, "batch *shape"],
@@ -80,7 +97,7 @@ def r1_penalty(
     """Squared gradient of the logits at real samples, averaged over the batch.
 
     The customary loss is gamma / 2 times it. `discriminate` maps samples to their
-    logits, each from its own sample only.
+    logits, each from its own sample only. At generated samples it is R2.
 
     Source: Mescheder et al. 2018, eq. 9.
     """

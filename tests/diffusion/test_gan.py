@@ -93,6 +93,19 @@ def test_losses_are_the_logarithms_of_probabilities():
     np.testing.assert_allclose(undecided, 2 * np.log(2), rtol=1e-6)
 
 
+def test_relativistic_loss_is_the_logarithm_of_a_win():
+    rng = np.random.default_rng(0)
+    won, lost = rng.normal(size=(2, 50)) * 3
+    expected = -np.log(1 / (1 + np.exp(lost - won))).mean()
+    as32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    found = gan.relativistic_loss(as32(won), as32(lost))
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    # What all logits share says nothing.
+    np.testing.assert_allclose(
+        gan.relativistic_loss(as32(won) + 5, as32(lost) + 5), found, rtol=1e-5
+    )
+
+
 def test_losses_are_finite_for_certain_discriminators():
     certain = jnp.array([-1e4, 1e4])
     assert np.isfinite(gan.discriminator_loss(certain, certain))

@@ -10,7 +10,11 @@ same t, noise and latent; there from two with fresh ones. The expectation of the
 gradient is the same, and a pass is saved. `Config.mask_frames` says how motions of
 different lengths are averaged.
 
-Source: Zhou et al. 2024 (EMDM), eq. 5-12; released code.
+Ours, off by default: relativistic losses with a penalty at generated pairs, too
+(`Config.discriminator_loss`), and a discriminator that judges noisy steps alone
+(`Config.discriminator_from`).
+
+Source: Zhou et al. 2024 (EMDM), eq. 5-12; released code; `diffusion.gan`.
 """
 
 import dataclasses
@@ -123,13 +127,13 @@ def _visible(x: Array, batch: Batch, config: Config) -> Array:
 
 
 def _generated(
-    params: Params, key: Key, batch: Batch, config: Config
+    params: Params, key: Key, batch: Batch, config: Config, *, least: int = 1
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Step, real x_{t-1}, x_t, predicted x_0, generated x_{t-1}."""
+    """Step from `least` on, real x_{t-1}, x_t, predicted x_0, generated x_{t-1}."""
     names = ("t", "pair", "keep", "latent", "dropout", "posterior")
     keys = dict(zip(names, jax.random.split(key, len(names)), strict=True))
     table, size = config.table(), batch.x_0.shape[0]
-    t = jax.random.randint(keys["t"], (size,), 1, config.num_steps + 1)
+    t = jax.random.randint(keys["t"], (size,), least, config.num_steps + 1)
     x_prev, x_t = gan.q_pair(table, keys["pair"], batch.x_0, t)
     keep = jax.random.bernoulli(keys["keep"], 1.0 - config.drop_condition, (size,))
     prediction = blocks.apply(
@@ -159,23 +163,31 @@ def discriminator_loss(
     penalized: Bool[Array, ""],
 ) -> tuple[Float[Array, ""], Info]:
     """The discriminator's loss: "adversarial", and "r1" in the updates that have it."""
-    t, x_prev, x_t, _, fake = _generated(generator, key, batch, config)
+    least = config.discriminator_from
+    t, x_prev, x_t, _, fake = _generated(generator, key, batch, config, least=least)
     net = emdm_model.discriminator(config)
     seen = emdm_model.discriminator_condition(batch.vector, config=config)
 
     def score(x: Array) -> Array:
         return blocks.apply(params, net, x, x_t, t, seen)
 
-    adversarial = gan.discriminator_loss(
-        score(x_prev), score(jax.lax.stop_gradient(fake))
-    )
-    r1 = jnp.zeros(())
+    fake = jax.lax.stop_gradient(fake)
+    if config.discriminator_loss == "relativistic":
+        adversarial = gan.relativistic_loss(score(x_prev), score(fake))
+        places = x_prev, fake
+    else:
+        adversarial = gan.discriminator_loss(score(x_prev), score(fake))
+        places = (x_prev,)
+    penalty = jnp.zeros(())
     if config.weight_r1:
-        r1 = jax.lax.cond(
-            penalized, lambda x: gan.r1_penalty(score, x), lambda x: r1, x_prev
+        penalty = jax.lax.cond(
+            penalized,
+            lambda places: sum(gan.r1_penalty(score, x) for x in places),
+            lambda places: penalty,
+            places,
         )
-    loss = adversarial + 0.5 * config.weight_r1 * r1
-    return loss, {"adversarial": adversarial, "r1": r1}
+    loss = adversarial + 0.5 * config.weight_r1 * penalty
+    return loss, {"adversarial": adversarial, "r1": penalty}
 
 
 def generator_loss(
@@ -191,15 +203,23 @@ def generator_loss(
 
     Geometry is None if the weights of positions, velocities and feet are 0.
     """
-    t, _, x_t, prediction, fake = _generated(params, key, batch, config)
+    t, x_prev, x_t, prediction, fake = _generated(params, key, batch, config)
     seen = emdm_model.discriminator_condition(batch.vector, config=config)
-    logits = blocks.apply(
-        discriminator, emdm_model.discriminator(config), fake, x_t, t, seen
-    )
+
+    def score(x: Array) -> Array:
+        net = emdm_model.discriminator(config)
+        return blocks.apply(discriminator, net, x, x_t, t, seen)
+
+    if config.discriminator_loss == "relativistic":
+        verdicts = jax.vmap(gan.relativistic_loss)(score(fake), score(x_prev))
+    else:
+        verdicts = jax.vmap(gan.generator_loss)(score(fake))
+    judged = t >= config.discriminator_from
+    verdict = jnp.sum(verdicts * judged) / jnp.maximum(jnp.sum(judged), 1)
     geometric, terms = geometric_loss(
         prediction, batch, t, config=config, geometry=geometry
     )
-    adversarial = config.weight_adversarial * gan.generator_loss(logits)
+    adversarial = config.weight_adversarial * verdict
     return adversarial + geometric, {"adversarial": adversarial, **terms}
 
 

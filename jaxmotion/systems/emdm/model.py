@@ -44,6 +44,8 @@ class Config:
       condition_size: Actions, or channels of a text vector; 0 for "none".
       schedule: "vp" (EMDM's), or MDM's "cosine".
       num_steps: T.
+      alpha_bar: Share of x_0's variance left at each step, falling (ours); empty for
+        the schedule's own.
       latent: Channels of z; 0 for a deterministic denoiser, that is a diffusion model.
       frames_per_token, token_margin, token_window, norm: Of the `SequenceGenerator`;
         the paper's by default.
@@ -53,6 +55,12 @@ class Config:
         motion of a batch counts the same, whatever its length.
       discriminator_width: Channels of the discriminator's first layers.
       discriminator_condition: Whether the discriminator sees the condition.
+      discriminator_network: "mlp", of whole motions (published), or "temporal", which
+        shares its weights over frames (ours).
+      discriminator_loss: "non_saturating" (published), or "relativistic" (ours), whose
+        gradient penalty is at generated pairs, too.
+      discriminator_from: Least step whose pairs it judges (ours; 1, all, as published):
+        below, where hardly anything is open, the errors alone count.
       drop_condition: Probability that the condition is dropped in training.
       weight_adversarial: Weight of the discriminator's verdict; 0 (ours): none is
         trained, to see what the geometric losses do alone.
@@ -82,6 +90,7 @@ class Config:
     condition_size: int = 12
     schedule: Literal["vp", "cosine"] = "vp"
     num_steps: int = 10
+    alpha_bar: tuple[float, ...] = ()
     latent: int = 64
     width: int = 1024
     depth: int = 12
@@ -95,6 +104,9 @@ class Config:
     mask_frames: bool = True
     discriminator_width: int = 1024
     discriminator_condition: bool = True
+    discriminator_network: Literal["mlp", "temporal"] = "mlp"
+    discriminator_loss: Literal["non_saturating", "relativistic"] = "non_saturating"
+    discriminator_from: int = 1
     drop_condition: float = 0.1
     weight_adversarial: float = 1.0
     weight_recon: float = 1.0
@@ -122,6 +134,22 @@ class Config:
                 f"frames is {self.frames}, expected a multiple of frames_per_token "
                 f"({self.frames_per_token})"
             )
+        if self.discriminator_network == "temporal" and self.frames < 8:
+            raise ValueError(
+                f"frames is {self.frames}, a temporal discriminator expects 8 or more"
+            )
+        if not self.discriminator_from <= self.num_steps:
+            raise ValueError(
+                f"discriminator_from is {self.discriminator_from}, expected at most "
+                f"num_steps ({self.num_steps})"
+            )
+        ends = (1.0, *self.alpha_bar, 0.0)
+        falls = all(a > b for a, b in zip(ends, ends[1:], strict=False))
+        if self.alpha_bar and (len(self.alpha_bar) != self.num_steps or not falls):
+            raise ValueError(
+                f"alpha_bar is {self.alpha_bar}, expected {self.num_steps} falling "
+                "numbers between 1 and 0"
+            )
 
     @property
     def adversarial(self) -> bool:
@@ -130,6 +158,9 @@ class Config:
 
     def table(self) -> Schedule:
         """The schedule."""
+        if self.alpha_bar:
+            left = jnp.asarray((1.0, *self.alpha_bar))
+            return schedule.schedule_from_betas(1.0 - left[1:] / left[:-1])
         make = {"vp": schedule.vp_schedule, "cosine": schedule.cosine_schedule}
         return make[self.schedule](self.num_steps)
 
@@ -190,11 +221,15 @@ def generator(config: Config) -> emdm_network.SequenceGenerator:
     return blocks.sized(emdm_network.SequenceGenerator, config)
 
 
-def discriminator(config: Config) -> emdm_network.SequenceDiscriminator:
+def discriminator(
+    config: Config,
+) -> emdm_network.SequenceDiscriminator | emdm_network.TemporalDiscriminator:
     """The discriminator's Flax module."""
-    return emdm_network.SequenceDiscriminator(
-        num_steps=config.num_steps, width=config.discriminator_width
-    )
+    make = {
+        "mlp": emdm_network.SequenceDiscriminator,
+        "temporal": emdm_network.TemporalDiscriminator,
+    }[config.discriminator_network]
+    return make(num_steps=config.num_steps, width=config.discriminator_width)
 
 
 def discriminator_condition(

@@ -22,6 +22,16 @@ from jaxmotion.typing import Key, Params
 SYSTEM = "emdm"
 _GEOMETRY = ("velocity", "position", "position_velocity", "acceleration", "foot")
 _FLAT = {f"weight_{name}": 0.0 for name in _GEOMETRY}
+# Few steps whose discriminator learns (ours).
+_FEW = dict(
+    discriminator_network="temporal",
+    discriminator_loss="relativistic",
+    discriminator_from=2,
+    weight_r1=500.0,
+    r1_every=4,
+    weigh_levels="posterior",
+    fade_geometry=True,
+)
 _DDPM = dict(latent=0, schedule="cosine", weight_recon=1.0)
 # Changes of the base configuration, by row.
 ROWS: dict[str, dict[str, Any]] = {
@@ -39,6 +49,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "recon_100": dict(weight_recon=100.0, **_FLAT),
     "recon_1000": dict(weight_recon=1000.0, **_FLAT),
     "no_condition": dict(discriminator_condition=False),
+    "few_3": dict(num_steps=3, alpha_bar=(0.9, 0.5, 4e-5), **_FEW),
     "no_r1": dict(weight_r1=0.0),
     "no_gan": dict(weight_adversarial=0.0),
     "no_gan_5": dict(weight_adversarial=0.0, num_steps=5),

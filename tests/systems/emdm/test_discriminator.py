@@ -19,12 +19,12 @@ def normal(*shape, seed=0):
     return jnp.asarray(values, jnp.float32)
 
 
-def pair(*batch, size=2):
+def pair(*batch, size=2, frames=5):
     """x_{t-1}, x_t, t and condition."""
     steps = np.random.default_rng(4).integers(1, 5, batch)
     return (
-        normal(*batch, 5, 3),
-        normal(*batch, 5, 3, seed=1),
+        normal(*batch, frames, 3),
+        normal(*batch, frames, 3, seed=1),
         jnp.asarray(steps, jnp.int32),
         normal(*batch, size, seed=2),
     )
@@ -129,3 +129,65 @@ def test_without_a_condition_its_vector_has_no_channels():
     params = make(NET, *arguments)
     assert params["layers_0"]["kernel"].shape == (2 * 15 + 16, 128)
     assert NET.apply({"params": params}, *arguments).shape == (3,)
+
+
+# --- the temporal one ---------------------------------------------------------------
+
+TEMPORAL = emdm_network.TemporalDiscriminator(num_steps=4, width=8, time_width=16)
+
+
+def leaky(x):
+    return np.where(x > 0, x, 0.2 * x)
+
+
+def dense(part, x):
+    return x @ np.float64(part["kernel"]) + np.float64(part.get("bias", 0))
+
+
+def convolved(part, x):
+    """Correlation over time with zeros beyond the ends, a channel at a time."""
+    kernel = np.float64(part["kernel"]).reshape(3, x.shape[1], -1)
+    out = np.zeros((len(x), kernel.shape[2])) + np.float64(part["bias"])
+    for i in range(x.shape[1]):
+        for j in range(kernel.shape[2]):
+            out[:, j] += np.correlate(np.pad(x[:, i], 1), kernel[:, i, j], "valid")
+    return out
+
+
+def temporal_oracle(params, x_prev, x_t, t, condition):
+    code = reference.time_code(t - 1, 16)
+    given = leaky(dense(params["given"], np.concatenate([code, condition])))
+    h = dense(params["embed"], np.concatenate([x_prev, x_t], axis=1))
+    for i in range(5):
+        part = params[f"blocks_{i}"]
+        inner = convolved(part["first"], leaky(h)) + dense(part["given"], given)
+        h = h + convolved(part["second"], leaky(inner))
+        if i in (1, 2, 3):
+            h = np.stack([h[k : k + 2].mean(axis=0) for k in range(0, len(h) - 1, 2)])
+    h = dense(params["hidden"], leaky(h).reshape(-1))
+    projected = dense(params["project"], condition) @ h / np.sqrt(8)
+    return dense(params["out"], leaky(h))[0] + projected
+
+
+@pytest.mark.parametrize("frames", [8, 13])
+def test_temporal_network_is_convolutions_of_three_frames(frames):
+    arguments = pair(3, frames=frames)
+    params = make(TEMPORAL, *arguments)
+    found = TEMPORAL.apply({"params": params}, *arguments)
+    x_prev, x_t, t, condition = (np.float64(x) for x in arguments)
+    expected = [
+        temporal_oracle(params, x_prev[i], x_t[i], int(t[i]), condition[i])
+        for i in range(3)
+    ]
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    assert np.ptp(found) > 1e-2
+
+
+def test_a_temporal_network_needs_no_condition_and_any_batch():
+    arguments = pair(2, 3, size=0, frames=8)
+    params = make(TEMPORAL, *arguments)
+    run = functools.partial(TEMPORAL.apply, {"params": params})
+    together = run(*arguments)
+    alone = jax.vmap(jax.vmap(run))(*arguments)
+    assert together.shape == (2, 3)
+    np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)

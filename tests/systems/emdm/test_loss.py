@@ -193,6 +193,51 @@ def test_a_penalty_is_half_its_weight_of_the_squared_gradient(watch, weight):
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
 
 
+def test_relativistic_losses_are_of_pairs_of_one_place(watch):
+    """Both players judge the same differences; the penalty is at both pairs."""
+    watch("generator", constant(0.2))
+    config = dataclasses.replace(CONFIG, discriminator_loss="relativistic")
+    seen = watch("discriminator", SUM)
+    key, data = jax.random.key, batch(6, 6)
+    loss, info = emdm_loss.discriminator_loss(
+        {}, {}, key(0), data, config=config, penalized=jnp.bool_(True)
+    )
+    real, fake = (np.float64(call[2]) for call in seen[:2])
+    expected = np.log1p(np.exp(fake - real)).mean()
+    assert np.ptp(real - fake) > 0.1
+    np.testing.assert_allclose(info["adversarial"], expected, rtol=1e-4)
+    np.testing.assert_allclose(info["r1"], 2 * 6 * 15, rtol=1e-5)
+    total = expected + config.weight_r1 / 2 * 2 * 6 * 15
+    np.testing.assert_allclose(loss, total, rtol=1e-5)
+    seen.clear()
+    _, info = emdm_loss.generator_loss(
+        {}, {}, key(0), data, config=config, geometry=None
+    )
+    fake, real = (np.float64(call[2]) for call in seen)
+    expected = np.log1p(np.exp(real - fake)).mean()
+    np.testing.assert_allclose(info["adversarial"], expected, rtol=1e-4)
+
+
+def test_a_discriminator_may_judge_noisy_steps_alone(watch):
+    """Below, it is shown nothing, and the generator has no verdict."""
+    watch("generator", constant(0.2))
+    data, key = batch(*[6] * 40), jax.random.key
+    config = dataclasses.replace(CONFIG, discriminator_from=3)
+    seen = watch("discriminator", SUM)
+    options = dict(config=config, penalized=jnp.bool_(False))
+    emdm_loss.discriminator_loss({}, {}, key(0), data, **options)
+    steps = np.asarray(seen[0][0][2])
+    assert set(steps) == {3, 4}
+    seen.clear()
+    _, info = emdm_loss.generator_loss(
+        {}, {}, key(0), data, config=config, geometry=None
+    )
+    steps, logits = np.asarray(seen[0][0][2]), np.float64(seen[0][2])
+    assert set(steps) == {1, 2, 3, 4}
+    expected = np.log1p(np.exp(-logits[steps >= 3])).mean()
+    np.testing.assert_allclose(info["adversarial"], expected, rtol=1e-4)
+
+
 def test_generator_loss_is_the_formula(watch):
     params, data = parameters(), batch(6, 6, 6)
     made, discriminated = watch("generator"), watch("discriminator")

@@ -113,6 +113,12 @@ def test_schedules_are_the_papers():
     np.testing.assert_allclose(found.beta[1:], diffusion.cosine_betas(20), rtol=1e-4)
 
 
+def test_a_schedule_may_be_told():
+    left = (0.9, 0.5, 0.2, 4e-5)
+    table = dataclasses.replace(CONFIG, alpha_bar=left).table()
+    np.testing.assert_allclose(table.alpha_bar, (1.0, *left), rtol=1e-3)
+
+
 def test_a_key_and_a_condition_give_one_motion():
     sample, condition = jitted(), one_condition()
     first = sample(jax.random.key(0), condition)
@@ -307,6 +313,11 @@ def test_conditions_that_do_not_fit_are_refused(width, lengths, message):
         (dict(condition_size=0), "condition_size is 0.*at least 1 for.*'action'"),
         (dict(condition="text", condition_size=0), "at least 1 for.*'text'"),
         (dict(frames_per_token=4), r"frames is 6.*multiple of.*\(4\)"),
+        (dict(discriminator_network="temporal"), "frames is 6.*expects 8 or more"),
+        (dict(discriminator_from=5), r"discriminator_from is 5.*num_steps \(4\)"),
+        (dict(alpha_bar=(0.9, 0.5, 0.1)), r"alpha_bar is .*expected 4 falling"),
+        (dict(alpha_bar=(0.9, 0.5, 0.5, 0.1)), "expected 4 falling"),
+        (dict(alpha_bar=(1.0, 0.5, 0.4, 0.1)), "expected 4 falling"),
     ],
 )
 def test_configurations_that_cannot_be_are_refused(changes, message):

@@ -128,6 +128,17 @@ def test_rows_are_changes_of_the_base():
         "no_r1": dict(weight_r1=0.0),
         "no_gan": dict(weight_adversarial=0.0),
         "no_condition": dict(discriminator_condition=False),
+        "few_3": dict(
+            num_steps=3,
+            alpha_bar=(0.9, 0.5, 4e-5),
+            discriminator_network="temporal",
+            discriminator_loss="relativistic",
+            discriminator_from=2,
+            weight_r1=500.0,
+            r1_every=4,
+            weigh_levels="posterior",
+            fade_geometry=True,
+        ),
     }
     for steps in (1, 2, 3, 5):
         alone = dict(weight_adversarial=0.0, num_steps=steps)
