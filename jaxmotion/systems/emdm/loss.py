@@ -211,11 +211,15 @@ def generator_loss(
         return blocks.apply(discriminator, net, x, x_t, t, seen)
 
     if config.discriminator_loss == "relativistic":
-        verdicts = jax.vmap(gan.relativistic_loss)(score(fake), score(x_prev))
+        judge, logits = gan.relativistic_loss, (score(fake), score(x_prev))
     else:
-        verdicts = jax.vmap(gan.generator_loss)(score(fake))
-    judged = t >= config.discriminator_from
-    verdict = jnp.sum(verdicts * judged) / jnp.maximum(jnp.sum(judged), 1)
+        judge, logits = gan.generator_loss, (score(fake),)
+    if config.discriminator_from == 1:
+        verdict = judge(*logits)
+    else:
+        judged = t >= config.discriminator_from
+        verdicts = jnp.where(judged, jax.vmap(judge)(*logits), 0.0)
+        verdict = jnp.sum(verdicts) / jnp.maximum(jnp.sum(judged), 1)
     geometric, terms = geometric_loss(
         prediction, batch, t, config=config, geometry=geometry
     )

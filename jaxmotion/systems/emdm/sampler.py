@@ -118,6 +118,7 @@ def load(path: Path, *, row: str = "emdm") -> tuple[Model, Params]:
 _FREE = (
     "num_steps",
     "schedule",
+    "alpha_bar",
     "dropout",
     "drop_condition",
     "geometry",

@@ -26,7 +26,7 @@ pytestmark = [
 
 CONFIG = emdm_model.Config(
     features=3,
-    frames=4,
+    frames=8,
     condition_size=2,
     num_steps=3,
     latent=2,
@@ -50,7 +50,7 @@ BUDGET = runs.Budget(
     chunk=1,
     save_every=2,
 )
-DATA = jnp.asarray(np.random.default_rng(0).normal(size=(20, 4, 3)), jnp.float32)
+DATA = jnp.asarray(np.random.default_rng(0).normal(size=(20, 8, 3)), jnp.float32)
 
 
 def batch(key, data, size):
@@ -59,7 +59,7 @@ def batch(key, data, size):
     return emdm_loss.Batch(
         x_0=data[chosen],
         vector=jax.nn.one_hot(chosen // 10, 2),
-        mask=jnp.ones((size, 4), bool),
+        mask=jnp.ones((size, 8), bool),
     )
 
 
@@ -170,7 +170,7 @@ def test_unknown_rows_are_named_with_the_known_ones(tmp_path):
 def trained(tmp_path_factory):
     """A run folder with a row of each kind."""
     folder = tmp_path_factory.mktemp("run")
-    for row in ("emdm", "no_gan", "ddpm_1000"):
+    for row in ("emdm", "few_3", "no_gan", "ddpm_1000"):
         fit(folder, row)
     return folder
 
@@ -185,16 +185,16 @@ def same(a, b):
     return all(np.array_equal(x, y) for x, y in pairs)
 
 
-@pytest.mark.parametrize("row", ["emdm", "no_gan", "ddpm_1000"])
+@pytest.mark.parametrize("row", ["emdm", "few_3", "no_gan", "ddpm_1000"])
 def test_a_row_leaves_checkpoints_and_losses(trained, row):
     folder = trained / row
     assert checkpoint.latest_step(folder / "checkpoints") == 4
     rows = losses(folder)
     assert [r["step"] for r in rows] == [1, 2, 3, 4]
     terms = {"recon", "position", "velocity", "foot"}
-    prefix = "generator/" if row == "emdm" else ""
+    prefix = "generator/" if row in ("emdm", "few_3") else ""
     assert {f"{prefix}{term}" for term in terms} <= set(rows[0])
-    assert ("discriminator/r1" in rows[0]) == (row == "emdm")
+    assert ("discriminator/r1" in rows[0]) == bool(prefix)
     config = dataclasses.asdict(emdm_training.row_config(CONFIG, row))
     runs.check_model(run_of(trained), row, config)
 
@@ -378,7 +378,7 @@ def test_a_motion_does_not_depend_on_how_many_are_made(many, scale, chunk, numbe
     sample, conditions, run = many
     scale = None if scale is None else jnp.float32(scale)
     whole = run(jax.random.key(0), conditions, scale)
-    assert whole.shape == (8, 4, 3)
+    assert whole.shape == (8, 8, 3)
     assert all(np.abs(whole[0] - whole[i]).max() > 1e-3 for i in range(1, 8))
     part = jax.tree.map(lambda x: x[:number], conditions)
     found = emdm_training.sample_many(sample, chunk=chunk)(
