@@ -162,7 +162,10 @@ def discriminator_loss(
     config: Config,
     penalized: Bool[Array, ""],
 ) -> tuple[Float[Array, ""], Info]:
-    """The discriminator's loss: "adversarial", and "r1" in the updates that have it."""
+    """The discriminator's loss: "adversarial", and "r1" in the updates that have it.
+
+    "r1" is the sum of both penalties where the loss is relativistic.
+    """
     least = config.discriminator_from
     t, x_prev, x_t, _, fake = _generated(generator, key, batch, config, least=least)
     net = emdm_model.discriminator(config)
