@@ -128,18 +128,21 @@ def test_rows_are_changes_of_the_base():
         "no_r1": dict(weight_r1=0.0),
         "no_gan": dict(weight_adversarial=0.0),
         "no_condition": dict(discriminator_condition=False),
-        "few_3": dict(
-            num_steps=3,
-            alpha_bar=(0.9, 0.5, 4e-5),
-            discriminator_network="temporal",
-            discriminator_loss="relativistic",
-            discriminator_from=2,
-            weight_r1=500.0,
-            r1_every=4,
-            weigh_levels="posterior",
-            fade_geometry=True,
-        ),
     }
+    learns = dict(
+        discriminator_network="temporal",
+        discriminator_loss="relativistic",
+        discriminator_from=2,
+        weight_r1=500.0,
+        r1_every=4,
+        weigh_levels="posterior",
+        fade_geometry=True,
+    )
+    left = {2: (0.7,), 3: (0.9, 0.5), 5: (0.95, 0.8, 0.6, 0.3)}
+    for steps, shares in left.items():
+        changes = dict(num_steps=steps, alpha_bar=(*shares, 4e-5))
+        expected[f"few_{steps}"] = changes | learns
+    expected["few_1"] = learns | dict(num_steps=1, discriminator_from=1)
     for steps in (1, 2, 3, 5):
         alone = dict(weight_adversarial=0.0, num_steps=steps)
         expected[f"no_gan_{steps}"] = alone
