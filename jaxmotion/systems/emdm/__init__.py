@@ -22,10 +22,10 @@ players). Ours, on in `experiments/emdm.py` because trainings here take minutes:
 * `weigh_levels="posterior"` and `fade_geometry` are options: errors count less at noisy
   steps; published: alike at all. So are errors of joints' displacements and their
   differences (`weight_position_velocity`, `weight_acceleration`); published: none.
-* rows "few_1", "few_2", "few_3" and "few_5": so many steps, all but the first through
-  little noise, and a discriminator that shares its weights over time and judges all but
-  the last (of one, that one), by relativistic losses with penalties at both pairs;
-  published: ten steps of one schedule, an MLP that judges all.
+* rows "few_1", "few_2", "few_3", "few_5" and "few_10": so many steps, all but the first
+  through less noise, and a discriminator that shares its weights over time and judges
+  all but the last (of one, that one), by relativistic losses with penalties at both
+  pairs; published: ten steps of one schedule, an MLP that judges all.
 * one forward pass for both losses of the generator: the same expected gradient, a pass
   less; published: two passes.
 * `norm="pre"` and no dropout: learn faster; published: post-norm, 0.1.

@@ -53,6 +53,11 @@ ROWS: dict[str, dict[str, Any]] = {
     "few_2": dict(num_steps=2, alpha_bar=(0.7, 4e-5), **_FEW),
     "few_3": dict(num_steps=3, alpha_bar=(0.9, 0.5, 4e-5), **_FEW),
     "few_5": dict(num_steps=5, alpha_bar=(0.95, 0.8, 0.6, 0.3, 4e-5), **_FEW),
+    "few_10": dict(
+        num_steps=10,
+        alpha_bar=(0.99, 0.95, 0.89, 0.81, 0.71, 0.59, 0.45, 0.31, 0.16, 4e-5),
+        **_FEW,
+    ),
     "no_r1": dict(weight_r1=0.0),
     "no_gan": dict(weight_adversarial=0.0),
     "no_gan_5": dict(weight_adversarial=0.0, num_steps=5),

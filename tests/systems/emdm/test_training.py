@@ -139,6 +139,7 @@ def test_rows_are_changes_of_the_base():
         fade_geometry=True,
     )
     left = {2: (0.7,), 3: (0.9, 0.5), 5: (0.95, 0.8, 0.6, 0.3)}
+    left[10] = (0.99, 0.95, 0.89, 0.81, 0.71, 0.59, 0.45, 0.31, 0.16)
     for steps, shares in left.items():
         changes = dict(num_steps=steps, alpha_bar=(*shares, 4e-5))
         expected[f"few_{steps}"] = changes | learns
