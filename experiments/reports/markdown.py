@@ -98,11 +98,19 @@ def difference(claim: Claim, pair: tuple[str, str], values: np.ndarray) -> str:
 
 
 def left_open(claim: Claim, decision: verdicts.Decision) -> str:
-    """How far apart rows may be that all trainings there are to be left open; or ""."""
+    """How far apart rows may be that all trainings there are to be left open; or "".
+
+    Their mean difference is told in deviations of a training, too.
+    """
     if decision.trainings < verdicts.MAX_TRAININGS:
         return ""
-    every = decision.differences
-    return "; ".join(difference(claim, pair, every[pair]) for pair in decision.open)
+    texts = []
+    for pair in decision.open:
+        values = decision.differences[pair]
+        size = abs(values.mean()) / values.std(ddof=1) if values.std() else 0.0
+        text = difference(claim, pair, values)
+        texts.append(f"{text}, {number(size)} deviations of one")
+    return "; ".join(texts)
 
 
 def table_lines(header: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
@@ -240,11 +248,19 @@ def section(
 
 
 def counts(decided: Decided) -> dict[str, str]:
-    """Number of claims of each verdict, in words, such as "3 reproduced"."""
-    return {
+    """Number of claims of each verdict, in words, such as "3 reproduced".
+
+    Those that the last training left open are counted again, in brackets.
+    """
+    found = {
         name: f"{sum(x.verdict == name for _, _, x in decided)} {name}"
         for name in verdicts.Verdict.__args__
     }
+    last = verdicts.MAX_TRAININGS
+    ended = sum(x.verdict == "not decided" and x.trainings >= last for *_, x in decided)
+    if ended:
+        found["not decided"] += f" ({ended} of them after {last} trainings)"
+    return found
 
 
 def summary(decided: Decided) -> list[str]:

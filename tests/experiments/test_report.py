@@ -310,8 +310,13 @@ def test_what_twelve_trainings_leave_open_has_its_interval(load, over):
         text = markdown.left_open(claim, made)
         assert text.startswith(expected) and bool(text) == bool(expected)
     mean, low, high = sequential.interval(wiggle)
-    numbers = map(markdown.number, (mean, low, high))
-    assert text == "B less A: {} [{}, {}] of 12 trainings".format(*numbers)
+    size = abs(scipy.stats.ttest_1samp(wiggle, 0.0).statistic) / np.sqrt(12)
+    numbers = map(markdown.number, (mean, low, high, size))
+    words = "B less A: {} [{}, {}] of 12 trainings, {} deviations of one"
+    assert text == words.format(*numbers)
+    decided = [(None, claim, made)] * 2
+    words = "2 not decided (2 of them after 12 trainings)"
+    assert markdown.counts(decided)["not decided"] == words
 
 
 def test_likeness_needs_both_sides(over):
