@@ -43,6 +43,7 @@ class Config:
       name: What it is stored as, system/table; of a further training, with _seed1 and
         so on at its end.
       title: What the stored table answers; "" for that of the file it replaces.
+      add: Add the rows of `keep` to those that are stored under that name.
       write_docs: Instead of a report: write the pages' tables, plots and figures.
     """
 
@@ -53,6 +54,7 @@ class Config:
     keep: Path | None = None
     name: str = ""
     title: str = ""
+    add: bool = False
     write_docs: bool = False
 
 
@@ -130,7 +132,9 @@ def report(args: Config) -> None:
 def keep_and_write(args: Config) -> None:
     """Stores a result, writes the pages, or both; says what was written."""
     if args.keep is not None:
-        made = stored.keep(stored.FOLDER, args.keep, args.name, args.title)
+        made = stored.keep(
+            stored.FOLDER, args.keep, args.name, args.title, add=args.add
+        )
         print(f"wrote {made}")
     if args.write_docs:
         for path in pages.write():
@@ -140,6 +144,8 @@ def keep_and_write(args: Config) -> None:
 def main() -> None:
     """Parses the command line and does what it says."""
     args = cli.check(tyro.cli(Config, description=__doc__))
+    if args.add and args.keep is None:
+        raise ValueError("add: expected --keep, whose rows should be added")
     if args.keep is not None or args.write_docs:
         keep_and_write(args)
     else:

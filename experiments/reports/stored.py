@@ -261,7 +261,44 @@ def is_measured(path: Path) -> bool:
     return path.is_file() and "measured" in json.loads(path.read_text())
 
 
-def keep(folder: Path, path: Path, name: str, title: str = "") -> Path:
+def _joined(place: Path, before: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """A stored table with the rows of another evaluation of the same kind.
+
+    Raises:
+      ValueError: names in what they differ, or the row that both have otherwise.
+    """
+    if "measured" not in before:
+        raise ValueError(f"{place}: is no measured table, to which rows can be added")
+    for field in ("seeds", "data", "evaluator", "arguments"):
+        was, given = before.get(field), new.get(field)
+        if field == "arguments":
+            was, given = ({**(x or {}), "rows": None} for x in (was, given))
+        if was != given:
+            raise ValueError(
+                f"{place}: field {field!r} is {was!r:.200}, but {given!r:.200} in what "
+                "should be added"
+            )
+    rows = new["rows"]
+    for row in before["rows"].keys() & rows.keys():
+        if before["rows"][row] != rows[row]:
+            raise ValueError(f"{place}: has another row {row!r}")
+    added = [row for row in rows if row not in before["rows"]]
+    if not added:
+        raise ValueError(f"{place}: has all rows, expected one to add")
+    command = (
+        f"{before['measured']['command']}; at {new['measured']['git_commit'][:8]} "
+        f"{', '.join(added)}: {new['measured']['command']}"
+    )
+    whole = {**before, "measured": {**before["measured"], "command": command}}
+    for field in ("rows", "columns", "training", "minutes"):
+        whole[field] = {**new.get(field, {}), **before.get(field, {})}
+    whole["rows"] = before["rows"] | {row: rows[row] for row in added}
+    return whole
+
+
+def keep(
+    folder: Path, path: Path, name: str, title: str = "", *, add: bool = False
+) -> Path:
     """Trims an evaluation's file and stores it.
 
     Args:
@@ -270,6 +307,8 @@ def keep(folder: Path, path: Path, name: str, title: str = "") -> Path:
       name: "system/table", or "system/table_seed1" for a further training.
       title: What it answers; "" for that of the file it replaces, or of the first
         training.
+      add: Add its rows to those that are stored, instead of replacing them; both
+        evaluations must be of the same seeds, data, evaluator and arguments.
 
     Returns:
       The file that was written.
@@ -299,6 +338,8 @@ def keep(folder: Path, path: Path, name: str, title: str = "") -> Path:
     whole["columns"] = {id: said.get(id, x) for id, x in whole["columns"].items()}
     if "names" in whole:
         whole["names"] = {k: v for k, v in whole["names"].items() if k in found.rows}
+    if add:
+        whole = _joined(place, before if place.exists() else {}, whole)
     files.write_text(place, to_text(whole))
     _read_one(place)
     return place

@@ -180,6 +180,44 @@ def test_what_is_kept_of_an_evaluation(stored, tmp_path):
     assert again["columns"]["foot_slide"]["title"] == "slide of feet"
 
 
+def test_rows_are_added_to_those_of_the_same_kind(stored, tmp_path):
+    """Trained apart, evaluated alike: one table; anything else is named."""
+    real = {"real": {"fid": 1.0}}
+    about = dict(seeds={"training": [3]}, arguments={"rows": ["a"], "samples": 9})
+    source = tmp_path / "metrics.json"
+
+    def made(rows, **changes):
+        metrics(source, rows, **about | changes)
+        path = stored.keep(tmp_path, source, "emdm/it", "A title", add=True)
+        return json.loads(path.read_text())
+
+    with pytest.raises(ValueError, match="is no measured table"):
+        made(real)
+    metrics(source, real | {"a": {"fid": 2.0}}, minutes={"a": 4.0}, **about)
+    stored.keep(tmp_path, source, "emdm/it", "A title")
+    other = dict(minutes={"b": 5.0}, git_commit="0123456789", command="c.py")
+    whole = made(
+        real | {"b": {"fid": 3.0, "jerk": 9.0}},
+        **other,
+        arguments={"rows": ["b"], "samples": 9},
+    )
+    values = {row: cells["fid"]["value"] for row, cells in whole["rows"].items()}
+    assert values == {"real": 1.0, "a": 2.0, "b": 3.0}
+    assert whole["minutes"] == {"a": 4.0, "b": 5.0} and "jerk" in whole["columns"]
+    command = "python a.py --run runs/a; at 01234567 b: c.py"
+    assert whole["measured"] == {"command": command, "git_commit": "abc"}
+    kept = (tmp_path / "emdm/it.json").read_text()
+    for rows, changes, message in (
+        ({"c": {"fid": 3.0}}, {"seeds": {"training": [4]}}, "field 'seeds' is"),
+        ({"c": {"fid": 3.0}}, {"arguments": {"samples": 8}}, "field 'arguments'"),
+        ({"real": {"fid": 1.5}, "c": {"fid": 3.0}}, {}, "has another row 'real'"),
+        (real, {}, "has all rows"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            made(rows, **changes)
+    assert (tmp_path / "emdm/it.json").read_text() == kept
+
+
 def test_what_is_kept_of_a_benchmark(stored, tmp_path):
     made = dict(command="python b.py", git_commit="abc", cpu="a processor")
     names = {"emdm batch=1 p50": 2.0, "emdm batch=1 frames": 9.0}
