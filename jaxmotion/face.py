@@ -61,8 +61,8 @@ def load(
         are cleaned with foresight (`control.foot_lock.clean_motion`).
       **options: For the system's `load_character` or `load_sampler`: `step` makes
         another step of the chain, such as `diffusion.chain.ddim_step`; CAMDM has
-        `control` and `steps` (those of the schedule to visit) as well, EMDM `scale`
-        and `row`.
+        `control` and `steps` (those of the schedule to visit) as well, AAMDM `held`
+        (the frame before instead of drafts: two calls), EMDM `scale` and `row`.
 
     Returns:
       A `control.steering.Character` for `rollout`, whose `start` makes states; of EMDM,

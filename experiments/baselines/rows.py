@@ -2,6 +2,8 @@
 
 aamdm               2 polishes after 3 drafts, in the embedded space
 polish1_draft3 ...  other numbers of steps (its table 2); polish5_draft0 has no GAN
+polish2_held3 ...   polishes of a chain of five in which the frame before stands for the
+                    three drafts (`aamdm.model.sampler`)
 full_pose           2 and 3 without the embedding
 frame               2 and 3 as published: networks predict the frame instead of its
                     change, on windows of ten, without errors of poses, toes, or noise
@@ -43,7 +45,7 @@ MORE = (
     *("frame", *(f"{name}_frame" for name in TABLE_2), "full_pose_frame"),
     *("amdm5_embedded", "amdm200_embedded"),
 )
-_CHAIN = re.compile(r"polish(\d+)_draft(\d+)(_frame)?$")
+_CHAIN = re.compile(r"polish(\d+)_(draft|held)(\d+)(_frame)?$")
 _AMDM = ("amdm5", "amdm200", "amdm5_embedded", "amdm200_embedded")
 _BASELINES = dict.fromkeys(_AMDM, amdm) | {"lmm": lmm, "mvae": mvae}
 # Frames of the windows that each baseline is trained on, and which is the first given.
@@ -99,14 +101,20 @@ def check(names: tuple[str, ...]) -> None:
         if name not in _BASELINES and not is_chain(name):
             raise ValueError(
                 f"unknown row {name!r}: there are {', '.join((*ALL, *MORE))}, "
-                "polish<n>_draft<m> and polish<n>_draft<m>_frame"
+                "polish<n>_draft<m>, polish<n>_held<m>, and both with _frame"
             )
 
 
 def _steps(name: str) -> tuple[int, int]:
     """Polishes and drafts of a chain."""
     found = _CHAIN.match(name)
-    return (int(found[1]), int(found[2])) if found else (2, 3)
+    return (int(found[1]), int(found[3])) if found else (2, 3)
+
+
+def _held(name: str) -> bool:
+    """Whether the frame before stands for drafts."""
+    found = _CHAIN.match(name)
+    return bool(found) and found[2] == "held"
 
 
 def _predict(name: str) -> Literal["frame", "change"]:
@@ -206,7 +214,7 @@ def train_row(
     config, where = _config(name, space, sizes), space_of(name)
     if config.polishes:
         aamdm_training.train_polisher(run, where, space, config, polisher)
-    if config.drafts:
+    if config.drafts and not _held(name):
         aamdm_training.train_generator(run, where, space, config, generator)
 
 
@@ -248,6 +256,7 @@ def load_row(
             drafts=drafts,
             polishes=polishes,
             predict=_predict(name),
+            held=_held(name),
         )
         memory = None
         if half_life:

@@ -41,6 +41,8 @@ Run-time:
   bounded=False)`: not.
 * noise of the posteriors may be remembered (`noise_half_life`; 0 as published). Tables
   that use it say so, and give it to AAMDM's own rows alone.
+* `held=True` is an option: the previous frame, noised to the step where polishing
+  begins, stands for the drafts, so that a frame takes two calls; published: drafts.
 * guidance (eq. 13) acts in the chain's last step alone, which steers as well as all of
   them and costs less; published, and `guided_steps=None`: in all.
 * the path that is wished for begins no faster than told. Whoever stands is asked to go

@@ -349,13 +349,18 @@ class Method:
     memory: Memory | None = None
     step: chain.StepFactory = chain.ancestral_step
     start: float = 0.0
+    held: bool = False
 
     def __call__(self, params: tuple[Params, Space]) -> Controller:
         """The controller."""
         networks, space = params
         change = aamdm_training.scale_of_changes(space, self.config)
         sample = aamdm_model.sampler(
-            networks, config=self.config, change=change, step=self.step
+            networks,
+            config=self.config,
+            change=change,
+            step=self.step,
+            held=self.held,
         )
         return controller(
             guided(
@@ -462,14 +467,15 @@ def load_character(
     *,
     step: chain.StepFactory = chain.ancestral_step,
     noise_half_life: float | None = None,
+    held: bool = False,
 ) -> Character:
     """The character of a run folder or an exported file.
 
     It starts in the model's own frames where it has some, else in held-out poses.
     Commands have no labels. Noise of the posteriors is forgotten in `noise_half_life`
     seconds; 0 draws it anew in every frame (paper), None is what the model was exported
-    with, 0 for a run folder. `CheckpointError` if a stage was not trained, or the file
-    is damaged, `ValueError` for another system.
+    with, 0 for a run folder. `held` is as in `model.sampler`. `CheckpointError` if a
+    stage was not trained, or the file is damaged, `ValueError` for another system.
     """
     if path.is_file():
         model, networks = aamdm_stored.load(path)
@@ -485,7 +491,7 @@ def load_character(
     memory = None
     if half_life:
         memory = Memory(num_steps=model.config.num_steps, half_life=half_life)
-    num_joints = model.skeleton.num_joints
+    num_joints, steps = model.skeleton.num_joints, model.config.num_steps
     method = Method(
         config=model.config,
         num_joints=num_joints,
@@ -493,6 +499,7 @@ def load_character(
         memory=memory,
         step=step,
         start=0.0 if model.starts is None else START,
+        held=held,
     )
     return Character(
         skeleton=model.skeleton,
@@ -502,9 +509,11 @@ def load_character(
         params=(networks, space),
         method=method,
         tuning=Tuning(
-            method=lambda num_steps, scale: dataclasses.replace(method, scale=scale),
-            num_steps=(model.config.num_steps,),
-            own_steps=model.config.num_steps,
+            method=lambda num_steps, scale: dataclasses.replace(
+                method, scale=scale, held=num_steps < steps
+            ),
+            num_steps=tuple(sorted({model.config.polishes or steps, steps})),
+            own_steps=model.config.polishes if held else steps,
             scale=float(method.scale),
             scales=(0.0, 4 * float(method.scale)),
             patience=0,

@@ -224,12 +224,15 @@ def sampler(
     config: Config,
     change: Float[Array, " features"] | None = None,
     step: chain.StepFactory = chain.ancestral_step,
+    held: bool = False,
 ) -> Sample:
     """The sampler of the next frame.
 
     Of the parameters the discriminator's are not used, and those of a network that
     takes no steps may be missing; `change` is as in `to_frame`. A step that looks back
-    forgets where the polisher takes over.
+    forgets where the polisher takes over. Where the previous frame is `held` it stands
+    for the draft of the next one, and the generator takes no steps (ours); it is a
+    `ValueError` where nobody polishes.
 
     `sample(key, previous, *, objective=None, scale=0.0, guided_steps=None, noise=None)
     -> next`: with an objective of the predicted frame so many steps at the chain's end
@@ -238,7 +241,10 @@ def sampler(
     """
     check_change(config, change)
     table, net = config.table(), network(config)
-    number = {"generator": config.drafts, "polisher": config.polishes}
+    if held and not config.polishes:
+        raise ValueError("held: a chain of drafts alone, expected polishes")
+    drafts = 0 if held else config.drafts
+    number = {"generator": drafts, "polisher": config.polishes}
     # Here, so that a rollout does it once.
     weights = {
         name: net.layout(params[name], config.features)
@@ -277,7 +283,9 @@ def sampler(
 
         key_start, key_chain = jax.random.split(key)
         x = jax.random.normal(key_start, previous.shape, previous.dtype)
-        if config.drafts:
+        if held:
+            x = tables.q_sample(table, previous, jnp.array(config.polishes), x)
+        if drafts:
             drafter = _denoiser(
                 weights["generator"], previous, config, change, config.latent
             )

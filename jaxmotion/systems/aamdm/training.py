@@ -421,8 +421,11 @@ def load_networks(
     drafts: int,
     polishes: int,
     predict: Literal["frame", "change"] = "change",
+    held: bool = False,
 ) -> tuple[Params, aamdm_model.Config]:
     """Parameters of a trained chain's stages that take steps, and their configuration.
+
+    The generator takes none where the previous frame is `held` in place of drafts.
 
     `CheckpointError` if a stage is missing or of another kind, `ValueError` if it was
     trained for another space.
@@ -454,14 +457,19 @@ def load_networks(
             lambda network=network: init()[network],
             adversarial=network == "generator",
         )
-        for network, steps in (("generator", drafts), ("polisher", polishes))
+        for network, steps in (
+            ("generator", 0 if held else drafts),
+            ("polisher", polishes),
+        )
         if steps
     }
     return params, config
 
 
-def load_chain(run: Run, name: SpaceName, space: Space, **chain: Any) -> Sample:
+def load_chain(
+    run: Run, name: SpaceName, space: Space, *, held: bool = False, **chain: Any
+) -> Sample:
     """The sampler of a trained chain, named as `load_networks` takes it."""
-    params, config = load_networks(run, name, space, **chain)
+    params, config = load_networks(run, name, space, held=held, **chain)
     change = scale_of_changes(space, config)
-    return aamdm_model.sampler(params, config=config, change=change)
+    return aamdm_model.sampler(params, config=config, change=change, held=held)

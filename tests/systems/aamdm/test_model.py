@@ -51,6 +51,32 @@ def test_drafts_come_before_polishes(drafts, polishes):
     np.testing.assert_allclose(found, x, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("predict", ["frame", "change"])
+def test_a_held_frame_stands_for_the_drafts(predict):
+    """The frame before, noised to the step where polishing begins; no generator."""
+    config = dataclasses.replace(CONFIG, predict=predict)
+    change = CHANGE if predict == "change" else None
+    polisher = parameters()["polisher"]
+    sample = aamdm_model.sampler(
+        {"polisher": polisher}, config=config, change=change, held=True
+    )
+    key, previous = jax.random.key(1), normal(3)
+    found = jax.jit(sample)(key, previous)
+
+    key_start, key_chain = jax.random.split(jax.random.clone(key))
+    kept = config.table().alpha_bar[2]
+    noise = jax.random.normal(key_start, (3,))
+    x = jnp.sqrt(kept) * previous + jnp.sqrt(1 - kept) * noise
+    denoise = aamdm_model.polish(polisher, previous, config=config, change=change)
+    for t in (2, 1):
+        step = chain.ancestral_step(config.table(), denoise)
+        x = step(jax.random.fold_in(key_chain, t), x, jnp.array(t))
+    np.testing.assert_allclose(found, x, rtol=1e-5, atol=1e-6)
+    drafts = dataclasses.replace(config, drafts=5, polishes=0)
+    with pytest.raises(ValueError, match="held: a chain of drafts alone"):
+        aamdm_model.sampler({}, config=drafts, change=change, held=True)
+
+
 @pytest.mark.slow
 def test_characters_batch_by_vmap_and_compile_once():
     step = aamdm_model.sampler(parameters(), config=CONFIG)
