@@ -49,6 +49,7 @@ class Config:
       toe_height: Height at which the skeleton's toes rest, for the lock, meters; None
         for that of the model, or of the shipped ones.
       visit: Steps of the schedule that a plan visits (CAMDM); none: the model's own.
+      held: The frame before stands for drafts (AAMDM).
       chunk: Characters to run at a time, at most.
       seed: Seeds poses and noise.
     """
@@ -71,6 +72,7 @@ class Config:
     foot_lock: bool = True
     toe_height: cli.Optional[float] = None
     visit: tuple[int, ...] = ()
+    held: bool = False
     chunk: int = 4
     seed: int = 0
 
@@ -100,6 +102,7 @@ def main() -> None:
     args = cli.check(tyro.cli(Config, description=__doc__))
     loop.check_writable(args.out)
     options = {"steps": args.visit} if args.visit else {}
+    options |= {"held": True} if args.held else {}
     model = jm.load(args.model, foot_lock=False, **options)
     model = steering.steered(model, what=args.model)
     train, held_out = load_clips(args, model)

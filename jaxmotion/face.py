@@ -18,6 +18,7 @@ What is slow to import (Flax, Orbax, matplotlib) is imported by those who need i
 
 import dataclasses
 import html as escaping
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -71,8 +72,8 @@ def load(
 
     Raises:
       OSError: if a file cannot be read.
-      ValueError: if there is no such model, it is of no system that is known, or its
-        skeleton has no legs whose feet could be locked.
+      ValueError: if there is no such model, it is of no system that is known or of one
+        without such an option, or its skeleton has no legs whose feet could be locked.
     """
     path = Path(source)
     is_shipped = not path.exists()
@@ -92,13 +93,18 @@ def load(
     wanted = is_shipped if foot_lock is None else foot_lock
     lock = wanted if isinstance(wanted, FootLock) else None
     if found.steerable:
-        model = found.room("controller").load_character(path, **options)
-        if wanted is not False:
-            model = lock_feet(model, lock)
+        make = found.room("controller").load_character
     else:
-        model = found.room("sampler").load_sampler(path, **options)
-        if wanted is not False:
-            model = clean_sampler(model, lock)
+        make = found.room("sampler").load_sampler
+    if unknown := options.keys() - (known := inspect.signature(make).parameters):
+        raise ValueError(
+            f"{source}: no option {', '.join(sorted(unknown))}; a model of "
+            f"{found.name} takes {', '.join(list(known)[1:])}"
+        )
+    model = make(path, **options)
+    if wanted is not False:
+        lock_or_clean = lock_feet if found.steerable else clean_sampler
+        model = lock_or_clean(model, lock)
     if is_shipped:
         model = dataclasses.replace(model, license=files.SHIPPED_LICENSE)
     return model

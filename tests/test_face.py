@@ -234,6 +234,12 @@ def test_a_steered_model_is_not_sampled(model):
         jm.sample(model, jax.random.key(0))
 
 
+def test_an_option_of_another_system_is_named():
+    message = "no option held, scal; a model of camdm takes control, step, steps"
+    with pytest.raises(ValueError, match="locomotion: " + message):
+        jm.load("locomotion", held=True, scal=2.0)
+
+
 def test_a_system_that_nobody_knows_is_named(tmp_path):
     (tmp_path / "config.json").write_text('{"system": "mdm"}')
     with pytest.raises(ValueError, match="'mdm', expected one of camdm, aamdm"):

@@ -78,6 +78,16 @@ def test_characters_start_in_its_frames(model, file):
     )
 
 
+def test_it_may_do_without_drafts(file):
+    """In as many steps as are polished; the live page offers both."""
+    for held, own in ((False, 5), (True, 2)):
+        character = aamdm_controller.load_character(file, held=held)
+        tuning = character.tuning
+        assert (tuning.num_steps, tuning.own_steps) == ((2, 5), own)
+        assert tuning.method(own, tuning.scale) == character.method
+        assert character.method.held == held
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
