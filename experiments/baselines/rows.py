@@ -45,7 +45,7 @@ MORE = (
     *("frame", *(f"{name}_frame" for name in TABLE_2), "full_pose_frame"),
     *("amdm5_embedded", "amdm200_embedded"),
 )
-_CHAIN = re.compile(r"polish(\d+)_(draft|held)(\d+)(_frame)?$")
+_CHAIN = re.compile(r"polish(?!0_held)(\d+)_(draft|held)(\d+)(_frame)?$")
 _AMDM = ("amdm5", "amdm200", "amdm5_embedded", "amdm200_embedded")
 _BASELINES = dict.fromkeys(_AMDM, amdm) | {"lmm": lmm, "mvae": mvae}
 # Frames of the windows that each baseline is trained on, and which is the first given.

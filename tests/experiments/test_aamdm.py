@@ -185,6 +185,7 @@ def test_a_rollout_is_written_as_bvh_gif_and_page(
 
 BAD = [
     ("train --data {data} --out {out} --rows amdm6", "unknown row 'amdm6'.*lmm"),
+    ("train --data {data} --out {out} --rows polish0_held3", "'polish0_held3': there"),
     ("train --data {data} --out {out} --rows", "--rows is empty, expected names"),
     (
         "train --data {gone} --out {out} {settings}",
