@@ -45,6 +45,7 @@ MORE = (
     *("frame", *(f"{name}_frame" for name in TABLE_2), "full_pose_frame"),
     *("amdm5_embedded", "amdm200_embedded"),
 )
+# A frame that is held and not polished would stay as it is for ever.
 _CHAIN = re.compile(r"polish(?!0_held)(\d+)_(draft|held)(\d+)(_frame)?$")
 _AMDM = ("amdm5", "amdm200", "amdm5_embedded", "amdm200_embedded")
 _BASELINES = dict.fromkeys(_AMDM, amdm) | {"lmm": lmm, "mvae": mvae}
