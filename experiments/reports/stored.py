@@ -4,8 +4,9 @@ A file is what an evaluation left behind (metrics.json, or a sweep's table.json)
 to what tables and verdicts need. Beside its rows it declares its columns and says where
 its numbers come from: `measured` (command, commit, date, hardware, versions) or, for
 numbers whose file was not kept, `transcribed` (from which text). Files of further
-trainings have the seed at the end of their name: x.json, x_seed1.json, ...; where one's
-clips were rounded to be carried to another machine, `rounded` says how.
+trainings have the seed at the end of their name: x.json, x_seed1.json, ... Where the
+last digits of one's clips differ, since they were rounded, or prepared on another
+machine, `rounded` says why: checksums of its clips are then not compared.
 """
 
 import dataclasses

@@ -180,6 +180,19 @@ def test_whatever_is_trained_first_has_a_title(load):
             assert one.title or place.is_file(), one.name
 
 
+def test_stored_trainings_go_together(load):
+    module = load("train_queue")
+    several = 0
+    for source in (x for y in module.sources_of(module.Config()).values() for x in y):
+        place = module.stored.FOLDER / f"{source.name}.json"
+        again = sorted(place.parent.glob(f"{place.stem}_seed*.json"))
+        if place.is_file() and again:
+            found = module.results.read_trainings([place, *again])
+            assert None not in found.trainings and len(found.seeds) == 1
+            several += 1
+    assert several > 9
+
+
 def test_a_job_has_the_commands_of_its_run_with_its_seed(load, tmp_path):
     module = load("train_queue")
     args = module.Config(runs=tmp_path, only=("smgdiff",))
