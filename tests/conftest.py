@@ -9,6 +9,7 @@ import gc
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -18,6 +19,7 @@ os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 import jax  # noqa: E402
 import jaxlib  # noqa: E402
 import pytest  # noqa: E402
+from jax._src.interpreters import mlir  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
@@ -31,7 +33,7 @@ DRAWS = ("control", "diffusion", "evaluators", "learning", "networks", "systems"
 # the other's last module.
 FIRST = ("systems", "contracts", "learning", "test_face.py", "evaluators")
 # Compiled programs of so many modules are kept: they take memory, and time to forget.
-MODULES_REMEMBERED = 5
+MODULES_REMEMBERED = 20
 # Programs that compile faster than this, seconds, are not stored: it takes as long.
 LEAST_STORED = 0.05
 # Objects made before garbage is looked for: traces make many, and hardly any cycles.
@@ -101,6 +103,25 @@ def _known(flags, cache):
         if cache:
             cache.set(entry, known)
     return known
+
+
+def _share_contexts():
+    """Lowers all programs of a thread in one MLIR context.
+
+    JAX makes one for each, and keeps it as long as the program: a fifth of the suite's
+    time, and most of its memory. It has no public setting for that.
+    """
+    of_thread, make = threading.local(), mlir.make_ir_context
+
+    def shared():
+        if not hasattr(of_thread, "context"):
+            of_thread.context = make()
+        return of_thread.context
+
+    mlir.make_ir_context = shared
+
+
+_share_contexts()
 
 
 @pytest.fixture(scope="session")
