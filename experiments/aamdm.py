@@ -50,8 +50,8 @@ class Train:
       full_pose_steps: Updates of the diffusion model of the full-pose row, which cost
         more: in about the same time.
       batch: Windows per update.
-      width: Channels of the networks of AAMDM and AMDM (Learned Motion Matching has
-        512, Motion VAE 256, as published).
+      width: Channels of the networks of AAMDM and AMDM (of AMDM a power of two no less
+        than a frame's; Learned Motion Matching has 512, Motion VAE 256, as published).
       window: Frames that AAMDM's polishers predict in a row in training (paper: 10).
       polisher_batch: Windows per update of these.
       weight_pose: Weight of the errors of the poses that these frames mean (paper: 0).

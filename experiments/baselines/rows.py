@@ -58,7 +58,7 @@ class Sizes:
     """Sizes of the rows' networks; ours.
 
     Attributes:
-      width: Channels of the networks of AAMDM and AMDM.
+      width: Channels of the networks of AAMDM, and of AMDM but where frames have more.
       schedule: Schedule of AAMDM's chains.
       window: Frames that AAMDM's polishers predict in a row in training.
       weight_pose: Weight of the poses' errors in their loss.
@@ -150,7 +150,11 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
     if name == "mvae":
         # With the published weight 1 the latent dies: of 350 channels most are smooth.
         return mvae.Config(**common | {"width": 256}, weight_kl=0.01)
-    return amdm.Config(**common, num_steps=int(name.split("_")[0].removeprefix("amdm")))
+    # Noise that is to be told passes through the hidden layers: narrower than a frame,
+    # they lose some of it, and what is left of it in each frame shakes.
+    width = max(sizes.width, 2 ** (space.num_features - 1).bit_length())
+    steps = int(name.split("_")[0].removeprefix("amdm"))
+    return amdm.Config(**common | {"width": width}, num_steps=steps)
 
 
 def _stage(name: str) -> str:

@@ -6,6 +6,7 @@ import re
 import runpy
 import shutil
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -252,3 +253,15 @@ def test_what_is_wrong_is_said_in_one_line(
 @pytest.mark.slow
 def test_a_run_is_steered_by_the_face(trained):
     check_face_steers(trained)
+
+
+@pytest.mark.parametrize(
+    ("row", "features", "width"),
+    [("amdm5", 350, 512), ("amdm200", 512, 512), ("amdm5_embedded", 64, 256)],
+)
+def test_amdm_is_no_narrower_than_a_frame(load, row, features, width):
+    """It tells the noise of all channels, which a narrower layer does not pass on."""
+    rows = load("baselines.rows")
+    space = types.SimpleNamespace(num_features=features)
+    assert rows._config(row, space, rows.Sizes()).width == width
+    assert rows._config("aamdm", space, rows.Sizes()).width == 256
