@@ -66,7 +66,7 @@ class Sizes:
       gan_window: Frames of the windows of AAMDM's GANs.
       levels: Steps that each of AAMDM's networks learns.
       previous_noise: Noise on given previous frames in training, for all rows but those
-        as published alike.
+        as published and AMDM alike.
     """
 
     width: int = 256
@@ -177,6 +177,8 @@ def train_baseline(
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     loss = _baseline_loss(name, frames, space, config)
     length, given = _WINDOWS[name]
+    # AMDM, which is trained on its own predictions, falls apart with it.
+    largest = 0.0 if name in _AMDM else sizes.previous_noise
     windows, arrays = aamdm_training.frame_windows(
         frames, run.train, length, batch=budget.batch, balance=run.balance
     )
@@ -185,7 +187,7 @@ def train_baseline(
         key_windows, key_noise = jax.random.split(key)
         found = windows(key_windows, arrays)
         noise = aamdm_loss.random_noise(
-            key_noise, found[:, given].shape, largest=sizes.previous_noise
+            key_noise, found[:, given].shape, largest=largest
         )
         return found.at[:, given].add(noise)
 
@@ -198,7 +200,7 @@ def train_baseline(
         arrays,
         budget=budget,
         model=dataclasses.asdict(config),
-        settings={"previous_noise": sizes.previous_noise},
+        settings={"previous_noise": largest},
     )
 
 
