@@ -60,7 +60,7 @@ class Train:
       gan_window: Frames of the windows of the GANs (paper: 10).
       levels: Steps that each network learns: all, or its own.
       previous_noise: Largest deviation of the noise on given previous frames in
-        training, in deviations of the data.
+        training, in deviations of the data; rows as published and AMDM have none.
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with these settings where a stage began with others.
     """
