@@ -108,8 +108,8 @@ def _known(flags, cache):
 def _share_contexts():
     """Lowers all programs of a thread in one MLIR context.
 
-    JAX makes one for each, and keeps it as long as the program: a fifth of the suite's
-    time, and most of its memory. It has no public setting for that.
+    JAX makes one for each, and keeps it as long as the program: a fifth of the time of
+    small programs, and most of their memory. It has no public setting for that.
     """
     make = getattr(mlir, "make_ir_context", None)
     if make is None:  # another version of JAX: slower, and no less true

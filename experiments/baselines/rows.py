@@ -177,7 +177,7 @@ def train_baseline(
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     loss = _baseline_loss(name, frames, space, config)
     length, given = _WINDOWS[name]
-    # AMDM, which is trained on its own predictions, falls apart with it.
+    # AMDM's authors have none; with it joints jerk twice as much.
     largest = 0.0 if name in _AMDM else sizes.previous_noise
     windows, arrays = aamdm_training.frame_windows(
         frames, run.train, length, batch=budget.batch, balance=run.balance

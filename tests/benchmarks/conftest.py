@@ -21,8 +21,8 @@ def load():
 @pytest.fixture(autouse=True)
 def _drawn_networks(monkeypatch):
     """Parameters are drawn by NumPy: those of full sizes take seconds to compile."""
-    for system in registry.SYSTEMS:
-        model = importlib.import_module(f"jaxmotion.systems.{system}.model")
+    for system in registry.SYSTEMS.values():
+        model = system.room("model")
         monkeypatch.setattr(
             model,
             "init",

@@ -184,10 +184,9 @@ def test_stored_trainings_go_together(load):
     module = load("train_queue")
     several = 0
     for source in (x for y in module.sources_of(module.Config()).values() for x in y):
-        place = module.stored.FOLDER / f"{source.name}.json"
-        again = sorted(place.parent.glob(f"{place.stem}_seed*.json"))
-        if place.is_file() and again:
-            found = module.results.read_trainings([place, *again])
+        paths = module.stored.paths_of(module.stored.FOLDER, source.name)
+        if len(paths) > 1:
+            found = module.results.read_trainings(paths)
             assert None not in found.trainings and len(found.seeds) == 1
             several += 1
     assert several > 9
