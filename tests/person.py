@@ -1,22 +1,18 @@
 """A person of six joints with chest, hips and toes, and motions of it in NumPy."""
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.data.clips import Clips, clips_from_motions
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.motion.trajectory import PlanarFrame, Trajectory
+from tests.tiny import float32
 
 NAMES = ("Hips", "LeftUpLeg", "LeftToe", "RightUpLeg", "RightToe", "Spine2")
 PARENTS = (-1, 0, 1, 0, 3, 0)
 FEET = (2, 4)
 OFFSETS = np.array([[0, 0, 0], [0.1, -0.05, 0], [0, -0.8, 0.15]])
 OFFSETS = np.concatenate([OFFSETS, [[-0.1, -0.05, 0], [0, -0.8, 0.15], [0, 0.4, 0.02]]])
-
-
-def float32(array):
-    return jnp.asarray(array, jnp.float32)
 
 
 def skeleton(names=NAMES, feet=FEET) -> Skeleton:

@@ -159,19 +159,25 @@ def test_shipped_models_say_what_they_are(name):
     assert model.source in repr(model) and len(repr(model)) < 400
 
 
-def test_goals_are_told_in_a_line(monkeypatch):
-    """One path for all, which start at its first point; a path each elsewhere."""
+def walked(number, **told):
+    """Walkers that are told a goal."""
     model = jm.load("walker")
+    return jm.rollout(model, jax.random.key(0), model.start(number), **told)
+
+
+@pytest.mark.slow
+def test_who_is_told_one_path_starts_at_its_first_point():
     path = jm.path([(1, 2), (1, 5), (3, 5)], speed=(1.2, 1.2, 0.8))
-    roll = lambda number, **more: jm.rollout(  # noqa: E731
-        model, jax.random.key(0), model.start(number), **more
-    )
-    frames = roll(2, goal=path, seconds=0.2)
+    frames = walked(2, goal=path, seconds=0.2)
     assert frames.root_position.shape[:2] == (2, 6)
     np.testing.assert_allclose(frames.root_position[:, 0, ::2], [(1, 2)] * 2, atol=0.1)
+
+
+def test_goals_are_told_in_a_line(monkeypatch):
+    """A place each, from a place each; and what is not told follows from the goal."""
     place = jm.place([(2, 3), (0, 3)], facing=(90, 0), seconds=4.0)
     np.testing.assert_allclose(place.facing, [(1, 0), (0, 1)], atol=1e-6)
-    frames = roll(2, goal=place, places=[(0, 0), (5, 5)], seconds=0.2, labels=0)
+    frames = walked(2, goal=place, places=[(0, 0), (5, 5)], seconds=0.2, labels=0)
     np.testing.assert_allclose(
         frames.root_position[:, 0, ::2], [(0, 0), (5, 5)], atol=0.1
     )
@@ -182,7 +188,7 @@ def test_goals_are_told_in_a_line(monkeypatch):
         patch.setattr(
             goals, "goal_rollouts", lambda *given, **more: asked.update(more) or frames
         )
-        roll(2, goal=near)
+        walked(2, goal=near)
     assert asked["seconds"] == pytest.approx(3.0)
     for wrong, message in (
         ({}, "expected commands, or a goal"),
@@ -191,7 +197,7 @@ def test_goals_are_told_in_a_line(monkeypatch):
         ({"goal": jm.place([(0, 1)] * 3, seconds=1.0)}, "3 goals for 2 characters"),
     ):
         with pytest.raises(ValueError, match=message):
-            roll(2, **wrong)
+            walked(2, **wrong)
 
 
 @pytest.mark.parametrize(

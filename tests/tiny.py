@@ -7,7 +7,6 @@ nothing of the package's own generator.
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.data import windows
@@ -26,10 +25,15 @@ STYLES = ("calm", "brisk")
 positions = jax.jit(joint_positions)
 
 
+def float32(x) -> jax.Array:
+    """Numbers of the host on the device; JAX would compile a program for each shape."""
+    return jax.device_put(np.asarray(x, np.float32))
+
+
 def skeleton() -> Skeleton:
     """Hips and two legs without knees; the toes are the feet."""
     return Skeleton(
-        offsets=jnp.array(OFFSETS, jnp.float32),
+        offsets=float32(OFFSETS),
         parents=PARENTS,
         names=NAMES,
         feet=(2, 4),
@@ -72,10 +76,8 @@ def walk(
         axis=1,
     )
     return Motion(
-        root_position=jnp.asarray(
-            np.stack([path[:, 0], height, path[:, 1]], -1), jnp.float32
-        ),
-        joint_rotation=jnp.asarray(_columns(joints), jnp.float32),
+        root_position=float32(np.stack([path[:, 0], height, path[:, 1]], -1)),
+        joint_rotation=float32(_columns(joints)),
         fps=fps,
     )
 
@@ -124,9 +126,9 @@ def random_params(init, *args, seed: int = 0):
     def draw(path, x):
         name = path[-1].key
         if name == "scale":
-            return jnp.ones(x.shape, x.dtype)
+            return float32(np.ones(x.shape))
         deviation = 0.1 if name == "bias" else x.shape[-2] ** -0.5
-        return jnp.asarray(generator.normal(0.0, deviation, x.shape), x.dtype)
+        return float32(generator.normal(0.0, deviation, x.shape))
 
     return jax.tree_util.tree_map_with_path(draw, shapes)
 

@@ -25,7 +25,6 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxmotion.motion.trajectory import Command
@@ -164,7 +163,7 @@ def course_batch(
     }
     # On the host: a program with an operand for each character compiles for minutes.
     rows = [each[pair] for pair in told]
-    return jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *rows)
+    return jax.tree.map(lambda *x: jax.device_put(np.stack(x)), *rows)
 
 
 def segment_commands(
@@ -184,7 +183,7 @@ def segment_commands(
     time = np.arange(ticks) / fps % ends[-1]
     row = table[np.searchsorted(ends, time, side="right")]
     return Command(
-        velocity=jnp.asarray(_unit(row[:, 1]) * row[:, 3:4], dtype=jnp.float32),
-        facing=jnp.asarray(_unit(row[:, 2]), dtype=jnp.float32),
-        label=jnp.asarray(row[:, 4], jnp.int32),
+        velocity=jax.device_put(np.float32(_unit(row[:, 1]) * row[:, 3:4])),
+        facing=jax.device_put(np.float32(_unit(row[:, 2]))),
+        label=jax.device_put(np.int32(row[:, 4])),
     )

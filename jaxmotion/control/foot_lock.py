@@ -444,15 +444,15 @@ def lock_frame(
     """
     state = _move_body(state, fps=fps, lock=lock)
     root_position = root_position.at[::2].add(state.body)
-    pose = global_transforms(skeleton, root_position, joint_rotation)
-    toes = pose[0][jnp.array(skeleton.feet)]
-    hips = [pose[0][chain[0]] for chain in legs(skeleton)]
+    places, turns = global_transforms(skeleton, root_position, joint_rotation)
+    toes = places[jnp.array(skeleton.feet)]
+    hips = [places[chain[0]] for chain in legs(skeleton)]
     side = None
     if len(hips) == 2:
         level = (hips[0] - hips[1]) * jnp.array([1.0, 0.0, 1.0])
         side = safe_normalize(level, jnp.array([1.0, 0.0, 0.0]))
     state = step_lock(state, toes, fps=fps, lock=lock, side=side)
-    shown = _place(skeleton, *pose, joint_rotation, state.shown, lock=lock)
+    shown = _place(skeleton, places, turns, joint_rotation, state.shown, lock=lock)
     return state, root_position, shown
 
 
@@ -516,8 +516,8 @@ def clean_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motio
     places before the contact begins, see `toe_offsets`.
     """
     transforms = jax.vmap(functools.partial(global_transforms, skeleton))
-    pose = transforms(motion.root_position, motion.joint_rotation)
-    toes = pose[0][:, jnp.array(skeleton.feet)]
+    places, turns = transforms(motion.root_position, motion.joint_rotation)
+    toes = places[:, jnp.array(skeleton.feet)]
     planted = _planted(toes, fps=motion.fps, lock=lock)
     steps = jnp.diff(toes, axis=0) * motion.fps
     speed = jnp.sqrt(jnp.sum(steps**2, axis=-1) + 1e-12)
@@ -525,7 +525,7 @@ def clean_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motio
     wanted = toes.at[..., ::2].add(toe_offsets(toes, planted))
     wanted = wanted.at[:-1, :, 1].max(least)
     place = jax.vmap(functools.partial(_place, skeleton, lock=lock))
-    rotations = place(*pose, motion.joint_rotation, wanted)
+    rotations = place(places, turns, motion.joint_rotation, wanted)
     return dataclasses.replace(motion, joint_rotation=rotations)
 
 

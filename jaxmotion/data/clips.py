@@ -152,7 +152,7 @@ def clips_from_motions(
     return Clips(
         root_position=_join([motion.root_position for motion in motions]),
         joint_rotation=_join([motion.joint_rotation for motion in motions]),
-        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
+        offsets=jax.device_put(np.cumsum([0, *lengths], dtype=np.int32)),
         labels={
             field: _label_numbers(field, values, words[field], names)
             for field, values in labels.items()
@@ -177,12 +177,12 @@ def _label_numbers(
                 f"clip {name!r}: unknown {field} {value!r}, expected one of "
                 f"{', '.join(words)}"
             )
-    return jnp.asarray([words.index(value) for value in values], jnp.int32)
+    return jax.device_put(np.array([words.index(value) for value in values], np.int32))
 
 
 def _join(arrays: Sequence[Array]) -> Array:
     """Concatenates on the host: thousands of device arrays would compile for ever."""
-    return jnp.asarray(np.concatenate([np.asarray(array) for array in arrays]))
+    return jax.device_put(np.concatenate([np.asarray(array) for array in arrays]))
 
 
 def clip_motion(clips: Clips, index: int) -> Motion:
@@ -237,11 +237,11 @@ def stretches(
     )
     return dataclasses.replace(
         clips,
-        root_position=jnp.asarray(np.asarray(clips.root_position)[frames]),
-        joint_rotation=jnp.asarray(np.asarray(clips.joint_rotation)[frames]),
-        offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
+        root_position=jax.device_put(np.asarray(clips.root_position)[frames]),
+        joint_rotation=jax.device_put(np.asarray(clips.joint_rotation)[frames]),
+        offsets=jax.device_put(np.cumsum([0, *lengths], dtype=np.int32)),
         labels={
-            field: jnp.asarray(np.asarray(values)[owners])
+            field: jax.device_put(np.asarray(values)[owners])
             for field, values in clips.labels.items()
         },
         clip_names=names,

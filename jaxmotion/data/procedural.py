@@ -118,8 +118,8 @@ def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> 
     )
     root, local = solve_pose(path, yaw, steps, gait, fps=fps)
     motion = Motion(
-        root_position=jnp.asarray(root, jnp.float32),
-        joint_rotation=rotation.rot6d_from_matrix(jnp.asarray(local, jnp.float32)),
+        root_position=jax.device_put(np.float32(root)),
+        joint_rotation=rotation.rot6d_from_matrix(jax.device_put(np.float32(local))),
         fps=fps,
     )
     return Walk(motion=motion, contact=steps.contact)

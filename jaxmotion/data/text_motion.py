@@ -10,6 +10,7 @@ and compiles once.
 
 import collections
 import dataclasses
+import functools
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -431,6 +432,7 @@ def text_arrays(
     )
 
 
+@functools.partial(jax.jit, static_argnames=("batch",))
 def sample_text_batch(
     key: Key, arrays: TextArrays, *, batch: int
 ) -> tuple[

@@ -5,6 +5,7 @@ is a gather that jit-compiles, so that data stays on the device for a whole trai
 """
 
 import dataclasses
+import functools
 from typing import Any, Literal
 
 import jax
@@ -172,14 +173,17 @@ def cut(clips: Clips, start: Int[Array, ""], length: int) -> Motion:
     )
 
 
+@functools.partial(jax.jit, static_argnames=("length",))
+def _cut_all(clips: Clips, starts: Int[Array, " windows"], length: int) -> Motion:
+    return jax.vmap(lambda start: cut(clips, start, length))(starts)
+
+
 def sample_windows(
     key: Key, clips: Clips, index: WindowIndex, *, batch: int
 ) -> tuple[Motion, Int[Array, "{batch}"]]:
     """Windows [batch, length, ...], uniformly over all starts, and the clip of each."""
     chosen = jax.random.randint(key, (batch,), 0, index.starts.shape[0])
-    windows = jax.vmap(lambda start: cut(clips, start, index.length))(
-        index.starts[chosen]
-    )
+    windows = _cut_all(clips, index.starts[chosen], index.length)
     return windows, index.clips[chosen]
 
 
@@ -213,7 +217,7 @@ def eval_windows(clips: Clips, *, stride: int, field: str) -> EvalWindows:
     window are left out. The label field `field` is the style.
     """
     index = window_index(clips, EVAL_WINDOW, stride=stride, short="skip")
-    motion = jax.vmap(lambda s: cut(clips, s, EVAL_WINDOW))(index.starts)
+    motion = _cut_all(clips, index.starts, EVAL_WINDOW)
     path = trajectory.root_trajectory(clips.skeleton, motion)
     matrix = trajectory.smoothing_matrices(EVAL_WINDOW, (10.0,))[0]
     position = trajectory.smooth(path.position, matrix)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.stats
 from jaxtyping import Array, Float
@@ -30,7 +29,8 @@ def confidence_interval(
     count = samples.shape[0]
     if count < 2:
         raise ValueError(f"{count} samples, expected at least 2 to have an interval")
-    mean, error = float(jnp.mean(samples)), float(jnp.std(samples, ddof=1))
+    values = np.asarray(samples, np.float64)
+    mean, error = float(values.mean()), float(values.std(ddof=1))
     half = scipy.stats.t.ppf(0.5 + level / 2, count - 1) * error / count**0.5
     return Interval(estimate=mean, low=mean - half, high=mean + half)
 

@@ -250,7 +250,7 @@ def restore_part(
         raise _foreign(folder, step, error) from error
     _check_state(folder, step, found)
     found = found if within is None else found[within]
-    return jax.tree.map(jax.numpy.asarray, found)
+    return jax.device_put(found)
 
 
 def _check_part(folder: Path, step: int, like: Any, stored: Any) -> None:
@@ -315,7 +315,7 @@ def _insert(path: str | Path, params: Params, name: str, array: np.ndarray) -> N
             break
     if not isinstance(node, dict) or last in node:
         raise CheckpointError(f"{path}: field {name!r} is within another array")
-    node[last] = jax.numpy.asarray(values)
+    node[last] = jax.device_put(values)
 
 
 def _read_export(

@@ -30,6 +30,7 @@ Average = Literal["frames", "samples"]
 OVER_SEAM = 2
 
 
+@functools.partial(jax.jit, static_argnames=("average",))
 def masked_mse(
     prediction: Float[Array, "*batch frames features"],
     target: Float[Array, "*batch frames features"],
@@ -57,6 +58,7 @@ def displacement(x: Float[Array, "*batch frames n"]) -> Array:
     return x[..., 1:, :] - x[..., :-1, :]
 
 
+@functools.partial(jax.jit, static_argnames=("average",))
 def velocity_loss(
     prediction: Float[Array, "*batch frames features"],
     target: Float[Array, "*batch frames features"],

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array
 
@@ -75,7 +75,7 @@ def skeleton_from_json(value: Any) -> Skeleton:
             raise ValueError(f"{name} should be a list, found {found!r:.100}")
     check_skeleton(**fields)
     return Skeleton(
-        offsets=jnp.asarray(np.asarray(fields["offsets"], np.float32)),
+        offsets=jax.device_put(np.asarray(fields["offsets"], np.float32)),
         parents=tuple(fields["parents"]),
         names=tuple(fields["names"]),
         feet=tuple(fields["feet"]),
@@ -204,7 +204,9 @@ def normalizer_from_json(value: Any, *, size: int) -> Normalizer:
         name: numbers_from_json(name, value[name], least=least, size=size)
         for name, least in (("mean", -1e6), ("std", 1e-12))
     }
-    return Normalizer(**{k: jnp.asarray(x, jnp.float32) for k, x in made.items()})
+    return Normalizer(
+        **{k: jax.device_put(np.array(x, np.float32)) for k, x in made.items()}
+    )
 
 
 def arrays_to_json(arrays: Mapping[str, Any]) -> dict[str, Any]:
@@ -243,7 +245,7 @@ def arrays_from_json(
         )
     if not all((np.abs(x) <= MAX_METERS).all() for x in found.values()):
         raise ValueError(f"has numbers that are not within {MAX_METERS:g}")
-    return {name: jnp.asarray(x, jnp.float32) for name, x in found.items()}
+    return {name: jax.device_put(np.float32(x)) for name, x in found.items()}
 
 
 def starts_from_json(

@@ -8,6 +8,8 @@ compared (95th percentile 1.8, at most 7.4); its evaluation takes hips and shoul
 (`body_facing`).
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -80,6 +82,7 @@ def facing_from_across(across: Float[Array, "*batch 3"]) -> Float[Array, "*batch
     return ground.unit(jnp.stack([-across[..., 2], across[..., 0]], axis=-1))
 
 
+@functools.partial(jax.jit, static_argnames=("hips",))
 def hip_facing(
     skeleton: Skeleton,
     joint_rotation: Float[Array, "*batch joints 6"],
@@ -100,6 +103,7 @@ def hip_facing(
     )
 
 
+@jax.jit
 def body_facing(
     skeleton: Skeleton, positions: Float[Array, "*batch joints 3"]
 ) -> Float[Array, "*batch 2"]:

@@ -57,6 +57,7 @@ def feature_layout(**sizes: int) -> FeatureLayout:
     return FeatureLayout(fields=tuple(fields))
 
 
+@functools.partial(jax.jit, static_argnames=("layout",))
 def pack(
     layout: FeatureLayout, parts: Mapping[str, Float[Array, "*batch _"]]
 ) -> Float[Array, "*batch features"]:

@@ -5,12 +5,14 @@ An angle here is a yaw: it turns +z toward +x, so the direction of yaw a is
 products, which wraps by itself; nothing needs to be unwrapped.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 _TINY = 1e-12
 
 
+@jax.jit
 def unit(
     vector: Float[Array, "*batch 2"], fallback: Float[Array, "*batch 2"] | None = None
 ) -> Float[Array, "*batch 2"]:
@@ -28,6 +30,7 @@ def unit(
     return jnp.where(is_zero, fallback, vector / length)
 
 
+@jax.jit
 def turn(
     vector: Float[Array, "*batch 2"], yaw: Float[Array, "*batch"]
 ) -> Float[Array, "*batch 2"]:
@@ -37,6 +40,7 @@ def turn(
     return jnp.stack([cos * x + sin * z, cos * z - sin * x], axis=-1)
 
 
+@jax.jit
 def angle_from_to(
     start: Float[Array, "*batch 2"], end: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch"]:
@@ -51,6 +55,7 @@ def angle_from_to(
     return jnp.arctan2(cross, jnp.sum(a * b, axis=-1))
 
 
+@jax.jit
 def into_frame(
     vector: Float[Array, "*batch 2"], facing: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch 2"]:
@@ -60,6 +65,7 @@ def into_frame(
     return jnp.stack([fz * x - fx * z, fx * x + fz * z], axis=-1)
 
 
+@jax.jit
 def out_of_frame(
     vector: Float[Array, "*batch 2"], facing: Float[Array, "*batch 2"]
 ) -> Float[Array, "*batch 2"]:

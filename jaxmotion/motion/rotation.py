@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 _TINY = 1e-12
 
 
+@jax.jit
 def safe_normalize(
     x: Float[Array, "*batch n"], fallback: Float[Array, " n"]
 ) -> Float[Array, "*batch n"]:

@@ -182,6 +182,7 @@ def _chain_backward(
 _chain.defvjp(_chain_forward, _chain_backward)
 
 
+@jax.jit
 def global_transforms(
     skeleton: Skeleton,
     root_position: Float[Array, "*batch 3"],

@@ -430,9 +430,8 @@ def test_offsets_are_those_of_the_normal_equations():
     want = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
     toes = np.zeros((frames, 1, 3), np.float32)
     toes[:, 0, ::2] = path
-    found = foot_lock.toe_offsets(
-        jnp.asarray(toes), jnp.asarray(planted[:, None]), stand=stand, smooth=smooth
-    )
+    run = functools.partial(foot_lock.toe_offsets, stand=stand, smooth=smooth)
+    found = jax.jit(run)(toes, planted[:, None])
     np.testing.assert_allclose(found[:, 0], want, atol=2e-5)
 
 

@@ -62,9 +62,8 @@ def test_who_is_beside_a_path_heads_for_it_as_far_ahead_as_he_looks(ahead, meter
     path = goals.Path(
         points=jnp.array([[0.0, 0.0], [0.0, 9.0]]), speed=jnp.full(2, 2.0)
     )
-    velocity, way = goals.pursue(
-        path, walker((0.5, 2.0)), jnp.float32(2.0), ahead=ahead
-    )
+    pursue = jax.jit(functools.partial(goals.pursue, ahead=ahead))
+    velocity, way = pursue(path, walker((0.5, 2.0)), jnp.float32(2.0))
     assert float(way) == pytest.approx(2.0)
     heading = np.array([-0.5, meters]) / np.hypot(0.5, meters)
     np.testing.assert_allclose(velocity, 2.0 * heading, atol=1e-5)
@@ -169,7 +168,7 @@ def test_nobody_walks_through_a_circle():
 def test_alone_nobody_leaves_his_way():
     wanted = jnp.array([[1.0, 0.5], [0.0, 0.0]])
     far = walker([[0.0, 0.0], [50.0, 0.0]], np.zeros((2, 2)), [[0.0, 1.0]] * 2)
-    np.testing.assert_array_equal(goals.avoid(wanted, far), wanted)
+    np.testing.assert_array_equal(jax.jit(goals.avoid)(wanted, far), wanted)
 
 
 def test_small_differences_are_not_told():

@@ -1,11 +1,11 @@
 """Small BVH files, skeletons and clips that the data tests share."""
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.data.clips import Clips, clips_from_motions
 from jaxmotion.motion.skeleton import Motion, Skeleton
+from tests.tiny import float32
 
 # A body whose axes are the world's (left is +x), and one whose right limbs have all
 # axes turned round, as mirrored rigs have them.
@@ -20,7 +20,7 @@ TURNED += [[-0.02, -0.1, 0], [-0.8, 0, 0]]
 def skeleton(offsets=PLAIN) -> Skeleton:
     """Six joints."""
     return Skeleton(
-        offsets=jnp.array(offsets, jnp.float32),
+        offsets=float32(offsets),
         parents=PARENTS,
         names=NAMES,
         feet=(3, 5),
@@ -37,10 +37,8 @@ def motion(num_frames: int, seed: int, fps: float = 30.0, num_joints: int = 6):
     generator = np.random.default_rng(seed)
     turns = Rotation.random(num_frames * num_joints, rng=generator).as_matrix()
     return Motion(
-        root_position=jnp.array(generator.normal(size=(num_frames, 3)), jnp.float32),
-        joint_rotation=jnp.array(
-            columns(turns.reshape(num_frames, num_joints, 3, 3)), jnp.float32
-        ),
+        root_position=float32(generator.normal(size=(num_frames, 3))),
+        joint_rotation=float32(columns(turns.reshape(num_frames, num_joints, 3, 3))),
         fps=fps,
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxmotion.diffusion import chain, guidance, schedule
-from tests import mostly_slow
+from tests import mostly_slow, tiny
 from tests.reference import diffusion as reference
 from tests.reference import smgdiff as oracle
 
@@ -21,7 +21,7 @@ clone = jax.random.clone
 
 
 def random(seed, shape=SHAPE):
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+    return tiny.float32(np.random.default_rng(seed).normal(size=shape))
 
 
 GOAL = random(10)

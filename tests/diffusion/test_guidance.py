@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from jaxmotion.diffusion import chain, guidance, schedule
+from tests import tiny
 
 
 def random(seed, shape=(5, 3)):
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+    return tiny.float32(np.random.default_rng(seed).normal(size=shape))
 
 
 def network(key, x_t, t, cond):

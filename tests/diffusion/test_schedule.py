@@ -6,7 +6,7 @@ import pytest
 from jaxtyping import TypeCheckError
 
 from jaxmotion.diffusion import schedule
-from tests import mostly_slow
+from tests import mostly_slow, tiny
 from tests.reference import diffusion as reference
 
 # Published or independently computed tables, steps 1..T. Cosine T = 4 is the JSON that
@@ -113,7 +113,7 @@ def posterior_coefficients(table):
 
 
 def random(seed, shape=(6, 3)):
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+    return tiny.float32(np.random.default_rng(seed).normal(size=shape))
 
 
 @pytest.mark.parametrize(("name", "num_steps", "expected"), TABLES)

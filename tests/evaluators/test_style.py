@@ -1,5 +1,7 @@
 """The evaluator sees limbs and nothing else, and learns to tell styles."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,8 +57,9 @@ def test_the_loss_is_the_cross_entropy():
             params, key, (x, labels), config=CONFIG
         )
     )(params, jax.random.key(1))
-    _, logits = style_evaluator.WindowClassifier(2).apply(
-        {"params": params}, x, train=True, rngs={"dropout": jax.random.key(1)}
+    net = style_evaluator.WindowClassifier(2)
+    _, logits = jax.jit(functools.partial(net.apply, train=True))(
+        {"params": params}, x, rngs={"dropout": jax.random.key(1)}
     )
     logits = np.asarray(logits, np.float64)
     chance = np.exp(logits) / np.exp(logits).sum(axis=-1, keepdims=True)

@@ -149,6 +149,7 @@ def test_a_queue_that_is_killed_twice_ends_with_the_same_numbers(queue, tmp_path
     assert numbers(killed) == numbers(whole) and len(numbers(whole)) == 3
 
 
+@pytest.mark.slow
 def test_what_fails_is_named_and_the_rest_is_made(queue, tmp_path):
     code, shown = finish(queue(f"--runs {tmp_path}/runs", "fail,9,0", "good,9,0"))
     assert code == 1 and "fail: failed: no such thing" in shown

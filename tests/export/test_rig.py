@@ -11,6 +11,7 @@ import jaxmotion as jm
 from jaxmotion.export import rig as rigging
 from jaxmotion.motion import anatomy
 from jaxmotion.motion.skeleton import joint_positions
+from tests import mostly_slow
 from tests.export.test_gltf import VALIDATE, accessor, validator  # noqa: F401
 from tests.retarget import rigs
 from tests.viz import samples
@@ -107,7 +108,7 @@ def test_the_users_own_mesh_walks(hero, tmp_path):
     assert -0.01 < min(low) < 0.02
 
 
-@pytest.mark.parametrize("suffix", [".bvh", ".npz", ".csv"])
+@pytest.mark.parametrize("suffix", mostly_slow([".bvh", ".npz", ".csv"], [".bvh"]))
 def test_other_formats_have_the_rigs_skeleton(hero, tmp_path, suffix):
     skeleton, motion = samples.person(seconds=0.3)
     jm.save(tmp_path / f"a{suffix}", skeleton, motion, onto=hero)
@@ -130,7 +131,7 @@ def test_a_gltf_with_a_buffer_beside_it_and_a_vrm_are_rigs(hero, tmp_path):
 
 
 @pytest.mark.parametrize("version", ["VRMC_vrm", "VRM"])
-@pytest.mark.parametrize("skin", [True, False])
+@pytest.mark.parametrize("skin", mostly_slow([True, False], [False]))
 def test_a_vrm_says_which_joint_is_which(version, skin, hero, tmp_path):
     plain = rigging.read_rig(hero)
     index = {node["name"]: n for n, node in enumerate(plain.content["nodes"])}

@@ -10,6 +10,7 @@ import optax
 import pytest
 
 from jaxmotion.learning import adversarial, checkpoint, loop, together, training
+from tests import mostly_slow
 
 
 def fitted(folder, seed, *, scale=2.0, num_steps=5, shift=None, stages=("a",)):
@@ -51,7 +52,7 @@ def rows(folder):
     return [{k: v for k, v in row.items() if k != "steps_per_second"} for row in found]
 
 
-@pytest.mark.parametrize("shifts", [False, True], ids=["same", "own_constants"])
+@pytest.mark.parametrize("shifts", mostly_slow([False, True], [True]))
 def test_each_is_what_it_is_alone(tmp_path, shifts):
     """States, losses, checkpoints of two stages; with constants of their own, too."""
     seeds = (3, 0, 7)

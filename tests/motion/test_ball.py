@@ -5,12 +5,9 @@ import pytest
 
 from jaxmotion.data import rolling
 from jaxmotion.motion import ball
+from tests.tiny import float32
 
 REACH, FPS = 2.0, 30.0
-
-
-def float32(array):
-    return jnp.asarray(array, jnp.float32)
 
 
 def weights(place, root):

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxmotion.motion import rotation
 from tests.reference import motion as reference
+from tests.tiny import float32
 
 COUNT = 200
 # Half turns about the axes and about two diagonals, where trace formulas divide by 0.
@@ -15,10 +16,6 @@ AXES = np.array(
 )
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
 HALF_TURNS = Rotation.from_rotvec(np.pi * AXES)
-
-
-def float32(array):
-    return jnp.asarray(array, jnp.float32)
 
 
 def same_up_to_sign(a, b, atol):

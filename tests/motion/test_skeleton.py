@@ -20,15 +20,12 @@ from jaxmotion.motion.skeleton import (
     joint_velocities,
 )
 from tests.reference import motion as reference
+from tests.tiny import float32
 
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 1, 7, 0)
 NAMES = tuple(f"joint{j}" for j in range(len(PARENTS)))
 OFFSETS = np.random.default_rng(0).normal(size=(len(PARENTS), 3))
 SHAPE = (3, 4)
-
-
-def float32(array):
-    return jnp.asarray(array, jnp.float32)
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def parameters():
 
 def normal(*shape, seed=0):
     values = np.random.default_rng(seed).normal(size=shape)
-    return jnp.asarray(values, jnp.float32)
+    return tiny.float32(values)
 
 
 @pytest.mark.slow

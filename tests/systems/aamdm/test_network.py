@@ -14,7 +14,7 @@ DECODER = aamdm_network.PoseDecoder(features=7, width=8)
 
 def vectors(size, *batch, seed=0):
     values = np.random.default_rng(seed).normal(scale=2.0, size=(*batch, size))
-    return jnp.asarray(values, jnp.float32)
+    return tiny.float32(values)
 
 
 def formula(params, x, layers, activation):

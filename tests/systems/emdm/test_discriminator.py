@@ -16,7 +16,7 @@ NET = emdm_network.SequenceDiscriminator(num_steps=4, width=128, time_width=16)
 
 def normal(*shape, seed=0):
     values = np.random.default_rng(seed).normal(size=shape)
-    return jnp.asarray(values, jnp.float32)
+    return tiny.float32(values)
 
 
 def pair(*batch, size=2, frames=5):
@@ -85,7 +85,7 @@ def test_widths_and_groups_are_the_published_ones():
     expected = reference.discriminator(
         oracle(params), x_prev, x_t, int(t) - 1, condition
     )
-    found = net.apply({"params": params}, *arguments)
+    found = jax.jit(net.apply)({"params": params}, *arguments)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
@@ -128,7 +128,7 @@ def test_without_a_condition_its_vector_has_no_channels():
     arguments = pair(3, size=0)
     params = make(NET, *arguments)
     assert params["layers_0"]["kernel"].shape == (2 * 15 + 16, 128)
-    assert NET.apply({"params": params}, *arguments).shape == (3,)
+    assert jax.jit(NET.apply)({"params": params}, *arguments).shape == (3,)
 
 
 # --- the temporal one ---------------------------------------------------------------
@@ -173,7 +173,7 @@ def temporal_oracle(params, x_prev, x_t, t, condition):
 def test_temporal_network_is_convolutions_of_three_frames(frames):
     arguments = pair(3, frames=frames)
     params = make(TEMPORAL, *arguments)
-    found = TEMPORAL.apply({"params": params}, *arguments)
+    found = jax.jit(TEMPORAL.apply)({"params": params}, *arguments)
     x_prev, x_t, t, condition = (np.float64(x) for x in arguments)
     expected = [
         temporal_oracle(params, x_prev[i], x_t[i], int(t[i]), condition[i])
@@ -187,7 +187,7 @@ def test_a_temporal_network_needs_no_condition_and_any_batch():
     arguments = pair(2, 3, size=0, frames=8)
     params = make(TEMPORAL, *arguments)
     run = functools.partial(TEMPORAL.apply, {"params": params})
-    together = run(*arguments)
-    alone = jax.vmap(jax.vmap(run))(*arguments)
+    together = jax.jit(run)(*arguments)
+    alone = jax.jit(jax.vmap(jax.vmap(run)))(*arguments)
     assert together.shape == (2, 3)
     np.testing.assert_allclose(together, alone, rtol=1e-4, atol=1e-5)

@@ -44,7 +44,7 @@ def network(name):
 
 def normal(*shape, seed=0):
     values = np.random.default_rng(seed).normal(size=shape)
-    return jnp.asarray(values, jnp.float32)
+    return tiny.float32(values)
 
 
 def given(net, mask=MASK):

@@ -17,6 +17,7 @@ from tests import mostly_slow, tiny
 from tests.reference import diffusion
 from tests.reference import emdm as reference
 from tests.systems.emdm import test_discriminator
+from tests.tiny import float32
 
 # Four joints, and a translation that the velocity loss leaves out.
 CONFIG = emdm_model.Config(
@@ -59,10 +60,6 @@ def joints(x):
 GEOMETRY = emdm_loss.Geometry(
     positions=joints, feet=(1, 3), channels=slice(0, 12), fps=20.0
 )
-
-
-def float32(x):
-    return jnp.asarray(x, jnp.float32)
 
 
 def batch(*lengths, seed=0, config=CONFIG):
@@ -271,7 +268,7 @@ def test_the_discriminators_gradient_stops_at_the_generator(watch):
 
     make = functools.partial(emdm_loss.generator_loss, config=config, geometry=GEOMETRY)
     slopes = [
-        jax.grad(loss, has_aux=True)(jnp.float32(0.5), {}, key(0), data)[0]
+        jax.jit(jax.grad(loss, has_aux=True))(jnp.float32(0.5), {}, key(0), data)[0]
         for loss in (discriminate, make)
     ]
     assert slopes[0] == 0.0 != slopes[1]
