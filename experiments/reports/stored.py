@@ -119,7 +119,7 @@ def paths_of(folder: Path, name: str) -> list[Path]:
     return [first, *(further[seed] for seed in sorted(further))]
 
 
-@functools.lru_cache
+@functools.cache  # of all tables: a page after the other asks for each
 def _parsed(paths: tuple[Path, ...], _: tuple[int, ...]) -> Measured:
     first, *again = map(_read_one, paths)
     return dataclasses.replace(first, again=tuple(again))

@@ -417,15 +417,22 @@ BAD = {
 }
 
 
+@pytest.fixture(scope="module")
+def of_balls(tmp_path_factory):
+    """The file of an evaluator that no model but SMGDiff is scored by."""
+    path = tmp_path_factory.mktemp("evaluator") / "evaluator.npz"
+    frozen.save(path, samples.evaluator("ball"))
+    return path
+
+
 @pytest.mark.parametrize("line", BAD)
-def test_what_is_wrong_is_named_before_any_work(call, data, tmp_path, line):
+def test_what_is_wrong_is_named_before_any_work(call, data, of_balls, tmp_path, line):
     (tmp_path / "plain").write_text("")
-    frozen.save(tmp_path / "evaluator.npz", samples.evaluator("ball"))
     places = dict(
         data=data,
         gone=tmp_path / "gone.npz",
         file=tmp_path / "plain",
-        evaluator=tmp_path / "evaluator.npz",
+        evaluator=of_balls,
         new=tmp_path / "new",
     )
     with pytest.raises((OSError, ValueError), match=BAD[line]):
