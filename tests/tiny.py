@@ -26,8 +26,11 @@ positions = jax.jit(joint_positions)
 
 
 def float32(x) -> jax.Array:
-    """Numbers of the host on the device; JAX would compile a program for each shape."""
-    return jax.device_put(np.asarray(x, np.float32))
+    """Numbers of the host on the device; JAX would compile a program for each shape.
+
+    A copy: `device_put` may go on with the memory that it is given.
+    """
+    return jax.device_put(np.array(x, np.float32))
 
 
 def skeleton() -> Skeleton:

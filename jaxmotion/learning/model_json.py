@@ -245,7 +245,7 @@ def arrays_from_json(
         )
     if not all((np.abs(x) <= MAX_METERS).all() for x in found.values()):
         raise ValueError(f"has numbers that are not within {MAX_METERS:g}")
-    return {name: jax.device_put(np.float32(x)) for name, x in found.items()}
+    return {name: jax.device_put(np.array(x, np.float32)) for name, x in found.items()}
 
 
 def starts_from_json(

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -182,7 +181,7 @@ def _characters(skeleton: Skeleton, motion: Motion, what: str) -> Motion:
     _check_finite(what, root)
     _check_finite(what, turns)
     return dataclasses.replace(
-        motion, root_position=jax.device_put(root), joint_rotation=jax.device_put(turns)
+        motion, root_position=jnp.asarray(root), joint_rotation=jnp.asarray(turns)
     )
 
 

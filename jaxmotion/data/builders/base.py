@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 import tensorflow_datasets as tfds
 from jaxtyping import Float
@@ -105,8 +105,8 @@ def motion_from_matrices(
     """
     columns = np.concatenate([local[..., 0], local[..., 1]], axis=-1)
     return Motion(
-        root_position=jax.device_put(np.float32(root_position)),
-        joint_rotation=jax.device_put(np.float32(columns)),
+        root_position=jnp.asarray(root_position, jnp.float32),
+        joint_rotation=jnp.asarray(columns, jnp.float32),
         fps=fps,
     )
 
@@ -261,7 +261,7 @@ def clips_from_records(
     for record in records:
         skeletons.append(
             Skeleton(
-                offsets=jax.device_put(record["offsets"]),
+                offsets=jnp.asarray(record["offsets"]),
                 parents=tuple(int(parent) for parent in record["parents"]),
                 names=tuple(_word(record["joint_names"]).split("\n")),
                 feet=tuple(int(foot) for foot in record["feet"]),
@@ -269,8 +269,8 @@ def clips_from_records(
         )
         motions.append(
             Motion(
-                root_position=jax.device_put(record["root_position"]),
-                joint_rotation=jax.device_put(record["joint_rotation"]),
+                root_position=jnp.asarray(record["root_position"]),
+                joint_rotation=jnp.asarray(record["joint_rotation"]),
                 fps=float(record["fps"]),
             )
         )
