@@ -96,7 +96,8 @@ class Claim:
       column: Name of the column.
       pairs: Rows (smaller, larger); with `toward`, (nearer, farther).
       where: Section or table of the paper.
-      factor: The larger is at least so many times the smaller.
+      factor: The larger is at least so many times the smaller; None to compare
+        differences.
       toward: Row that the nearer is nearer to; None to compare values.
       margin: The two rows differ by less, in the column's unit; None for an ordering.
     """
@@ -105,7 +106,7 @@ class Claim:
     column: str
     pairs: tuple[tuple[str, str], ...]
     where: str
-    factor: float = 1.0
+    factor: float | None = None
     toward: str | None = None
     margin: float | None = None
 

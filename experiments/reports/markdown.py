@@ -89,10 +89,12 @@ def difference(claim: Claim, pair: tuple[str, str], values: np.ndarray) -> str:
         return ""
     first, second = pair
     where = f"distances to {claim.toward}, " if claim.toward else ""
-    times = "" if claim.factor == 1 else f"{claim.factor:g} × "
-    mean, low, high = map(number, sequential.interval(values))
+    ends, less = sequential.interval(values), "less"
+    if claim.factor is not None:
+        ends, less = claim.factor * np.exp(ends), "over"
+    mean, low, high = map(number, ends)
     return (
-        f"{where}{second} less {times}{first}: {mean} [{low}, {high}] of {len(values)} "
+        f"{where}{second} {less} {first}: {mean} [{low}, {high}] of {len(values)} "
         "trainings"
     )
 

@@ -41,9 +41,9 @@ RULE = (
     "One training decides nothing, for intervals over its replications, clips or "
     "rollouts do not hold what another seed would change.",
     "Where the larger is claimed to be so many times the smaller, the difference is "
-    "that of the larger and so many times the smaller. The bar is ours, below the "
-    "paper's own ratio, since machines differ. Nearness to recorded motion compares "
-    "distances to it.",
+    "that of the logarithms of the larger and of so many times the smaller: a busy "
+    "machine slows both by a factor. The bar is ours, below the paper's own ratio, "
+    "since machines differ. Nearness to recorded motion compares distances to it.",
     "That two rows are alike is claimed with a margin: both that their difference is "
     "above its negative and that it is below it must hold (two one-sided tests).",
     "Rows of several files that an evaluator scored are compared only if the files "
@@ -181,12 +181,16 @@ def holds(claim: Claim, values: Sequence[float]) -> float:
 
     Returns:
       Positive where it holds, negative where it does not; for a claim of likeness, how
-      far the difference is below the margin.
+      far the difference is below the margin; for one of a factor a logarithm, not
+      finite where a value is not positive.
     """
     first, second, *target = values
     if target:
         first, second = (abs(x - target[0]) for x in (first, second))
-    difference = second - claim.factor * first
+    if claim.factor is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.log(second) - np.log(claim.factor * first))
+    difference = second - first
     return difference if claim.margin is None else claim.margin - abs(difference)
 
 
