@@ -70,6 +70,21 @@ def build(cls, tmp_path, source, config=None):
     return base.clips_from_source(base.prepare(builder, source))
 
 
+def test_what_another_process_prepared_meanwhile_is_taken(tmp_path, monkeypatch):
+    source = put(tmp_path / "raw", bandai_files())
+    generate = bandai_namco.BandaiNamco._generate_examples
+
+    def late(own, *args):
+        yield from generate(own, *args)
+        if not own.is_prepared():
+            monkeypatch.setattr(type(own), "_generate_examples", generate)
+            build(bandai_namco.BandaiNamco, tmp_path, source, "2")
+
+    monkeypatch.setattr(bandai_namco.BandaiNamco, "_generate_examples", late)
+    found = build(bandai_namco.BandaiNamco, tmp_path, source, "2")
+    assert found.num_clips == 2
+
+
 @pytest.mark.parametrize(
     "archive",
     [None, "Bandai-Namco-Research-Motiondataset-2.zip"],

@@ -6,6 +6,7 @@ windows are cut later, on the device. World coordinates stay as published: nothi
 centered, turned or put on the floor.
 """
 
+import functools
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -199,7 +200,7 @@ def prepare(
     """Reads the published files into the builder's folder, unless it is there.
 
     The builder was made with `file_format="array_record"`; with `overwrite` the files
-    are read again.
+    are read again. Several processes may do so at a time.
 
     `FileNotFoundError` if the folder or its files are missing, `OSError` if the
     builder's cannot be written, as on a full disk; a `ValueError` names a malformed
@@ -217,11 +218,16 @@ def prepare(
     config = tfds.download.DownloadConfig(
         manual_dir=os.fspath(manual_dir), download_mode=mode
     )
+    read = functools.partial(builder.download_and_prepare, download_config=config)
     try:
-        builder.download_and_prepare(download_config=config)
+        read()
     except RuntimeError as error:  # as the writer of array_record says it
         line = str(error).splitlines()[0]
         raise OSError(f"cannot write {builder.data_path}: {line}") from error
+    except OSError:
+        if overwrite or not builder.is_prepared():
+            raise
+        read()  # another process was faster
     return builder
 
 
