@@ -236,7 +236,8 @@ def main() -> None:
     rows = rows_of(curves, args.chunk)
     about = {"source": run.source} | reporting.provenance(args)
     about |= {"seeds": {"training": list(range(args.seeds))}}
-    for name in ("training", "minutes"):  # of the run, which is not continued
+    # Of the run, which is not continued.
+    for name in ("training", "models", "minutes"):
         about.pop(name, None)
     about["curves"] = {
         name: [

@@ -201,7 +201,8 @@ def provenance(arguments: Any = None) -> dict[str, Any]:
 
     Versions, hardware, commit, command and date, and the "arguments" of a command
     line's dataclass, if there is one; where these name a run folder, also its "seeds",
-    its "data", the "training" of its stages, and its "minutes", without compiling.
+    its "data", and of its stages the "training", the "models", which have the sizes of
+    networks, and the "minutes", without compiling.
     """
     given = {} if arguments is None else {"arguments": arguments_json(arguments)}
     if (run := getattr(arguments, "run", None)) is not None and run.is_dir():
@@ -220,18 +221,21 @@ def provenance(arguments: Any = None) -> dict[str, Any]:
 
 def _training(folder: Path) -> dict[str, Any]:
     """Seeds and other settings of a run's stages, and fingerprints of its data."""
-    seeds, settings = set(), {}
+    seeds, settings, models = set(), {}, {}
     for place in sorted(folder.glob("**/checkpoints")):
         with contextlib.suppress(checkpoint.CheckpointError):
-            how = checkpoint.load_config(place).get("training", {})
+            config = checkpoint.load_config(place)
+            how = config.get("training", {})
             if "seed" in how:
+                stage = place.parent.relative_to(folder).as_posix()
                 seeds.add(how.pop("seed"))
-                settings[place.parent.relative_to(folder).as_posix()] = how
+                settings[stage], models[stage] = how, config.get("model")
     config = files.read_object(folder / "config.json", what="expected a run folder")
     return {
         "seeds": {"training": sorted(seeds)},
         "data": config.get("files"),
         "training": settings,
+        "models": models,
         "minutes": _minutes(folder),
     }
 

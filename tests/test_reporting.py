@@ -62,7 +62,7 @@ def test_a_run_folder_says_what_was_trained_on_what(tmp_path):
     assert "seeds" not in reporting.provenance(Arguments(tmp_path / "file.npz"))
     (tmp_path / "config.json").write_text('{"files": {"train.npz": "f00d"}}')
     for stage, seed in (("motion", 3), ("deep/er", 3), ("other", 5)):
-        how = {"training": {"seed": seed, "steps": 9}}
+        how = {"model": {"width": 8}, "training": {"seed": seed, "steps": 9}}
         checkpoint.save(tmp_path / stage / "checkpoints", 1, {"x": np.ones(2)}, how)
     # Neither a stage that is made without training nor one that has just begun.
     checkpoint.save(tmp_path / "space" / "checkpoints", 0, {"x": np.ones(2)}, {})
@@ -77,5 +77,6 @@ def test_a_run_folder_says_what_was_trained_on_what(tmp_path):
     assert found["training"] == dict.fromkeys(
         ("motion", "deep/er", "other"), {"steps": 9}
     )
+    assert found["models"] == dict.fromkeys(found["training"], {"width": 8})
     assert found["data"] == {"train.npz": "f00d"}
     assert found["minutes"] == {"motion": 2.0}

@@ -32,7 +32,7 @@ _MEASURED = (
 )
 _KEPT = (
     *("source", "arguments", "seeds", "data", "rounded"),
-    *("training", "minutes", "evaluator"),
+    *("training", "models", "minutes", "evaluator"),
 )
 _EITHER = ("measured", "transcribed")
 _FIELDS = {*_KEPT, *_EITHER, "title", "interval", "columns", "rows", "names"}
@@ -291,7 +291,7 @@ def _joined(place: Path, before: dict[str, Any], new: dict[str, Any]) -> dict[st
         f"{', '.join(added)}: {new['measured']['command']}"
     )
     whole = {**before, "measured": {**before["measured"], "command": command}}
-    for field in ("rows", "columns", "training", "minutes"):
+    for field in ("rows", "columns", "training", "models", "minutes"):
         whole[field] = {**new.get(field, {}), **before.get(field, {})}
     whole["rows"] = before["rows"] | {row: rows[row] for row in added}
     return whole

@@ -193,7 +193,13 @@ def test_rows_are_added_to_those_of_the_same_kind(stored, tmp_path):
 
     with pytest.raises(ValueError, match="is no measured table"):
         made(real)
-    metrics(source, real | {"a": {"fid": 2.0}}, minutes={"a": 4.0}, **about)
+    metrics(
+        source,
+        real | {"a": {"fid": 2.0}},
+        minutes={"a": 4.0},
+        models={"a": {}},
+        **about,
+    )
     stored.keep(tmp_path, source, "emdm/it", "A title")
     other = dict(minutes={"b": 5.0}, git_commit="0123456789", command="c.py")
     whole = made(
@@ -204,6 +210,7 @@ def test_rows_are_added_to_those_of_the_same_kind(stored, tmp_path):
     values = {row: cells["fid"]["value"] for row, cells in whole["rows"].items()}
     assert values == {"real": 1.0, "a": 2.0, "b": 3.0}
     assert whole["minutes"] == {"a": 4.0, "b": 5.0} and "jerk" in whole["columns"]
+    assert whole["models"] == {"a": {}}
     command = "python a.py --run runs/a; at 01234567 b: c.py"
     assert whole["measured"] == {"command": command, "git_commit": "abc"}
     kept = (tmp_path / "emdm/it.json").read_text()
