@@ -115,6 +115,7 @@ def test_rows_are_changes_of_the_base():
     flat = dict(weight_position=0.0, weight_velocity=0.0, weight_foot=0.0)
     flat |= dict(weight_position_velocity=0.0, weight_acceleration=0.0)
     mdm = dict(latent=0, schedule="cosine", weight_recon=1.0)
+    fine = (0.999, 0.99, 0.95, 0.86, 0.71, 0.5, 0.3, 0.14, 0.04, 4e-5)
     expected = {
         "emdm": {},
         "emdm_5": dict(num_steps=5),
@@ -127,6 +128,7 @@ def test_rows_are_changes_of_the_base():
         "ddim_10": dict(num_steps=1000, **mdm),
         "no_r1": dict(weight_r1=0.0),
         "no_gan": dict(weight_adversarial=0.0),
+        "no_gan_fine": dict(weight_adversarial=0.0, alpha_bar=fine),
         "no_condition": dict(discriminator_condition=False),
     }
     learns = dict(
