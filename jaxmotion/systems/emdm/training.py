@@ -66,6 +66,16 @@ ROWS: dict[str, dict[str, Any]] = {
         weight_adversarial=0.0,
         alpha_bar=(0.999, 0.99, 0.95, 0.86, 0.71, 0.5, 0.3, 0.14, 0.04, 4e-5),
     ),
+    # The same last steps, and the published noisy ones, at which variety is chosen.
+    "no_gan_14": dict(
+        weight_adversarial=0.0,
+        num_steps=14,
+        alpha_bar=(
+            *(0.999, 0.99, 0.95, 0.86, 0.71, 0.5, 0.3, 0.14),
+            *(0.07867597, 0.02607685, 0.007086248, 0.001578794),
+            *(0.0002883917, 4.319044e-05),
+        ),
+    ),
     "no_gan_5": dict(weight_adversarial=0.0, num_steps=5),
     "no_gan_3": dict(weight_adversarial=0.0, num_steps=3),
     "no_gan_2": dict(weight_adversarial=0.0, num_steps=2),

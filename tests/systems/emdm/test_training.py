@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.diffusion import chain
+from jaxmotion.diffusion import chain, schedule
 from jaxmotion.learning import adversarial, checkpoint, runs, training
 from jaxmotion.systems.emdm import loss as emdm_loss
 from jaxmotion.systems.emdm import model as emdm_model
@@ -129,6 +129,9 @@ def test_rows_are_changes_of_the_base():
         "no_r1": dict(weight_r1=0.0),
         "no_gan": dict(weight_adversarial=0.0),
         "no_gan_fine": dict(weight_adversarial=0.0, alpha_bar=fine),
+        "no_gan_14": dict(
+            weight_adversarial=0.0, num_steps=14, alpha_bar=make("no_gan_14").alpha_bar
+        ),
         "no_condition": dict(discriminator_condition=False),
     }
     learns = dict(
@@ -151,6 +154,10 @@ def test_rows_are_changes_of_the_base():
         expected[f"no_gan_{steps}"] = alone
     for weight in (0, 1, 10, 100, 1000):
         expected[f"recon_{weight}"] = dict(weight_recon=float(weight), **flat)
+    both = make("no_gan_14").alpha_bar
+    published = schedule.vp_schedule(10).alpha_bar[5:]
+    assert both[:8] == fine[:8]
+    np.testing.assert_allclose(both[8:], published, rtol=1e-5)
     assert set(expected) == {*emdm_training.ROWS, *emdm_training.SAMPLERS}
     for row, changes in expected.items():
         assert make(row) == dataclasses.replace(base, **changes)
