@@ -61,6 +61,7 @@ class Train:
       levels: Steps that each network learns: all, or its own.
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data; rows as published and AMDM have none.
+      init: Run folder of a row "aamdm" to start that from, in its learned space.
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with these settings where a stage began with others.
     """
@@ -90,6 +91,7 @@ class Train:
     gan_window: int = 3
     levels: Literal["all", "own"] = "all"
     previous_noise: float = 0.5
+    init: cli.Optional[Path] = None
     distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False
@@ -166,6 +168,8 @@ def train(args: Train) -> None:
     cli.join_processes(args.distributed)
     names = cli.chosen_rows(args, rows.ALL)
     rows.check(names)
+    if args.init and names != ("aamdm",):
+        raise ValueError(f"init is {args.init}, but rows are {names}: expected 'aamdm'")
     loop.check_writable(args.out)
     run = aamdm_training.prepare(
         args.out,
@@ -195,7 +199,11 @@ def train(args: Train) -> None:
         )
 
     adversarial = budget(args.generator_steps, optimizer="radam", learning_rate=2e-4)
-    spaces = {}
+    spaces, networks = {}, None
+    if args.init:
+        spaces["embedded"], networks = aamdm_training.start_of(
+            args.init, run, width=args.width
+        )
     for name in names:
         where, begun = rows.space_of(name), time.perf_counter()
         if where not in spaces:
@@ -222,6 +230,7 @@ def train(args: Train) -> None:
                 optimizer="adamw",
                 learning_rate=1e-3,
             ),
+            init=networks,
         )
         print(f"{name}: {time.perf_counter() - begun:.0f} s", flush=True)
 

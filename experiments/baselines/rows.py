@@ -32,6 +32,7 @@ from jaxmotion.systems.aamdm import training as aamdm_training
 from jaxmotion.systems.aamdm.controller import Memory, Stepper
 from jaxmotion.systems.aamdm.space import Space
 from jaxmotion.systems.aamdm.training import Run, SpaceName
+from jaxmotion.typing import Params
 
 TABLE_1 = ("aamdm", "amdm5", "lmm", "mvae")
 TABLE_2 = tuple(
@@ -213,16 +214,17 @@ def train_row(
     polisher: Budget,
     generator: Budget,
     baseline: Budget,
+    init: Params | None = None,
 ) -> None:
-    """Trains what a row needs and does not have yet."""
+    """Trains what a row needs and does not have yet; AAMDM's start with `init`."""
     if not is_chain(name):
         train_baseline(name, run, space, sizes, baseline)
         return
     config, where = _config(name, space, sizes), space_of(name)
     if config.polishes:
-        aamdm_training.train_polisher(run, where, space, config, polisher)
+        aamdm_training.train_polisher(run, where, space, config, polisher, init=init)
     if config.drafts and not _held(name):
-        aamdm_training.train_generator(run, where, space, config, generator)
+        aamdm_training.train_generator(run, where, space, config, generator, init=init)
 
 
 def load_row(

@@ -9,12 +9,14 @@ import sys
 import types
 from pathlib import Path
 
+import chex
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxmotion.data import bvh_text, clips_io, procedural
 from jaxmotion.learning import checkpoint
+from jaxmotion.systems.aamdm import training as aamdm_training
 from tests.experiments.conftest import check_face_steers
 
 ROOT = Path(__file__).parents[2]
@@ -97,6 +99,29 @@ def test_what_is_trained_is_not_trained_again(call, trained, data):
     assert losses(trained) == before
     for name in STAGES:
         assert checkpoint.latest_step(trained / name / "checkpoints") == 10
+
+
+@pytest.mark.slow
+def test_a_row_goes_on_from_another_folders(call, trained, data, tmp_path):
+    """Its space is the other's, and its networks begin where those ended."""
+    out = tmp_path / "on"
+    rows = SETTINGS.replace("aamdm lmm", "aamdm").replace("steps 10", "steps 1")
+    call(f"train --data {data} --out {out} {rows} --weight-foot 9 --init {trained}")
+    assert not (out / "autoencoder").exists()
+
+    def parts(folder):
+        run = aamdm_training.load_run(folder)
+        space = aamdm_training.load_space(run, "embedded")
+        chain = dict(drafts=3, polishes=2)
+        return space, *aamdm_training.load_networks(run, "embedded", space, **chain)
+
+    (space, networks, config), (first, before, _) = parts(out), parts(trained)
+    assert config.weight_foot == 9
+    chex.assert_trees_all_equal(space, first)
+    # One update.
+    chex.assert_trees_all_close(networks, before, atol=0.02)
+    with pytest.raises(AssertionError):
+        chex.assert_trees_all_close(networks["polisher"], before["polisher"], atol=1e-7)
 
 
 # --- evaluation --------------------------------------------------------------------
@@ -194,6 +219,15 @@ BAD = [
     ),
     ("train --data {data} --out {file}/below {settings}", "plain/below"),
     ("train --data {data} --out {out} --field mood", "field 'mood'"),
+    (
+        "train --data {data} --out {out} {settings} --init {run}",
+        r"init is .*run, but rows are \('aamdm', 'lmm'\): expected 'aamdm'",
+    ),
+    (
+        "train --data {data} --out {out} {settings} --rows aamdm --width 16 "
+        "--init {run}",
+        "run: expected a model like the one to train: width is 32, given 16",
+    ),
     ("train --data {data} --out {out} {settings} --fps 24", "resampled to 24"),
     (
         "train --data {data} --out {run} {settings} --fps 120",

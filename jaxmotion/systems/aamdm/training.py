@@ -265,9 +265,13 @@ def make_space(run: Run, autoencoder: Autoencoder | None) -> Space:
     if checkpoint.latest_step(run.record.checkpoints(name)) is not None:
         return load_space(run, name)
     space = jax.jit(functools.partial(_space, run))(autoencoder)
+    _store_space(run, name, space)
+    return space
+
+
+def _store_space(run: Run, name: SpaceName, space: Space) -> None:
     leaves = {str(i): x for i, x in enumerate(jax.tree.leaves(space))}
     runs.store(run.record, name, leaves, model=dataclasses.asdict(run.embedding))
-    return space
 
 
 def load_space(run: Run, name: SpaceName) -> Space:
@@ -342,15 +346,56 @@ def _pose_error(
     return total
 
 
+def start_of(path: Path, run: Run, *, width: int) -> tuple[Space, Params]:
+    """Embedded space and networks of another run folder, to train on from.
+
+    The run takes that space as its own, and needs no autoencoder. `CheckpointError` if
+    the other has not trained its row "aamdm"; a `ValueError` names what differs of
+    skeletons, autoencoders or widths of networks.
+    """
+    first = load_run(path)
+    space = load_space(first, "embedded")
+    networks, config = load_networks(first, "embedded", space, drafts=3, polishes=2)
+    found, wanted = (
+        {
+            "config": dataclasses.asdict(x.embedding),
+            "skeleton": model_json.skeleton_to_json(x.skeleton),
+            "width": size,
+        }
+        for x, size in ((first, config.width), (run, width))
+    )
+    model_json.check_start(path, found, wanted, free=())
+    if checkpoint.latest_step(run.record.checkpoints("embedded")) is None:
+        _store_space(run, "embedded", space)
+    return space, networks
+
+
+def _begin(
+    config: aamdm_model.Config, budget: Budget, init: Params | None
+) -> dict[str, Params]:
+    """Parameters that a chain's stage begins with."""
+    params = aamdm_model.init(jax.random.key(budget.seed), config)
+    return params | init if init else params
+
+
 def train_polisher(
-    run: Run, name: SpaceName, space: Space, config: aamdm_model.Config, budget: Budget
+    run: Run,
+    name: SpaceName,
+    space: Space,
+    config: aamdm_model.Config,
+    budget: Budget,
+    *,
+    init: Params | None = None,
 ) -> Params:
-    """Stage 2: trains the diffusion model, and returns its averaged parameters."""
+    """Stage 2: trains the diffusion model, and returns its averaged parameters.
+
+    A new stage starts with the networks of `init`.
+    """
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     change = scale_of_changes(space, config)
     error = functools.partial(_pose_error, run, space, config.weight_foot)
     state = runs.minimize(
-        aamdm_model.init(jax.random.key(budget.seed), config)["polisher"],
+        _begin(config, budget, init)["polisher"],
         run.record,
         _stage(name, config, "polisher"),
         functools.partial(
@@ -374,11 +419,17 @@ def train_polisher(
 
 
 def train_generator(
-    run: Run, name: SpaceName, space: Space, config: aamdm_model.Config, budget: Budget
+    run: Run,
+    name: SpaceName,
+    space: Space,
+    config: aamdm_model.Config,
+    budget: Budget,
+    *,
+    init: Params | None = None,
 ) -> Params:
     """Stage 3: trains the generator, and returns its averaged parameters.
 
-    Both players have the budget's optimizer.
+    Both players have the budget's optimizer; `init` is as in `train_polisher`.
     """
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
     change = scale_of_changes(space, config)
@@ -387,7 +438,7 @@ def train_generator(
         for loss in (aamdm_loss.discriminator_loss, aamdm_loss.generator_loss)
     )
     optimizer = runs.make_optimizer(budget)
-    params = aamdm_model.init(jax.random.key(budget.seed), config)
+    params = _begin(config, budget, init)
     players = {
         player: training.init_train_state(params[player], optimizer)
         for player in ("generator", "discriminator")

@@ -35,6 +35,8 @@ _FEW = dict(
 # Shares left at last steps of little noise (ours): the published schedule, made for a
 # discriminator, goes from .32 deviations to none.
 _FINE = (0.999, 0.99, 0.95, 0.86, 0.71, 0.5, 0.3, 0.14)
+# Shares left at the published schedule's five noisiest steps.
+_NOISY = (0.02607685, 0.007086248, 0.001578794, 0.0002883917, 4.319044e-05)
 _DDPM = dict(latent=0, schedule="cosine", weight_recon=1.0)
 # Changes of the base configuration, by row.
 ROWS: dict[str, dict[str, Any]] = {
@@ -66,12 +68,11 @@ ROWS: dict[str, dict[str, Any]] = {
     "no_gan_fine": dict(weight_adversarial=0.0, alpha_bar=(*_FINE, 0.04, 4e-5)),
     # The same last steps, and the six noisiest published ones.
     "no_gan_14": dict(
-        weight_adversarial=0.0,
-        num_steps=14,
-        alpha_bar=(
-            *(*_FINE, 0.07867597, 0.02607685, 0.007086248),
-            *(0.001578794, 0.0002883917, 4.319044e-05),
-        ),
+        weight_adversarial=0.0, num_steps=14, alpha_bar=(*_FINE, 0.07867597, *_NOISY)
+    ),
+    # Ten of these: five last ones, and the five noisiest.
+    "no_gan_10": dict(
+        weight_adversarial=0.0, alpha_bar=(*_FINE[:2], *_FINE[3::2], *_NOISY)
     ),
     "no_gan_5": dict(weight_adversarial=0.0, num_steps=5),
     "no_gan_3": dict(weight_adversarial=0.0, num_steps=3),

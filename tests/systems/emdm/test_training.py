@@ -132,6 +132,9 @@ def test_rows_are_changes_of_the_base():
         "no_gan_14": dict(
             weight_adversarial=0.0, num_steps=14, alpha_bar=make("no_gan_14").alpha_bar
         ),
+        "no_gan_10": dict(
+            weight_adversarial=0.0, alpha_bar=make("no_gan_10").alpha_bar
+        ),
         "no_condition": dict(discriminator_condition=False),
     }
     learns = dict(
@@ -158,6 +161,8 @@ def test_rows_are_changes_of_the_base():
     published = schedule.vp_schedule(10).alpha_bar[5:]
     assert both[:8] == fine[:8]
     np.testing.assert_allclose(both[8:], published, rtol=1e-5)
+    visited = (0, 1, 3, 5, 7, *range(9, 14))
+    assert make("no_gan_10").alpha_bar == tuple(both[i] for i in visited)
     assert set(expected) == {*emdm_training.ROWS, *emdm_training.SAMPLERS}
     for row, changes in expected.items():
         assert make(row) == dataclasses.replace(base, **changes)
