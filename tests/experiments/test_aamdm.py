@@ -10,6 +10,7 @@ import types
 from pathlib import Path
 
 import chex
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -102,7 +103,7 @@ def test_what_is_trained_is_not_trained_again(call, trained, data):
 
 
 @pytest.mark.slow
-def test_a_row_goes_on_from_another_folders(call, trained, data, tmp_path):
+def test_a_row_goes_on_from_another_folders(call, trained, data, tmp_path, monkeypatch):
     """Its space is the other's, and its networks begin where those ended."""
     out = tmp_path / "on"
     rows = SETTINGS.replace("aamdm lmm", "aamdm").replace("steps 10", "steps 1")
@@ -122,6 +123,17 @@ def test_a_row_goes_on_from_another_folders(call, trained, data, tmp_path):
     chex.assert_trees_all_close(networks, before, atol=0.02)
     with pytest.raises(AssertionError):
         chex.assert_trees_all_close(networks["polisher"], before["polisher"], atol=1e-7)
+    call(f"train --data {data} --out {out} {rows} --weight-foot 9 --init {trained}")
+
+    load, other = aamdm_training.load_space, jax.tree.map(lambda x: x + 1, first)
+    monkeypatch.setattr(
+        aamdm_training,
+        "load_space",
+        lambda run, name: other if run.record.folder == trained else load(run, name),
+    )
+    run = aamdm_training.load_run(out)
+    with pytest.raises(ValueError, match="on: has another space than .*run; use"):
+        aamdm_training.start_of(trained, run, width=32)
 
 
 # --- evaluation --------------------------------------------------------------------

@@ -351,7 +351,7 @@ def start_of(path: Path, run: Run, *, width: int) -> tuple[Space, Params]:
 
     The run takes that space as its own, and needs no autoencoder. `CheckpointError` if
     the other has not trained its row "aamdm"; a `ValueError` names what differs of
-    skeletons, autoencoders or widths of networks.
+    skeletons, autoencoders or widths of networks, or that the run has another space.
     """
     first = load_run(path)
     space = load_space(first, "embedded")
@@ -367,6 +367,13 @@ def start_of(path: Path, run: Run, *, width: int) -> tuple[Space, Params]:
     model_json.check_start(path, found, wanted, free=())
     if checkpoint.latest_step(run.record.checkpoints("embedded")) is None:
         _store_space(run, "embedded", space)
+    pairs = zip(
+        *map(jax.tree.leaves, (load_space(run, "embedded"), space)), strict=True
+    )
+    if not all(np.array_equal(*pair) for pair in pairs):
+        raise ValueError(
+            f"{run.record.folder}: has another space than {path}; use another folder"
+        )
     return space, networks
 
 
