@@ -128,6 +128,7 @@ def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
         ({"out": tmp_path}, IsADirectoryError, "is a folder"),
         ({"fps": 1e300}, ValueError, "--fps should be in 0.001..100000, found 1e.300"),
         ({"seed": -1}, ValueError, "--seed should be in 0..2"),
+        ({"loops": True, "actions": True}, ValueError, "not of stretches of --actions"),
     ]
     for change, error, message in cases:
         with pytest.raises(error, match=message):
