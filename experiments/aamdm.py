@@ -105,6 +105,8 @@ class Evaluate:
 
     Attributes:
       rows: Which rows; "all": those that were trained.
+      data: Takes that characters start from and are compared with, chosen and split as
+        those of training; None for those of training.
       out: Folder for metrics.json and table.md; None for <run>/evaluation.
       rollouts: Characters; a multiple of 4.
       seconds: Length of each rollout, seconds (the paper: 1000 frames).
@@ -122,6 +124,7 @@ class Evaluate:
 
     run: Path = Path("runs/aamdm")
     rows: tuple[str, ...] = ("all",)
+    data: cli.Optional[Path] = None
     out: Path | None = None
     rollouts: int = 16
     seconds: float = 1000 / 60
@@ -240,6 +243,8 @@ def evaluate(args: Evaluate) -> None:
     rows.check(cli.chosen_rows(args))
     out = cli.out_folder(args, "evaluation")
     run = aamdm_training.load_run(args.run)
+    if args.data:
+        run = aamdm_training.with_takes(run, args.data)
     cli.announce("compiling the rollouts of each row", 40)
     table, report = tables.evaluate(run, args, out)
     guided = "all" if args.guided_steps is None else f"the last {args.guided_steps}"

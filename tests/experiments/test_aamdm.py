@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxmotion.data import bvh_text, clips_io, procedural
+from jaxmotion.data import bvh_text, clips_io, procedural, selection
 from jaxmotion.learning import checkpoint
 from jaxmotion.systems.aamdm import training as aamdm_training
 from tests.experiments.conftest import check_face_steers
@@ -56,10 +56,10 @@ def trained(call, data, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def evaluated(call, trained):
+def evaluated(call, trained, data):
     call(
-        f"evaluate --run {trained} --rollouts 4 --seconds 2 --long-minutes 0.1 "
-        "--long-rollouts 2"
+        f"evaluate --run {trained} --data {data} --rollouts 4 --seconds 2 "
+        "--long-minutes 0.1 --long-rollouts 2"
     )
     return trained / "evaluation"
 
@@ -193,6 +193,23 @@ def test_the_table_has_a_line_for_each_row(evaluated):
     assert "no evaluator" in note
     assert [line.split("|")[1].strip() for line in lines[2:]] == list(found)
     assert len({line.count("|") for line in lines}) == 1
+
+
+@pytest.mark.slow
+def test_other_takes_are_chosen_and_split_as_those_of_training(trained, data, tmp_path):
+    run = aamdm_training.load_run(trained)
+    same = aamdm_training.with_takes(run, data)
+    for mine, own in ((same.train, run.train), (same.held_out, run.held_out)):
+        np.testing.assert_array_equal(mine.poses, own.poses)
+        np.testing.assert_array_equal(mine.offsets, own.offsets)
+    assert same.record is run.record
+    path = tmp_path / "others.npz"
+    clips = clips_io.load_clips(data)
+    clips_io.save_clips(
+        path, selection.select(clips, "style", clips.names("style")[:1])
+    )
+    other = aamdm_training.with_takes(run, path)
+    assert 0 < other.train.num_frames < run.train.num_frames
 
 
 # --- rollouts ----------------------------------------------------------------------

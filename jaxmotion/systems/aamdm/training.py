@@ -9,6 +9,7 @@ full_pose/...                                the same without the embedding
 import dataclasses
 import functools
 import operator
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -143,6 +144,22 @@ def prepare(
 
 
 _FILES = ("train.npz", "held_out.npz")
+
+
+def with_takes(run: Run, data: Path) -> Run:
+    """The run with frames of other takes, chosen and split as its own were.
+
+    `ValueError` if their skeleton is another, or they do not fit.
+    """
+    settings = run.record.settings | {"labels": tuple(run.record.settings["labels"])}
+    with tempfile.TemporaryDirectory() as folder:
+        other = prepare(Path(folder) / "run", data, **settings)
+    if other.skeleton.names != run.skeleton.names:
+        raise ValueError(
+            f"{data}: has joints {', '.join(other.skeleton.names)}, expected those of "
+            f"{run.record.folder}: {', '.join(run.skeleton.names)}"
+        )
+    return dataclasses.replace(run, train=other.train, held_out=other.held_out)
 
 
 def load_run(folder: Path) -> Run:
