@@ -117,6 +117,7 @@ COLUMNS: dict[str, Column] = {
         Column(id="skate", title="skate", unit="mm"),
         Column(id="skate_recorded", title="recorded", unit="mm", better=""),
         Column(id="crossings", title="legs cross", unit="per minute", better="real"),
+        Column(id="strides", title="strides", unit="per second", better="real"),
         Column(id="toe_sink", title="lowest toe below rest", unit="cm"),
         Column(id="toe_depth", title="mean toe below rest", unit="cm"),
         Column(id="toe_swing", title="swinging toe", unit="cm", better=""),

@@ -127,6 +127,32 @@ def leg_crossings(
     return 60.0 * fps * jnp.mean(begun, axis=-1)
 
 
+# Strides per second that are looked for, and samples of the spectrum.
+_STRIDES, _SPECTRUM = (0.4, 4.0), 4096
+
+
+def stride_rate(
+    foot_positions: Float[Array, "*batch frames 2 3"],
+    facing: Float[Array, "*batch frames 2"],
+    fps: Scalar,
+) -> Float[Array, "*batch"]:
+    """Strides (of two steps) per second: how often one foot overtakes the other.
+
+    The strongest frequency of .4 to 4 Hz in how far the left foot is ahead of the right
+    one along the facing (x, z; unit length). Meaningless for who stands. Feet are world
+    positions, meters.
+    """
+    gap = foot_positions[..., 0, ::2] - foot_positions[..., 1, ::2]
+    ahead = into_frame(gap, facing)[..., 1]
+    ahead = ahead - jnp.mean(ahead, axis=-1, keepdims=True)
+    taper = jnp.broadcast_to(jnp.hanning(ahead.shape[-1]), ahead.shape)
+    power = jnp.abs(jnp.fft.rfft(ahead * taper, n=_SPECTRUM))
+    rate = jnp.arange(power.shape[-1]) * fps / _SPECTRUM
+    is_gait = (_STRIDES[0] <= rate) & (rate <= _STRIDES[1])
+    gait = jnp.where(jnp.broadcast_to(is_gait, power.shape), power, 0.0)
+    return rate[jnp.argmax(gait, axis=-1)]
+
+
 class Swing(NamedTuple):
     """How high swinging feet are, by window.
 

@@ -49,6 +49,8 @@ from jaxmotion.motion.trajectory import Command
 SKIP = 3.0
 # Real windows count for a told speed if their own is within 15 %, or 0.1 m/s.
 _NEAR, _STILL = 0.15, 0.1
+# Who is slower, m/s, makes no strides.
+_GOES = 0.3
 # Real windows turn if they end facing this far, degrees, from where they began.
 _TURNING = 90.0
 # A stop, a start and a turn are done below 0.1 m/s, at 90 % of the told speed, within
@@ -133,6 +135,7 @@ def _window_metrics(
     toes = feet[..., 1]
     reach, fps = _reach(x.motion.fps), x.motion.fps
     speed = alignment.steady_speed(positions[..., 0, ::2], fps, reach=reach)
+    mean_speed = jnp.mean(speed[..., reach:-reach], axis=-1)
     metrics = locomotion.locomotion_metrics(
         skeleton, x.motion, x.velocity, x.facing, contact_height=ground.contact
     )
@@ -144,8 +147,10 @@ def _window_metrics(
     return {name: metrics[name] for name in names} | {
         "turn": jnp.rad2deg(jnp.abs(turn)),
         "crossings": contact.leg_crossings(feet, facing, fps),
+        "strides": contact.stride_rate(feet, facing, fps),
         "ffr_mann": contact.skating_frame_ratio(raised, fps),
-        "speed": jnp.mean(speed[..., reach:-reach], axis=-1),
+        "speed": mean_speed,
+        "goes": (mean_speed > _GOES).astype(jnp.float32),
         "sink": ground.rest - jnp.min(toes, axis=(-2, -1)),
         "swing": swing.median,
         "swing_low": swing.low,
@@ -255,6 +260,7 @@ _OF_WINDOWS = {
     "ffr_mann": ("ffr_mann", None, 1.0),
     "jerk": ("jerk", None, 1.0),
     "crossings": ("crossings", None, 1.0),
+    "strides": ("strides", "goes", 1.0),
     "toe_sink": ("sink", None, 100.0),
     "toe_depth": ("depth", None, 100.0),
     "toe_swing": ("swing", "swing_seconds", 100.0),

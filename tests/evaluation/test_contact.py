@@ -77,6 +77,22 @@ def test_feet_side_by_side_do_not_cross_whichever_way_they_face():
     assert contact.leg_crossings(steps, -ahead, 30.0) == 60 * 30 / 4
 
 
+@pytest.mark.parametrize(("rate", "frames"), [(1.0, 120), (1.6, 60), (2.5, 60)])
+def test_strides_are_counted_whichever_way_one_goes(rate, frames):
+    """Feet swing against each other with one harmonic, while the body goes on."""
+    time = np.arange(frames) / 60.0
+    turn = 2 * np.pi * rate * time
+    ahead = 0.4 * np.sin(turn) + 0.1 * np.sin(2 * turn + 1.0)
+    way = np.array([0.6, 0.8])
+    body = (3.0 * time)[:, None] * way
+    feet = np.zeros((frames, 2, 3))
+    for foot, sign in enumerate((0.5, -0.5)):
+        feet[:, foot, ::2] = body + sign * ahead[:, None] * way
+    facing = jnp.tile(jnp.asarray(way, jnp.float32), (frames, 1))
+    found = contact.stride_rate(jnp.asarray(feet, jnp.float32), facing, 60.0)
+    assert abs(found - rate) < 0.05
+
+
 def sliding(speed, height, frames=5):
     """Two feet: one slides along the ground at a height, one stands still beside it."""
     along = speed * np.arange(frames) / 60.0
