@@ -61,6 +61,8 @@ class Train:
       levels: Steps that each network learns: all, or its own.
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data; rows as published and AMDM have none.
+      constant_rate: Keep the polishers' rate; without it the rate falls to a twentieth
+        of its peak. What is kept is a moving average of the parameters, always.
       init: Run folder of a row "aamdm" to start that from, in its learned space.
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with these settings where a stage began with others.
@@ -91,6 +93,7 @@ class Train:
     gan_window: int = 3
     levels: Literal["all", "own"] = "all"
     previous_noise: float = 0.5
+    constant_rate: bool = False
     init: cli.Optional[Path] = None
     distributed: cli.Distributed = ()
     seed: int = 0
@@ -226,7 +229,7 @@ def train(args: Train) -> None:
             run,
             spaces[where],
             sizes,
-            polisher=budget(steps, windows),
+            polisher=budget(steps, windows, constant=args.constant_rate or None),
             generator=adversarial,
             baseline=budget(
                 args.window_steps if name in ("mvae", "lmm") else args.amdm_steps,
