@@ -151,9 +151,10 @@ def with_takes(run: Run, data: Path) -> Run:
 
     `ValueError` if their skeleton is another, or they do not fit.
     """
-    settings = run.record.settings | {"labels": tuple(run.record.settings["labels"])}
+    settings = run.record.settings
+    labels = tuple(settings["labels"])
     with tempfile.TemporaryDirectory() as folder:
-        other = prepare(Path(folder) / "run", data, **settings)
+        other = prepare(Path(folder) / "run", data, **{**settings, "labels": labels})
     if other.skeleton.names != run.skeleton.names:
         raise ValueError(
             f"{data}: has joints {', '.join(other.skeleton.names)}, expected those of "
