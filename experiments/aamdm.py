@@ -63,7 +63,8 @@ class Train:
         training, in deviations of the data; rows as published and AMDM have none.
       constant_rate: Keep the polishers' rate; without it the rate falls to a twentieth
         of its peak. What is kept is a moving average of the parameters, always.
-      init: Run folder of a row "aamdm" to start that from, in its learned space.
+      init: Run folder or exported model to start the row "aamdm" from, in its learned
+        space.
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with these settings where a stage began with others.
     """

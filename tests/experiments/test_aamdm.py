@@ -17,6 +17,7 @@ from PIL import Image
 
 from jaxmotion.data import bvh_text, clips_io, procedural, selection
 from jaxmotion.learning import checkpoint
+from jaxmotion.systems.aamdm import stored as aamdm_stored
 from jaxmotion.systems.aamdm import training as aamdm_training
 from tests.experiments.conftest import check_face_steers
 
@@ -139,6 +140,31 @@ def test_a_row_goes_on_from_another_folders(call, trained, data, tmp_path, monke
     run = aamdm_training.load_run(out)
     with pytest.raises(ValueError, match="on: has another space than .*run; use"):
         aamdm_training.start_of(trained, run, width=32)
+
+
+@pytest.mark.slow
+def test_a_row_goes_on_from_an_exported_file(call, trained, data, tmp_path):
+    """In a folder that is none's but its own."""
+    file, out = tmp_path / "model.npz", tmp_path / "on"
+    call(f"export --run {trained} --out {file}")
+    rows = SETTINGS.replace("aamdm lmm", "aamdm").replace("steps 10", "steps 1")
+    call(f"train --data {data} --out {out} {rows} --init {file}")
+    run = aamdm_training.load_run(out)
+    space = aamdm_training.load_space(run, "embedded")
+    first = aamdm_training.load_space(aamdm_training.load_run(trained), "embedded")
+    # As the file has it: in half precision.
+    chex.assert_trees_all_close(space, first, rtol=1e-3, atol=1e-6)
+    found, _ = aamdm_training.load_networks(
+        run, "embedded", space, drafts=3, polishes=2
+    )
+    _, stored = aamdm_stored.load(file)
+    chex.assert_trees_all_close(found, stored, atol=0.02)
+
+    params, value = checkpoint.import_params(file)
+    del params["encoder"]
+    checkpoint.export_params(tmp_path / "old.npz", params, value)
+    with pytest.raises(ValueError, match="old.npz: has no encoder: expected a file"):
+        aamdm_training.start_of(tmp_path / "old.npz", run, width=32)
 
 
 # --- evaluation --------------------------------------------------------------------

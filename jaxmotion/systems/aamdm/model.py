@@ -31,6 +31,8 @@ from jaxmotion.diffusion.schedule import Schedule
 from jaxmotion.networks import blocks, mlp
 from jaxmotion.typing import Denoiser, Key, Objective, Params
 
+SYSTEM = "aamdm"
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config:

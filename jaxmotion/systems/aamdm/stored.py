@@ -1,6 +1,7 @@
 """AAMDM's character as one file: all that its run-time needs, and poses of its own.
 
-The autoencoder's encoder stays behind: a character starts in frames of the space.
+The encoder, with which one starts in other poses or trains on, is there unless the file
+was written before 2026-11-29.
 """
 
 import dataclasses
@@ -18,12 +19,13 @@ from jaxmotion.motion import pose
 from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.aamdm import embedding as aamdm_embedding
 from jaxmotion.systems.aamdm import model as aamdm_model
+from jaxmotion.systems.aamdm.model import SYSTEM
 from jaxmotion.systems.aamdm.space import Autoencoder, Space
-from jaxmotion.systems.aamdm.training import SYSTEM
 from jaxmotion.typing import Params
 
 # Networks that take part in a tick.
 _NETWORKS = ("generator", "polisher")
+_AUTOENCODER = ("encoder", "decoder")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,7 +83,7 @@ def export(path: Path, model: Model, networks: Params) -> None:
         "toe_height": model.toe_height,
     }
     params = {name: networks[name] for name in _NETWORKS}
-    params["decoder"] = own.params["decoder"]
+    params |= {name: own.params[name] for name in _AUTOENCODER if name in own.params}
     checkpoint.export_params(path, params, value)
 
 
@@ -114,9 +116,11 @@ def load(path: Path) -> tuple[Model, Params]:
                 f"{where}: field {name!r} has {found}, expected {expected}"
             )
     like = jax.eval_shape(lambda: _init(config, embedding))
+    if "encoder" not in params:
+        del like["encoder"]
     checkpoint.check_params(path, params, like)
     own = Autoencoder(
-        params={"decoder": params.pop("decoder")},
+        params={name: params.pop(name) for name in _AUTOENCODER if name in params},
         statistics=_statistics(value, where, embedding),
         config=embedding,
     )
@@ -145,8 +149,8 @@ def load(path: Path) -> tuple[Model, Params]:
 def _init(config: aamdm_model.Config, embedding: aamdm_embedding.Config) -> Params:
     """Parameters of a file's shapes."""
     found = aamdm_model.init(jax.random.key(0), config)
-    decoder = aamdm_embedding.init(jax.random.key(1), embedding)["decoder"]
-    return {name: found[name] for name in _NETWORKS} | {"decoder": decoder}
+    autoencoder = aamdm_embedding.init(jax.random.key(1), embedding)
+    return {name: found[name] for name in _NETWORKS} | autoencoder
 
 
 def _statistics(

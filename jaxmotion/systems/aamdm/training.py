@@ -31,12 +31,12 @@ from jaxmotion.systems.aamdm import embedding as aamdm_embedding
 from jaxmotion.systems.aamdm import loss as aamdm_loss
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
+from jaxmotion.systems.aamdm import stored as aamdm_stored
 from jaxmotion.systems.aamdm.data import PoseData
 from jaxmotion.systems.aamdm.model import Sample
 from jaxmotion.systems.aamdm.space import Autoencoder, Space
 from jaxmotion.typing import Key, Params
 
-SYSTEM = "aamdm"
 SpaceName = Literal["embedded", "full_pose"]
 
 
@@ -138,7 +138,7 @@ def prepare(
         balance=balance,
     )
     record = runs.begin(
-        folder, system=SYSTEM, data=[data], settings=settings, make=make
+        folder, system=aamdm_model.SYSTEM, data=[data], settings=settings, make=make
     )
     return _decode(record)
 
@@ -165,7 +165,7 @@ def with_takes(run: Run, data: Path) -> Run:
 
 def load_run(folder: Path) -> Run:
     """Loads the data of a run folder; a `ValueError` names what is none of AAMDM's."""
-    return _decode(runs.load(folder, system=SYSTEM))
+    return _decode(runs.load(folder, system=aamdm_model.SYSTEM))
 
 
 def _decode(record: runs.Run) -> Run:
@@ -365,22 +365,33 @@ def _pose_error(
 
 
 def start_of(path: Path, run: Run, *, width: int) -> tuple[Space, Params]:
-    """Embedded space and networks of another run folder, to train on from.
+    """Embedded space and networks of another run folder or exported file, to train on.
 
     The run takes that space as its own, and needs no autoencoder. `CheckpointError` if
-    the other has not trained its row "aamdm"; a `ValueError` names what differs of
-    skeletons, autoencoders or widths of networks, or that the run has another space.
+    the other folder has not trained its row "aamdm"; a `ValueError` names what differs
+    of skeletons, autoencoders or widths of networks, that the run has another space, or
+    a file without an encoder.
     """
-    first = load_run(path)
-    space = load_space(first, "embedded")
-    networks, config = load_networks(first, "embedded", space, drafts=3, polishes=2)
+    if path.is_dir():
+        first = load_run(path)
+        space, skeleton = load_space(first, "embedded"), first.skeleton
+        networks, config = load_networks(first, "embedded", space, drafts=3, polishes=2)
+    else:
+        model, networks = aamdm_stored.load(path)
+        space, skeleton, config = model.space, model.skeleton, model.config
+    own = space.autoencoder
+    if own is None or "encoder" not in own.params:
+        raise ValueError(f"{path}: has no encoder: expected a file exported with one")
     found, wanted = (
         {
-            "config": dataclasses.asdict(x.embedding),
-            "skeleton": model_json.skeleton_to_json(x.skeleton),
+            "config": dataclasses.asdict(x),
+            "skeleton": model_json.skeleton_to_json(joints),
             "width": size,
         }
-        for x, size in ((first, config.width), (run, width))
+        for x, joints, size in (
+            (own.config, skeleton, config.width),
+            (run.embedding, run.skeleton, width),
+        )
     )
     model_json.check_start(path, found, wanted, free=())
     if checkpoint.latest_step(run.record.checkpoints("embedded")) is None:

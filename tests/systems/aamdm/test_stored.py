@@ -1,5 +1,6 @@
 """AAMDM's character as one file."""
 
+import dataclasses
 import json
 
 import jax
@@ -14,6 +15,7 @@ from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm import space as aamdm_space
 from jaxmotion.systems.aamdm import stored as aamdm_stored
 from tests import person, tiny
+from tests.systems.aamdm import test_space
 from tests.systems.aamdm.test_space import frames_of, space_of
 
 
@@ -54,7 +56,7 @@ def test_a_file_gives_the_character_back(model, networks, file):
             networks[name],
         )
     np.testing.assert_allclose(found.starts, model.starts, atol=1e-5)
-    # What decodes frames is there; numbers of the space are as they were.
+    # What encodes and decodes frames is there; numbers of the space are as they were.
     for name in ("change", "low", "high"):
         np.testing.assert_array_equal(
             getattr(found.space, name), getattr(model.space, name)
@@ -62,6 +64,32 @@ def test_a_file_gives_the_character_back(model, networks, file):
     poses = aamdm_space.to_poses(found.space, model.starts)
     expected = aamdm_space.to_poses(model.space, model.starts)
     np.testing.assert_allclose(poses, expected, atol=2e-2)
+    given = test_space.walks()
+    np.testing.assert_allclose(
+        aamdm_space.to_frames(found.space, *given),
+        aamdm_space.to_frames(model.space, *given),
+        atol=2e-2,
+    )
+
+
+def test_a_file_without_an_encoder_is_a_character(tmp_path, model, networks, file):
+    """As those that were written before 2026-11-29."""
+    autoencoder = model.autoencoder
+    decoder = {"decoder": autoencoder.params["decoder"]}
+    space = dataclasses.replace(
+        model.space, autoencoder=dataclasses.replace(autoencoder, params=decoder)
+    )
+    old = tmp_path / "old.npz"
+    aamdm_stored.export(old, dataclasses.replace(model, space=space), networks)
+    assert old.stat().st_size < file.stat().st_size
+    found, _ = aamdm_stored.load(old)
+    assert sorted(found.autoencoder.params) == ["decoder"]
+    np.testing.assert_array_equal(
+        *(
+            aamdm_space.to_poses(x.space, model.starts)
+            for x in (found, aamdm_stored.load(file)[0])
+        )
+    )
 
 
 def test_characters_start_in_its_frames(model, file):
