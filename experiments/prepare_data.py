@@ -91,10 +91,10 @@ class Config:
     """Cut takes into stretches of 3 to 4 s in which a person walks, jogs, runs, turns,
     crouches, jumps, pushes or stands, by rule (field "action"); for takes with styles
     such as those of o3de_motion_matching."""
-    loops: bool = False
-    """Add strides at 1.9 m/s and more that end as they begin, repeated for 12 s, slower
-    and faster, too, so that a model sees people who run on; from the part of each take
-    that remains when its last tenth is held out."""
+    loops: float | None = None
+    """Add strides at 1.9 m/s and more that end as they begin, repeated for so many
+    seconds, slower and faster, too, so that a model sees people who run on; from the
+    part of each take that remains when its last tenth is held out."""
     cut_fps: float = 20.0
     """Frames per second by which the times of captions cut clips; the released loaders
     take 20 for kit_ml too, whose rate is 12.5."""
@@ -139,7 +139,9 @@ def check_config(config: Config) -> None:
         raise ValueError(
             f"{config.source} has no takes to cut: --actions does not apply"
         )
-    if config.loops and (kind != "clips" or config.actions):
+    if config.loops is not None and not 2 <= config.loops <= 3600:
+        raise ValueError(f"--loops should be in 2..3600 seconds, found {config.loops}")
+    if config.loops is not None and (kind != "clips" or config.actions):
         what = "stretches of --actions" if config.actions else config.source
         raise ValueError(f"--loops repeats strides of takes, not of {what}")
     if kind != "clips" and (config.mirror or config.fps is not None):
@@ -314,8 +316,8 @@ def prepare(config: Config) -> None:
         clips = at_rate(data, config.fps or set_fps or data.fps)
         if config.actions:
             clips = actions.cut_actions(clips)
-        if config.loops:
-            clips = loops.with_loops(clips)
+        if config.loops is not None:
+            clips = loops.with_loops(clips, seconds=config.loops)
         if config.mirror and not mirrored:
             clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
         clips_io.save_clips(config.out, clips)

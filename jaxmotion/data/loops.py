@@ -147,7 +147,7 @@ def _about_up(yaw: float) -> Float[np.ndarray, "3 3"]:
     return Rotation.from_rotvec([0.0, yaw, 0.0]).as_matrix()
 
 
-def with_loops(clips: Clips, *, seconds: float = 12.0, held_out: float = 0.1) -> Clips:
+def with_loops(clips: Clips, *, seconds: float, held_out: float = 0.1) -> Clips:
     """The clips, and strides of theirs repeated for so long, slower and faster, too.
 
     Strides come from what is left of a clip when the last part of it is held out, and

@@ -107,11 +107,11 @@ def test_what_training_holds_out_is_in_no_loop():
     root = np.array(motion.root_position)
     root[:480, ::2] = root[480, ::2]
     late = clips(late=dataclasses.replace(motion, root_position=tiny.float32(root)))
-    assert loops.with_loops(late, held_out=0.0).num_clips > 1
+    assert loops.with_loops(late, seconds=3.0, held_out=0.0).num_clips > 1
     with pytest.raises(ValueError, match="no clip has a stride"):
-        loops.with_loops(late)
+        loops.with_loops(late, seconds=3.0)
 
 
 def test_nobody_who_runs_is_one_line():
     with pytest.raises(ValueError, match="no clip has a stride at 1.9 m/s or more"):
-        loops.with_loops(clips(walk=runner(speed=1.4), short=runner(1.0)))
+        loops.with_loops(clips(walk=runner(speed=1.4), short=runner(1.0)), seconds=3.0)

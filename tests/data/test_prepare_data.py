@@ -128,7 +128,8 @@ def test_bad_settings_stop_before_any_work(script, raw, tmp_path):
         ({"out": tmp_path}, IsADirectoryError, "is a folder"),
         ({"fps": 1e300}, ValueError, "--fps should be in 0.001..100000, found 1e.300"),
         ({"seed": -1}, ValueError, "--seed should be in 0..2"),
-        ({"loops": True, "actions": True}, ValueError, "not of stretches of --actions"),
+        ({"loops": 4.0, "actions": True}, ValueError, "not of stretches of --actions"),
+        ({"loops": 1.0}, ValueError, "--loops should be in 2..3600 seconds, found 1.0"),
     ]
     for change, error, message in cases:
         with pytest.raises(error, match=message):

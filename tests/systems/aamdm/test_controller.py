@@ -180,6 +180,25 @@ def test_who_is_too_fast_wants_no_more_than_told():
     assert np.linalg.norm(slower[:2]) < np.linalg.norm(expected[:2]) - 0.02
 
 
+@pytest.mark.parametrize(
+    "faster, less", [(0.5, 0.0), (1.0, 0.0), (1.04, 0.12), (1.1, 0.3), (4.0, 0.3)]
+)
+def test_who_is_too_fast_is_asked_to_go_slower(faster, less):
+    """Three times the share by which he is faster, at most .3; begun as told.
+
+    Springs are linear: who asks for less gets that much less of a start from rest.
+    """
+    ahead = person.directions(0.2)
+    told = command(2.5 * ahead, 0.2)
+    found = aamdm_controller.wanted_path(
+        character(faster * 2.5 * ahead, 0.2), told, fps=FPS, half_life=0.27, gain=3.0
+    )
+    begins = character(min(faster, 1.0) * 2.5 * ahead, 0.2)
+    expected = np.array(wanted_path(begins, told))
+    expected[:6] -= less * wanted_path(character([0.0, 0.0], 0.2), told)[:6]
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
 def test_who_is_told_to_stand_wants_to_stand_where_he_is():
     found = wanted_path(character([0.4, 2.0], 0.0), command([0.0, 0.0], 0.0))
     np.testing.assert_allclose(found[:6], 0.0, atol=1e-5)
@@ -413,3 +432,14 @@ def test_whoever_ships_starts_to_walk():
     place = np.asarray(frames.root_position)[..., ::2]
     moved = np.linalg.norm(place[:, -1] - place[:, 119], axis=-1)
     assert moved.min() > 1.0, moved
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("told", [1.4, 2.5])
+def test_whoever_ships_goes_as_fast_as_told(told):
+    model = jm.load("locomotion_fast")
+    given = jm.commands("straight", model, 8, seconds=8.0, speed=told)
+    frames = jm.rollout(model, jax.random.key(0), model.start(8, seed=0), given)
+    place = np.asarray(frames.root_position)[..., ::2]
+    speed = np.linalg.norm(place[:, -1] - place[:, 239], axis=-1) / 4.0
+    np.testing.assert_allclose(speed, told, rtol=0.12)
