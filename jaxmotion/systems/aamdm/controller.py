@@ -508,7 +508,8 @@ def load_character(
         fps=fps,
         memory=memory,
         step=step,
-        **({} if model.starts is None else dict(start=START, gain=GAIN)),
+        start=0.0 if model.starts is None else START,
+        gain=0.0 if model.starts is None else GAIN,
         held=held,
     )
     return Character(
