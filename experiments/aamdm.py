@@ -307,12 +307,14 @@ class Export:
       out: File to write, for `jaxmotion.load`.
       starts: Poses that the model itself stands in, with which characters start.
       noise_half_life: As of `evaluate`; the file's characters have it.
+      encoder: Keep the encoder, from which one trains on or starts in other poses.
     """
 
     run: Path = Path("runs/aamdm")
     out: Path = Path("aamdm.npz")
     starts: int = 4
     noise_half_life: float = 0.0
+    encoder: bool = True
 
 
 def export(args: Export) -> None:
@@ -325,7 +327,7 @@ def export(args: Export) -> None:
         args.run, number=args.starts, noise_half_life=args.noise_half_life
     )
     model = dataclasses.replace(model, starts=starts)
-    aamdm_stored.export(args.out, model, networks)
+    aamdm_stored.export(args.out, model, networks, encoder=args.encoder)
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
 
 

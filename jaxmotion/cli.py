@@ -92,6 +92,7 @@ LIMITS: dict[str, Range] = {
     "smooth": Range(0, 100),
     "window": Range(1, 1000),
     "balance": Range(0, 1),
+    "loops": Range(2, 3600),
     **dict.fromkeys(("diffusion_steps", "visit", "visits"), Range(1, 1000)),
     "depth": Range(1, 256),
     "crossing": Range(0, 10**4),

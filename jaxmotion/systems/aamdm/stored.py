@@ -1,7 +1,7 @@
 """AAMDM's character as one file: all that its run-time needs, and poses of its own.
 
-The encoder, with which one starts in other poses or trains on, is there unless the file
-was written before 2026-11-29.
+The encoder, with which one starts in other poses or trains on, may be left out: a
+character starts in frames of the space.
 """
 
 import dataclasses
@@ -58,8 +58,8 @@ class Model:
 _BOUNDS = ("change", "low", "high")
 
 
-def export(path: Path, model: Model, networks: Params) -> None:
-    """Writes a model with starts as one file."""
+def export(path: Path, model: Model, networks: Params, *, encoder: bool = True) -> None:
+    """Writes a model with starts as one file, with or without its encoder."""
     own, space = model.autoencoder, model.space
     statistics = {
         field.name: model_json.normalizer_to_json(getattr(own.statistics, field.name))
@@ -83,7 +83,8 @@ def export(path: Path, model: Model, networks: Params) -> None:
         "toe_height": model.toe_height,
     }
     params = {name: networks[name] for name in _NETWORKS}
-    params |= {name: own.params[name] for name in _AUTOENCODER if name in own.params}
+    kept = _AUTOENCODER if encoder else _AUTOENCODER[1:]
+    params |= {name: own.params[name] for name in kept if name in own.params}
     checkpoint.export_params(path, params, value)
 
 
