@@ -62,8 +62,7 @@ class Train:
       previous_noise: Largest deviation of the noise on given previous frames in
         training, in deviations of the data; rows as published and AMDM have none.
       constant_rate: Keep the polishers' rate; without it the rate falls to a twentieth
-        of its peak.
-      ema: Decay of the average of the polishers' parameters, which is what is kept.
+        of its peak. What is kept is a moving average of the parameters, always.
       init: Run folder or exported model to start the row "aamdm" from, in its learned
         space.
       distributed: One of several processes: "auto", or address, number, index.
@@ -96,7 +95,6 @@ class Train:
     levels: Literal["all", "own"] = "all"
     previous_noise: float = 0.5
     constant_rate: bool = False
-    ema: float = 0.999
     init: cli.Optional[Path] = None
     distributed: cli.Distributed = ()
     seed: int = 0
@@ -232,9 +230,7 @@ def train(args: Train) -> None:
             run,
             spaces[where],
             sizes,
-            polisher=budget(
-                steps, windows, constant=args.constant_rate or None, ema=args.ema
-            ),
+            polisher=budget(steps, windows, constant=args.constant_rate or None),
             generator=adversarial,
             baseline=budget(
                 args.window_steps if name in ("mvae", "lmm") else args.amdm_steps,
