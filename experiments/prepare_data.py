@@ -92,9 +92,10 @@ class Config:
     crouches, jumps, pushes or stands, by rule (field "action"); for takes with styles
     such as those of o3de_motion_matching."""
     loops: float | None = None
-    """Add strides at 1.9 m/s and more that end as they begin, repeated for so many
-    seconds, slower and faster, too, so that a model sees people who run on; from the
-    part of each take that remains when its last tenth is held out."""
+    """Add strides at 1.9 m/s and more that end as they begin, repeated, slower and
+    faster, too, so that a model sees people who run on: until each half of a meter per
+    second from 2 m/s to 4.1 can be learned from for so many seconds, when the last
+    tenth of each take is held out."""
     cut_fps: float = 20.0
     """Frames per second by which the times of captions cut clips; the released loaders
     take 20 for kit_ml too, whose rate is 12.5."""

@@ -31,6 +31,9 @@ _SLOWEST, _APART, _MOST = 1.9, 0.3, 10
 _RATES = ((0.85, 2.4), (1.0, 2.0), (1.12, 2.7), (1.24, 2.7))
 # Fastest copies: meters per second, strides per second.
 _FASTEST, _CADENCE = 4.1, 1.85
+# Speeds from one to the next, and above the last, are shown for as long; m/s. Speed is
+# that of the root, averaged over so many seconds.
+_BANDS, _AVERAGED = (2.0, 2.5, 3.0, 3.5), 0.68
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,8 +74,7 @@ def find_strides(
     if not first.size:
         return []
     yaw = np.unwrap(np.arctan2(facing[:, 0], facing[:, 1]))
-    root = uniform_filter1d(joints[:, 0, ::2], round(0.68 * fps), axis=0)
-    speed = np.linalg.norm(np.gradient(root, axis=0), axis=1) * fps
+    speed = _speeds(joints, fps)
     sides = np.stack([facing[:, ::-1] * [1, -1], facing], axis=1)
 
     def of_hips(x: np.ndarray) -> np.ndarray:
@@ -143,56 +145,85 @@ def repeat_stride(motion: Motion, stride: Stride, *, frames: int) -> Motion:
     )
 
 
+def _speeds(
+    joints: Float[np.ndarray, "frames joints 3"], fps: float
+) -> Float[np.ndarray, " frames"]:
+    root = uniform_filter1d(joints[:, 0, ::2], round(_AVERAGED * fps), axis=0)
+    return np.linalg.norm(np.gradient(root, axis=0), axis=1) * fps
+
+
+def _cadence(stride: Stride, fps: float) -> float:
+    """Strides per second."""
+    return (1 if stride.frames < 0.93 * fps else 2) / stride.frames * fps
+
+
 def _about_up(yaw: float) -> Float[np.ndarray, "3 3"]:
     return Rotation.from_rotvec([0.0, yaw, 0.0]).as_matrix()
 
 
 def with_loops(clips: Clips, *, seconds: float, held_out: float = 0.1) -> Clips:
-    """The clips, and strides of theirs repeated for so long, slower and faster, too.
+    """The clips, and strides of theirs repeated, slower and faster, too.
 
-    Strides come from what is left of a clip when the last part of it is held out, and
-    the second before that. A loop has its clip's labels, and its name followed by the
-    loop's number and rate: "Run1_loop3x1.12". Copies at 0.85, 1.12 and 1.24 times the
-    speed are made where people still move so: of runs, up to 4.1 m/s and 1.85 strides
-    per second.
+    Each half of a meter per second from 2 m/s to 4.1 is then to be learned from for so
+    many seconds, its loops as long as each other; one of which the clips have as much
+    gets none. Learned from is what is left of a clip when the last part of it is held
+    out, and the second before that; strides come from there. A loop has its clip's
+    labels, and its name followed by the loop's number and rate: "Run1_loop3x1.12".
+    Copies at 0.85, 1.12 and 1.24 times the speed are made where people still move so:
+    of runs, up to 4.1 m/s and 1.85 strides per second.
 
-    `ValueError` if no clip has such a stride, or a hip joint is missing.
+    `ValueError` if no clip has such a stride, none is missing, or a hip joint is.
     """
-    joints = np.asarray(all_joints(clips), np.float64)
+    fps, joints = clips.fps, np.asarray(all_joints(clips), np.float64)
     facing = np.asarray(hip_facing(clips.skeleton, clips.joint_rotation), np.float64)
     offsets, found = np.asarray(clips.offsets), []
+    missing = np.full(len(_BANDS), seconds * fps)
     for clip, (start, stop) in enumerate(zip(offsets[:-1], offsets[1:], strict=True)):
-        kept = int((stop - start) * (1.0 - held_out)) - round(clips.fps)
-        part = slice(start, start + max(kept, 0))
-        strides = find_strides(joints[part], facing[part], fps=clips.fps)
+        kept = int((stop - start) * (1.0 - held_out)) - round(fps)
+        if kept <= 1:
+            continue
+        part = slice(start, start + kept)
+        missing -= np.histogram(_speeds(joints[part], fps), (*_BANDS, np.inf))[0]
+        strides = find_strides(joints[part], facing[part], fps=fps)
         found += [(stride.speed, clip, stride) for stride in strides]
     if not found:
         raise ValueError(
             f"no clip has a stride at {_SLOWEST:g} m/s or more that ends as it begins"
         )
-    motions, names, whose = [], [], []
-    length = round(seconds * clips.fps)
     found.sort(key=lambda x: (x[0], x[1], x[2].start))
-    for number, (speed, clip, stride) in enumerate(found):
-        cadence = (1 if stride.frames < 0.93 * clips.fps else 2) / stride.frames
-        for rate, least in _RATES:
-            too_fast = rate * cadence * clips.fps > _CADENCE
-            if too_fast or not least <= rate * speed <= _FASTEST:
-                continue
-            longer = repeat_stride(
-                clip_motion(clips, clip), stride, frames=int(length * rate) + 2
+    copies = [
+        (number, rate, np.searchsorted(_BANDS, rate * speed, side="right") - 1)
+        for number, (speed, _, stride) in enumerate(found)
+        for rate, least in _RATES
+        if rate * _cadence(stride, fps) <= _CADENCE
+        and least <= rate * speed <= _FASTEST
+    ]
+    made = np.bincount([band for _, _, band in copies], minlength=len(_BANDS))
+    each = np.round((missing / np.maximum(made, 1) + fps) / (1.0 - held_out))
+    lengths = np.where((made > 0) & (missing > 0), each, 0)
+    if not lengths.any():
+        raise ValueError(
+            f"nothing to add: the clips show each speed for {seconds:g} s already"
+        )
+    motions, names, whose = [], [], []
+    for number, rate, band in copies:
+        _, clip, stride = found[number]
+        length = int(lengths[band])
+        if not length:
+            continue
+        longer = repeat_stride(
+            clip_motion(clips, clip), stride, frames=int(length * rate) + 2
+        )
+        motion = resample.resample(dataclasses.replace(longer, fps=fps * rate), fps)
+        motions.append(
+            dataclasses.replace(
+                motion,
+                root_position=motion.root_position[:length],
+                joint_rotation=motion.joint_rotation[:length],
             )
-            played = dataclasses.replace(longer, fps=clips.fps * rate)
-            motion = resample.resample(played, clips.fps)
-            motions.append(
-                dataclasses.replace(
-                    motion,
-                    root_position=motion.root_position[:length],
-                    joint_rotation=motion.joint_rotation[:length],
-                )
-            )
-            names.append(f"{clips.clip_names[clip]}_loop{number}x{rate:g}")
-            whose.append(clip)
+        )
+        names.append(f"{clips.clip_names[clip]}_loop{number}x{rate:g}")
+        whose.append(clip)
     loops = clips_from_motions(
         motions,
         clips.skeleton,

@@ -89,17 +89,33 @@ def test_no_seam_where_ends_differ():
 
 def test_copies_go_at_their_rates_and_keep_labels():
     made = clips(run=runner(), walk=runner(speed=1.4))
-    found = loops.with_loops(made, seconds=3.0)
+    found = loops.with_loops(made, seconds=30.0)
     assert found.clip_names[:2] == ("run", "walk")
     rates = {name.split("x")[1] for name in found.clip_names[2:]}
     # 1.5 strides per second; faster ones than 1.85 would be no person's.
     assert rates == {"0.85", "1", "1.12"}
     for clip, name in enumerate(found.clip_names[2:], 2):
         motion = clip_motion(found, clip)
-        assert motion.root_position.shape[0] == 180
         moved = np.linalg.norm(np.diff(motion.root_position[:, ::2], axis=0), axis=-1)
         assert abs(moved.mean() * FPS - 3.0 * float(name.split("x")[1])) < 0.02
     assert set(np.asarray(found.labels["style"]).tolist()) == {0}
+
+
+def test_each_speed_is_learned_from_for_as_long():
+    run, walk, jog = runner(20.0, speed=3.2), runner(speed=1.4), runner(speed=2.2)
+    found = loops.with_loops(clips(run=run, walk=walk, jog=jog), seconds=12.0)
+    shown = np.zeros(4)
+    for name, frames in zip(found.clip_names, np.diff(found.offsets), strict=True):
+        take, _, rate = name.partition("x")
+        speed = {"r": 3.2, "w": 1.4, "j": 2.2}[take[0]] * float(rate or 1)
+        if speed > 2.0:
+            shown[int(2 * (speed - 2.0))] += 0.9 * frames / FPS - 1.0
+    # Averaged speeds are lower in the third of a second at the ends of a take; lengths
+    # are whole frames. At 3.2 m/s there are 17 s already.
+    np.testing.assert_allclose(shown[[0, 1, 3]], 12.0, atol=0.7)
+    assert shown[2] == pytest.approx(0.9 * 20.0 - 1.0)
+    with pytest.raises(ValueError, match="nothing to add: .* for 3 s already"):
+        loops.with_loops(clips(jog=runner(20.0, speed=2.1)), seconds=3.0)
 
 
 def test_what_training_holds_out_is_in_no_loop():
@@ -107,7 +123,7 @@ def test_what_training_holds_out_is_in_no_loop():
     root = np.array(motion.root_position)
     root[:480, ::2] = root[480, ::2]
     late = clips(late=dataclasses.replace(motion, root_position=tiny.float32(root)))
-    assert loops.with_loops(late, seconds=3.0, held_out=0.0).num_clips > 1
+    assert loops.with_loops(late, seconds=30.0, held_out=0.0).num_clips > 1
     with pytest.raises(ValueError, match="no clip has a stride"):
         loops.with_loops(late, seconds=3.0)
 
