@@ -53,8 +53,8 @@ SCALE = 3.0
 # How many steps at the chain's end are guided; ours. The paper guides all: what earlier
 # ones add is denoised away (experiments/results/findings.md), at a gradient each.
 GUIDED_STEPS = 1
-# `Character.coast`; with .25 s, as others have, it stops 10 cm and more before a place.
-COAST = 0.05
+# `Character.coast`; with .25 s, as others have, it comes later to a place.
+COAST = 0.15
 # What who stands is asked to go faster than told, m/s (`wanted_path`). Without it, told
 # to go at 0.8 m/s, two of 16 stand for two seconds. He stands whose speed is a small
 # part of the commanded one, or of this, m/s.
