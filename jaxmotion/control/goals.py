@@ -164,8 +164,8 @@ def arrive(
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """Velocity and facing of who is to be at a place at a time; it is `seconds` now.
 
-    He slows down to a slow step, and takes up the facing. Who stands beyond 15 cm starts
-    anew, facing where he goes.
+    He slows down to a slow step, and takes up the facing. Who stands beyond 15 cm
+    starts anew, facing where he goes.
 
     Told to slow down, he goes on as he was for `coast` seconds.
     """
