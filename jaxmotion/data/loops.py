@@ -148,6 +148,7 @@ def repeat_stride(motion: Motion, stride: Stride, *, frames: int) -> Motion:
 def _speeds(
     joints: Float[np.ndarray, "frames joints 3"], fps: float
 ) -> Float[np.ndarray, " frames"]:
+    """Averaged speed of the root, meters per second."""
     root = uniform_filter1d(joints[:, 0, ::2], round(_AVERAGED * fps), axis=0)
     return np.linalg.norm(np.gradient(root, axis=0), axis=1) * fps
 
@@ -172,7 +173,8 @@ def with_loops(clips: Clips, *, seconds: float, held_out: float = 0.1) -> Clips:
     Copies at 0.85, 1.12 and 1.24 times the speed are made where people still move so:
     of runs, up to 4.1 m/s and 1.85 strides per second.
 
-    `ValueError` if no clip has such a stride, none is missing, or a hip joint is.
+    `ValueError` if no clip has such a stride, nothing is to be added, or a hip joint is
+    missing.
     """
     fps, joints = clips.fps, np.asarray(all_joints(clips), np.float64)
     facing = np.asarray(hip_facing(clips.skeleton, clips.joint_rotation), np.float64)

@@ -104,6 +104,32 @@ def test_a_place_is_approached_from_where_a_walker_comes_to(coast):
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
+def test_nobody_who_moves_creeps_and_who_stands_too_far_off_starts_anew():
+    def told(away, speed):
+        place = goals.Place(
+            position=jnp.array([away, 0.0]),
+            facing=jnp.array([0.0, 1.0]),
+            seconds=jnp.float32(0.0),
+        )
+        velocity = np.array([speed, 0.0])
+        start = walker((0.0, 0.0), velocity, (0.0, 1.0))
+        found = goals.arrive(place, start, jnp.float32(1.0), coast=0.0)
+        return np.concatenate(found)
+
+    np.testing.assert_allclose(told(0.1, 0.5), [goals.CREEP, 0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(told(0.04, 0.5), [0, 0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(told(0.09, 0.0), [0, 0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(told(0.25, 0.0), [goals.SLOWEST, 0, 1, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("distance, speed", [(4.0, 1.2), (0.6, 1.2), (0.2, 0.7)])
+def test_the_time_to_a_place_is_that_of_the_speeds_on_the_way(distance, speed):
+    left = np.linspace(0.0, distance, 200_001)[1:]
+    law = np.maximum(np.minimum(speed, left / goals.ARRIVE), goals.CREEP)
+    found = goals._seconds_to(jnp.float32(distance), jnp.float32(speed))
+    np.testing.assert_allclose(found, np.sum(left[0] / law), rtol=1e-3)
+
+
 def test_who_cannot_come_in_time_runs():
     place = goals.Place(
         position=jnp.array([0.0, 30.0]),

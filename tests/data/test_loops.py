@@ -99,6 +99,9 @@ def test_copies_go_at_their_rates_and_keep_labels():
         moved = np.linalg.norm(np.diff(motion.root_position[:, ::2], axis=0), axis=-1)
         assert abs(moved.mean() * FPS - 3.0 * float(name.split("x")[1])) < 0.02
     assert set(np.asarray(found.labels["style"]).tolist()) == {0}
+    lengths = list(zip(found.clip_names, np.diff(found.offsets).tolist(), strict=True))
+    for rate in rates:
+        assert len({n for name, n in lengths[2:] if name.endswith(f"x{rate}")}) == 1
 
 
 def test_each_speed_is_learned_from_for_as_long():
