@@ -164,8 +164,8 @@ def arrive(
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """Velocity and facing of who is to be at a place at a time; it is `seconds` now.
 
-    He slows down to a slow step, and takes up the facing. Who stands beyond 15 cm
-    starts anew, facing where he goes.
+    He slows down to a slow step, and takes up the facing. Who stands within 10 cm
+    stays there; farther off he starts anew, facing where he goes.
 
     Told to slow down, he goes on as he was for `coast` seconds.
     """
@@ -185,11 +185,11 @@ def arrive(
     moving = _length(walker.velocity) > 0.5 * SLOWEST
     waits = ~moving & (_seconds_to(distance, slow) < left)
     there = distance < jnp.where(moving, THERE, 2 * THERE)
-    least = jnp.where(moving, CREEP, SLOWEST * (distance > 3 * THERE))
+    least = jnp.where(moving, CREEP, SLOWEST)
     speed = jnp.maximum(jnp.minimum(speed, distance / ARRIVE), least)
     speed = speed * ~(waits | there)
     heading = ground.unit(gap, walker.facing)
-    near = distance < jnp.where(moving, 0.5 * ARRIVE, 3 * THERE)
+    near = distance < jnp.where(moving, 0.5 * ARRIVE, 2 * THERE)
     facing = jnp.where(near, place.facing, jnp.where(waits, walker.facing, heading))
     return speed * heading, facing
 
