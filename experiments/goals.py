@@ -32,6 +32,8 @@ from jaxmotion.viz.stage import make_stage
 SPEED, DISTANCE = 1.4, 1.5
 SETTLE = 3.0  # seconds in which a follower comes up
 NEAR = 0.1  # meters at which one has arrived
+# Seconds after its time from which one should rest at a place, and m/s at which not.
+REST, MOVES = 1.5, 0.15
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +117,8 @@ def path_errors(model: Character, number: int, seed: int) -> dict[str, np.ndarra
 def place_errors(model: Character, number: int, seed: int) -> dict[str, np.ndarray]:
     """Distance at the time, cm, how late the last decimeter began, s, and the facing.
 
-    Who never comes so near counts with the whole time that was left.
+    Who never comes so near counts with the whole time that was left. Also who does not
+    rest: how much of the time from `REST` after his own on he goes at `MOVES` or more.
     """
     goal, key = some_places(number, seed), jax.random.key(seed)
     seconds = 9.0
@@ -123,7 +126,8 @@ def place_errors(model: Character, number: int, seed: int) -> dict[str, np.ndarr
         model, key, model.start(number, seed=seed), goal, seconds=seconds
     )
     due = np.asarray(goal.seconds)
-    away = np.linalg.norm(_ground(frames) - np.asarray(goal.position)[:, None], axis=-1)
+    walked = _ground(frames)
+    away = np.linalg.norm(walked - np.asarray(goal.position)[:, None], axis=-1)
     rows = np.arange(number)
     ticks = np.minimum(np.round(due * model.fps).astype(int), away.shape[1] - 1)
     near = away < NEAR
@@ -132,11 +136,15 @@ def place_errors(model: Character, number: int, seed: int) -> dict[str, np.ndarr
         jm.motion.trajectory.root_trajectory(model.skeleton, frames.motion).facing
     )[:, -1]
     cosine = np.clip(np.sum(facing * np.asarray(goal.facing), axis=-1), -1.0, 1.0)
+    over = round(0.2 * model.fps)
+    speed = np.linalg.norm(walked[:, over:] - walked[:, :-over], axis=-1) / 0.2
+    after = np.arange(speed.shape[1]) / model.fps > due[:, None] + REST
     return {
         "place_error": 100 * away[rows, ticks],
         "place_end": 100 * away[:, -1],
         "late": np.abs(came - due),
         "place_facing": np.rad2deg(np.arccos(cosine)),
+        "place_moves": ((speed >= MOVES) & after).sum(axis=1) / after.sum(axis=1),
     }
 
 

@@ -47,9 +47,11 @@ from jaxmotion.typing import Key, Params
 # within so many meters of the last one.
 NEAREST, REACH = 0.25, 1.0
 # Nobody is asked to go slower or faster, m/s, but to stop, nor to slow down below the
-# last: standing, `locomotion_fast` does not begin at .2 to .45 m/s. Nor is he asked
-# to be nearer than this to a place, where he stands, meters.
-SLOWEST, FASTEST, THERE, CREEP = 0.6, 3.5, 0.05, 0.45
+# last: standing, `locomotion_fast` does not begin at .2 to .45 m/s.
+SLOWEST, FASTEST, CREEP = 0.6, 3.5, 0.45
+# Nor is who moves asked to come nearer than this to a place, meters, nor who stands
+# within the second: steps so short end beyond it, and he would never rest.
+THERE, STAYS = 0.05, 0.2
 # Radius of a walker, meters; collisions within so many seconds count; what a collision
 # in one second is worth in m/s. Another direction shows after so many seconds (of
 # `locomotion`): counting on half of them, walkers in a crowd run into each other.
@@ -164,7 +166,7 @@ def arrive(
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """Velocity and facing of who is to be at a place at a time; it is `seconds` now.
 
-    He slows down to a slow step, and takes up the facing. Who stands within 10 cm
+    He slows down to a slow step, and takes up the facing. Who stands within 20 cm
     stays there; farther off he starts anew, facing where he goes.
 
     Told to slow down, he goes on as he was for `coast` seconds.
@@ -184,12 +186,12 @@ def arrive(
     (_, speed), _ = jax.lax.scan(halve, (slow, fast), None, length=16)
     moving = _length(walker.velocity) > 0.5 * SLOWEST
     waits = ~moving & (_seconds_to(distance, slow) < left)
-    there = distance < jnp.where(moving, THERE, 2 * THERE)
+    there = distance < jnp.where(moving, THERE, STAYS)
     least = jnp.where(moving, CREEP, SLOWEST)
     speed = jnp.maximum(jnp.minimum(speed, distance / ARRIVE), least)
     speed = speed * ~(waits | there)
     heading = ground.unit(gap, walker.facing)
-    near = distance < jnp.where(moving, 0.5 * ARRIVE, 2 * THERE)
+    near = distance < jnp.where(moving, 0.5 * ARRIVE, STAYS)
     facing = jnp.where(near, place.facing, jnp.where(waits, walker.facing, heading))
     return speed * heading, facing
 

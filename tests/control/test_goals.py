@@ -118,8 +118,8 @@ def test_nobody_who_moves_creeps_and_who_stands_too_far_off_starts_anew():
 
     np.testing.assert_allclose(told(0.1, 0.5), [goals.CREEP, 0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(told(0.04, 0.5), [0, 0, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(told(0.09, 0.0), [0, 0, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(told(0.12, 0.0), [goals.SLOWEST, 0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(told(0.19, 0.0), [0, 0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(told(0.22, 0.0), [goals.SLOWEST, 0, 1, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("distance, speed", [(4.0, 1.2), (0.6, 1.2), (0.2, 0.7)])
