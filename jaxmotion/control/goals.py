@@ -50,8 +50,8 @@ NEAREST, REACH = 0.25, 1.0
 # last: standing, `locomotion_fast` does not begin at .2 to .45 m/s.
 SLOWEST, FASTEST, CREEP = 0.6, 3.5, 0.45
 # Nor is who moves asked to come nearer than this to a place, meters, nor who stands
-# within the second: steps so short end beyond it, and he would never rest.
-THERE, STAYS = 0.05, 0.2
+# within twice as much; within the last, to start anew: steps so short end beyond it.
+THERE, BESIDE = 0.05, 0.2
 # Radius of a walker, meters; collisions within so many seconds count; what a collision
 # in one second is worth in m/s. Another direction shows after so many seconds (of
 # `locomotion`): counting on half of them, walkers in a crowd run into each other.
@@ -166,8 +166,9 @@ def arrive(
 ) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """Velocity and facing of who is to be at a place at a time; it is `seconds` now.
 
-    He slows down to a slow step, and takes up the facing. Who stands within 20 cm
-    stays there; farther off he starts anew, facing where he goes.
+    He slows down to a slow step, and takes up the facing. Who stands within 10 cm
+    stays there; within 20 cm he is asked for what slow steps he can, and farther off he
+    starts anew, facing where he goes.
 
     Told to slow down, he goes on as he was for `coast` seconds.
     """
@@ -186,12 +187,12 @@ def arrive(
     (_, speed), _ = jax.lax.scan(halve, (slow, fast), None, length=16)
     moving = _length(walker.velocity) > 0.5 * SLOWEST
     waits = ~moving & (_seconds_to(distance, slow) < left)
-    there = distance < jnp.where(moving, THERE, STAYS)
-    least = jnp.where(moving, CREEP, SLOWEST)
+    there = distance < jnp.where(moving, THERE, 2 * THERE)
+    least = jnp.where(moving, CREEP, SLOWEST * (distance > BESIDE))
     speed = jnp.maximum(jnp.minimum(speed, distance / ARRIVE), least)
     speed = speed * ~(waits | there)
     heading = ground.unit(gap, walker.facing)
-    near = distance < jnp.where(moving, 0.5 * ARRIVE, STAYS)
+    near = distance < jnp.where(moving, 0.5 * ARRIVE, BESIDE)
     facing = jnp.where(near, place.facing, jnp.where(waits, walker.facing, heading))
     return speed * heading, facing
 

@@ -118,7 +118,9 @@ def test_nobody_who_moves_creeps_and_who_stands_too_far_off_starts_anew():
 
     np.testing.assert_allclose(told(0.1, 0.5), [goals.CREEP, 0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(told(0.04, 0.5), [0, 0, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(told(0.19, 0.0), [0, 0, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(told(0.09, 0.0), [0, 0, 0, 1], atol=1e-6)
+    slow = 0.14 / goals.ARRIVE
+    np.testing.assert_allclose(told(0.14, 0.0), [slow, 0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(told(0.22, 0.0), [goals.SLOWEST, 0, 1, 0], atol=1e-6)
 
 

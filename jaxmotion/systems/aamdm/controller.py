@@ -60,8 +60,8 @@ COAST = 0.15
 # part of the commanded one, or of this, m/s.
 START, _WALK = 0.5, 0.9
 # How much slower than told who is too fast is asked to go, in shares of either, and the
-# largest such share (`wanted_path`). Without it, told to walk, he goes .15 to .25 m/s
-# faster, since guidance pulls at the path that a frame promises, not at its pose.
+# largest such share (`wanted_path`), since guidance pulls at the path that a frame
+# promises, not at its pose. Without it, told .8 m/s, he goes at .88, with it at .83.
 GAIN, _CUT = 3.0, 0.3
 
 
