@@ -49,7 +49,7 @@ class Config:
     """
 
     model: tuple[str, ...] = ("locomotion", "locomotion_fast", "dribble", "walker")
-    characters: tuple[int, ...] = (1, 256)
+    characters: tuple[int, ...] = (1, 64)
     crossing: int = 64
     gif: cli.Optional[Path] = None
     out: Path = Path("runs/goals")
