@@ -167,8 +167,8 @@ def arrive(
     """Velocity and facing of who is to be at a place at a time; it is `seconds` now.
 
     He slows down to a slow step, and takes up the facing. Who stands within 10 cm
-    stays there; within 20 cm he is asked for what slow steps he can, and farther off he
-    starts anew, facing where he goes.
+    stays there; within 20 cm he is asked to go as slowly as he is near, and farther off
+    he starts anew, facing where he goes.
 
     Told to slow down, he goes on as he was for `coast` seconds.
     """

@@ -77,3 +77,29 @@ def test_shipped_players_fetch_their_ball(load, fetches):
     found = load("goals").fetch_errors(model, 8, 0)
     back = (found["fetch"] < 6.0) & (found["ball_end"] < 80.0)
     assert back.all() == fetches, found
+
+
+def test_who_does_not_rest_at_his_place_is_counted(load, monkeypatch):
+    """One stands, one creeps, one walks on, and one walks for half of that time."""
+    script, model = load("goals"), jm.load("walker")
+    ticks = np.arange(round(9.0 * model.fps)) / model.fps
+    due = np.asarray(script.some_places(4, seed=0).seconds)
+    half = due[3] + script.REST + (9.0 - due[3] - script.REST) / 2
+    x = np.stack([0 * ticks, 0.1 * ticks, 0.3 * ticks, 0.3 * np.minimum(ticks, half)])
+    root = jnp.asarray(np.stack([x, np.ones_like(x), 0 * x], axis=-1), jnp.float32)
+    still = jnp.zeros((*x.shape, 2))
+    upright = jnp.eye(3)[:2].reshape(6)
+    frames = Frame(
+        root_position=root,
+        joint_rotation=jnp.broadcast_to(
+            upright, (*x.shape, model.skeleton.num_joints, 6)
+        ),
+        desired_velocity=still,
+        desired_facing=still,
+        planned=jnp.zeros(x.shape, bool),
+        extra={},
+        fps=model.fps,
+    )
+    monkeypatch.setattr(script.goals, "goal_rollouts", lambda *_, **__: frames)
+    found = script.place_errors(model, 4, seed=0)["place_moves"]
+    np.testing.assert_allclose(found, [0.0, 0.0, 1.0, 0.5], atol=0.1)
