@@ -75,6 +75,8 @@ COLUMNS: dict[str, Column] = {
         _evaluated("diversity", "diversity of features", "real"),
         _evaluated("multimodality", "multimodality", "higher"),
         Column(id="deviation", title="deviation of poses", unit="cm", better="real"),
+        Column(id="nearest", title="to a training clip", unit="cm", better="real"),
+        _share("copied", "copies of training motions"),
         Column(
             id="kept", title="deviation of samples over what is open", better="real"
         ),

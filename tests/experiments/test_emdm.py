@@ -117,6 +117,9 @@ def test_actions_are_scored_beside_real_motions(call, actions):
         assert expected <= set(row), name
         assert 0 < row["deviation"]["value"] < 100, name  # cm
         assert 0 <= row["accuracy"]["value"] <= 1 and row["fid"]["value"] >= 0
+        assert 0 < row["nearest"]["value"] < 200, name  # cm
+        # Of training clips' own windows none is the nearest of another clip.
+        assert ("copied" in row) == (name != "real (training clips)")
         assert row["fid"]["samples"] == 2 and row["fid"]["low"] is not None
     assert rows["emdm"]["network_calls"]["value"] == 10
     assert rows["ddpm_50"]["network_calls"]["value"] == 50

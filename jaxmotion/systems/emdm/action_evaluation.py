@@ -21,6 +21,7 @@ from jaxmotion.evaluation import (
     contact,
     diversity,
     frechet,
+    memorization,
     plausibility,
     smoothness,
 )
@@ -189,6 +190,23 @@ def scorer(
     return score
 
 
+def nearest_clips(part: ActionArrays) -> Callable[[Array], memorization.Nearest]:
+    """The part's clips nearest to motions, `positions -> distances`, jitted."""
+    start, clip = emdm_data.all_windows(part)
+
+    def window(number: Int[Array, " chunk"]) -> Array:
+        motions = emdm_data.motions_at(part, start[number], clip[number])
+        return joint_positions(part.clips.skeleton, motions)
+
+    @jax.jit
+    def of(positions: Array) -> memorization.Nearest:
+        return memorization.nearest(
+            positions, window, clip, num_clips=part.clips.num_clips
+        )
+
+    return of
+
+
 def ground_height(run: ActionRun) -> float:
     """Height, meters, of the lowest joint of who stands: the median over frames."""
     motion = Motion(
@@ -240,13 +258,21 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
     truth = real_positions(key_motion, wanted, run.train)
     reference = moments(evaluator, run)(key_state, truth)
     ground = ground_height(run)
-    score = scorer(evaluator, run, reference, ground=ground)
+    scores = scorer(evaluator, run, reference, ground=ground)
+    nearest = nearest_clips(run.train)
+
+    def score(key: Key, positions: Array, *, trained: bool = False) -> Scores:
+        near = nearest(positions)
+        found = {"nearest": 100 * jnp.mean(near.other if trained else near.clip)}
+        if not trained:
+            found["copied"] = memorization.copied(near)
+        return scores(key, positions, wanted) | found
 
     def score_real(key: Key, part: ActionArrays) -> Row:
         def once(key: Key) -> Scores:
             key_motion, key_score = jax.random.split(key)
             positions = real_positions(key_motion, wanted, part)
-            return score(key_score, positions, wanted)
+            return score(key_score, positions, trained=part is run.train)
 
         return replicated_row(key, once, number=settings.replications)
 
@@ -272,7 +298,7 @@ def row_scorer(folder: Path, settings: Settings) -> RowScorer:
     def score_row(key: Key, many: Many) -> Scores:
         key_sample, key_score = jax.random.split(key)
         x = many(key_sample, conditions, scale)
-        found = score(key_score, positions_of(x), wanted)
+        found = score(key_score, positions_of(x))
         if not conditional:
             found = {
                 k: found[k]

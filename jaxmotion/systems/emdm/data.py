@@ -120,7 +120,16 @@ def sample_motions(
     first, stop = clips.offsets[clip], clips.offsets[clip + 1]
     latest = jnp.maximum(stop - first - frames, 0)
     start = first + jax.random.randint(key_start, action.shape, 0, latest + 1)
-    rows = jnp.add.outer(start, jnp.arange(frames))
+    return motions_at(arrays, start, clip)
+
+
+def motions_at(
+    arrays: ActionArrays, start: Int[Array, " batch"], clip: Int[Array, " batch"]
+) -> skeleton.Motion:
+    """Motions from rows of clips on, from the ground's origin and facing +z."""
+    clips = arrays.clips
+    rows = jnp.add.outer(start, jnp.arange(arrays.frames))
+    stop = clips.offsets[clip + 1]
     rows = jnp.minimum(rows, jnp.broadcast_to(stop[:, None] - 1, rows.shape))
     motions = skeleton.Motion(
         root_position=clips.root_position[rows],
@@ -128,6 +137,17 @@ def sample_motions(
         fps=clips.fps,
     )
     return features.to_first_pose(clips.skeleton, motions)
+
+
+def all_windows(
+    arrays: ActionArrays,
+) -> tuple[Int[Array, " windows"], Int[Array, " windows"]]:
+    """First row and clip of every motion that can be drawn."""
+    offsets = np.asarray(arrays.clips.offsets)
+    number = np.maximum(np.diff(offsets) - arrays.frames, 0) + 1
+    clip = np.repeat(np.arange(len(number)), number)
+    place = np.arange(len(clip)) - np.repeat(np.cumsum(number) - number, number)
+    return jnp.asarray(offsets[clip] + place), jnp.asarray(clip)
 
 
 # Motions from which means and deviations of features are taken.

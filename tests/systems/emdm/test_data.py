@@ -120,6 +120,21 @@ def test_clips_are_listed_by_action(arrays):
     assert arrays.frames == FRAMES
 
 
+def test_all_windows_are_those_that_are_drawn(arrays):
+    start, clip = emdm_data.all_windows(arrays)
+    expected = [
+        (sum(LENGTHS[:i]) + first, i)
+        for i, number in enumerate(LENGTHS)
+        for first in range(max(number - FRAMES, 0) + 1)
+    ]
+    assert list(zip(start.tolist(), clip.tolist(), strict=True)) == expected
+    every = emdm_data.motions_at(arrays, start, clip).root_position[:, :, 1]
+    actions = jnp.repeat(jnp.arange(arrays.counts.shape[0]), 200)
+    drawn = emdm_data.sample_motions(jax.random.key(0), arrays, actions)
+    unique = lambda x: np.unique(np.asarray(x).round(3), axis=0)  # noqa: E731
+    np.testing.assert_array_equal(unique(drawn.root_position[:, :, 1]), unique(every))
+
+
 def test_an_action_without_clips_is_named():
     given = dataclasses.replace(
         clips(), label_names=(("content", (*clips().names("content"), "swim")),)
