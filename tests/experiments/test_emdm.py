@@ -298,7 +298,7 @@ def test_released_weights_become_a_row(call, released, tmp_path):
     call(f"{run} --text", "a person turns left")
     motion = bvh_text.read_bvh(tmp_path / "a_person_turns_left.bvh")
     assert motion.values.shape[0] == 40
-    with pytest.raises(ValueError, match="row 'emdm' exists"):
+    with pytest.raises(ValueError, match="'emdm' exists; use another folder"):
         call(f"{line} --heads 4")
 
 
@@ -307,5 +307,7 @@ def test_weights_of_another_task_are_refused(call, released, texts, actions):
     weights = f"import --weights {released}/t2m.pth --heads 4 --run"
     with pytest.raises(ValueError, match="'text_form' is 'unit', expected 'released'"):
         call(f"{weights} {texts}")
-    with pytest.raises(ValueError, match="'task' is 'action', expected 'text'"):
+    with pytest.raises(
+        ValueError, match="'settings.task' is 'action', expected 'text'"
+    ):
         call(f"{weights} {actions}")

@@ -118,9 +118,10 @@ def check_task(run: runs.Run, expected: tuple[TaskName, ...]) -> None:
     settings, own = run.settings, ("field",)
     if "text" in expected:
         own = ("encoder", "text_form")
-    wrong = {x: "a text" for x in ("task", *own) if type(settings.get(x)) is not str}
+    wrong = {}
     if settings.get("task") not in expected:
         wrong["task"] = " or ".join(map(repr, expected))
+    wrong |= {x: "a text" for x in own if type(settings.get(x)) is not str}
     frames = settings.get("frames")
     if type(frames) is not int or not 2 <= frames <= 10**5:
         wrong["frames"] = "a whole number from 2 to 100000"
