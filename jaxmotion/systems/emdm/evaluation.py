@@ -165,9 +165,9 @@ def make_motions(
             raise ValueError(
                 f"unknown action {action!r}: expected one of {', '.join(run.actions)}"
             )
-    numbers = jnp.asarray([run.actions.index(a) for a in actions], jnp.int32)
     vectors = jnp.zeros((1, 0))
     if actions:
+        numbers = jnp.asarray([run.actions.index(a) for a in actions], jnp.int32)
         vectors = emdm_model.action_vectors(numbers, len(run.actions))
     x = _features(record, vectors, **options)
     motions = emdm_features.to_motion(x, run.representation)
