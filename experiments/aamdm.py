@@ -1,4 +1,4 @@
-"""AAMDM and what it is compared with, on prepared clips: train, evaluate, roll out.
+"""AAMDM and what it is compared with: train, evaluate, roll out, export, levels.
 
 Examples:
   python experiments/prepare_data.py lafan1 --manual-dir path/to/zips --out data/lafan1.npz
@@ -21,6 +21,8 @@ from jaxmotion.control.courses import Course
 from jaxmotion.learning import loop, runs
 from jaxmotion.systems.aamdm import controller as aamdm_controller
 from jaxmotion.systems.aamdm import evaluation as aamdm_evaluation
+from jaxmotion.systems.aamdm import levels as aamdm_levels
+from jaxmotion.systems.aamdm import space as aamdm_space
 from jaxmotion.systems.aamdm import stored as aamdm_stored
 from jaxmotion.systems.aamdm import training as aamdm_training
 
@@ -327,11 +329,56 @@ def export(args: Export) -> None:
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
 
 
+@dataclasses.dataclass(frozen=True)
+class Levels:
+    """What a row's networks predict at each step of their chain; writes a table.
+
+    Example: python experiments/aamdm.py levels --run runs/aamdm --row frame
+
+    Attributes:
+      row: A row that is AAMDM.
+      out: Folder; None for <run>/levels.
+      samples: Training frames, given to every step.
+      latents: Latents of the generator for each.
+      seed: Seeds frames, noise and latents.
+    """
+
+    run: Path = Path("runs/aamdm")
+    row: str = "aamdm"
+    out: Path | None = None
+    samples: int = 2000
+    latents: int = 16
+    seed: int = 0
+
+
+def levels(args: Levels) -> None:
+    """Writes the table."""
+    chain = rows.chain_of(args.row)
+    out = cli.out_folder(args, "levels")
+    run = aamdm_training.load_run(args.run)
+    where = rows.space_of(args.row)
+    space = aamdm_training.load_space(run, where)
+    params, config = aamdm_training.load_networks(run, where, space, **chain)
+    key_frames, key = jax.random.split(jax.random.key(args.seed))
+    frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
+    table = aamdm_levels.level_table(
+        params,
+        key,
+        *aamdm_levels.pairs(frames, run.train, key_frames, args.samples),
+        config=config,
+        change=aamdm_training.scale_of_changes(space, config),
+        latents=args.latents,
+    )
+    report = {"source": run.source} | reporting.provenance(args)
+    reporting.write_table(out, table, report, (run.source,))
+
+
 Command = (
     Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Rollout, tyro.conf.subcommand("rollout")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Levels, tyro.conf.subcommand("levels")]
 )
 
 
@@ -339,7 +386,7 @@ def main() -> None:
     """Parses the command line and runs the command."""
     args = cli.check(tyro.cli(Command, description=__doc__))
     run = {Train: train, Evaluate: evaluate, Rollout: rollout, Export: export}
-    run[type(args)](args)
+    (run | {Levels: levels})[type(args)](args)
 
 
 if __name__ == "__main__":

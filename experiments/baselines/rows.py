@@ -123,6 +123,20 @@ def _predict(name: str) -> Literal["frame", "change"]:
     return "frame" if is_published(name) else "change"
 
 
+def chain_of(name: str) -> dict[str, Any]:
+    """Its chain, as `aamdm.training.load_networks` takes it.
+
+    `ValueError` names a row that is not AAMDM.
+    """
+    check((name,))
+    if not is_chain(name):
+        raise ValueError(f"row is {name!r}: expected AAMDM's, not one compared with it")
+    polishes, drafts = _steps(name)
+    return dict(
+        drafts=drafts, polishes=polishes, predict=_predict(name), held=_held(name)
+    )
+
+
 def _config(name: str, space: Space, sizes: Sizes) -> Any:
     """Configuration of a row's networks."""
     common = dict(features=space.num_features, width=sizes.width)
@@ -257,19 +271,12 @@ def load_row(
     if is_chain(name):
         if is_published(name):
             guided_steps = None
-        polishes, drafts = _steps(name)
-        transition = aamdm_training.load_chain(
-            run,
-            space_of(name),
-            space,
-            drafts=drafts,
-            polishes=polishes,
-            predict=_predict(name),
-            held=_held(name),
-        )
+        chain = chain_of(name)
+        transition = aamdm_training.load_chain(run, space_of(name), space, **chain)
         memory = None
         if half_life:
-            memory = Memory(num_steps=polishes + drafts, half_life=half_life)
+            steps = chain["drafts"] + chain["polishes"]
+            memory = Memory(num_steps=steps, half_life=half_life)
         return aamdm_controller.guided(
             transition, scale=scale, guided_steps=guided_steps, memory=memory
         )

@@ -84,6 +84,13 @@ COLUMNS: dict[str, Column] = {
         Column(id="discriminator", title="loss of the discriminator", better=""),
         Column(id="prediction_error", title="error of features, deviations"),
         Column(id="over_latents", title="deviation over latents", better=""),
+        Column(id="frame_error", title="error of the mean frame", unit="changes"),
+        Column(
+            id="frame_over_latents",
+            title="deviation over latents",
+            unit="changes",
+            better="",
+        ),
         Column(id="spread", title="deviation of poses over the data's", better="real"),
         Column(id="div", title="diversity of poses", better="real"),
         Column(id="pose_variance", title="diversity", unit="m²", better="higher"),

@@ -104,6 +104,19 @@ def test_what_is_trained_is_not_trained_again(call, trained, data):
 
 
 @pytest.mark.slow
+def test_levels_have_a_row_each(call, trained, tmp_path):
+    call(f"levels --run {trained} --samples 50 --latents 4 --out {tmp_path}")
+    rows = json.loads((tmp_path / "metrics.json").read_text())["rows"]
+    assert len(rows) == 3 + 2 + 2
+    for name, cells in rows.items():
+        assert 0 < cells["frame_error"]["value"] < 100
+        drafted = cells["frame_over_latents"]["value"] > 1e-5
+        assert drafted == name.startswith("generator")
+    with pytest.raises(ValueError, match="row is 'lmm': expected AAMDM's"):
+        call(f"levels --run {trained} --row lmm --out {tmp_path}")
+
+
+@pytest.mark.slow
 def test_a_row_goes_on_from_another_folders(call, trained, data, tmp_path, monkeypatch):
     """Its space is the other's, and its networks begin where those ended."""
     out = tmp_path / "on"
