@@ -16,6 +16,7 @@ and their minutes, which add up over restarts).
 
 import dataclasses
 import fcntl
+import itertools
 import json
 import os
 import shlex
@@ -117,22 +118,35 @@ def job_of(args: Config, sources: list[Source], seed: int) -> Job:
     return Job(run, folder, tuple(dict.fromkeys(lines)), found)
 
 
+def paths_of(args: Config, source: Source) -> list[Path]:
+    """A source's files of seeds 0, 1, ..., up to the first that is not there."""
+    jobs = (job_of(args, [source], seed) for seed in range(args.most))
+    there = itertools.takewhile(lambda job: job.done, jobs)
+    return [job.measured(*job.files) for job in there]
+
+
 def needed(args: Config, sources: list[Source]) -> int:
-    """Trainings that a run needs, as far as those that are there tell."""
-    tables = [
-        x for x in writing.TABLES if any(x.source_of(r) in sources for r in x.rows)
-    ]
-    claims = [(table, claim) for table in tables for claim in table.claims]
-    there = 0
-    while there < args.most and job_of(args, sources, there).done:
-        there += 1
+    """Trainings that a run needs, as far as those that are there tell.
+
+    A claim that is not decided asks for one more, unless rows that it compares with,
+    of other runs, have fewer.
+    """
+    there = min(len(paths_of(args, source)) for source in sources)
     if there < args.least:
         return args.least
-    jobs = [job_of(args, sources, seed) for seed in range(there)]
-    paths = zip(*(map(job.measured, job.files) for job in jobs), strict=True)
-    found = dict(zip(sources, map(results.read_trainings, paths), strict=True))
-    made = [verdicts.decide(table, claim, found).verdict for table, claim in claims]
-    return min(there + ("not decided" in made), args.most)
+    for table in writing.TABLES:
+        rows = dict.fromkeys(map(table.source_of, table.rows))
+        if not rows.keys() & {*sources}:
+            continue
+        paths = {source: paths_of(args, source) for source in rows}
+        found = {k: results.read_trainings(own) for k, own in paths.items() if own}
+        for claim in table.claims:
+            asked = {table.source_of(table.row(name)) for name in claim.rows}
+            if not asked & {*sources} or min(len(paths[x]) for x in asked) < there:
+                continue
+            if verdicts.decide(table, claim, found).verdict == "not decided":
+                return min(there + 1, args.most)
+    return there
 
 
 class Running(NamedTuple):
@@ -272,7 +286,8 @@ def work(args: Config, show: Callable[[str], None] = print) -> list[Job]:
                     if args.keep:
                         for path in keep(job, sources[job.run]):
                             show(f"wrote {path}")
-                    wanted[job.run] = needed(args, sources[job.run])
+                    # Other runs may have waited for this one's rows.
+                    wanted |= {k: needed(args, own) for k, own in sources.items()}
                 else:
                     left[job.folder] = job
                     failed.append(job)

@@ -76,7 +76,8 @@ class Row:
       paper: One value a column.
       source: Where it is measured; None for the table's source.
       reason: Why it cannot be run here.
-      ours: The same by our recipe, as metrics.json names it; None where there is none.
+      ours: The same by our recipe, as the metrics.json of the table's source names it;
+        None where there is none.
     """
 
     name: str
@@ -149,7 +150,10 @@ class Table:
     @property
     def ours(self) -> "Table":
         """The table with the rows of our recipes in place of the published ones."""
-        rows = [dataclasses.replace(x, here=x.ours or x.here) for x in self.rows]
+        rows = [
+            dataclasses.replace(x, here=x.ours, source=None) if x.ours else x
+            for x in self.rows
+        ]
         return dataclasses.replace(self, rows=tuple(rows))
 
     def column(self, name: str) -> Column:

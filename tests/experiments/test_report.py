@@ -453,7 +453,7 @@ def test_rows_of_two_runs_pair_by_seed_and_data(load, tmp_path):
     )
     claim = claims.Claim(words="w", column="FID", pairs=(("A", "B"),), where="here")
 
-    def decided(seeds, data):
+    def decided(seeds, data, **more):
         found = {}
         for source, own, print_, value in zip(
             sources, seeds, data, (1.0, 5.0), strict=True
@@ -461,7 +461,7 @@ def test_rows_of_two_runs_pair_by_seed_and_data(load, tmp_path):
             paths = [tmp_path / source.run / str(i) / "m.json" for i in range(len(own))]
             for path, seed in zip(paths, own, strict=True):
                 about = dict(seeds={"training": [seed]}, data={"train.npz": print_})
-                measured(load, path, {"it": value + 0.1 * seed}, **about)
+                measured(load, path, {"it": value + 0.1 * seed}, **about, **more)
             found[source] = results.read_trainings(paths)
         return verdicts.decide(table, claim, found)
 
@@ -469,6 +469,18 @@ def test_rows_of_two_runs_pair_by_seed_and_data(load, tmp_path):
     assert (made.verdict, made.trainings) == ("reproduced", 3)
     assert "different seeds" in decided(((0, 1), (0, 2)), "xx").reason
     assert "different data" in decided(((0, 1), (0, 1)), "xy").reason
+    # Clips that differ in their last digits are the same.
+    assert not decided(((0, 1), (0, 1)), "xy", rounded="elsewhere").reason.startswith(
+        "rows were"
+    )
+    # A row by our recipe is one of the table's own file.
+    published, other = table.rows[1], dataclasses.replace(table.rows[1], ours="our")
+    whole = dataclasses.replace(table, rows=(table.rows[0], other))
+    assert [(x.here, whole.source_of(x)) for x in whole.ours.rows] == [
+        ("it", sources[0]),
+        ("our", sources[0]),
+    ]
+    assert table.ours.source_of(published) == sources[1]
     # Of one training each, nothing is paired.
     made = decided(((0,), (7,)), "xx")
     assert (made.verdict, made.trainings) == ("not decided", 1)

@@ -36,7 +36,7 @@ about = {"seeds": {"training": [seed]}, "command": "train", "git_commit": ""}
 """  # noqa: E501
 
 DRIVER = """
-import sys
+import dataclasses, sys
 sys.path.insert(0, sys.argv[1])
 import train_queue
 from jaxmotion import cli
@@ -63,7 +63,15 @@ def make(name, gap, pause):
         claims=(claim,),
     )
 made = [make(*x.split(",")) for x in sys.argv[4:]]
-writing.SOURCES, writing.TABLES = tuple(zip(*made))
+writing.SOURCES, writing.TABLES = map(list, zip(*made))
+# A run "beside,.." has a row of its own in the table of the run before it.
+for i in range(1, len(made)):
+    if made[i][0].run == "beside":
+        rows = (made[i - 1][1].rows[0], dataclasses.replace(
+            made[i][1].rows[1], source=made[i][0]
+        ))
+        writing.TABLES[i - 1] = dataclasses.replace(made[i - 1][1], rows=rows)
+        writing.TABLES[i] = dataclasses.replace(made[i][1], claims=())
 sys.argv = ["train_queue.py", *sys.argv[3].split()]
 cli.start(train_queue.main)
 """
@@ -122,6 +130,21 @@ def test_trainings_are_added_until_a_claim_is_decided(queue, tmp_path):
     before = {path: path.stat().st_mtime for path in runs.glob("*/metrics.json")}
     assert finish(queue(f"--runs {runs} --most 5", "clear,9,0"))[0] == 0
     assert before == {path: path.stat().st_mtime for path in before}
+
+
+@pytest.mark.slow
+def test_runs_whose_rows_are_compared_wait_for_each_other(queue, tmp_path):
+    """A claim of two runs' rows asks both for more; one alone gets one ahead."""
+    runs, most = tmp_path / "runs", f"--runs {tmp_path}/runs --most 5"
+    made = lambda: sorted(numbers(runs))  # noqa: E731
+    for only, counts in (("own", (3, 0)), ("beside", (3, 4)), ("beside", (3, 4))):
+        options = f"{most} --only {only}"
+        code, shown = finish(queue(options, "own,0,0", "beside,0,0"))
+        assert code == 0, shown
+        assert tuple(sum(y in x for x in made()) for y in ("own", "beside")) == counts
+    code, shown = finish(queue(most, "own,0,0", "beside,0,0"))
+    assert code == 0, shown
+    assert len(made()) == 5 + 5
 
 
 @pytest.mark.slow
