@@ -9,8 +9,9 @@ A page says between markers, which no reader sees, what stands there:
     ... written here ...
     <!-- end -->
 
-`table` shows rows and columns of a stored table, and as `less` the mean difference of
-two rows within each training, with its 95 % interval; `grid` cells, one by one, where a
+`table` shows rows and columns of a stored table ("system/table | row" is another's),
+and as `less` the mean difference of two rows within each training, with its 95 %
+interval; `grid` cells, one by one, where a
 page needs other rows and columns than the file has ("{}" stands for each of `across`);
 `plot` draws a column of chosen rows beside the page, or, with `panels`, quality over
 time beside peers' times; `claims` the papers' claims with verdicts; `absent` what
@@ -191,20 +192,23 @@ def _table(store: Store, name: str, options: dict[str, Any], page: Path) -> list
     interval = options.get("interval", True)
     titles = [title or header(one.columns[id]) for id, title in shown.items()]
     bold = options.get("bold", [])
-    lines = []
-    for row, title in rows.items():
-        title = title or one.title(row)
+    lines, tables = [], {name: one}
+    for key, title in rows.items():
+        where, _, row = key.rpartition(" | ")
+        own = tables.setdefault(where or name, store.table(where or name))
+        title = title or own.title(row)
         cells = [
-            text_of(one.cells(row, id), one.columns[id], interval=interval)
+            text_of(own.cells(row, id), one.columns[id], interval=interval)
             for id in shown
         ]
-        lines.append([f"**{title}**" if row in bold else title, *cells])
+        lines.append([f"**{title}**" if key in bold else title, *cells])
     for title, pair in options.get("less", {}).items():
         cells = [_difference(one, *pair, one.columns[id]) for id in shown]
         lines.append([title, *cells])
     made = markdown.table_lines(["", *titles], lines)
     if options.get("source", True):
-        made += _where_from(one, page, store.folder)
+        for own in tables.values():
+            made += _where_from(own, page, store.folder)
     return made
 
 

@@ -391,6 +391,25 @@ def test_differences_are_taken_within_trainings(pages, store, tmp_path):
     assert any(x.startswith("| none | 0 ") for x in lines)
 
 
+def test_a_table_shows_rows_of_another_file(pages, stored, store, tmp_path):
+    """With the file that they come from, and what that calls them."""
+    rows = {"a": {"fid": {"value": 7.0, "samples": 5}}}
+    fid = {"title": "FID", "better": "lower"}
+    whole = dict(transcribed="elsewhere", columns={"fid": fid}, rows=rows)
+    text = stored.to_text(dict(title="t", **whole, names={"a": "theirs"}))
+    (tmp_path / "emdm/other.json").write_text(text)
+    marker = (
+        '<!-- table emdm/three\nrows = ["data", "emdm/other | a"]\n'
+        'bold = ["emdm/other | a"]\n-->\n<!-- end -->'
+    )
+    found = pages.written(tmp_path / "page.md", marker, store).splitlines()
+    assert "| data | 0.50 [0.25, 0.75] |" in found and "| **theirs** | 7 |" in found
+    files = [x for x in found if x.startswith("<sub>")]
+    assert len(files) == 2 and "emdm/other.json" in files[1]
+    with pytest.raises(ValueError, match="emdm/other: no row 'b', expected of a"):
+        pages.written(tmp_path / "page.md", marker.replace("| a", "| b"), store)
+
+
 def test_claims_are_decided_from_stored_trainings(pages, checkout):
     """The mean over trainings and its interval, by SciPy, and the verdict's word."""
     folder = checkout / "experiments/results"
