@@ -133,7 +133,7 @@ def needed(args: Config, sources: list[Source]) -> int:
     """
     there = min(len(paths_of(args, source)) for source in sources)
     if there < args.least:
-        return args.least
+        return min(args.least, args.most)
     for table in writing.TABLES:
         rows = dict.fromkeys(map(table.source_of, table.rows))
         if not rows.keys() & {*sources}:

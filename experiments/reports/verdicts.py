@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+import operator
 from collections.abc import Sequence
 from typing import Literal
 
@@ -152,13 +153,37 @@ def printed(value: Stated) -> float | None:
     return value[0] if isinstance(value, tuple) else value
 
 
+def _paired(table: Table, rows: list[Row], found: Found) -> Found:
+    """The trainings of the seeds that the files of all rows have, in their order.
+
+    As they are where there is one file, where one says of no seed, or where each has
+    one training, which nothing is paired of.
+    """
+    sources = {table.source_of(row) for row in rows}
+    files = {source: x for source in sources if (x := found.get(source))}
+    own = {
+        source: {one.seeds: one for one in x.trainings if one is not None}
+        for source, x in files.items()
+    }
+    one_each = all(len(seeds) == 1 for seeds in own.values())
+    if len(own) <= 1 or one_each or any(() in seeds for seeds in own.values()):
+        return found
+    common = functools.reduce(operator.and_, (seeds.keys() for seeds in own.values()))
+    kept = {source: [own[source][seed] for seed in sorted(common)] for source in own}
+    return found | {
+        source: dataclasses.replace(trained[0], again=tuple(trained[1:]))
+        for source, trained in kept.items()
+        if trained
+    }
+
+
 def _incomparable(table: Table, column: Column, rows: list[Row], found: Found) -> str:
     """Why rows of several files do not compare; "" if they do."""
     sources = {table.source_of(row) for row in rows}
     files = [x for source in sources if (x := found.get(source))]
     if len(files) <= 1:
         return ""
-    several = all(len(x.trainings) > 1 for x in files)
+    several = any(len(x.trainings) > 1 for x in files)
     for trained in zip(*(x.trainings for x in files), strict=False):
         there = [x for x in trained if x is not None]
         evaluators = {x.evaluator for x in there}
@@ -235,16 +260,18 @@ def when_decided(
       Trainings until all comparisons hold, and until one fails; infinite for never.
       Without an effect the one or the other is finite with probability `ALPHA` at most.
     """
-    hold, fail = [], []
+    hold = []
     for own in differences:
-        if margin is None:
-            sides, against = [own], [-own]
-        else:
-            sides, against = [margin + own, margin - own], [own - margin, -own - margin]
+        sides = [own] if margin is None else [margin + own, margin - own]
         hold += [_first(sequential.log_evidence(x), 1 / ALPHA) for x in sides]
-        bar = len(differences) * len(against) / ALPHA
-        fail += [_first(sequential.log_evidence(x), bar) for x in against]
-    return max(hold), min(fail)
+    return max(hold), min(_failed(x, len(differences), margin) for x in differences)
+
+
+def _failed(own: np.ndarray, comparisons: int, margin: float | None) -> float:
+    """Trainings until one of so many comparisons is found to fail."""
+    against = [-own] if margin is None else [own - margin, -own - margin]
+    bar = comparisons * len(against) / ALPHA
+    return min(_first(sequential.log_evidence(x), bar) for x in against)
 
 
 def decide(table: Table, claim: Claim, found: Found) -> Decision:
@@ -260,6 +287,7 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     """
     column = table.column(claim.column)
     rows = [table.row(name) for name in claim.rows]
+    found = _paired(table, rows, found)
     cells = {row.name: cells_of(table, row, column, found) for row in rows}
     absent = [name for name, own in cells.items() if not any(own)]
     present = [row for row in rows if row.name not in absent]
@@ -270,10 +298,11 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     decision = functools.partial(Decision, differences=differences, trainings=trainings)
     hold, fail = when_decided(list(differences.values()), margin=claim.margin)
     if fail < hold:
+        # Each by the bar of them all.
         failed = [
             pair
             for pair, own in differences.items()
-            if when_decided([own], margin=claim.margin)[1] <= fail
+            if _failed(own, len(differences), claim.margin) <= fail
         ]
         reason = f"fails: {_pairs(failed)}"
         return decision(verdict="not reproduced", reason=reason, trainings=int(fail))

@@ -286,6 +286,15 @@ def test_evidence_decides_as_the_densities_of_t_do(over):
     assert len(set(seen)) == 3 and all(seen.count(x) > 3 for x in set(seen))
 
 
+def test_what_fails_is_named_by_the_bar_of_all_comparisons(over):
+    """Evidence of 27, which fails alone, is none of two comparisons."""
+    a = np.array([10.0, 10.0, 10.0])
+    rows = dict(a=a, b=a - [1.0, 1.2, 0.8], c=a - [1.0, 1.01, 0.99])
+    assert over(rows)[0].reason == "fails: A and B"
+    made, _ = over(rows, pairs=(("A", "B"), ("A", "C")))
+    assert (made.verdict, made.reason) == ("not reproduced", "fails: A and C")
+
+
 def test_so_many_times_as_much_does_not_depend_on_how_busy_a_machine_is(load, over):
     """A load that both rows share cancels, and the interval is of their ratio."""
     generator = np.random.default_rng(0)
@@ -467,7 +476,11 @@ def test_rows_of_two_runs_pair_by_seed_and_data(load, tmp_path):
 
     made = decided(((0, 1, 2, 3), (0, 1, 2)), "xx")
     assert (made.verdict, made.trainings) == ("reproduced", 3)
-    assert "different seeds" in decided(((0, 1), (0, 2)), "xx").reason
+    assert "different seeds" in decided(((0, 1), (3, 2)), "xx").reason
+    # A seed that one file lacks does not shift those after it.
+    made = decided(((0, 1, 2, 3, 5), (0, 1, 2, 4, 5)), "xx")
+    assert made.differences[("A", "B")].size == 4
+    assert decided(((0, 1), (0, 2)), "xx").trainings == 1
     assert "different data" in decided(((0, 1), (0, 1)), "xy").reason
     # Clips that differ in their last digits are the same.
     assert not decided(((0, 1), (0, 1)), "xy", rounded="elsewhere").reason.startswith(
