@@ -154,7 +154,7 @@ class Running(NamedTuple):
 
     Attributes:
       job: Which.
-      process: Its shell, in a session of its own.
+      process: Its shell.
       minutes: What it had taken before.
       begun: When it started, on the monotonic clock.
     """

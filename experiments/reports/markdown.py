@@ -26,7 +26,8 @@ def number(value: float) -> str:
     Returns:
       The text.
     """
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    # What three digits would round up to a thousand, too.
+    return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
 
 
 def stated(value: Stated) -> str:

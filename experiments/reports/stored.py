@@ -212,7 +212,7 @@ def trimmed(measured: Measured, title: str) -> dict[str, Any]:
 
 
 def _rounded(rows: dict[str, Any]) -> dict[str, Any]:
-    """Six digits, which no table shows more of."""
+    """Six digits: no table shows more, but of a million and more."""
 
     def short(value: Any) -> Any:
         return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -120,6 +120,7 @@ def dsg_step(
 
     Args:
       objective: Of the prediction; its gradient is finite.
+      last_sigma: sigma of the step from t = 1; None for that of t = 2, as the released
         code's clipped variance has it. It is a fifth of the data's deviation at T = 8,
         all of it along one direction: smaller values disturb less.
 

@@ -106,23 +106,25 @@ def linear_schedule(
 ) -> Schedule:
     """Variances on a straight line.
 
-    From `beta_min` to `beta_max`, both in (0, 1], chosen for T = 1000. Where `scaled`,
-    both are multiplied by 1000 / T, so that few steps add as much noise as 1000 would.
-    All arguments are static. `ValueError` for one out of range, or T < 1000 * beta_max
-    if scaled; names the smallest usable number of steps.
+    From `beta_min` in (0, 1) to `beta_max` in (0, 1], chosen for T = 1000. Where
+    `scaled`, both are multiplied by 1000 / T, so that few steps add as much noise as
+    1000 would. All arguments are static. `ValueError` for one out of range, also after
+    scaling; names the smallest usable number of steps.
 
     Source: Ho et al. 2020, section 4; `scaled` as in the released code of MDM and
     CAMDM.
     """
     _check_num_steps(num_steps)
-    _check_range("beta_min", beta_min, 0.0 < beta_min <= 1.0, "in (0, 1]")
+    # A step before the last that leaves no signal would leave none to be told later.
+    _check_range("beta_min", beta_min, 0.0 < beta_min < 1.0, "in (0, 1)")
     _check_range("beta_max", beta_max, 0.0 < beta_max <= 1.0, "in (0, 1]")
-    largest = max(beta_min, beta_max)
-    if scaled and 1000.0 * largest > num_steps:
+    least = max(math.floor(1000.0 * beta_min) + 1, math.ceil(1000.0 * beta_max))
+    if scaled and num_steps < least:
+        largest = 1000.0 * max(beta_min, beta_max) / num_steps
         raise ValueError(
             f"scaled linear schedule with num_steps={num_steps} has a beta of "
-            f"{1000.0 * largest / num_steps:.4g}, expected at most 1: use at least "
-            f"{math.ceil(1000.0 * largest)} steps, or the cosine schedule"
+            f"{largest:.4g}, expected at most 1: use at least {least} steps, or the "
+            "cosine schedule"
         )
     scale = 1000.0 / num_steps if scaled else 1.0
     return schedule_from_betas(

@@ -44,7 +44,9 @@ def place_sums(
     """
     at = jax.nn.one_hot(place, num_places)
     weights = jnp.ones(values.shape) if weights is None else weights
-    total = jnp.einsum("...fp,...f->p", at, values * weights)
+    # What is left out may be no number.
+    counted = jnp.where((place >= 0) & (place < num_places), values * weights, 0.0)
+    total = jnp.einsum("...fp,...f->p", at, counted)
     return jnp.stack([total, jnp.einsum("...fp,...f->p", at, weights)])
 
 

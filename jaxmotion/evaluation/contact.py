@@ -146,8 +146,9 @@ def stride_rate(
     ahead = into_frame(gap, facing)[..., 1]
     ahead = ahead - jnp.mean(ahead, axis=-1, keepdims=True)
     taper = jnp.broadcast_to(jnp.hanning(ahead.shape[-1]), ahead.shape)
-    power = jnp.abs(jnp.fft.rfft(ahead * taper, n=_SPECTRUM))
-    rate = jnp.arange(power.shape[-1]) * fps / _SPECTRUM
+    size = max(_SPECTRUM, ahead.shape[-1])
+    power = jnp.abs(jnp.fft.rfft(ahead * taper, n=size))
+    rate = jnp.arange(power.shape[-1]) * fps / size
     is_gait = (_STRIDES[0] <= rate) & (rate <= _STRIDES[1])
     gait = jnp.where(jnp.broadcast_to(is_gait, power.shape), power, 0.0)
     return rate[jnp.argmax(gait, axis=-1)]

@@ -28,7 +28,8 @@ class Nearest(NamedTuple):
 
     Attributes:
       clip: To the nearest clip.
-      other: To the nearest of the others; infinite if there are none.
+      other: To the nearest of the others; infinite if there are none. Both are infinite
+        for motions with numbers that are not finite.
     """
 
     clip: Float[Array, " motions"]
@@ -56,7 +57,8 @@ def nearest(
     # The last chunk is filled up with the last window.
     number = jnp.arange(-(-len(clip) // _CHUNK) * _CHUNK).reshape(-1, _CHUNK)
     number = jnp.minimum(number, len(clip) - 1)
-    center = jnp.mean(positions, axis=0, keepdims=True)
+    there = jnp.isfinite(positions)
+    center = jnp.mean(positions, axis=0, keepdims=True, where=there)
 
     def flat(x: Array) -> tuple[Array, Array]:
         x = (x - center).reshape(len(x), -1)
@@ -65,13 +67,14 @@ def nearest(
     made, made_square = flat(positions)
 
     def body(least: Array, number: Array) -> tuple[Array, None]:
-        there, there_square = flat(window(number))
-        product = jnp.matmul(there, made.T, precision="highest")
-        square = there_square[:, None] + made_square[None] - 2.0 * product
+        given, given_square = flat(window(number))
+        product = jnp.matmul(given, made.T, precision="highest")
+        square = given_square[:, None] + made_square[None] - 2.0 * product
         return least.at[clip[number]].min(square), None
 
     start = jnp.full((num_clips, motions), jnp.inf)
     least, _ = jax.lax.scan(body, start, number)
+    least = jnp.where(jnp.all(there, axis=(1, 2, 3)), least, jnp.inf)
     least = jnp.sqrt(jnp.maximum(least, 0.0) / (frames * joints))
     least = jnp.pad(least, ((0, 1), (0, 0)), constant_values=jnp.inf)
     two, _ = jax.lax.top_k(-least.T, 2)
@@ -79,5 +82,6 @@ def nearest(
 
 
 def copied(found: Nearest) -> Float[Array, ""]:
-    """Share of motions that are copies."""
-    return jnp.mean(found.clip < COPY * found.other)
+    """Share of motions that are copies; none where there is one clip, or none near."""
+    near = found.clip < COPY * found.other
+    return jnp.mean(near & jnp.isfinite(found.other))

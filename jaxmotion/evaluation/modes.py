@@ -26,8 +26,8 @@ def mode_scores(
       least_within_3_sigma: least share of points at any step within 3 sigma of some
         center.
       within_3_sigma: the same over all steps.
-      spread: standard deviation of a coordinate about the nearest center, of points
-        within 3 sigma, over sigma (1 for the data, but for the cut; 0 if none).
+      spread: root mean square of a coordinate's distance to the nearest center, of
+        points within 3 sigma, over sigma (1 for the data, but for the cut; 0 if none).
       kl_to_uniform: divergence in nats of the nearest modes' histogram from uniform.
       transition_distance: total variation between the frequencies of pairs of
         neighboring modes and uniform ones.
@@ -49,7 +49,7 @@ def mode_scores(
         "least_modes_covered": float((counts >= share).sum(axis=0).min()),
         "least_within_3_sigma": float(inside.mean(axis=0).min()),
         "within_3_sigma": float(inside.mean()),
-        "spread": float(offset.std() / sigma) if inside.any() else 0.0,
+        "spread": float(np.sqrt(np.mean(offset**2)) / sigma) if inside.any() else 0.0,
         "kl_to_uniform": float(np.sum(known * np.log(known * number))),
         "transition_distance": float(0.5 * np.abs(pairs - 1 / number**2).sum()),
     }

@@ -55,11 +55,12 @@ def log_evidence(samples: np.ndarray) -> np.ndarray:
     values = np.asarray(samples, np.float64)
     # Scaled first: squares of tiny or huge numbers would vanish or overflow.
     size = np.max(
-        np.abs(values), axis=-1, keepdims=True, initial=0.0, where=values == values
+        np.abs(values), axis=-1, keepdims=True, initial=0.0, where=np.isfinite(values)
     )
     values = values / np.where(size > 0.0, size, 1.0)
     norm = np.sqrt(np.cumsum(np.square(values), axis=-1))
-    ratio = np.cumsum(values, axis=-1) / np.where(norm > 0.0, norm, 1.0)
+    with np.errstate(invalid="ignore"):  # infinite ones
+        ratio = np.cumsum(values, axis=-1) / np.where(norm > 0.0, norm, 1.0)
     found = np.zeros(values.shape)
     for count in range(2, values.shape[-1] + 1):
         found[..., count - 1] = np.interp(ratio[..., count - 1], *_table(count))

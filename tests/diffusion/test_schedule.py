@@ -420,6 +420,15 @@ def test_gradients_are_finite_and_reach_the_betas():
         (lambda: schedule.vp_schedule(4, beta_max=0.01), "beta_max is 0.01"),
         (lambda: schedule.linear_schedule(4, beta_max=1.5), "beta_max is 1.5"),
         (lambda: schedule.linear_schedule(4, beta_min=0.0), "beta_min is 0.0"),
+        (lambda: schedule.linear_schedule(4, beta_min=1.0), "beta_min is 1.0"),
+        (
+            lambda: schedule.linear_schedule(8, beta_min=0.008, scaled=True),
+            "at least 20 steps",
+        ),
+        (
+            lambda: schedule.linear_schedule(40, beta_min=0.04, scaled=True),
+            "at least 41 steps",
+        ),
         (lambda: schedule.linear_schedule(19, scaled=True), "at least 20 steps"),
         (lambda: schedule.linear_schedule(8, scaled=True), "at least 20 steps"),
         (lambda: schedule.schedule_from_betas(jnp.array([])), "T >= 1"),

@@ -26,6 +26,12 @@ def test_frames_since_the_last_plan():
     np.testing.assert_array_equal(by_frame.frames_since(planned), expected)
 
 
+def test_what_is_left_out_may_be_no_number():
+    values, place = jnp.array([jnp.nan, 2.0, 4.0, jnp.inf]), jnp.array([-1, 0, 0, 3])
+    sums = by_frame.place_sums(values, place, num_places=2)
+    np.testing.assert_array_equal(sums, [[6.0, 0.0], [2.0, 0.0]])
+
+
 def test_a_jump_at_a_border_shows_in_three_frames(skeleton):
     """1 cm sideways between frames 4 and 5 of each ten: jerk 1:2:1, slide in one."""
     motion = still(40)

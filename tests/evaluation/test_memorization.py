@@ -58,3 +58,14 @@ def test_two_windows_of_one_clip_are_not_two_clips():
     assert got.clip[0] < 1e-3 and got.other[0] > 1.0
     alone = find(one[None], [one, one], [0, 0], 1)
     assert np.isinf(alone.other[0])
+    assert float(memorization.copied(alone)) == 0  # nothing to compare it with
+
+
+def test_a_motion_that_is_no_number_is_near_nothing_and_changes_no_other():
+    one, other = made(2, seed=6)
+    broken = one.copy()
+    broken[2, 1, 0] = np.nan
+    got = find([one, broken, other], [one, other], [0, 1], 2)
+    assert np.isinf(got.clip[1]) and np.isinf(got.other[1])
+    np.testing.assert_allclose(got.clip[::2], 0, atol=2e-3)
+    assert float(memorization.copied(got)) == pytest.approx(2 / 3)

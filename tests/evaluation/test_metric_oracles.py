@@ -164,7 +164,7 @@ def test_mode_scores():
         "least_modes_covered": 3,
         "within_3_sigma": inside.mean(),
         "least_within_3_sigma": min(inside[:, t].mean() for t in range(4)),
-        "spread": np.std(off) / 0.2,
+        "spread": np.sqrt(np.mean(np.square(off))) / 0.2,
         "kl_to_uniform": sum(p * np.log(3 * p) for p in shares),
         "transition_distance": 0.5 * np.abs(pairs - 1 / 9).sum(),
     }.items():

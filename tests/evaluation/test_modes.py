@@ -28,6 +28,11 @@ def test_the_data_score_full():
     assert scores["spread"] == pytest.approx(0.975, abs=0.02)
 
 
+def test_points_that_are_all_on_one_side_are_spread_about_the_center():
+    x = np.broadcast_to(CENTERS[None, :, :] + [0.1, 0.0], (50, 9, 2))
+    assert modes.mode_scores(x, CENTERS, sigma=0.1)["spread"] == pytest.approx(0.5**0.5)
+
+
 def test_a_lost_mode_is_counted_at_its_step():
     def choose(rng, shape):
         mode = uniform(rng, shape)

@@ -47,8 +47,11 @@ def test_evidence_without_an_effect_is_rarely_large_at_any_count(mean):
 
 def test_zeros_are_no_evidence_and_what_is_no_number_spreads():
     np.testing.assert_array_equal(sequential.log_evidence(np.zeros(4)), np.zeros(4))
-    found = sequential.log_evidence(np.array([1.0, 2.0, np.nan, 1.0]))
-    assert np.isfinite(found[:2]).all() and np.isnan(found[2:]).all()
+    finite = sequential.log_evidence(np.array([1.0, 2.0]))
+    for none in (np.nan, np.inf, -np.inf):
+        found = sequential.log_evidence(np.array([1.0, 2.0, none, 1.0]))
+        np.testing.assert_array_equal(found[:2], finite)
+        assert np.isnan(found[2:]).all()
 
 
 def test_intervals_hold_the_mean_at_all_counts_at_once():
