@@ -13,8 +13,14 @@ from jaxmotion.learning import model_json
 from reports.claims import Source
 
 NOT_RECORDED = "not recorded"
-# Arguments that trainings of one run may differ in.
-_FREE = ("run", "out", "models", "evaluator", "rows", "tables", "seed")
+# Arguments that trainings of one run may differ in: what they name is compared itself,
+# and files that are stored do not have paths.
+_FREE = ("run", "out", "data", "models", "evaluator", "rows", "tables", "seed")
+
+
+def _seeds(about: dict[str, Any]) -> tuple[Any, ...]:
+    found = (about.get("seeds") or {}).get("training", ())
+    return tuple(found) if isinstance(found, list | tuple) else (found,)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,9 +47,7 @@ class Measured:
     @property
     def seeds(self) -> tuple[int, ...]:
         """Seeds of the training; none where the file does not say."""
-        found = self.about.get("seeds")
-        found = found.get("training", ()) if isinstance(found, dict) else ()
-        return tuple(found) if isinstance(found, list) else (found,)
+        return _seeds(self.about)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -132,6 +136,10 @@ def read(path: Path) -> Measured | None:
     about = dict(_object(path, "(whole file)", whole))
     if "rows" not in about:
         raise ValueError(f"{path}: field 'rows' is missing")
+    for name in ("training", "seeds"):
+        _object(path, name, about.get(name) or {})
+    if wrong := [x for x in _seeds(about) if type(x) is not int]:
+        _fail(path, "seeds.training", wrong[0], "a whole number")
     rows = {
         row: {
             column: _cell(path, f"rows.{row}.{column}", cell)

@@ -423,6 +423,11 @@ def test_what_is_no_further_training_is_named(load, tmp_path):
         with pytest.raises(ValueError, match=message) as error:
             read(paths)
         assert "\n" not in str(error.value)
+    # A file that is stored does not name the one it was made from, nor folders.
+    given = {"n": 3, "data": None, "run": "runs/a", "out": None}
+    own = about | dict(seeds={"training": [1]}, arguments=given)
+    measured(load, paths[1], {"a": 1.0}, **own)
+    assert [x is None for x in read(paths).trainings] == [False, False, True]
 
 
 def test_rounded_clips_are_the_same_clips(load, tmp_path):
@@ -647,6 +652,8 @@ DAMAGED = {
     "{}": "field 'rows' is missing",
     '{"rows": 3}': "field 'rows' is 3, expected an object",
     '{"rows": {"a": 3}}': "field 'rows.a' is 3",
+    '{"rows": {}, "training": [1]}': "field 'training' is \\[1\\], expected an object",
+    '{"rows": {}, "seeds": {"training": [[1]]}}': "field 'seeds.training' is \\[1\\]",
     '{"rows": {"a": {"b": 3}}}': "field 'rows.a.b' is 3",
     '{"rows": {"a": {"b": {"samples": 1}}}}': "field 'rows.a.b.value' is missing",
     '{"rows": {"a": {"b": {"value": 1}}}}': "field 'rows.a.b.samples' is missing",
