@@ -146,7 +146,8 @@ def commands(
       Commands [number, ticks, ...] for characters that start facing +z.
 
     Raises:
-      ValueError: if the course or a label is unknown, or numbers do not agree.
+      ValueError: if the course or a label is unknown, numbers do not agree or are not
+        finite, or the length is less than a tick.
     """
     if np.ndim(speed) and number is None and (labels is None or np.ndim(labels) == 0):
         number = len(np.asarray(speed))
@@ -170,10 +171,12 @@ def _segments(
 ) -> Command:
     rows = []
     for number, segment in enumerate(course):
-        if len(segment) not in (4, 5) or not segment[0] > 0 or not segment[3] >= 0:
+        fits = len(segment) in (4, 5) and np.isfinite(segment[:4]).all()
+        if not fits or not segment[0] > 0 or not segment[3] >= 0:
             raise ValueError(
                 f"segment {number} of the course is {segment!r}, expected (seconds, "
-                "direction, facing, m/s) and perhaps a label, with positive seconds"
+                "direction, facing, m/s), finite and with positive seconds, perhaps a "
+                "label"
             )
         own = (model.label(segment[4]),) if len(segment) == 5 else (-1,)
         rows.append((*map(float, segment[:4]), *own))
@@ -194,17 +197,21 @@ def path(points: Any, *, speed: Any = 1.2) -> goals.Path:
       speed: m/s; for all points, or one for each.
 
     Raises:
-      ValueError: if there are fewer than two points, two in a row are the same, or
-        speeds are not positive or of another number.
+      ValueError: if there are fewer than two points, two in a row are the same, speeds
+        are not positive or of another number, or one is not finite.
     """
     found, speeds = np.asarray(points, np.float32), np.asarray(speed, np.float32)
     shape = found.shape
     if len(shape) not in (2, 3) or shape[-1] != 2 or shape[-2] < 2:
         raise ValueError(f"points of shape {shape}, expected two or more (x, z)")
-    if not (np.linalg.norm(np.diff(found, axis=-2), axis=-1) > 1e-3).all():
+    apart = np.linalg.norm(np.diff(found, axis=-2), axis=-1) > 1e-3
+    if not (np.isfinite(found).all() and apart.all()):
         raise ValueError("two points in a row are the same, or one is not finite")
-    if speeds.shape not in ((), shape[-2:-1], shape[:-1]) or not (speeds > 0).all():
-        raise ValueError(f"speed is {speed!r}, expected one above 0, or one per point")
+    fits = speeds.shape in ((), shape[-2:-1], shape[:-1])
+    if not (fits and (speeds > 0).all() and np.isfinite(speeds).all()):
+        raise ValueError(
+            f"speed is {speed!r}, expected one above 0 and finite, or one per point"
+        )
     speeds = np.broadcast_to(speeds, shape[:-1])
     return goals.Path(points=jnp.asarray(found), speed=jnp.asarray(speeds))
 
@@ -218,7 +225,8 @@ def place(position: Any, *, facing: Any = 0.0, seconds: Any) -> goals.Place:
       seconds: When to be there, from the beginning; for all or for each.
 
     Raises:
-      ValueError: if shapes do not agree, or a time is not positive.
+      ValueError: if shapes do not agree, a number is not finite, or a time is not
+        positive.
     """
     found = np.asarray(position, np.float32)
     angle, time = np.deg2rad(np.asarray(facing, np.float32)), np.asarray(seconds)
@@ -227,8 +235,10 @@ def place(position: Any, *, facing: Any = 0.0, seconds: Any) -> goals.Place:
     for name, value in (("facing", angle), ("seconds", time)):
         if value.shape not in ((), found.shape[:-1]):
             raise ValueError(f"{name} of shape {value.shape} for {found.shape[:-1]}")
-    if not (time > 0).all():
-        raise ValueError(f"seconds is {seconds!r}, expected above 0")
+    if not np.isfinite(angle).all():
+        raise ValueError(f"facing is {facing!r}, expected degrees")
+    if not ((time > 0).all() and np.isfinite(time).all()):
+        raise ValueError(f"seconds is {seconds!r}, expected above 0 and finite")
     ways = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
     return goals.Place(
         position=jnp.asarray(found),
@@ -299,6 +309,17 @@ def _go(
     **options: Any,
 ) -> Frame:
     """`rollout` with a goal."""
+    if not isinstance(goal, goals.Goal):
+        raise ValueError(
+            f"goal is a {type(goal).__name__}, expected one of `path` or `place`, or a "
+            "Follow"
+        )
+    around = circles is not None and np.size(circles)
+    if unknown := options.keys() - {"avoiding"}:
+        raise ValueError(
+            f"no option {', '.join(sorted(unknown))}; goals take seconds, places, "
+            "labels, avoiding, circles"
+        )
     number = jax.tree.leaves(states)[0].shape[0]
     starts = jnp.zeros(2)
     if isinstance(goal, goals.Path):
@@ -312,7 +333,7 @@ def _go(
         goal = jax.tree.map(every, goal)
     starts = starts if places is None else jnp.asarray(places, jnp.float32)
     if starts.ndim == 1:
-        starts = jnp.broadcast_to(starts, (number, 2))
+        starts = jnp.broadcast_to(starts, (number, *starts.shape))
     if seconds is None and isinstance(goal, goals.Follow):
         if commands is None:
             raise ValueError("who follows needs seconds, or commands of a leader")
@@ -325,7 +346,7 @@ def _go(
         seconds=float(jnp.max(needs)) + 2.0 if seconds is None else seconds,
         places=starts,
         labels=jnp.asarray(steering.label_indices(character.labels, labels, number)),
-        circles=None if circles is None else jnp.asarray(circles, jnp.float32),
+        circles=jnp.asarray(circles, jnp.float32) if around else None,
         commands=commands,
         **options,
     )

@@ -2,20 +2,25 @@
 
 import csv
 import dataclasses
+import inspect
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxmotion as jm
-from jaxmotion import files
+from jaxmotion import face, files
 from jaxmotion.control import goals, steering
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.diffusion import chain
 from jaxmotion.motion import trajectory
 from jaxmotion.motion.skeleton import joint_positions
 from tests import samples
+
+NAN, INF = float("nan"), float("inf")
+untyped = inspect.unwrap(jm.rollout)  # as without the tests' type checker
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +121,14 @@ def test_a_view_lives_without_a_kernel(model, frames):
     assert "http://" not in page and "https://" not in page
 
 
+def told(model, **wrong):
+    """A rollout whose commands are wrong in one field."""
+    commands = jm.commands("forward", model, 2, seconds=0.3)
+    for name, value in wrong.items():
+        object.__setattr__(commands, name, value)  # which no type checker sees
+    return jm.rollout(model, jax.random.key(0), model.start(2), commands)
+
+
 @pytest.mark.parametrize(
     "call, message",
     [
@@ -125,6 +138,14 @@ def test_a_view_lives_without_a_kernel(model, frames):
         (lambda m, f: jm.commands("forward", m, 3, speed=-1.0), "-1.0 m/s"),
         (lambda m, f: jm.commands([], m, 3), "no segments"),
         (lambda m, f: jm.commands([(1, 0, 0)], m), "segment 0 of the course"),
+        (lambda m, f: jm.commands([(1, NAN, 0, 1)], m), "finite and with positive"),
+        (lambda m, f: jm.commands([(1, 0, 0, INF)], m), "finite and with positive"),
+        (lambda m, f: jm.commands([(1e-3, 0, 0, 1)], m), "expected a tick or more"),
+        (lambda m, f: jm.commands([(1, 0, 0, 1)], m, seconds=NAN), "nan s at 30"),
+        (
+            lambda m, f: untyped("walker", None, None),
+            "a str, expected one of `load`",
+        ),
         (lambda m, f: jm.commands("forward", m, 2, labels="x"), "unknown label 'x'"),
         (lambda m, f: m.start(0), "number of characters is 0"),
         (lambda m, f: m.start(3, labels=[0, 1]), "2 labels for 3 characters"),
@@ -135,6 +156,12 @@ def test_a_view_lives_without_a_kernel(model, frames):
                 m, jax.random.key(0), m.start(2), jm.commands("forward", m, 3)
             ),
             "2 states and commands for 3 characters",
+        ),
+        (lambda m, f: told(m, label=jnp.zeros((2, 9))), "expected whole numbers"),
+        (lambda m, f: told(m, facing=jnp.zeros((2, 9, 3))), r"\(2, 9, 3\), expected"),
+        (
+            lambda m, f: told(m, velocity=jnp.zeros((2, 8, 2))),
+            r"velocity has .*\(2, 8,",
         ),
         (lambda m, f: jm.save("a.fbx", m.skeleton, f[0]), "'.fbx', expected one of"),
         (lambda m, f: jm.save("a.bvh", m.skeleton, f), r"\(32, 3\): expected those"),
@@ -159,6 +186,17 @@ def test_shipped_models_say_what_they_are(name):
     assert model.source in repr(model) and len(repr(model)) < 400
 
 
+@pytest.mark.slow
+def test_a_rollout_may_be_part_of_a_compiled_program():
+    """Labels cannot be checked in there; all else is as outside."""
+    model, key = jm.load("walker"), jax.random.key(0)
+    states, commands = model.start(2), jm.commands("forward", model, 2, seconds=0.5)
+    frames = jax.jit(lambda *given: jm.rollout(model, *given))(key, states, commands)
+    chex.assert_trees_all_close(
+        frames, jm.rollout(model, key, states, commands), atol=1e-5
+    )
+
+
 def walked(number, **told):
     """Walkers that are told a goal."""
     model = jm.load("walker")
@@ -173,7 +211,7 @@ def test_who_is_told_one_path_starts_at_its_first_point():
     np.testing.assert_allclose(frames.root_position[:, 0, ::2], [(1, 2)] * 2, atol=0.1)
 
 
-def test_goals_are_told_in_a_line(monkeypatch):
+def test_goals_are_told_in_a_line(model, monkeypatch):
     """A place each, from a place each; and what is not told follows from the goal."""
     place = jm.place([(2, 3), (0, 3)], facing=(90, 0), seconds=4.0)
     np.testing.assert_allclose(place.facing, [(1, 0), (0, 1)], atol=1e-6)
@@ -183,7 +221,7 @@ def test_goals_are_told_in_a_line(monkeypatch):
     )
     # A meter at 1 m/s, and two seconds.
     near = jm.path([[(0, 0), (0, 1)], [(0, 0), (1, 0)]], speed=1.0)
-    asked = {}
+    commands, asked = jm.commands("forward", jm.load("walker"), 2, seconds=0.1), {}
     with monkeypatch.context() as patch:
         patch.setattr(
             goals, "goal_rollouts", lambda *given, **more: asked.update(more) or frames
@@ -195,9 +233,21 @@ def test_goals_are_told_in_a_line(monkeypatch):
         ({"seconds": 3.0}, "and its options, found seconds"),
         ({"goal": near, "chunk": 2}, "no chunk"),
         ({"goal": jm.place([(0, 1)] * 3, seconds=1.0)}, "3 goals for 2 characters"),
+        ({"goal": near, "circle": 2}, "no option circle; goals take seconds"),
+        ({"goal": near, "seconds": 0.0}, "seconds is 0.0, expected a tick"),
+        ({"goal": near, "places": (0, 0, 0)}, "places of shape"),
+        ({"goal": near, "circles": [(1, 2)]}, r"circles of shape \(1, 2\), expected"),
+        ({"goal": near, "commands": commands}, "commands with a Path: only leaders"),
+        (
+            {"goal": goals.Follow(leader=jnp.array([0, 7]), distance=jnp.ones(2))}
+            | {"commands": commands},
+            r"leaders are in 0..7, expected 0..1",
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             walked(2, **wrong)
+    with pytest.raises(ValueError, match="goal is a list, expected one of `path`"):
+        inspect.unwrap(face._go)(model, None, None, [(0, 1)], None)
 
 
 @pytest.mark.parametrize(
@@ -207,7 +257,11 @@ def test_goals_are_told_in_a_line(monkeypatch):
         (lambda: jm.path([0, 1]), "expected two or more"),
         (lambda: jm.path([(0, 0), (0, 0), (1, 0)]), "two points in a row"),
         (lambda: jm.path([(0, 0), (0, float("nan"))]), "not finite"),
+        (lambda: jm.path([(0, 0), (0, INF)]), "not finite"),
         (lambda: jm.path([(0, 0), (0, 1)], speed=-1), "speed is -1"),
+        (lambda: jm.path([(0, 0), (0, 1)], speed=INF), "speed is inf"),
+        (lambda: jm.place((0, 1), facing=NAN, seconds=2.0), "facing is nan"),
+        (lambda: jm.place((0, 1), seconds=INF), "seconds is inf"),
         (lambda: jm.path([(0, 0), (0, 1)], speed=(1, 1, 1)), "one per point"),
         (lambda: jm.place((0, 0, 1), seconds=2.0), r"expected \(x, z\)"),
         (lambda: jm.place((0, 1), seconds=-2.0), "seconds is -2"),

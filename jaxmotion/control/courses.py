@@ -175,8 +175,12 @@ def segment_commands(
     """Commands of segments, one per tick [ticks, ...]; they begin again at their end.
 
     A segment is seconds, direction of travel and facing in degrees from +z toward +x,
-    speed in m/s, and label.
+    speed in m/s, and label. `ValueError` if the length is less than a tick.
     """
+    if not (np.isfinite(seconds * fps) and seconds * fps >= 1):
+        raise ValueError(
+            f"{seconds} s at {fps} ticks per second: expected a tick or more"
+        )
     table = np.array(segments)
     ticks = round(seconds * fps)
     ends = np.cumsum(table[:, 0])

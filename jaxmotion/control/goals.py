@@ -363,11 +363,14 @@ def goal_rollouts(
 
     Raises:
       ValueError: if goals, states, places and commands are of different numbers of
-        characters or seconds, somebody leads without commands, or a label is none of
-        the model's.
+        characters or seconds, somebody leads without commands or follows nobody, there
+        are commands but no leaders, less than a tick is asked for, circles are of
+        another shape, or a label is none of the model's.
     """
     number = jax.tree.leaves(states)[0].shape[0]
     places = jnp.zeros((number, 2)) if places is None else jnp.asarray(places)
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise ValueError(f"places of shape {places.shape}, expected {(number, 2)}")
     labels = jnp.zeros(number, jnp.int32) if labels is None else jnp.asarray(labels)
     for what, found in (
         ("goals", jax.tree.leaves(goal)[0].shape[0]),
@@ -377,14 +380,34 @@ def goal_rollouts(
         if found != number:
             raise ValueError(f"{found} {what} for {number} characters")
     steering.check_labels(labels, character.labels)
+    if not (np.isfinite(seconds) and seconds * character.fps >= 1):
+        raise ValueError(f"seconds is {seconds}, expected a tick or more")
     ticks = round(seconds * character.fps)
-    if commands is not None and commands.label.shape != (number, ticks):
-        raise ValueError(
-            f"commands of shape {commands.label.shape}, expected {(number, ticks)}"
-        )
-    if isinstance(goal, Follow) and commands is None:
-        if alone := np.flatnonzero(np.asarray(goal.leader) == np.arange(number)).size:
+    if commands is not None:
+        if not isinstance(goal, Follow):
+            raise ValueError(
+                f"commands with a {type(goal).__name__}: only leaders of a Follow are "
+                "told what to do"
+            )
+        steering.check_commands(commands)
+        if commands.label.shape != (number, ticks):
+            raise ValueError(
+                f"commands of shape {commands.label.shape}, expected {(number, ticks)}"
+            )
+    if isinstance(goal, Follow):
+        leaders = np.asarray(goal.leader)
+        if leaders.size and not 0 <= leaders.min() <= leaders.max() < number:
+            raise ValueError(
+                f"leaders are in {leaders.min()}..{leaders.max()}, expected "
+                f"0..{number - 1}"
+            )
+        alone = np.flatnonzero(leaders == np.arange(number)).size
+        if alone and commands is None:
             raise ValueError(f"{alone} leaders without commands")
+    if circles is not None and (circles.ndim != 2 or circles.shape[1] != 3):
+        raise ValueError(
+            f"circles of shape {circles.shape}, expected [circles, 3]: x, z and radius"
+        )
     return _rollouts(
         character.params,
         key,

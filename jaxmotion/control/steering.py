@@ -142,11 +142,13 @@ class Character:
 
 def steered(model: Any, *, what: str = "this model") -> Character:
     """The model, which must be a character; raises `ValueError` for whole motions."""
-    if not isinstance(model, Character):
-        raise ValueError(
-            f"{what} makes whole motions: it is sampled, not steered or rolled out"
-        )
-    return model
+    if isinstance(model, Character):
+        return model
+    if not hasattr(model, "skeleton"):
+        raise ValueError(f"{what} is a {type(model).__name__}, expected one of `load`")
+    raise ValueError(
+        f"{what} makes whole motions: it is sampled, not steered or rolled out"
+    )
 
 
 def label_indices(
@@ -185,14 +187,32 @@ def label_indices(
 def check_labels(labels: np.ndarray | Array, names: tuple[str, ...]) -> None:
     """Raises unless labels are indices of names; compiled code cannot.
 
-    All pass where a model has no labels; a `ValueError` names the range and the labels.
+    All pass where a model has no labels, and within a caller's `jax.jit`, where nobody
+    knows them; a `ValueError` names the range and the labels.
     """
+    if isinstance(labels, jax.core.Tracer):
+        return
     found, last = np.asarray(labels), len(names) - 1
     if names and found.size and (found.min() < 0 or found.max() > last):
         raise ValueError(
             f"labels are in {found.min()}..{found.max()}, expected 0..{last} "
             f"({', '.join(names)})"
         )
+
+
+def check_commands(commands: Command) -> None:
+    """Raises `ValueError` unless they are of many characters over time, as arrays."""
+    label, shape = commands.label, commands.label.shape
+    if len(shape) != 2 or not jnp.issubdtype(label.dtype, jnp.integer):
+        raise ValueError(
+            f"commands' labels are {label.dtype}{list(shape)}, expected whole numbers "
+            "[characters, ticks]"
+        )
+    for name in ("velocity", "facing"):
+        if (found := getattr(commands, name).shape) != (*shape, 2):
+            raise ValueError(
+                f"commands' {name} has shape {found}, expected {(*shape, 2)}"
+            )
 
 
 def steered_rollouts(
@@ -214,9 +234,11 @@ def steered_rollouts(
       mesh: Devices to split the characters over; see `rollout.rollout`.
 
     Raises:
-      ValueError: if states and commands are of different numbers of characters, the
-        chunk is not positive, or a label is none of the model's.
+      ValueError: if states and commands are of different numbers of characters,
+        commands of different numbers of ticks, the chunk is not positive, or a label is
+        none of the model's.
     """
+    check_commands(commands)
     check_labels(commands.label, character.labels)
     number = commands.label.shape[0]
     found = jax.tree.leaves(states)[0].shape[0]
