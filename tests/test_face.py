@@ -235,8 +235,6 @@ def test_goals_are_told_in_a_line(model, monkeypatch):
         ({"goal": jm.place([(0, 1)] * 3, seconds=1.0)}, "3 goals for 2 characters"),
         ({"goal": near, "circle": 2}, "no option circle; goals take seconds"),
         ({"goal": near, "seconds": 0.0}, "seconds is 0.0, expected a tick"),
-        ({"goal": near, "places": (0, 0, 0)}, "places of shape"),
-        ({"goal": near, "circles": [(1, 2)]}, r"circles of shape \(1, 2\), expected"),
         ({"goal": near, "commands": commands}, "commands with a Path: only leaders"),
         (
             {"goal": goals.Follow(leader=jnp.array([0, 7]), distance=jnp.ones(2))}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -232,6 +233,19 @@ def test_numbers_of_goals_and_characters_agree():
         goals.goal_rollouts(
             model, jax.random.key(0), model.start(2), place, seconds=1.0
         )
+
+
+@pytest.mark.parametrize("name", ["places", "circles"])
+def test_shapes_of_places_and_circles_are_told(name):
+    """Without the tests' type checker."""
+    model = jm.load("walker")
+    place = goals.Place(
+        position=jnp.zeros((2, 2)), facing=jnp.ones((2, 2)), seconds=jnp.ones(2)
+    )
+    roll = inspect.unwrap(goals.goal_rollouts)
+    given = {"seconds": 1.0, name: jnp.zeros((2, 4))}
+    with pytest.raises(ValueError, match=rf"{name} of shape \(2, 4\), expected"):
+        roll(model, jax.random.key(0), model.start(2), place, **given)
 
 
 def test_leaders_need_commands_of_all_characters_and_seconds():
