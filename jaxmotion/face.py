@@ -374,11 +374,14 @@ def sample(
       the first.
 
     Raises:
-      ValueError: if the model is steered, a label is unknown, or numbers do not agree.
+      ValueError: if the model is steered, a label is unknown, numbers do not agree, or
+        the chunk is not positive.
     """
     if not isinstance(model, Sampler):
         raise ValueError("this model is steered: expected `rollout`, not `sample`")
     found = steering.label_indices(model.labels, labels, number)
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"chunks of {chunk} motions, expected 1 or more")
     if chunk is None:
         on_cpu = jax.default_backend() == "cpu"
         chunk = _CPU_CHUNK if on_cpu else len(found)
@@ -386,7 +389,7 @@ def sample(
 
 
 def _one(frames: Frame | Motion) -> Motion:
-    """The motion of one character; raises for several."""
+    """The motion of one character; raises for several, or none that can be told."""
     if not isinstance(frames, Frame | Motion):
         raise ValueError(f"frames are a {type(frames).__name__}, expected a Frame")
     shape = frames.root_position.shape
@@ -395,7 +398,11 @@ def _one(frames: Frame | Motion) -> Motion:
             f"frames of shape {shape[:-1]}: expected those of one character, such as "
             "frames[0]"
         )
-    return frames.motion if isinstance(frames, Frame) else frames
+    motion = frames.motion if isinstance(frames, Frame) else frames
+    values = (motion.root_position, motion.joint_rotation)
+    if not (shape[0] and all(np.isfinite(np.asarray(x)).all() for x in values)):
+        raise ValueError(f"{shape[0]} frames: expected one or more that are finite")
+    return motion
 
 
 def _stage(skeleton: Skeleton, frames: Frame | Motion) -> Stage:
@@ -586,10 +593,12 @@ def save(
     Raises:
       ModuleNotFoundError: for robots without the extra [robot].
       OSError: if the file cannot be written.
-      ValueError: if the suffix is unknown, frames are not those of one character, or
-        the skeleton has no arms and legs to be named.
+      ValueError: if the suffix is unknown, frames are not those of one character or not
+        finite, the skeleton has no arms and legs to be named, or roles are of nothing.
     """
     path = Path(path)
+    if roles is not None and onto is None and robot is None:
+        raise ValueError("roles are of a rig's joints: expected `onto` or `robot`")
     if robot is not None:
         if path.suffix.lower() != ".npz" or t_pose or mixamo or onto is not None:
             raise ValueError(f"{path}: a robot's motion is an .npz, without `onto`")

@@ -121,6 +121,10 @@ def test_a_view_lives_without_a_kernel(model, frames):
     assert "http://" not in page and "https://" not in page
 
 
+def broken(frames):
+    return dataclasses.replace(frames, root_position=frames.root_position + NAN)
+
+
 def told(model, **wrong):
     """A rollout whose commands are wrong in one field."""
     commands = jm.commands("forward", model, 2, seconds=0.3)
@@ -166,6 +170,9 @@ def told(model, **wrong):
         (lambda m, f: jm.save("a.fbx", m.skeleton, f[0]), "'.fbx', expected one of"),
         (lambda m, f: jm.save("a.bvh", m.skeleton, f), r"\(32, 3\): expected those"),
         (lambda m, f: jm.show(m.skeleton, f[0, 0]), "expected those of one"),
+        (lambda m, f: jm.save("a.csv", m.skeleton, f[0, :0]), "0 frames: expected one"),
+        (lambda m, f: jm.save("a.npz", m.skeleton, broken(f[0])), "that are finite"),
+        (lambda m, f: jm.save("a.bvh", m.skeleton, f[0], roles={}), "expected `onto`"),
     ],
 )
 def test_wrong_input_is_one_clear_line(model, frames, call, message):
@@ -195,6 +202,17 @@ def test_a_rollout_may_be_part_of_a_compiled_program():
     chex.assert_trees_all_close(
         frames, jm.rollout(model, key, states, commands), atol=1e-5
     )
+
+
+@pytest.mark.slow
+def test_players_are_drawn_each_with_his_ball(tmp_path):
+    model = jm.load("dribble")
+    commands = jm.commands("forward", model, 2, seconds=0.2)
+    frames = jm.rollout(model, jax.random.key(0), model.start(2), commands)
+    for name in ("a.gif", "a.html"):
+        jm.save(tmp_path / name, model.skeleton, frames)
+        assert (tmp_path / name).stat().st_size > 1000
+    assert "<iframe" in jm.show(model.skeleton, frames)._repr_html_()
 
 
 def walked(number, **told):
@@ -290,6 +308,8 @@ def test_paths_and_places_are_reached(model):
 def test_a_steered_model_is_not_sampled(model):
     with pytest.raises(ValueError, match="expected `rollout`"):
         jm.sample(model, jax.random.key(0))
+    with pytest.raises(ValueError, match="chunks of 0 motions"):
+        jm.sample(jm.load("actions"), jax.random.key(0), chunk=0)
 
 
 def test_an_option_of_another_system_is_named():

@@ -216,7 +216,7 @@ def _ball(center: np.ndarray, radius: float, color: int) -> _Solid:
 
 
 def _solid(shot: _Shot, frame: int, *, ghost: bool = False) -> _Solid:
-    """All bodies, the ball, and marks of what touches it; or all ghosts."""
+    """All bodies, balls, and marks of what touches them; or all ghosts."""
     stage, body = shot.stage, shot.stage.body
     pose = stage.positions, stage.rotations
     if ghost and stage.ghost_pose is not None:
@@ -233,8 +233,9 @@ def _solid(shot: _Shot, frame: int, *, ghost: bool = False) -> _Solid:
         for joint in stage.ball.touching(frame):
             touch = shot.colors.index(_TOUCH)
             found.append(_ball(stage.positions[0, frame, joint], _MARK, touch))
-        place, radius = stage.ball.position[frame], stage.ball.radius
-        found.append(_ball(place, radius, shot.colors.index(_BALL)))
+        color, radius = shot.colors.index(_BALL), stage.ball.radius
+        places = stage.ball.position[:, frame]
+        found += [_ball(place, radius, color) for place in places]
     return _joined(found)
 
 

@@ -98,12 +98,13 @@ function assemble(pose, frame, mesh) {
   }
   bring(mesh);
 }
-// The ball, and marks where it is touched: place, radius, color of each.
+// Balls, and marks where one is touched: place, radius, color of each.
 const spheres = [];
 function gather(frame) {
   const found = [];
   if (!ball) return found;
-  found.push([ball.place.slice(3 * frame, 3 * frame + 3), ball.radius, "#e8e4da"]);
+  for (let at = 3 * frame; at < ball.place.length; at += 3 * frames)
+    found.push([ball.place.slice(at, at + 3), ball.radius, "#e8e4da"]);
   for (const j of ball.touching[frame])
     found.push([world.slice(12 * j, 12 * j + 3), 0.05, "#2fae4a"]);
   while (spheres.length < found.length) spheres.push(sphereMesh(24, 16));

@@ -20,16 +20,16 @@ _CROWD = 4
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ball:
-    """A ball beside a motion.
+    """A ball beside a motion, or one beside each of many.
 
     Attributes:
       position: World position of its center, meters.
-      touch: Which of the joints touch it; None if that is not known.
+      touch: Which of the joints touch it; None if that is not known, or for many.
       joints: Joints that may touch it.
       radius: Meters.
     """
 
-    position: Float[np.ndarray, "frames 3"]
+    position: Float[np.ndarray, "*characters frames 3"]
     touch: Bool[np.ndarray, "frames touching"] | None = None
     joints: tuple[int, ...] = ()
     radius: float = 0.11
@@ -51,7 +51,7 @@ class Stage:
       ghost: A pose per frame that is drawn pale, such as where a plan ends; None for
         none.
       wanted: Commanded ground paths (x, z), meters; None for none.
-      ball: A ball, or None.
+      ball: A ball of each character, or None.
     """
 
     skeleton: Skeleton
@@ -134,18 +134,24 @@ def make_stage(
                 f"expected {(count, frames)}"
             )
     if ball is not None:
-        if count != 1 or np.shape(ball.position) != (frames, 3):
+        at = np.asarray(ball.position, float)
+        at = at[None] if at.ndim == 2 else at
+        if at.shape != (count, frames, 3):
             raise ValueError(
                 f"ball is {np.shape(ball.position)} beside {count} characters, "
-                f"expected {(frames, 3)} beside one"
+                f"expected {(count, frames, 3)}"
             )
-        _check_finite("ball", np.asarray(ball.position)[None])
+        _check_finite("ball", at)
         touches = (frames, len(ball.joints))
-        if ball.touch is not None and np.shape(ball.touch) != touches:
+        if ball.touch is not None and (count, np.shape(ball.touch)) != (1, touches):
             raise ValueError(
-                f"ball's touch is {np.shape(ball.touch)}, expected {touches}"
+                f"ball's touch is {np.shape(ball.touch)} beside {count} characters, "
+                f"expected {touches} beside one"
             )
+        ball = dataclasses.replace(ball, position=at)
     place = _places(motion, apart)
+    if ball is not None:
+        ball = dataclasses.replace(ball, position=ball.position + place[:, None])
     motion = _moved(motion, place)
     positions, rotations = kinematics(skeleton, motion)
     if body is None:

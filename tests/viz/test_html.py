@@ -5,9 +5,11 @@ import re
 import shutil
 import subprocess
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.motion.skeleton import Motion
 from jaxmotion.viz import html as page
 from jaxmotion.viz import stage
 from tests.viz import samples
@@ -165,3 +167,27 @@ def test_a_path_below_a_file_is_an_error_that_names_it(tmp_path):
     (tmp_path / "plain").write_text("")
     with pytest.raises(OSError, match=r"plain/a\.html: cannot write here"):
         save(tmp_path / "plain" / "a.html")
+
+
+def test_the_script_draws_a_ball_of_each_character(tmp_path):
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    skeleton, motion = samples.person(seconds=0.4)
+    two = Motion(
+        root_position=jnp.stack([motion.root_position, motion.root_position + 3.0]),
+        joint_rotation=jnp.stack([motion.joint_rotation] * 2),
+        fps=motion.fps,
+    )
+    place = np.arange(2 * 12 * 3.0).reshape(2, 12, 3)
+    shown = stage.make_stage(skeleton, two, ball=stage.Ball(position=place, radius=0.2))
+    source = Reader(save(tmp_path / "a.html", shown)).texts["script"]
+    script = tmp_path / "a.js"
+    script.write_text(
+        BROWSER + source + "next(-16); next(84);\nconsole.log(JSON.stringify(gather(3)"
+        ".map(([place, radius]) => [...place, radius])));"
+    )
+    done = subprocess.run([node, script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    expected = np.concatenate([place[:, 3], [[0.2], [0.2]]], axis=1)
+    np.testing.assert_allclose(json.loads(done.stdout), expected, atol=1e-5)

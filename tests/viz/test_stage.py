@@ -70,11 +70,15 @@ BAD = [
     (dict(ghost=motion((5, 3))), r"ghost is \(1, 5\) .*, expected \(1, 12\)"),
     (
         dict(ball=stage.Ball(**BALL, touch=np.zeros((12, 2), bool))),
-        r"touch is \(12, 2\), expected \(12, 1\)",
+        r"touch is \(12, 2\) beside 1 characters, expected \(12, 1\)",
     ),
     (
         dict(ball=stage.Ball(**BALL | dict(position=np.zeros((5, 3))))),
         r"ball is \(5, 3\) beside 1 characters",
+    ),
+    (
+        dict(ball=stage.Ball(**BALL | dict(position=np.full((1, 12, 3), np.nan)))),
+        "ball: frame 0 is not finite",
     ),
     (dict(sides=("left",)), "expected 4 of left, right, middle"),
 ]
@@ -84,6 +88,33 @@ BAD = [
 def test_wrong_shapes_are_named(bad, message):
     with pytest.raises(ValueError, match=message):
         samples.circle_stage(**bad)
+
+
+def test_each_of_many_has_a_ball_that_is_set_apart_with_him():
+    one, _ = samples.circle()
+    many = Motion(
+        root_position=jnp.stack([one.root_position] * 3),
+        joint_rotation=jnp.stack([one.joint_rotation] * 3),
+        fps=samples.FPS,
+    )
+    place = np.asarray(many.root_position) + [0.5, -0.8, 0.0]
+    ball = stage.Ball(position=place)
+    made = stage.make_stage(samples.figure(), many, ball=ball)
+    assert np.ptp(made.positions[:, 0, 0, 0]) > 1
+    gap = made.ball.position - made.positions[:, :, 0]
+    np.testing.assert_allclose(
+        gap, np.broadcast_to([0.5, -0.8, 0.0], gap.shape), atol=1e-5
+    )
+    touched = dataclasses.replace(ball, touch=np.zeros((12, 1), bool), joints=(3,))
+    for wrong, message in (
+        (
+            dataclasses.replace(ball, position=place[:2]),
+            r"ball is \(2, 12, 3\) beside 3",
+        ),
+        (touched, "touch is .* beside 3 characters, expected .* beside one"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            stage.make_stage(samples.figure(), many, ball=wrong)
 
 
 def test_a_frame_that_is_not_finite_is_named():
