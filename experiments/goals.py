@@ -22,7 +22,7 @@ import jaxmotion as jm
 from jaxmotion import cli, reporting
 from jaxmotion.control import goals, rollout
 from jaxmotion.control.frame import Frame
-from jaxmotion.control.steering import Character
+from jaxmotion.control.steering import Character, steered
 from jaxmotion.evaluation import table
 from jaxmotion.evaluation.table import Rows
 from jaxmotion.learning import loop
@@ -255,7 +255,7 @@ def main() -> None:
     """Writes the table, and the picture."""
     args = cli.check(tyro.cli(Config, description=__doc__))
     loop.check_writable(args.out)
-    models = {name: jm.load(name) for name in args.model}
+    models = {x: steered(jm.load(x), what=x) for x in args.model}
     cli.announce("compiling the rollouts of each model and number", 60)
     rows: Rows = {}
     for name, model in models.items():

@@ -19,6 +19,7 @@ What is slow to import (Flax, Orbax, matplotlib) is imported by those who need i
 import dataclasses
 import html as escaping
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -269,7 +270,8 @@ def rollout(
         Those with goals, who may see each other, run all at once.
       mesh: Devices to split the characters over; None for one.
       **options: With a goal, those of `control.goals.goal_rollouts`: `seconds` (None
-        for as long as it takes, and 2 s), `places` to start at (None for the first
+        for as long as it takes and 2 s, in whole seconds: each number of ticks is a
+        program of its own), `places` to start at (None for the first
         points of paths, else the origin), `labels`, `avoiding`, `circles`.
 
     Returns:
@@ -338,12 +340,14 @@ def _go(
         if commands is None:
             raise ValueError("who follows needs seconds, or commands of a leader")
         seconds = commands.label.shape[-1] / character.fps
+    if seconds is None:
+        seconds = float(math.ceil(float(jnp.max(needs)) + 2.0))
     return goals.goal_rollouts(
         character,
         key,
         states,
         goal,
-        seconds=float(jnp.max(needs)) + 2.0 if seconds is None else seconds,
+        seconds=seconds,
         places=starts,
         labels=jnp.asarray(steering.label_indices(character.labels, labels, number)),
         circles=jnp.asarray(circles, jnp.float32) if around else None,
@@ -378,6 +382,7 @@ def sample(
         the chunk is not positive.
     """
     if not isinstance(model, Sampler):
+        steering.steered(model)
         raise ValueError("this model is steered: expected `rollout`, not `sample`")
     found = steering.label_indices(model.labels, labels, number)
     if chunk is not None and chunk < 1:

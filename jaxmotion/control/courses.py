@@ -184,7 +184,8 @@ def segment_commands(
     table = np.array(segments)
     ticks = round(seconds * fps)
     ends = np.cumsum(table[:, 0])
-    time = np.arange(ticks) / fps % ends[-1]
+    # Sums of seconds are a little off: a thousandth of a tick does not matter.
+    time = (np.arange(ticks) + 1e-3) / fps % ends[-1]
     row = table[np.searchsorted(ends, time, side="right")]
     return Command(
         velocity=jax.device_put(np.float32(_unit(row[:, 1]) * row[:, 3:4])),

@@ -131,6 +131,15 @@ def test_bad_arguments_are_named(bad, message):
         commands(**(dict(name="forward") | bad))
 
 
+@pytest.mark.parametrize("tenths", [1, 2, 7, 13])
+def test_segments_change_in_the_tick_in_which_they_end(tenths):
+    """At 30 per second, whatever sums of tenths of a second come to in floats."""
+    segments = [(tenths / 10, 90.0 * (i % 2), 0.0, 1.0, i % 2) for i in range(10)]
+    found = courses.segment_commands(segments, seconds=3.0 * tenths, fps=30.0)
+    expected = np.repeat(np.arange(30) % 2, 3 * tenths)
+    np.testing.assert_array_equal(found.label, expected)
+
+
 def test_the_path_is_the_integral_of_the_velocity():
     time = np.arange(1, 91) / FPS
     velocity = np.stack([np.cos(time), np.sin(time)], axis=-1).astype(np.float32)
