@@ -149,7 +149,7 @@ def why_not(table: Table, row: Row, found: Found) -> str:
     if row.here is None:
         return f"not run: {row.reason}"
     there = found.get(table.source_of(row))
-    if there is None or row.here not in there.rows:
+    if there is None or not any(x and row.here in x.rows for x in there.trainings):
         return "not run"
     return ""
 
@@ -176,7 +176,7 @@ def _sources(table: Table, found: Found, commands: Commands) -> list[str]:
         there = found.get(source)
         rows = [r for r in table.rows if r.here and table.source_of(r) == source]
         names = ", ".join(row.name for row in rows)
-        lacks = [r.name for r in rows if there is None or r.here not in there.rows]
+        lacks = [r.name for r in rows if why_not(table, r, found)]
         if there is None:
             lines += [
                 f"{names}: **not run**. To be made by",

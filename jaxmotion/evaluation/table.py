@@ -60,25 +60,31 @@ def cell(
     *,
     scale: float = 1.0,
     bounds: tuple[float, float] = (-math.inf, math.inf),
+    part: float = 0.0,
 ) -> Cell:
     """Mean of independent samples with its 95 % interval (Student's t).
 
     No interval for a single sample, not a number for none. The scale is for the unit of
     the table; the interval is cut to the bounds of what the mean can be before scaling,
-    such as 0 and 1 of a proportion.
+    such as 0 and 1 of a proportion. Samples from a `part` of the same things each are
+    as in `statistics.confidence_interval`.
     """
     count = int(samples.shape[0])
     if count == 0:
         return Cell(value=math.nan, samples=0)
     if count < 2:
         return Cell(value=float(samples[0]) * scale, samples=count)
-    estimate, *ends = (float(x) for x in statistics.confidence_interval(samples))
+    interval = statistics.confidence_interval(samples, part=part)
+    estimate, *ends = (float(x) for x in interval)
     low, high = (scale * min(max(end, bounds[0]), bounds[1]) for end in ends)
     return Cell(value=scale * estimate, low=low, high=high, samples=count)
 
 
-def row(scores: Sequence[dict[str, Array]]) -> Row:
+def row(scores: Sequence[dict[str, Array]], *, part: float = 0.0) -> Row:
     """Means over replications, a dictionary each, with 95 % intervals within bounds.
+
+    Replications of a `part` of the same clips or windows each are not independent: see
+    `statistics.confidence_interval`.
 
     Columns stand in the order of their declaration; others follow. (Compiled programs
     return dictionaries in alphabetical order.)
@@ -88,7 +94,8 @@ def row(scores: Sequence[dict[str, Array]]) -> Row:
     found = {}
     for name in sorted(scores[0], key=lambda name: places.get(name, len(places))):
         bounds = known[name].bounds if name in known else (-math.inf, math.inf)
-        found[name] = cell(jnp.stack([one[name] for one in scores]), bounds=bounds)
+        values = jnp.stack([one[name] for one in scores])
+        found[name] = cell(values, bounds=bounds, part=part)
     return found
 
 

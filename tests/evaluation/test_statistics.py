@@ -30,6 +30,22 @@ def test_student_interval_holds_the_mean_as_often_as_it_says():
     assert abs(rate - 0.9) < 4 * np.sqrt(0.09 / 500)
 
 
+@pytest.mark.parametrize("size", [10, 60])
+@pytest.mark.parametrize("count", [6, 20])
+def test_draws_of_the_same_things_hold_the_mean_as_often_as_they_say(size, count):
+    """Of 120 things: without their part, intervals of halves hold it in 60 or 38 %."""
+    generator, hits, plain = np.random.default_rng(0), 0, 0
+    for _ in range(400):
+        things = generator.normal(size=120)
+        draws = [generator.permutation(things)[:size].mean() for _ in range(count)]
+        found = statistics.confidence_interval(jnp.asarray(draws), part=size / 120)
+        hits += found.low <= 0 <= found.high
+        plain_one = statistics.confidence_interval(jnp.asarray(draws))
+        plain += plain_one.low <= 0 <= plain_one.high
+    assert abs(hits / 400 - 0.95) < 4 * np.sqrt(0.05 * 0.95 / 400)
+    assert size == 10 or plain / 400 < 0.7
+
+
 def test_bootstrap_of_a_mean_is_near_its_student_interval():
     x = np.random.default_rng(1).normal(size=200)
     got = statistics.bootstrap_interval(x, np.mean, seed=2, num_resamples=2000)

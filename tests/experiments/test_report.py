@@ -430,6 +430,27 @@ def test_what_is_no_further_training_is_named(load, tmp_path):
     assert [x is None for x in read(paths).trainings] == [False, False, True]
 
 
+def test_a_row_that_the_first_training_lacks_was_run(load, tmp_path):
+    claims, markdown = load("reports.claims"), load("reports.markdown")
+    source = claims.Source(run="a", file="m.json", commands=("make {run}",))
+    row = claims.Row(name="B", here="b", paper=(1.0,))
+    table = claims.Table(
+        paper="P",
+        number="1",
+        title="t",
+        source=source,
+        columns=(claims.Column(name="FID", here="fid", better="lower"),),
+        rows=(row,),
+    )
+    paths = [tmp_path / f"{i}.json" for i in range(2)]
+    for seed, (path, rows) in enumerate(zip(paths, ("a", "ab"), strict=True)):
+        about = dict(seeds={"training": [seed]})
+        measured(load, path, dict.fromkeys(rows, 1.0), **about)
+    read = load("reports.results").read_trainings
+    assert markdown.why_not(table, row, {source: read(paths)}) == ""
+    assert markdown.why_not(table, row, {source: read(paths[:1])}) == "not run"
+
+
 def test_rounded_clips_are_the_same_clips(load, tmp_path):
     read = load("reports.results").read_trainings
     paths = [tmp_path / f"{i}.json" for i in range(2)]

@@ -287,7 +287,8 @@ def path_table(
                 chunk=chunk,
             )
             scores = score_players(setting, model, play, repeats=repeats, starts=starts)
-            row = table.row(scores)
+            part = starts / setting.known.label.shape[0]
+            row = table.row(scores, part=min(part, smgdiff_evaluation.HALF))
             rows[f"{name}, guidance {schedule}"] = row
             print(f"{name}, guidance {schedule}: done", flush=True)
     return rows
