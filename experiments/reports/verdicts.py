@@ -46,8 +46,8 @@ RULE = (
     "machine slows both by a factor. The bar is ours, below the paper's own ratio, "
     "since machines differ. Nearness to recorded motion compares distances to it.",
     "That two rows are alike is claimed with a margin: both that their difference is "
-    "above its negative and that it is below it must hold (two one-sided tests). It has "
-    f"two opposites, so the bar of either is {2 / ALPHA:g} k.",
+    "above its negative and that it is below it must hold (two one-sided tests). Of "
+    f"its two opposites either has the bar {2 / ALPHA:g} k.",
     "Rows of several files that an evaluator scored are compared only if the files "
     "name the same evaluator and reference clips.",
     "Intervals of a claim's differences hold the mean at all numbers of trainings at "
