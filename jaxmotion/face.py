@@ -74,7 +74,8 @@ def load(
     Raises:
       OSError: if a file cannot be read.
       ValueError: if there is no such model, it is of no system that is known or of one
-        without such an option, or its skeleton has no legs whose feet could be locked.
+        without such an option, an option is of another kind, or its skeleton has no
+        legs whose feet could be locked.
     """
     path = Path(source)
     is_shipped = not path.exists()
@@ -102,6 +103,10 @@ def load(
             f"{source}: no option {', '.join(sorted(unknown))}; a model of "
             f"{found.name} takes {', '.join(list(known)[1:])}"
         )
+    if not callable(step := options.get("step", len)):
+        raise ValueError(f"{source}: step is {step!r}, expected a function of a step")
+    if not isinstance(foot_lock, FootLock | bool | None):
+        raise ValueError(f"{source}: foot_lock is {foot_lock!r}, expected a FootLock")
     model = make(path, **options)
     if wanted is not False:
         lock_or_clean = lock_feet if found.steerable else clean_sampler

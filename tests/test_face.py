@@ -316,6 +316,10 @@ def test_an_option_of_another_system_is_named():
     message = "no option held, scal; a model of camdm takes control, step, steps"
     with pytest.raises(ValueError, match="locomotion: " + message):
         jm.load("locomotion", held=True, scal=2.0)
+    with pytest.raises(ValueError, match="step is 'ddim', expected a function"):
+        jm.load("locomotion", step="ddim")
+    with pytest.raises(ValueError, match="foot_lock is 'yes', expected a FootLock"):
+        inspect.unwrap(jm.load)("locomotion", foot_lock="yes")
 
 
 def test_a_system_that_nobody_knows_is_named(tmp_path):
