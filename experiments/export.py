@@ -80,6 +80,14 @@ class Config:
     scale: float | None = None
 
 
+def refuse(args: Config, names: tuple[str, ...], what: str) -> None:
+    """Raises `ValueError` for an option that would say nothing."""
+    for name in names:
+        if (value := getattr(args, name)) != getattr(Config(), name):
+            option = name.replace("_", "-")
+            raise ValueError(f"--{option} is {value}, but {what} has no such choice")
+
+
 def batch_of(text: str) -> graph.Batch:
     """What --batch asks for."""
     if text in ("one", graph.ANY):
@@ -155,19 +163,25 @@ def export(args: Config) -> None:
     if (not args.model) == (args.run is None):
         raise ValueError("expected either --model or --run")
     if args.format == "web":
+        refuse(args, ("batch", "row", "scale"), "a page")
         return export_page(args)
+    refuse(args, ("steps", "cache"), f"the format {args.format}")
     if len(args.model) > 1:
         raise ValueError(
             f"--model has {len(args.model)} names, expected one (but for --format web)"
         )
-    writer = FORMATS[args.format]
-    writer.check()
-    loop.check_writable(args.out)
     source = args.model[0] if args.run is None else args.run
     path = files.SHIPPED.get(args.model[0]) if args.run is None else args.run
     system = None
     if path is not None:
         system = registry.get(str(face.system_of(path)))
+    if system is None or system.steerable:
+        refuse(args, ("row", "scale"), "a model that is steered")
+    else:
+        refuse(args, ("foot_lock",), "a model of whole motions")
+    writer = FORMATS[args.format]
+    writer.check()
+    loop.check_writable(args.out)
     if system is not None and not system.steerable:
         functions, condition, facts = system.room("evaluation").exports(
             path, row=args.row, scale=args.scale

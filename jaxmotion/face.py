@@ -464,11 +464,12 @@ def _save_npz(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     motion = _one(frames)
     positions = joint_positions(skeleton, motion)
     feet = positions[:, np.array(skeleton.feet, int)]
+    feet = jnp.repeat(feet, 2, axis=0) if len(feet) == 1 else feet  # a speed takes two
     arrays = dict(
         root_position=motion.root_position,
         joint_rotation=motion.joint_rotation,
         joint_position=positions,
-        foot_contact=foot_contacts(jnp.concatenate([feet, feet[-1:]]), motion.fps)[:-1],
+        foot_contact=foot_contacts(feet, motion.fps)[: len(positions)],
         feet=[skeleton.names[foot] for foot in skeleton.feet],
         offsets=skeleton.offsets,
         parents=skeleton.parents,

@@ -15,7 +15,7 @@ from jaxmotion import face, files
 from jaxmotion.control import goals, steering
 from jaxmotion.data import bvh, bvh_text
 from jaxmotion.diffusion import chain
-from jaxmotion.motion import trajectory
+from jaxmotion.motion import contact, trajectory
 from jaxmotion.motion.skeleton import joint_positions
 from tests import samples
 
@@ -108,7 +108,9 @@ def test_each_suffix_is_written(model, frames, tmp_path, suffix):
             assert found["fps"] == 30.0
             np.testing.assert_array_equal(found["joint_position"], joints)
             assert found["names"].tolist() == list(model.skeleton.names)
-            assert found["foot_contact"].shape == (len(joints), len(found["feet"]))
+            feet = jnp.asarray(joints[:, list(model.skeleton.feet)])
+            contacts = contact.foot_contacts(feet, 30.0)
+            np.testing.assert_array_equal(found["foot_contact"], contacts)
     else:
         assert path.stat().st_size > 1000
 

@@ -375,7 +375,7 @@ def _numbers(values) -> str:
     """Numbers with up to nine decimals and no negative zeros."""
     # Positional, because some readers know no exponents.
     return " ".join(
-        np.format_float_positional(float(value) + 0.0, precision=9, trim="-")
+        np.format_float_positional(round(float(value), 9) + 0.0, precision=9, trim="-")
         for value in values
     )
 

@@ -41,12 +41,18 @@ _REFLECTIONS = np.array(
 )
 _SIDES = {"left": "right", "l": "r"}
 _SIDES |= {right: left for left, right in _SIDES.items()}
-# Where a name says its side, surest first; the group is the side.
+# Where a name says its side, surest first. A word that only ends so, as "upright" and
+# "cleft" do, says none; "handleft" does.
+_WORDS = ("up", "out", "down", *(x + y for x in (r"\b", "_") for y in "abcfw"))
 _SIDE_PATTERNS = (
-    re.compile(r"(left|right)", re.IGNORECASE),
-    re.compile(r"(?:^|(?<=[_\-.: ]))([lr])(?=$|[_\-.: ])", re.IGNORECASE),
-    re.compile(r"^([lrLR])(?=[A-Z])"),
-    re.compile(r"(?<=[a-z])([LR])$"),
+    re.compile(
+        r"(?<![a-z])(?:left|right)|(?-i:(?<=[a-z])(?:Left|Right))|"
+        rf"{''.join(f'(?<!{x})' for x in _WORDS)}(?:left|right)(?![a-z])",
+        re.IGNORECASE,
+    ),
+    re.compile(r"(?:^|(?<=[_\-.: ]))[lr](?=$|[_\-.: ])", re.IGNORECASE),
+    re.compile(r"^[lrLR](?=[A-Z])"),
+    re.compile(r"(?<=[a-z])[LR]$"),
 )
 
 
@@ -79,7 +85,7 @@ def swap_sides(name: str) -> str:
     """
     for pattern in _SIDE_PATTERNS:
         if pattern.search(name):
-            return pattern.sub(lambda match: _other_side(match.group(1)), name)
+            return pattern.sub(lambda match: _other_side(match.group()), name)
     return name
 
 

@@ -257,7 +257,7 @@ def read_labels(name: str, text: str) -> list[tuple[str, float, float, str]]:
     An empty end is the file's; an empty start its beginning. A `ValueError` names the
     first line that is wrong.
     """
-    rows = csv.reader(io.StringIO(text))
+    rows = csv.reader(io.StringIO(text, newline=None))  # lines may end in any way
     head = [word.strip().lower() for word in next(rows, [])]
     if head != _COLUMNS:
         raise ValueError(
@@ -395,8 +395,8 @@ def clips_from_recordings(
         pairs = zip(joints, known, strict=True)
         changed = ", ".join(f"{a}: {b}" for a, b in pairs if a != b)
         notes.append(f"renamed  {changed}")
+        feet = tuple(known[skeleton.index(foot)] for foot in feet)
         skeleton = dataclasses.replace(skeleton, names=known)
-        feet = tuple(known[joints.index(foot)] for foot in feet if foot in joints)
     skeleton = dataclasses.replace(skeleton, feet=_feet(skeleton, feet))
     clips = clips_from_motions(
         motions,

@@ -143,9 +143,9 @@ def write_character(
             file, crowd = (
                 key.replace("@", ".") + more + onnx.SUFFIX for more in ("", ".crowd")
             )
-            for one, name in ((made, file), (graph.together(made, places), crowd)):
+            for one, where in ((made, file), (graph.together(made, places), crowd)):
                 content = slim.slim(onnx.content(one), weights)
-                written.append(_write(folder / name, content, say))
+                written.append(_write(folder / where, content, say))
             graphs[key] = {
                 "file": file,
                 "crowd": {"file": crowd, "number": places},

@@ -278,13 +278,20 @@ def export_params(
 ) -> None:
     """Writes parameters, a nested dict, and their config (JSON) whole or not at all.
 
-    float16 halves the npz file at three decimal digits.
+    float16 halves the npz file at three decimal digits. `ValueError` for numbers that
+    are not finite, or too large for it.
     """
     leaves = jax.tree_util.tree_leaves_with_path(params)
-    arrays = {
-        "/".join(str(k.key) for k in keys): np.asarray(leaf, dtype)
-        for keys, leaf in leaves
-    }
+    with np.errstate(over="ignore"):
+        arrays = {
+            "/".join(str(k.key) for k in keys): np.asarray(leaf, dtype)
+            for keys, leaf in leaves
+        }
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise ValueError(
+                f"{name} has numbers that are not finite in {np.dtype(dtype).name}"
+            )
     path = Path(path)
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder, expected a file to write")

@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
+from jaxtyping import Array
 from tqdm import tqdm
 
 from jaxmotion import files
@@ -88,12 +90,23 @@ def check_finite(info: dict[str, Any], first_step: int, folder: Path) -> None:
         return
     row = int(bad[0])
     values = {name: float(np.asarray(x)[row]) for name, x in info.items()}
+    raise TrainingDiverged(
+        f"loss is not finite at step {first_step + row}: {values}; {_last_good(folder)}"
+    )
+
+
+def _last_good(folder: Path) -> str:
     good = checkpoint.latest_step(folder)
     where = f"there is none in {folder}" if good is None else f"{folder} step {good}"
-    raise TrainingDiverged(
-        f"loss is not finite at step {first_step + row}: {values}; "
-        f"last good checkpoint: {where}"
-    )
+    return f"last good checkpoint: {where}"
+
+
+@jax.jit
+def _finite(state: Any) -> Array:
+    numbers = [
+        x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.inexact)
+    ]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in numbers]))
 
 
 @contextlib.contextmanager
@@ -343,8 +356,14 @@ def train_all(
             stop = _any_process(bool(interrupts), asked)
             if done % loop.save_every == 0 or done >= loop.num_steps or stop:
                 for i, one in enumerate(loops):
-                    place = one.folder / "checkpoints"
-                    _save(place, done, part(state, i), one.config)
+                    place, own = one.folder / "checkpoints", part(state, i)
+                    # A finite loss may have a gradient that is not.
+                    if not _finite(own):
+                        raise TrainingDiverged(
+                            f"parameters are not finite after step {done}; "
+                            f"{_last_good(place)}"
+                        )
+                    _save(place, done, own, one.config)
     if stop and done < loop.num_steps:
         places = ", ".join(str(one.folder / "checkpoints") for one in loops)
         raise KeyboardInterrupt(f"stopped at step {done}; saved in {places}")

@@ -445,15 +445,14 @@ def read_robot(
     data = zero.data
     points, moved, feet = _person(path, zero, bodies)
     rest = _rest(path, points, feet)
-    # Sites do not change the numbers of bodies and joints.
+    # Sites do not change the numbers of bodies and joints; bodies need no names.
+    by_number = {one.id: one for one in spec.bodies}
     for role, body in moved.items():
         turn = data.xmat[body].reshape(3, 3)
         place = axes @ points[role] - data.xpos[body]
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, (turn.T @ axes).ravel())
-        spec.body(model.body(body).name).add_site(
-            name=MARK + role, pos=turn.T @ place, quat=quat
-        )
+        by_number[body].add_site(name=MARK + role, pos=turn.T @ place, quat=quat)
     model = compiled(path, spec)
     joints = [j for j in range(model.njnt) if model.jnt_bodyid[j] in tree and j != free]
     joints = np.array(joints)

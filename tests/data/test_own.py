@@ -99,6 +99,20 @@ def test_labels_from_a_table_cut_parts():
     ]
 
 
+def test_feet_of_renamed_joints_are_told_by_their_own_names():
+    found, _ = own.clips_from_recordings(two()[:1], feet=("J04", "J08"))
+    names = [found.skeleton.names[foot] for foot in found.skeleton.feet]
+    assert names == [PLAIN.names[4], PLAIN.names[8]]
+    with pytest.raises(ValueError, match="unknown joint 'J99': the skeleton has J00"):
+        own.clips_from_recordings(two()[:1], feet=("J04", "J99"))
+
+
+def test_lines_of_a_table_end_in_any_way():
+    lines = ["file,start,end,label", "a,0,1,walk"]
+    for end in ("\n", "\r\n", "\r"):
+        assert own.read_labels("t.csv", end.join(lines)) == [("a", 0.0, 1.0, "walk")]
+
+
 def test_long_takes_become_several_clips():
     clips, _ = own.clips_from_recordings(two()[:1], longest=0.3)
     assert clips.clip_names == ("takes/a-0", "takes/a-1", "takes/a-2")

@@ -82,6 +82,15 @@ def test_an_export_that_lists_no_files_is_left_alone(script, tmp_path, content):
             "--steps has 9, expected",
         ),
         ({"format": "glb", "model": ("one",)}, "expected one of onnx, stablehlo, web"),
+        (
+            {"model": ("one",), "steps": (4,)},
+            "--steps is .4,., but the format onnx has",
+        ),
+        ({"model": ("one",), "scale": 2.0}, "but a model that is steered has no such"),
+        (
+            {"format": "web", "model": ("one",), "batch": "any"},
+            "but a page has no such",
+        ),
     ],
 )
 def test_wrong_options_write_nothing(script, tmp_path, options, message):

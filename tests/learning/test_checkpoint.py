@@ -347,6 +347,9 @@ def test_export_and_import(tmp_path):
     assert half["bias"].dtype == jnp.float32
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3), half, params)
     assert [p.name for p in path.parent.iterdir()] == ["model.npz"]
+    for value in (1e5, jnp.nan):
+        with pytest.raises(ValueError, match="bias has numbers that are not finite in"):
+            checkpoint.export_params(path, {"bias": jnp.full(2, value)}, {})
     deep = {"a": {"b": {"c": jnp.ones(2)}, "d": jnp.zeros(1)}}
     checkpoint.export_params(path, deep, {})
     checkpoint.check_params(path, checkpoint.import_params(path)[0], deep)

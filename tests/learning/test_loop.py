@@ -380,3 +380,20 @@ def test_a_killed_training_goes_on_and_ends_as_if_nothing_had_been(tmp_path):
         like = {"params": params, "ema_params": params}
         states.append(checkpoint.restore_part(stage, like))
     jax.tree.map(np.testing.assert_array_equal, *states)
+
+
+def test_parameters_that_are_not_finite_are_not_saved(tmp_path):
+    """The root of a square is finite at zero, and its gradient there is none."""
+
+    def loss(params, key, batch):
+        return jnp.sqrt(params["w"] ** 2), {}
+
+    optimizer = optax.sgd(1.0)
+    update = training.make_update(loss, optimizer)
+    state = training.init_train_state({"w": jnp.float32(1.0)}, optimizer)
+    run = training.train_chunk(update, lambda key, data: data, num_steps=1)
+    place = Loop(num_steps=2, chunk=1, save_every=1, folder=tmp_path, config={})
+    message = "parameters are not finite after step 2; last good checkpoint: .* step 1"
+    with pytest.raises(TrainingDiverged, match=message):
+        train(run, state, jax.random.key(0), jnp.zeros(1), loop=place)
+    assert checkpoint.latest_step(tmp_path / "checkpoints") == 1

@@ -257,6 +257,19 @@ def test_bodies_may_be_told(tmp_path):
     assert given.items() <= bodies.items() and bodies["hips"] == "pelvis"
 
 
+def test_bodies_need_no_names(tmp_path):
+    """The pelvis, and another body before it: marks are on those of the roles."""
+    path = tmp_path / "x.xml"
+    text = robots.mjcf().replace(' name="pelvis"', "")
+    at = text.index("<worldbody>") + len("<worldbody>")
+    other = '<body pos="3 0 0"><geom type="sphere" size=".1"/></body>'
+    path.write_text(text[:at] + other + text[at:])
+    found = robot.read_robot(path)
+    assert found.model.body(found.bodies["hips"]).name == ""
+    for role, body in found.bodies.items():
+        assert found.model.site(robot.MARK + role).bodyid[0] == body
+
+
 WRONG = {
     "free joint": (robots.mjcf(free=False), "no free joint: expected a robot that"),
     "legs": (robots.mjcf(legs=False), "no person: missing leftUpperLeg"),
