@@ -62,7 +62,8 @@ class Config:
       format: onnx, stablehlo or web.
       steps: Numbers of diffusion steps that the page offers besides the model's own.
       batch: one (arrays have no axis for characters), a number, or any.
-      foot_lock: Planted feet stay; None as jm.load has it (on for shipped models).
+      foot_lock: Planted feet stay; None as jm.load has it (on for shipped models). Not
+        of whole motions, which are what the network makes.
       cache: Folder for the packages of npm that the page is made of.
       row: EMDM's row.
       scale: EMDM's guidance; None for the paper's.

@@ -213,12 +213,20 @@ def announce(what: str, seconds: int) -> None:
 def start(main: Callable[[], None]) -> None:
     """Runs a script.
 
-    It exits with one line and status 1 after bad input, a training that diverged, a
-    device without enough memory, or another process that died; with 130 after Ctrl-C.
+    It exits with one line and status 1 after bad input, without a package of an extra,
+    after a training that diverged, on a device without enough memory, or after another
+    process died; with 130 after Ctrl-C.
     """
+    known = (
+        OSError,
+        ValueError,
+        ModuleNotFoundError,
+        TrainingDiverged,
+        JaxRuntimeError,
+    )
     try:
         main()
-    except (OSError, ValueError, TrainingDiverged, JaxRuntimeError) as error:
+    except known as error:
         text = f"error: {' '.join(str(error).split())}"
         if not jax.distributed.is_initialized():
             sys.exit(text)

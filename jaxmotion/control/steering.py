@@ -439,6 +439,10 @@ def settled(told: Wish, wish: Wish, *, steady: bool) -> Wish:
     A steady wish, which was the same a tick ago, is passed on as it is.
     """
     stops = bool(told.speed) != bool(wish.speed)
-    turned = float(np.dot(told.facing, wish.facing)) < math.cos(HEADING_STEP)
+    step = math.cos(HEADING_STEP)
+    turned = float(np.dot(told.facing, wish.facing)) < step
+    # Another way to go with the same facing, as of a second stick, counts as well.
+    along = float(np.dot(told.velocity, wish.velocity))
+    turned = turned or along < step * told.speed * wish.speed
     far = turned or abs(told.speed - wish.speed) > SPEED_STEP
     return wish if stops or far or steady else told

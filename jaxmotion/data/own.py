@@ -9,6 +9,7 @@ import csv
 import dataclasses
 import io
 import itertools
+import re
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 from typing import Literal
@@ -295,7 +296,10 @@ def _parts(
     if table is not None:
         return [row[1:] for row in table if row[0] in (path.name, path.stem)]
     inside = PurePosixPath(name.removeprefix(folder).lstrip("/").replace("\\", "/"))
-    return [(0.0, np.inf, inside.parts[0] if len(inside.parts) > 1 else "all")]
+    above = [re.sub(r"\.zip$", "", part, flags=re.I) for part in inside.parts[:-1]]
+    # A folder, also within a zip; else the zip.
+    folders = [x for x, part in zip(above, inside.parts, strict=False) if x == part]
+    return [(0.0, np.inf, [*folders, *above, "all"][0])]
 
 
 def clips_from_recordings(

@@ -113,6 +113,22 @@ def test_lines_of_a_table_end_in_any_way():
         assert own.read_labels("t.csv", end.join(lines)) == [("a", 0.0, 1.0, "walk")]
 
 
+@pytest.mark.parametrize(
+    "name, style",
+    [
+        ("d/a.bvh", "all"),
+        ("d/calm/a.bvh", "calm"),
+        ("d/calm/deep/a.bvh", "calm"),
+        ("d/takes.zip/calm/a.bvh", "calm"),
+        ("d/Calm.ZIP/a.bvh", "Calm"),
+    ],
+)
+def test_the_style_is_the_folder_also_within_a_zip(name, style):
+    read = own.read_bvh(name, odd_file())
+    clips, _ = own.clips_from_recordings([read], folder="d")
+    assert dict(clips.label_names)["style"] == (style,)
+
+
 def test_long_takes_become_several_clips():
     clips, _ = own.clips_from_recordings(two()[:1], longest=0.3)
     assert clips.clip_names == ("takes/a-0", "takes/a-1", "takes/a-2")

@@ -89,6 +89,16 @@ def test_small_changes_are_not_told():
     assert steering.settled(ask("forward"), Wish(), steady=False) == Wish()
 
 
+def test_another_way_to_go_is_told_though_the_facing_is_held():
+    """A stick that turns by six degrees a tick, a second one that does not."""
+    told = ask("forward")
+    for degrees in range(0, 361, 6):
+        way = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+        wish = Wish(velocity=way, facing=told.facing)
+        told = steering.settled(told, wish, steady=False)
+        assert np.dot(told.velocity, way) > math.cos(steering.HEADING_STEP) - 1e-9
+
+
 def test_a_formation_has_the_first_in_front_and_room():
     for number in (1, 2, 7, 64):
         places = viewer.formation(number)

@@ -49,8 +49,10 @@ export function wanted(inputs, last, { position, speed, seconds }) {
 // What to tell the character: every change of it costs a plan, so small ones wait.
 export function settled(told, wish, steady) {
   const stops = Boolean(speedOf(told)) !== Boolean(speedOf(wish));
-  const along = told.facing[0] * wish.facing[0] + told.facing[1] * wish.facing[1];
-  const far = along < Math.cos(HEADING_STEP)
+  const along = (a, b) => a[0] * b[0] + a[1] * b[1], step = Math.cos(HEADING_STEP);
+  const far = along(told.facing, wish.facing) < step
+    // Another way to go with the same facing, as of a second stick, counts as well.
+    || along(told.velocity, wish.velocity) < step * speedOf(told) * speedOf(wish)
     || Math.abs(speedOf(told) - speedOf(wish)) > SPEED_STEP;
   return stops || far || steady ? wish : told;
 }
