@@ -181,7 +181,7 @@ def label_indices(
             raise ValueError(f"label is {label!r}, expected a name or an index")
         found.append(int(label))
     check_labels(np.array(found, int), names)
-    return np.array(found, np.int32)
+    return np.array(found if names else np.zeros(len(found)), np.int32)
 
 
 def check_labels(labels: np.ndarray | Array, names: tuple[str, ...]) -> None:

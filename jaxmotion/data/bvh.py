@@ -181,13 +181,15 @@ def motion_from_bvh(
     motion = Motion(
         root_position=jnp.asarray(position * scale, jnp.float32),
         joint_rotation=jnp.asarray(columns, jnp.float32),
-        fps=frame_rate(bvh.frame_time),
+        fps=frame_rate(bvh.frame_time, bvh.frame_decimals),
     )
     return skeleton, motion
 
 
-def frame_rate(frame_time: float) -> float:
+def frame_rate(frame_time: float, decimals: int | None = None) -> float:
     """Frames per second, freed of the rounding of a written frame time in seconds.
+
+    It was written with so many decimals; None for the shortest that tell it.
 
     Files write 1/30 s as 0.033333, 0.0333 or 0.033. A rate is meant when it alone of
     the customary ones, or of all whole ones, rounds or is cut to the written decimals;
@@ -195,8 +197,9 @@ def frame_rate(frame_time: float) -> float:
     """
     rate = 1.0 / frame_time
     error = abs(rate - round(rate)) / rate
-    # The shortest decimals of the number are those that the file wrote.
-    unit = 10.0 ** int(decimal.Decimal(repr(frame_time)).as_tuple().exponent)
+    if decimals is None:
+        decimals = -int(decimal.Decimal(repr(frame_time)).as_tuple().exponent)
+    unit = 10.0**-decimals
     least = math.ceil(1.0 / (frame_time + unit))
     most = math.floor(1.0 / max(frame_time - unit / 2, unit / 2))
     customary = [one for one in _CUSTOMARY if least <= one <= most]

@@ -7,6 +7,7 @@ all of that is kept as it is. Units are the file's own (mostly centimeters, degr
 """
 
 import dataclasses
+import math
 import os
 import re
 import warnings
@@ -193,6 +194,7 @@ class Bvh:
       end_sites: For each joint the offsets of its End Sites (none, one or several).
       values: Channel values, one row a frame; angles in degrees.
       frame_time: Seconds a frame.
+      frame_decimals: How many decimals of it are written; None where nobody says.
       name: File name (or another name) for messages.
     """
 
@@ -203,6 +205,7 @@ class Bvh:
     end_sites: tuple[tuple[tuple[float, float, float], ...], ...]
     values: Float[np.ndarray, "frames channels"]
     frame_time: float
+    frame_decimals: int | None = None
     name: str = "bvh"
 
     @property
@@ -296,6 +299,9 @@ def parse_bvh(text: str, *, name: str = "bvh") -> Bvh:
             f"{name}, line {start}: 'Frame Time:' should be in {_FRAME_TIMES[0]:g}.."
             f"{_FRAME_TIMES[1]:g} seconds, found {frame_time:g}"
         )
+    told = _FRAME_TIME.fullmatch(lines[start - 1])
+    whole, _, part = told[1].partition(".") if told else ("", "", "")
+    decimals = len(part) if f"{whole}{part}".isdecimal() else None
     width = sum(len(channels) for channels in hierarchy.channels)
     # The number of lines bounds the rows: a wild 'Frames:' must not allocate memory.
     if count > len(lines):
@@ -311,6 +317,7 @@ def parse_bvh(text: str, *, name: str = "bvh") -> Bvh:
         end_sites=tuple(tuple(sites) for sites in hierarchy.end_sites),
         values=_rows(lines, start, (int(count), width), name),
         frame_time=frame_time,
+        frame_decimals=decimals,
         name=name,
     )
 
@@ -388,7 +395,12 @@ def format_bvh(bvh: Bvh, *, decimals: int = 6) -> str:
     """
     joints, order = _joint_lines(bvh)
     lines = ["HIERARCHY", *joints, "MOTION"]
-    lines += [f"Frames: {bvh.num_frames}", f"Frame Time: {bvh.frame_time:.9g}"]
+    # As many decimals as were read, for they say how far the number is rounded; else
+    # nine digits.
+    most = bvh.frame_decimals
+    if most is None:
+        most = max(0, 8 - math.floor(math.log10(bvh.frame_time)))
+    lines += [f"Frames: {bvh.num_frames}", f"Frame Time: {bvh.frame_time:.{most}f}"]
     first = np.cumsum([0] + [len(channels) for channels in bvh.channels])
     columns = [c for joint in order for c in range(first[joint], first[joint + 1])]
     # Adding zero after rounding turns -0.0 into 0.0, which some readers reject.

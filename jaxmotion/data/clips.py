@@ -41,6 +41,11 @@ class Clips:
     source: str = jax.tree.static(default="")
 
     @property
+    def titles(self) -> tuple[str, ...]:
+        """Names of the clips; their numbers where they have none."""
+        return self.clip_names or tuple(f"clip {i}" for i in range(self.num_clips))
+
+    @property
     def num_clips(self) -> int:
         """Number of clips."""
         return self.offsets.shape[0] - 1
@@ -216,7 +221,7 @@ def take_clips(clips: Clips, indices: Sequence[int] | np.ndarray) -> Clips:
         indices,
         offsets[indices],
         np.diff(offsets)[indices],
-        names=tuple(clips.clip_names[i] for i in indices),
+        names=tuple(clips.titles[i] for i in indices),
     )
 
 

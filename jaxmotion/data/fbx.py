@@ -64,10 +64,17 @@ def read_fbx(
             return _matrix(node.local_transform)
         return _matrix(ufbx.evaluate_transform(take.anim, node, time))
 
-    # Bones of one tree, parents first; what is above (an armature) moves its root.
+    # Bones of one tree, parents first; nodes between them, and above the root (an
+    # armature), move what is below.
     index = {node.element_id: i for i, node in enumerate(bones)}
-    upper = [node.parent for node in bones]
-    parents = [-1 if n is None else index.get(n.element_id, -1) for n in upper]
+    parents, between = [], []
+    for bone in bones:
+        above, up = [], bone.parent
+        while up is not None and up.element_id not in index:
+            above.insert(0, up)
+            up = up.parent
+        parents.append(-1 if up is None else index[up.element_id])
+        between.append(above)
     root = max(
         (i for i, parent in enumerate(parents) if parent < 0),
         key=lambda i: sum(_below(parents, i, j) for j in range(len(bones))),
@@ -77,19 +84,13 @@ def read_fbx(
         key=lambda j: (_depth(parents, j), j),
     )
     places = [order.index(parents[j]) if at else -1 for at, j in enumerate(order)]
-    above = []
-    node = bones[root].parent
-    while node is not None:
-        above.insert(0, node)
-        node = node.parent
     world = np.zeros((len(times), len(order), 4, 4))
     for frame, time in enumerate(times):
-        base = np.eye(4)
-        for node in above:
-            base = base @ local(node, time)
         for at, j in enumerate(order):
-            start = base if at == 0 else world[frame, places[at]]
-            world[frame, at] = start @ local(bones[j], time)
+            place = np.eye(4) if at == 0 else world[frame, places[at]]
+            for node in (*between[j], bones[j]):
+                place = place @ local(node, time)
+            world[frame, at] = place
     turns = world[..., :3, :3]
     turns = turns / np.linalg.norm(turns, axis=-2, keepdims=True)
     if (np.linalg.det(turns) < 0.9).any():

@@ -98,7 +98,7 @@ def read_bvh(name: str, data: bytes) -> Recording:
         parents=content.parents,
         positions=positions,
         rotations=rotations,
-        fps=bvh.frame_rate(content.frame_time),
+        fps=bvh.frame_rate(content.frame_time, content.frame_decimals),
     )
 
 

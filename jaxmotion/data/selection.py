@@ -115,13 +115,13 @@ def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
 
     `ValueError` if a name is unknown, or no clip would be left to train on.
     """
-    unknown = [name for name in held_out if name not in clips.clip_names]
+    unknown = [name for name in held_out if name not in clips.titles]
     if unknown:
         raise ValueError(
             f"no clip named {', '.join(map(repr, unknown))}: the clips are "
-            f"{', '.join(clips.clip_names)}"
+            f"{', '.join(clips.titles)}"
         )
-    out = np.isin(np.asarray(clips.clip_names), held_out)
+    out = np.isin(np.asarray(clips.titles), held_out)
     if out.all():
         raise ValueError("all clips are held out, expected some to train on")
     train, rest = np.flatnonzero(~out), np.flatnonzero(out)
@@ -135,7 +135,7 @@ def cut(clips: Clips, spans: Sequence[tuple[int, int, int]]) -> Clips:
     "<clip>@<first frame>+<frames>".
     """
     owners, starts, lengths = np.array(spans, np.int64).reshape(-1, 3).T
-    names = clips.clip_names or [f"clip {i}" for i in range(clips.num_clips)]
+    names = clips.titles
     return stretches(
         clips,
         owners,
@@ -166,7 +166,7 @@ def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
         raise ValueError(f"rates differ: {sorted(rates)} frames per second")
     check_skeletons(
         [part.skeleton for part in parts],
-        [part.clip_names[0] for part in parts],
+        [part.titles[0] for part in parts],
         tolerance,
     )
     words = {
@@ -181,7 +181,7 @@ def concatenate(parts: Sequence[Clips], *, tolerance: float = 1e-3) -> Clips:
         offsets=jnp.asarray(np.cumsum([0, *lengths]), jnp.int32),
         labels={field: _merged(parts, field, words[field]) for field in fields},
         label_names=tuple(words.items()),
-        clip_names=tuple(name for part in parts for name in part.clip_names),
+        clip_names=tuple(name for part in parts for name in part.titles),
         source="; ".join(dict.fromkeys(part.source for part in parts)),
     )
 

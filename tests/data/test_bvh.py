@@ -317,6 +317,24 @@ def chain(num_joints: int) -> bvh_text.Bvh:
     )
 
 
+@pytest.mark.parametrize("fps", [62.5, 31.25, 500 / 3, 1000 / 13, 59.94, 30.0, 120.0])
+def test_rates_that_are_not_whole_survive(fps):
+    """Zeros at the end of a frame time say how far it is rounded."""
+    motion = Motion(
+        root_position=jnp.zeros((2, 3)),
+        joint_rotation=jnp.tile(jnp.array([1.0, 0, 0, 0, 1, 0]), (2, 5, 1)),
+        fps=fps,
+    )
+    text = format_bvh(bvh.bvh_from_motion(tiny.skeleton(), motion))
+    found = bvh_text.parse_bvh(text)
+    rate = bvh.frame_rate(found.frame_time, found.frame_decimals)
+    assert rate == pytest.approx(fps, rel=1e-6)
+    assert format_bvh(found) == text
+    # As far as anybody can tell, 0.016 is one of 60.
+    for time, decimals, meant in ((0.016, 3, 60.0), (0.016, 6, 62.5), (0.0333, 4, 30)):
+        assert bvh.frame_rate(time, decimals) == pytest.approx(meant)
+
+
 def test_long_chains_are_written_and_read():
     text = format_bvh(chain(5000))
     assert len(text) < 5_000_000

@@ -227,3 +227,11 @@ def test_concatenate_refuses_other_fields_rates_and_skeletons():
         selection.concatenate([clips, build(skeletons=moved, labels=labels)])
     with pytest.raises(ValueError, match="no clips"):
         selection.concatenate([])
+
+
+def test_clips_without_names_are_called_by_their_numbers():
+    plain = dataclasses.replace(samples.clips(), clip_names=())
+    names = [f"clip {i}" for i in range(plain.num_clips)]
+    assert take_clips(plain, [1]).clip_names == (names[1],)
+    both = selection.concatenate([plain, plain])
+    assert list(both.clip_names) == [*names, *names]

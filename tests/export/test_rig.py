@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxmotion as jm
+from jaxmotion.data import fbx
 from jaxmotion.export import rig as rigging
 from jaxmotion.motion import anatomy
 from jaxmotion.motion.skeleton import joint_positions
@@ -165,6 +166,27 @@ def test_an_fbx_of_bones_alone_is_a_rig(tmp_path):
     expected = anatomy.zero_pose(child)
     found = anatomy.zero_pose(target.skeleton)[order]
     np.testing.assert_allclose(found - found[0], expected - expected[0], atol=1e-4)
+
+
+def test_bones_below_a_node_that_is_none_are_found(tmp_path):
+    """A shoulder that is a Null: its arm stays, and stays where it is."""
+    pytest.importorskip("ufbx")
+    child = rigs.person("child")
+    j = next(j for j, n in enumerate(child.names) if "shoulder" in n.lower())
+    text = rigs.fbx(child).decode()
+    for a, b in (
+        (f'NodeAttribute: {1000 + j}, "NodeAttribute::", "LimbNode"', '"LimbNode"'),
+        (f'"Model::{child.names[j]}", "LimbNode"', '"LimbNode"'),
+    ):
+        assert text.count(a) == 1
+        text = text.replace(a, a.replace(b, '"Null"'))
+    whole, less = (
+        fbx.read_fbx("a.fbx", data, rest=True)
+        for data in (rigs.fbx(child), text.encode())
+    )
+    assert set(whole.names) - set(less.names) == {child.names[j]}
+    place = [whole.names.index(name) for name in less.names]
+    np.testing.assert_allclose(less.positions, whole.positions[:, place], atol=1e-4)
 
 
 def changed(hero, tmp_path, change):

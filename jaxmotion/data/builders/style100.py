@@ -132,7 +132,7 @@ def cut_clip(content: bvh_text.Bvh, cut: tuple[int, int]) -> bvh_text.Bvh:
 
     `BvhError` if the rate is another, or the cut is not within the recording.
     """
-    fps = bvh.frame_rate(content.frame_time)
+    fps = bvh.frame_rate(content.frame_time, content.frame_decimals)
     if fps not in (60.0, 30.0):
         raise bvh_text.BvhError(
             f"{content.name}: {fps:g} frames per second, expected 60 (or 30)"
