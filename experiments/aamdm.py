@@ -364,7 +364,7 @@ def levels(args: Levels) -> None:
     table = aamdm_levels.level_table(
         params,
         key,
-        *aamdm_levels.pairs(frames, run.train, key_frames, args.samples),
+        *aamdm_levels.pairs(key_frames, frames, run.train, args.samples),
         config=config,
         change=aamdm_training.scale_of_changes(space, config),
         latents=args.latents,

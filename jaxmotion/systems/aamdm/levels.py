@@ -22,7 +22,7 @@ Frames = Float[Array, "pairs features"]
 
 
 def pairs(
-    frames: Array, data: aamdm_data.PoseData, key: Key, number: int
+    key: Key, frames: Array, data: aamdm_data.PoseData, number: int
 ) -> tuple[Array, Array]:
     """Frames drawn alike from all takes, and those that follow them."""
     first = aamdm_data.starts(data, 2)

@@ -110,6 +110,6 @@ def test_pairs_are_neighbors_within_a_take():
         fps=60.0,
     )
     frames = jnp.arange(9.0)[:, None]
-    previous, frame = levels.pairs(frames, data, jax.random.key(0), 200)
+    previous, frame = levels.pairs(jax.random.key(0), frames, data, 200)
     np.testing.assert_array_equal(frame - previous, np.ones((200, 1)))
     assert set(np.asarray(previous).ravel()) == {0, 1, 2, 4, 5, 6, 7}
