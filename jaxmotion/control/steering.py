@@ -16,6 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh
 from jaxtyping import Array
 
@@ -190,7 +191,7 @@ def check_labels(labels: np.ndarray | Array, names: tuple[str, ...]) -> None:
     All pass where a model has no labels, and within a caller's `jax.jit`, where nobody
     knows them; a `ValueError` names the range and the labels.
     """
-    if isinstance(labels, jax.core.Tracer):
+    if isinstance(labels, Tracer):
         return
     found, last = np.asarray(labels), len(names) - 1
     if names and found.size and (found.min() < 0 or found.max() > last):
