@@ -361,10 +361,15 @@ def levels(args: Levels) -> None:
     params, config = aamdm_training.load_networks(run, where, space, **chain)
     key_frames, key = jax.random.split(jax.random.key(args.seed))
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
+    windows, arrays = aamdm_training.frame_windows(
+        frames, run.train, 2, batch=args.samples
+    )
+    pairs = windows(key_frames, arrays)
     table = aamdm_levels.level_table(
         params,
         key,
-        *aamdm_levels.pairs(key_frames, frames, run.train, args.samples),
+        pairs[:, 0],
+        pairs[:, 1],
         config=config,
         change=aamdm_training.scale_of_changes(space, config),
         latents=args.latents,

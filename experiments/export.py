@@ -176,15 +176,16 @@ def export(args: Config) -> None:
     system = None
     if path is not None:
         system = registry.get(str(face.system_of(path)))
-    if system is None or system.steerable:
+    whole = None if system is None or system.steerable else system
+    if whole is None:
         refuse(args, ("row", "scale"), "a model that is steered")
     else:
         refuse(args, ("foot_lock",), "a model of whole motions")
     writer = FORMATS[args.format]
     writer.check()
     loop.check_writable(args.out)
-    if system is not None and not system.steerable:
-        functions, condition, facts = system.room("evaluation").exports(
+    if whole is not None:
+        functions, condition, facts = whole.room("evaluation").exports(
             path, row=args.row, scale=args.scale
         )
         arguments, starts = {"condition": condition}, {}

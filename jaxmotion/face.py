@@ -313,7 +313,8 @@ def _go(
     places: Any = None,
     labels: Any = None,
     circles: Any = None,
-    **options: Any,
+    avoiding: bool = False,
+    **unknown: Any,
 ) -> Frame:
     """`rollout` with a goal."""
     if not isinstance(goal, goals.Goal):
@@ -321,12 +322,13 @@ def _go(
             f"goal is a {type(goal).__name__}, expected one of `path` or `place`, or a "
             "Follow"
         )
-    around = circles is not None and np.size(circles)
-    if unknown := options.keys() - {"avoiding"}:
+    if unknown:
         raise ValueError(
             f"no option {', '.join(sorted(unknown))}; goals take seconds, places, "
             "labels, avoiding, circles"
         )
+    if circles is not None:
+        circles = jnp.asarray(circles, jnp.float32) if np.size(circles) else None
     number = jax.tree.leaves(states)[0].shape[0]
     starts = jnp.zeros(2)
     if isinstance(goal, goals.Path):
@@ -355,9 +357,9 @@ def _go(
         seconds=seconds,
         places=starts,
         labels=jnp.asarray(steering.label_indices(character.labels, labels, number)),
-        circles=jnp.asarray(circles, jnp.float32) if around else None,
+        circles=circles,
         commands=commands,
-        **options,
+        avoiding=avoiding,
     )
 
 

@@ -11,8 +11,8 @@ A page says between markers, which no reader sees, what stands there:
 
 `table` shows rows and columns of a stored table ("system/table | row" is another's),
 and as `less` the mean difference of two rows within each training, with its 95 %
-interval; `grid` cells, one by one, where a
-page needs other rows and columns than the file has ("{}" stands for each of `across`);
+interval; `grid` cells, one by one, where a page needs other rows and columns than the
+file has ("{}" stands for each of `across`);
 `plot` draws a column of chosen rows beside the page, or, with `panels`, quality over
 time beside peers' times; `claims` the papers' claims with verdicts; `absent` what
 nobody here can measure; `headline` the rows of headline.toml. A

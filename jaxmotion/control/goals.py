@@ -371,7 +371,7 @@ def goal_rollouts(
     places = jnp.zeros((number, 2)) if places is None else jnp.asarray(places)
     if places.ndim != 2 or places.shape[1] != 2:
         raise ValueError(f"places of shape {places.shape}, expected {(number, 2)}")
-    labels = jnp.zeros(number) if labels is None else jnp.asarray(labels)
+    labels = jnp.zeros(number, int) if labels is None else jnp.asarray(labels)
     for what, found in (
         ("goals", jax.tree.leaves(goal)[0].shape[0]),
         ("places", places.shape[0]),

@@ -133,6 +133,7 @@ def make_stage(
                 f"ghost is {ghost.root_position.shape[:2]} characters and frames, "
                 f"expected {(count, frames)}"
             )
+    place = _places(motion, apart)
     if ball is not None:
         at = np.asarray(ball.position, float)
         at = at[None] if at.ndim == 2 else at
@@ -148,10 +149,7 @@ def make_stage(
                 f"ball's touch is {np.shape(ball.touch)} beside {count} characters, "
                 f"expected {touches} beside one"
             )
-        ball = dataclasses.replace(ball, position=at)
-    place = _places(motion, apart)
-    if ball is not None:
-        ball = dataclasses.replace(ball, position=ball.position + place[:, None])
+        ball = dataclasses.replace(ball, position=at + place[:, None])
     motion = _moved(motion, place)
     positions, rotations = kinematics(skeleton, motion)
     if body is None:

@@ -15,6 +15,15 @@ from jaxmotion.viz import stage
 from tests.viz import samples
 
 
+@pytest.fixture
+def node():
+    """Node, which runs the page's script; it is no package of Python's."""
+    found = shutil.which("node")
+    if found is None:
+        pytest.skip("node is not installed")
+    return found
+
+
 class Reader(html.parser.HTMLParser):
     """Text of each element by tag, and all tags with their attributes."""
 
@@ -82,10 +91,7 @@ def test_the_page_needs_no_network(tmp_path):
         assert not {"src", "href", "srcset", "action"} & set(attributes)
 
 
-def test_the_script_is_javascript(tmp_path):
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
+def test_the_script_is_javascript(tmp_path, node):
     script = tmp_path / "a.js"
     script.write_text(Reader(save(tmp_path / "a.html")).texts["script"])
     done = subprocess.run([node, "--check", script], capture_output=True, text=True)
@@ -118,11 +124,8 @@ console.log(JSON.stringify([drawn, parts.time.value, matrices, round]));
 """
 
 
-def test_the_script_draws_the_same_body(tmp_path):
+def test_the_script_draws_the_same_body(tmp_path, node):
     """The page's matrices, with its mesh, put vertices where Python has them."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
     skeleton, motion = samples.person(seconds=0.4)
     ball = stage.Ball(
         position=np.full((12, 3), 0.5),
@@ -169,10 +172,7 @@ def test_a_path_below_a_file_is_an_error_that_names_it(tmp_path):
         save(tmp_path / "plain" / "a.html")
 
 
-def test_the_script_draws_a_ball_of_each_character(tmp_path):
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
+def test_the_script_draws_a_ball_of_each_character(tmp_path, node):
     skeleton, motion = samples.person(seconds=0.4)
     two = Motion(
         root_position=jnp.stack([motion.root_position, motion.root_position + 3.0]),

@@ -13,21 +13,11 @@ from jaxtyping import Array, Float
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.evaluation.table import Cell, Rows
-from jaxmotion.systems.aamdm import data as aamdm_data
 from jaxmotion.systems.aamdm import model as aamdm_model
 from jaxmotion.systems.aamdm.model import Config
 from jaxmotion.typing import Key, Params
 
 Frames = Float[Array, "pairs features"]
-
-
-def pairs(
-    key: Key, frames: Array, data: aamdm_data.PoseData, number: int
-) -> tuple[Array, Array]:
-    """Frames drawn alike from all takes, and those that follow them."""
-    first = aamdm_data.starts(data, 2)
-    chosen = first[jax.random.randint(key, (number,), 0, first.shape[0])]
-    return frames[chosen], frames[chosen + 1]
 
 
 def level_table(

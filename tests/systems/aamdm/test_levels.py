@@ -100,16 +100,3 @@ def test_drafts_spread_over_latents_and_their_mean_errs_by_what_is_left(
 def test_steps_that_a_held_frame_takes_have_no_row(frames):
     rows = table_of(frames, "frame", params={"polisher": silent()["polisher"]})
     assert tuple(rows) == (*STEPS[3:], BEFORE, MEAN)
-
-
-def test_pairs_are_neighbors_within_a_take():
-    data = levels.aamdm_data.PoseData(
-        poses=jnp.zeros((9, 1)),
-        paths=jnp.zeros((9, 12)),
-        offsets=jnp.array([0, 4, 9]),
-        fps=60.0,
-    )
-    frames = jnp.arange(9.0)[:, None]
-    previous, frame = levels.pairs(jax.random.key(0), frames, data, 200)
-    np.testing.assert_array_equal(frame - previous, np.ones((200, 1)))
-    assert set(np.asarray(previous).ravel()) == {0, 1, 2, 4, 5, 6, 7}
