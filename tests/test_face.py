@@ -207,6 +207,19 @@ def test_a_rollout_may_be_part_of_a_compiled_program():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", sorted({*files.SHIPPED} - {"actions"}))
+def test_every_character_is_steered_in_double_precision(name):
+    """Who turns on 64 bits for other work gets them, and no error of a scan's types."""
+    with jax.enable_x64(True):
+        model = jm.load(name)
+        states = model.start(2)
+        commands = jm.commands("straight", model, 2, seconds=0.2, speed=1.0)
+        frames = jm.rollout(model, jax.random.key(0), states, commands)
+        assert frames.root_position.dtype == jnp.float64
+        assert np.isfinite(np.asarray(frames.joint_rotation)).all()
+
+
+@pytest.mark.slow
 def test_players_are_drawn_each_with_his_ball(tmp_path):
     model = jm.load("dribble")
     commands = jm.commands("forward", model, 2, seconds=0.2)

@@ -135,10 +135,18 @@ class Character:
         """
         found = label_indices(self.labels, labels, number)
         if clips is None:
-            return self.starts(found, seed)
+            return _as_precise(self.starts(found, seed))
         if self.clip_starts is None:
             raise ValueError("this model does not start from clips: leave them out")
-        return self.clip_starts(clips, found, seed)
+        return _as_precise(self.clip_starts(clips, found, seed))
+
+
+def _as_precise(states: Any) -> Any:
+    """With floats of JAX's default precision: a scan must hand on what it was given."""
+    wide = jnp.result_type(float)
+    return jax.tree.map(
+        lambda x: x.astype(wide) if jnp.issubdtype(x.dtype, jnp.floating) else x, states
+    )
 
 
 def steered(model: Any, *, what: str = "this model") -> Character:
