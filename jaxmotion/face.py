@@ -284,8 +284,8 @@ def rollout(
 
     Raises:
       ValueError: if the model is not steered, there is neither a goal nor commands,
-        states and commands are of different numbers of characters, or a label is none
-        of the model's.
+        states are of another model, states and commands of different numbers of
+        characters, or a label is none of the model's.
     """
     character = steering.steered(model)
     if goal is not None:

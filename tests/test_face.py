@@ -127,12 +127,13 @@ def broken(frames):
     return dataclasses.replace(frames, root_position=frames.root_position + NAN)
 
 
-def told(model, **wrong):
-    """A rollout whose commands are wrong in one field."""
+def told(model, states=None, **wrong):
+    """A rollout whose commands are wrong in one field, or from given states."""
     commands = jm.commands("forward", model, 2, seconds=0.3)
     for name, value in wrong.items():
         object.__setattr__(commands, name, value)  # which no type checker sees
-    return jm.rollout(model, jax.random.key(0), model.start(2), commands)
+    states = model.start(2) if states is None else states
+    return jm.rollout(model, jax.random.key(0), states, commands)
 
 
 @pytest.mark.parametrize(
@@ -162,6 +163,10 @@ def told(model, **wrong):
                 m, jax.random.key(0), m.start(2), jm.commands("forward", m, 3)
             ),
             "2 states and commands for 3 characters",
+        ),
+        (
+            lambda m, f: told(m, states=jm.load("walker").start(2)),
+            "states are of another model",
         ),
         (lambda m, f: told(m, label=jnp.zeros((2, 9))), "expected whole numbers"),
         (lambda m, f: told(m, facing=jnp.zeros((2, 9, 3))), r"\(2, 9, 3\), expected"),

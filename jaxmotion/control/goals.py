@@ -362,10 +362,10 @@ def goal_rollouts(
       system has as `extra` stays relative to each one's start.
 
     Raises:
-      ValueError: if goals, states, places and commands are of different numbers of
-        characters or seconds, somebody leads without commands or follows nobody, there
-        are commands but no leaders, less than a tick is asked for, circles are of
-        another shape, or a label is none of the model's.
+      ValueError: if states are of another model, goals, states, places and commands of
+        different numbers of characters or seconds, somebody leads without commands or
+        follows nobody, there are commands but no leaders, less than a tick is asked
+        for, circles are of another shape, or a label is none of the model's.
     """
     number = jax.tree.leaves(states)[0].shape[0]
     places = jnp.zeros((number, 2)) if places is None else jnp.asarray(places)
@@ -379,6 +379,7 @@ def goal_rollouts(
     ):
         if found != number:
             raise ValueError(f"{found} {what} for {number} characters")
+    steering.check_states(character, states)
     steering.check_labels(labels, character.labels)
     if not (np.isfinite(seconds) and seconds * character.fps >= 1):
         raise ValueError(f"seconds is {seconds}, expected a tick or more")

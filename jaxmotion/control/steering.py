@@ -114,6 +114,14 @@ class Character:
     ahead: float = AHEAD
     coast: float = LAG
 
+    @functools.cached_property
+    def state_form(self) -> Any:
+        """What its states consist of; None for a model that starts from clips only."""
+        try:
+            return _form(self.start(1))
+        except ValueError:
+            return None
+
     def label(self, name: str) -> int:
         """Index of a label; raises `ValueError` that names those there are."""
         return int(label_indices(self.labels, name)[0])
@@ -139,6 +147,20 @@ class Character:
         if self.clip_starts is None:
             raise ValueError("this model does not start from clips: leave them out")
         return _as_precise(self.clip_starts(clips, found, seed))
+
+
+def check_states(character: Character, states: Any) -> None:
+    """Raises `ValueError` for states of another model, where the model can start."""
+    if character.state_form not in (None, _form(states)):
+        raise ValueError(
+            "states are of another model: expected those of this one's start()"
+        )
+
+
+def _form(states: Any) -> tuple[Any, list[tuple[int, ...]]]:
+    """What one character's state consists of, and the shapes of its arrays."""
+    leaves, structure = jax.tree.flatten(states)
+    return structure, [x.shape[1:] for x in leaves]
 
 
 def _as_precise(states: Any) -> Any:
@@ -243,9 +265,9 @@ def steered_rollouts(
       mesh: Devices to split the characters over; see `rollout.rollout`.
 
     Raises:
-      ValueError: if states and commands are of different numbers of characters,
-        commands of different numbers of ticks, the chunk is not positive, or a label is
-        none of the model's.
+      ValueError: if states are of another model, states and commands of different
+        numbers of characters, commands of different numbers of ticks, the chunk is not
+        positive, or a label is none of the model's.
     """
     check_commands(commands)
     check_labels(commands.label, character.labels)
@@ -253,6 +275,7 @@ def steered_rollouts(
     found = jax.tree.leaves(states)[0].shape[0]
     if found != number:
         raise ValueError(f"{found} states and commands for {number} characters")
+    check_states(character, states)
     if chunk is not None:
         if chunk < 1:
             raise ValueError(f"chunks of {chunk} characters, expected 1 or more")
