@@ -261,7 +261,7 @@ def wanted_trajectory(
         return desired
     own = trajectory.extend(
         trajectory.root_trajectory(skeleton, state.plan),
-        control.apply,
+        config.future,  # a plan may come late, until all frames were displayed
         reuse=control.reuse,
     )
     ahead = jax.tree.map(

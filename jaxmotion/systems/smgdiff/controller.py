@@ -245,8 +245,10 @@ def kicked(
     past = dataclasses.replace(
         state.past, ball=ball.at[:, ::2].set(place[None] - ago * velocity[None])
     )
-    played = jnp.full_like(state.cursor, state.plan.ball.shape[0])
-    return dataclasses.replace(state, past=past, cursor=played)
+    nobody = dataclasses.replace(
+        state.command, label=jnp.full_like(state.command.label, -1)
+    )
+    return dataclasses.replace(state, past=past, command=nobody)
 
 
 def plan_level(
@@ -373,7 +375,7 @@ def wanted_trajectory(
         wanted = dataclasses.replace(wanted, facing=facing)
     own = trajectory.extend(
         trajectory.root_trajectory(skeleton, state.plan.motion),
-        control.apply,
+        config.future,  # a plan may come late, until all frames were displayed
         reuse=control.reuse,
     )
     ahead = jax.tree.map(

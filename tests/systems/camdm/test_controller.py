@@ -337,6 +337,29 @@ def test_without_extension_the_users_path_alone_is_wanted(skeleton):
     np.testing.assert_allclose(blended.facing[-1], alone.facing[-1], atol=1e-6)
 
 
+def test_however_late_a_plan_comes_it_goes_on_from_where_he_is(skeleton, use):
+    """A crowd shares its plans: who waits plays on, up to the last frame of his own."""
+    use(lambda condition, scale: jnp.float32(0.9))
+    made = camdm_controller.controller(None, skeleton, config=CONFIG, control=CONTROL)
+    command = commands_of(*(x[0, 0] for x in steady(1, 1)))
+    state = jax.tree.map(lambda x: x[0], states_of(skeleton, 1))
+    state = made.plans[0](jax.random.key(0), state, command)
+
+    @jax.jit
+    def play_on(state, _):
+        state, _ = made.advance(state, command)
+        wanted = camdm_controller.wanted_trajectory(
+            skeleton, state, command, config=CONFIG, control=CONTROL
+        )
+        return state, wanted.position[0] - state.past.root_position[-1, ::2]
+
+    state, steps = jax.lax.scan(play_on, state, length=CONFIG.future)
+    assert state.cursor == CONFIG.future
+    # He walks along +z at 1 m/s, as he is told.
+    ahead = np.full(CONFIG.future, 1.0 / CONFIG.fps)
+    np.testing.assert_allclose(steps[:, 1], ahead, rtol=0.25)
+
+
 def test_following_returns_to_the_commanded_path(skeleton, use):
     """A model that stays behind: with `follow` it is asked for more than without."""
     use(lambda condition, scale: jnp.float32(0.9))

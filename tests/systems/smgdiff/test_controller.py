@@ -486,6 +486,19 @@ def test_who_fetches_a_ball_aims_at_where_it_rolls(parts):
     )
 
 
+def test_after_a_kick_he_plans_from_where_he_is(parts):
+    """The plan that he displays says where that is, so nobody skips a part of it."""
+    _, config, _ = parts
+    told = jax.tree.map(lambda x: x[0], commands(1))
+    state = smgdiff_controller.init_state(tiny.skeleton(), past(), config=config)
+    state = dataclasses.replace(state, command=told, cursor=jnp.int32(2))
+    level = lambda s: int(smgdiff_controller.plan_level(s, told, control=CONTROL))  # noqa: E731
+    assert level(state) == 0
+    after = smgdiff_controller.kicked(state, jnp.array([1.0, 2.0]), jnp.zeros(2))
+    assert level(after) == 1 and after.cursor == state.cursor
+    np.testing.assert_array_equal(after.past.ball[-1, ::2], [1.0, 2.0])
+
+
 def test_a_lost_ball_rolls_and_is_not_planned(parts):
     representation, config, _ = parts
     driver = driver_of(representation, config, FETCHES)
