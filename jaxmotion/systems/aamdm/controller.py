@@ -21,6 +21,7 @@ What frames hold as `extra`: the simulation bone in the world ("bone_origin",
 
 import dataclasses
 import functools
+import inspect
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -484,8 +485,10 @@ def load_character(
     It starts in the model's own frames where it has some, else in held-out poses.
     Commands have no labels. Noise of the posteriors is forgotten in `noise_half_life`
     seconds; 0 draws it anew in every frame (paper), None is what the model was exported
-    with, 0 for a run folder. `held` is as in `model.sampler`. `CheckpointError` if a
-    stage was not trained, or the file is damaged, `ValueError` for another system.
+    with, 0 for a run folder and for a step that takes no `noise`, as `chain.ddim_step`.
+    `held` is as in `model.sampler`. `CheckpointError` if a stage was not trained, or
+    the file is damaged, `ValueError` for another system, or a half-life of noise that a
+    step draws itself.
     """
     if path.is_file():
         model, networks = aamdm_stored.load(path)
@@ -498,8 +501,13 @@ def load_character(
         )
     space, fps = model.space, model.autoencoder.config.fps
     half_life = model.noise_half_life if noise_half_life is None else noise_half_life
-    memory = None
-    if half_life:
+    memory, takes_noise = None, "noise" in inspect.signature(step).parameters
+    if noise_half_life and not takes_noise:
+        raise ValueError(
+            f"noise_half_life is {noise_half_life}, but the step draws its noise "
+            "itself: expected 0 or None, or a step that takes `noise`"
+        )
+    if half_life and takes_noise:
         memory = Memory(num_steps=model.config.num_steps, half_life=half_life)
     num_joints, steps = model.skeleton.num_joints, model.config.num_steps
     method = Method(

@@ -424,6 +424,20 @@ def test_the_step_of_the_chain_reaches_the_sampler(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("step", [chain.ddim_step, chain.dpm_solver_step])
+def test_whoever_ships_takes_steps_that_draw_their_own_noise(step):
+    """Its file remembers noise; what cannot take it from outside goes without."""
+    model = jm.load("locomotion_fast", step=step)
+    told = jm.commands("straight", model, 2, seconds=0.2, speed=1.0)
+    frames = jm.rollout(model, jax.random.key(0), model.start(2), told)
+    assert np.isfinite(np.asarray(frames.root_position)).all()
+    with pytest.raises(
+        ValueError, match=r"noise_half_life is 0\.1, but the step draws"
+    ):
+        jm.load("locomotion_fast", step=step, noise_half_life=0.1)
+
+
+@pytest.mark.slow
 def test_whoever_ships_starts_to_walk():
     """Told to go at 0.8 m/s, all of 16 walk a meter in the third and fourth second."""
     model = jm.load("locomotion_fast")
