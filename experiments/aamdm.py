@@ -256,7 +256,8 @@ def evaluate(args: Evaluate) -> None:
     guided = "all" if args.guided_steps is None else f"the last {args.guided_steps}"
     note = (
         f"Steered: course {args.course!r} at {args.speed:g} m/s, guidance "
-        f"{args.scale:g} in {guided} steps, half-life of noise "
+        f"{args.scale:g} in {guided} steps (rows as published: in all; AMDM: "
+        f"{args.amdm_scale:g} in all), half-life of noise "
         f"{args.noise_half_life:g} s; div and fid are of joint positions in the "
         "character's axes: no evaluator."
     )

@@ -150,7 +150,7 @@ class Evaluate:
       out: Folder; None for <run>/evaluation.
       samples: Motions of a replication (actions: rounded down to as many of each).
       replications: Sets of motions of each row.
-      long_replications: Sets of rows with 500 network calls and more.
+      long_replications: Sets of rows with 500 steps and more.
       scale: Scale of classifier-free guidance; None for the paper's of the task.
       evaluator_steps: Updates of the evaluator; None for 1500 of that of
         actions, 600 of that of texts, whose updates cost ten times as much.

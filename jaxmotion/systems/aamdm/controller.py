@@ -142,13 +142,22 @@ def init_state(
 
     Its first tick remembers the normal `noise`; None if none is remembered.
     """
+    frame = aamdm_space.to_frames(space, vector, path)
+    noise = jnp.zeros((0, space.num_features)) if noise is None else noise
+    return _state_of(frame, vector, noise, num_joints=num_joints)
+
+
+def _state_of(
+    frame: Array, vector: Array, noise: Array, *, num_joints: int
+) -> CharacterState:
+    """A character at the origin that faces +z and moves as its pose does."""
     parts = unpack(pose.pose_layout(num_joints), vector)
     return CharacterState(
-        frame=aamdm_space.to_frames(space, vector, path),
+        frame=frame,
         bone=PlanarFrame(origin=jnp.zeros(2), facing=jnp.array([0.0, 1.0])),
         velocity=parts["root_velocity"][::2],
         turn_rate=parts["root_angular_velocity"][1],
-        noise=jnp.zeros((0, space.num_features)) if noise is None else noise,
+        noise=noise,
     )
 
 
@@ -398,10 +407,18 @@ def start_states(
 ) -> CharacterState:
     """Characters in poses of the data, each at the origin and facing +z."""
     chosen = np.random.default_rng(seed).integers(0, data.num_frames, number)
-    init = functools.partial(init_state, space, num_joints=num_joints)
     steps = 0 if memory is None else memory.num_steps
     noise = jax.random.normal(jax.random.key(seed), (number, steps, space.num_features))
-    return jax.jit(jax.vmap(init))(data.poses[chosen], data.paths[chosen], noise)
+    poses, paths = data.poses[chosen], data.paths[chosen]
+    return _states_of(space, poses, paths, noise, num_joints=num_joints)
+
+
+@functools.partial(jax.jit, static_argnames="num_joints")
+def _states_of(
+    space: Space, poses: Array, paths: Array, noise: Array, *, num_joints: int
+) -> CharacterState:
+    init = functools.partial(init_state, space, num_joints=num_joints)
+    return jax.vmap(init)(poses, paths, noise)
 
 
 def own_states(
@@ -414,19 +431,18 @@ def own_states(
     chosen = np.random.default_rng(seed).integers(0, len(model.starts), number)
     steps = 0 if memory is None else memory.num_steps
     noise = jax.random.normal(jax.random.key(seed), (number, steps, space.num_features))
+    return _own_states_of(space, model.starts[chosen], noise, num_joints=joints)
 
+
+@functools.partial(jax.jit, static_argnames="num_joints")
+def _own_states_of(
+    space: Space, frames: Array, noise: Array, *, num_joints: int
+) -> CharacterState:
     def state(frame: Array, noise: Array) -> CharacterState:
         vector = aamdm_space.to_poses(space, frame)
-        parts = unpack(pose.pose_layout(joints), vector)
-        return CharacterState(
-            frame=frame,
-            bone=PlanarFrame(origin=jnp.zeros(2), facing=jnp.array([0.0, 1.0])),
-            velocity=parts["root_velocity"][::2],
-            turn_rate=parts["root_angular_velocity"][1],
-            noise=noise,
-        )
+        return _state_of(frame, vector, noise, num_joints=num_joints)
 
-    return jax.jit(jax.vmap(state))(model.starts[chosen], noise)
+    return jax.vmap(state)(frames, noise)
 
 
 def load_run(

@@ -35,14 +35,15 @@ def level_table(
     Each step is given the frame, noised to it, and the frame before; the generator has
     so many latents, of which the mean is taken. Both columns, its error and the
     deviation over latents, are root mean squares in units of the change from frame to
-    frame: each channel is divided by the deviation of its changes, and the frame before
-    then has error 1. `change` is as in `aamdm.model.to_frame`.
+    frame: each channel is divided by the deviation of its changes (those that never
+    change are left out), and the frame before then has error 1. `change` is as in
+    `aamdm.model.to_frame`.
     """
-    table, unit = config.table(), jnp.std(frame - previous, axis=0, keepdims=True)
+    table, unit = config.table(), jnp.std(frame - previous, axis=0)
+    rate = jnp.where(unit > 1e-6, 1.0 / unit, 0.0)
 
     def size(x: Array) -> Array:
-        scale = unit.reshape((1,) * (x.ndim - 2) + unit.shape)
-        return jnp.sqrt(jnp.mean((x / scale) ** 2))
+        return jnp.sqrt(jnp.mean((x * rate.reshape((1,) * (x.ndim - 1) + (-1,))) ** 2))
 
     one = size(frame - previous)
 

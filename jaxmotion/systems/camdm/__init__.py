@@ -76,7 +76,7 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
 * Locked feet (`jaxmotion/control/foot_lock.py`): what is displayed is the past of the
   next plan.
 
-`experiments/camdm.py train` starts from `--preset small`, which uses the first seven
+`experiments/camdm.py train` starts from `--preset small`, which uses the first eight
 and no dropout, since it is meant for a CPU; the shipped walker is such a model, without
 margins, whose feet were planted by a second training (`--preset planted`). `--preset
 paper` trains as the authors do (AdamW, 1e-4, batch 512; their 100 epochs are for

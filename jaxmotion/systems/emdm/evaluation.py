@@ -29,13 +29,13 @@ from jaxmotion.systems.emdm import training as emdm_training
 from jaxmotion.systems.emdm.scoring import Many, RowScorer, Settings
 from jaxmotion.typing import Exported, Key
 
-# Rows with so many network calls a motion are replicated less often.
+# Rows with so many steps a motion are replicated less often.
 _LONG = 500
 _CHUNK = 32
 
 
-def calls(config: emdm_model.Config, row: str) -> int:
-    """Network calls of one motion of a row."""
+def chain_steps(config: emdm_model.Config, row: str) -> int:
+    """Steps of the chain that makes a motion of a row."""
     samplers = emdm_training.SAMPLERS
     return samplers[row][1] if row in samplers else config.num_steps
 
@@ -68,7 +68,7 @@ def evaluate_run(
 ) -> tuple[Rows, dict[str, by_frame.ByFrame], RowScorer]:
     """The table of a run's rows, jerk and slide by place in a token, and what scored.
 
-    Without `rows` all that were trained; those with 500 network calls and more have
+    Without `rows` all that were trained; those with 500 steps and more have
     `long_replications`. `ValueError` if nothing was trained, or a row was not.
     """
     run = runs.load(folder, system=emdm_training.SYSTEM)
@@ -83,15 +83,16 @@ def evaluate_run(
         begun = time.perf_counter()
         params, config = emdm_training.load_row(run, row)
         sample = emdm_training.row_sampler(params, config, row)
-        number, scale = calls(config, row), scorer.scale
-        count = long_replications if number >= _LONG else settings.replications
+        steps, scale = chain_steps(config, row), scorer.scale
+        count = long_replications if steps >= _LONG else settings.replications
         many = emdm_training.sample_many(sample, chunk=_CHUNK)
         cells, key = score_row(scorer, many, settings, count=count)
         one = jax.jit(lambda key: sample(key, scorer.one, scale=scale))  # noqa: B023
         found[row] = cells | {
             # Per frame, as the paper gives it.
             "frame_time": bench.call_time(one, parts=config.frames, least=3),
-            "network_calls": Cell(value=float(number)),
+            # Guidance asks the network for the null condition, too.
+            "network_calls": Cell(value=float(steps if scale is None else 2 * steps)),
         }
         if scorer.by_frame is not None:
             places[row] = scorer.by_frame(key, many, config.frames_per_token)

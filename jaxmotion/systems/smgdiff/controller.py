@@ -634,15 +634,7 @@ def start_states(
         chosen.append(int(generator.choice(known)))
     scenes, _ = smgdiff_data.all_scenes(arrays, jnp.asarray(chosen))
     skeleton = model.representation.skeleton
-
-    @jax.jit
-    @jax.vmap
-    def state(past: Scene) -> PlayerState:
-        frame = smgdiff_scene.plan_frame(skeleton, past.motion)
-        local = smgdiff_scene.to_frame(past, frame)
-        return init_state(skeleton, local, config=model.config)
-
-    return state(scenes)
+    return _states_of(skeleton, _at_origin(skeleton, scenes), config=model.config)
 
 
 def own_states(model: Model, labels: np.ndarray, *, seed: int) -> PlayerState:
@@ -650,9 +642,23 @@ def own_states(model: Model, labels: np.ndarray, *, seed: int) -> PlayerState:
     if model.starts is None:
         raise ValueError("the model has no frames to start from")
     chosen = chosen_starts(model.starts, labels, model.labels, seed=seed)
-    skeleton = model.representation.skeleton
-    start = functools.partial(init_state, skeleton, config=model.config)
-    return jax.jit(jax.vmap(start))(chosen)
+    return _states_of(model.representation.skeleton, chosen, config=model.config)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _states_of(skeleton: Skeleton, scenes: Scene, *, config: Config) -> PlayerState:
+    return jax.vmap(functools.partial(init_state, skeleton, config=config))(scenes)
+
+
+@jax.jit
+def _at_origin(skeleton: Skeleton, scenes: Scene) -> Scene:
+    """Each scene moved so that its player ends at the origin and faces +z."""
+
+    def local(scene: Scene) -> Scene:
+        frame = smgdiff_scene.plan_frame(skeleton, scene.motion)
+        return smgdiff_scene.to_frame(scene, frame)
+
+    return jax.vmap(local)(scenes)
 
 
 def load_run(path: Path) -> tuple[smgdiff_training.Run, Model, dict[str, Params]]:
@@ -672,13 +678,6 @@ def own_starts(path: Path, *, number: int, seed: int = 0) -> Scene:
     """
     run, model, _ = load_run(path)
     character, skeleton = load_character(path), model.representation.skeleton
-
-    @jax.vmap
-    def local(frames: Frame) -> Scene:
-        scene = Scene(motion=frames.motion, **frames.extra)
-        frame = smgdiff_scene.plan_frame(skeleton, scene.motion)
-        return smgdiff_scene.to_frame(scene, frame)
-
     found = []
     for label in range(len(model.labels)):
         labels = np.full(16, label)
@@ -687,7 +686,8 @@ def own_starts(path: Path, *, number: int, seed: int = 0) -> Scene:
         _, frames = calmest(
             character, states, labels, number=number, past=past, seed=seed
         )
-        found.append(local(frames))
+        scenes = Scene(motion=frames.motion, **frames.extra)
+        found.append(_at_origin(skeleton, scenes))
     return jax.tree.map(lambda *x: jnp.stack(x), *found)
 
 

@@ -69,6 +69,17 @@ def test_networks_that_say_nothing_are_at_the_mean_or_at_the_frame_before(
     np.testing.assert_allclose(rows[MEAN]["frame_error"].value, mean, rtol=1e-5)
 
 
+def test_channels_that_never_change_are_left_out(frames):
+    """As a full pose has them: the rows are of the others alone."""
+    still = [np.column_stack([x[:, :-1], np.full(PAIRS, 0.5)]) for x in frames]
+    rows = table_of(still, "frame", params=silent())
+    assert rows[BEFORE]["frame_error"].value == pytest.approx(1)
+    others = [x[:, :-1] for x in frames]
+    for name, guess in ((STEPS[0], 0.0), (MEAN, others[1].mean(0))):
+        wanted = error(others, np.broadcast_to(guess, others[1].shape))
+        np.testing.assert_allclose(rows[name]["frame_error"].value, wanted, rtol=1e-5)
+
+
 def test_drafts_spread_over_latents_and_their_mean_errs_by_what_is_left(
     frames, monkeypatch
 ):
