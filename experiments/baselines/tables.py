@@ -102,13 +102,18 @@ def measure(
 def data_rows(
     run: aamdm_training.Run, reference: aamdm_evaluation.Reference, args: Any
 ) -> dict[str, Row]:
-    """Rows of real frames: those trained on, and those held out."""
+    """Rows of real frames: those trained on, and those held out.
+
+    The held-out ends of clips are short, and the fewer frames a row has, the larger is
+    its FID. So frames that were trained on are there as short, too: held-out frames
+    are to be compared with these, and never with a model's.
+    """
     found, ticks = {}, round(args.seconds * run.train.fps)
-    # The held-out ends of clips are short.
     longest = int(np.diff(np.asarray(run.held_out.offsets)).max())
     short = min(ticks, round(3 * run.train.fps), longest)
     for name, data, length in (
         ("data (trained on)", run.train, ticks),
+        ("data (trained on, as short)", run.train, short),
         ("data (held out)", run.held_out, short),
     ):
         frames = aamdm_evaluation.data_frames(
