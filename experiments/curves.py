@@ -28,7 +28,7 @@ from jaxmotion.viz import figure, plots
 # Values of losses.jsonl that are drawn, where a stage has them.
 _DRAWN = ("loss", "discriminator/loss")
 # How rows of recorded motion begin.
-_RECORDED = ("data", "real", "held-out", "ground truth", "noise floor")
+_RECORDED = ("data", "real", "held-out", "ground truth", "noise floor", "training")
 
 
 @dataclasses.dataclass(frozen=True)

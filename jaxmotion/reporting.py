@@ -138,7 +138,8 @@ def _draw(
     from jaxmotion.viz import plots
 
     def is_finite(row: str) -> bool:
-        return quality in rows[row] and math.isfinite(rows[row][quality].value)
+        found = rows.get(row, {}).get(quality)
+        return found is not None and math.isfinite(found.value)
 
     shown = [point for point in points if is_finite(point.row)]
     if shown:
@@ -151,7 +152,7 @@ def _draw(
             ),
             references={
                 name: np.array(_ends(rows[name][quality]))
-                for name in (bench.GROUND_TRUTH, bench.NOISE_FLOOR)
+                for name in (bench.GROUND_TRUTH, bench.NOISE_FLOOR, bench.REFERENCE)
                 if is_finite(name)
             },
             xlabel=f"{sample}, batch 1: p50, ms",

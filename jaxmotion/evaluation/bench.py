@@ -22,7 +22,8 @@ from jaxmotion.typing import Key
 
 # Rows of recorded motion, in the table of every sweep.
 GROUND_TRUTH = "ground truth (held-out clips)"
-NOISE_FLOOR = "noise floor (training clips)"
+NOISE_FLOOR = "noise floor (training clips)"  # one half of them against the other
+REFERENCE = "training clips (in the reference)"  # drawn from what they are scored on
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -224,7 +225,7 @@ class Evaluation:
     """The same evaluation for every trained model of a sweep.
 
     Attributes:
-      real: Rows of recorded motion: `GROUND_TRUTH` and `NOISE_FLOOR`.
+      real: Rows of recorded motion: `GROUND_TRUTH`, and `NOISE_FLOOR` or `REFERENCE`.
       score: Row of a model; every model gets the same noise and commands.
       sampler: A jitted function of a key that makes one sample at batch 1, with the
         parameters as constants.

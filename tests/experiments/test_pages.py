@@ -70,7 +70,7 @@ def test_a_changed_digit_is_noticed_wherever_it_is(pages, checkout):
     text = path.read_text()
     path.write_text(text.replace('"value": 17.2599', '"value": 17.1', 1))
     stale = {x.name for x in pages.stale(checkout)}
-    assert stale == {"aamdm.md", "locomotion_fast.md", "shipped.svg"}
+    assert stale == {"README.md", "aamdm.md", "locomotion_fast.md", "shipped.svg"}
 
 
 def test_a_picture_of_costs_joins_tables(pages, checkout):

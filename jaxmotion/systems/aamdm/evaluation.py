@@ -487,7 +487,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
         return lambda key: roll(key, states, given)
 
     return bench.Evaluation(
-        real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: real(run.train)},
+        real={bench.GROUND_TRUTH: truth, bench.REFERENCE: real(run.train)},
         score=score,
         sampler=sampler,
         describe={

@@ -309,7 +309,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
 
     actions, (_, config) = len(run.actions), emdm_training.load_row(run.record, _ROW)
     return bench.Evaluation(
-        real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: floor},
+        real={bench.GROUND_TRUTH: truth, bench.REFERENCE: floor},
         score=score,
         sampler=sampler,
         describe={

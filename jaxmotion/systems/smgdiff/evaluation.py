@@ -395,7 +395,7 @@ def _prepare(job: bench.Job) -> bench.Evaluation:
     windows = int(setting.known.label.shape[0])
     model, _ = smgdiff_training.load_stage(run, _stage(job.points[0]))
     return bench.Evaluation(
-        real={bench.GROUND_TRUTH: truth, bench.NOISE_FLOOR: floor},
+        real={bench.GROUND_TRUTH: truth, bench.REFERENCE: floor},
         score=score,
         sampler=lambda point: _timed(
             _sampler(run, _stage(point), UNGUIDED)[1], setting
