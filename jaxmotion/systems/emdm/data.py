@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 from jaxmotion.data import captions, clips_io, mirror, resample, selection, text_motion
 from jaxmotion.data.clips import Clips
 from jaxmotion.data.text_motion import TextMotions
-from jaxmotion.learning import runs
+from jaxmotion.learning import model_json, runs
 from jaxmotion.motion import features, humanml, humanml_skeleton, skeleton
 from jaxmotion.motion.humanml_layout import HUMANML3D
 from jaxmotion.systems.emdm import features as emdm_features
@@ -208,8 +208,12 @@ def prepare(
         if mirrored:
             both = [parts[0], mirror.mirror_clips(parts[0])]
             parts = (selection.concatenate(both), parts[1])
+        fitted = _fit(parts[0], action_arrays(parts[0], field=field, frames=frames))
         return runs.Content(
-            model={"actions": list(clips.names(field))},
+            model={
+                "actions": list(clips.names(field)),
+                "normalizer": model_json.normalizer_to_json(fitted.normalizer),
+            },
             source=clips.source,
             split={
                 name: list(part.clip_names)
@@ -251,16 +255,27 @@ def _decode(record: runs.Run) -> ActionRun:
     field, frames = record.settings["field"], record.settings["frames"]
     parts = [clips_io.load_clips(record.file(name)) for name in _FILES]
     train, held_out = (action_arrays(x, field=field, frames=frames) for x in parts)
-    actions = jnp.arange(_FIT) % train.counts.shape[0]
-    motions = sample_motions(jax.random.key(0), train, actions)
+    representation = _fit(parts[0], train)
+    if "normalizer" in record.model:  # older folders have none
+        stored = model_json.normalizer_from_json(
+            record.model["normalizer"], size=representation.num_features
+        )
+        representation = dataclasses.replace(representation, normalizer=stored)
     return ActionRun(
         record=record,
         clips=selection.concatenate(parts),
         train=train,
         held_out=held_out,
-        representation=emdm_features.fit(parts[0].skeleton, motions),
+        representation=representation,
         field=field,
     )
+
+
+def _fit(clips: Clips, arrays: ActionArrays) -> Representation:
+    """Units of features; they hang on what JAX draws, so run folders keep them."""
+    actions = jnp.arange(_FIT) % arrays.counts.shape[0]
+    motions = sample_motions(jax.random.key(0), arrays, actions)
+    return emdm_features.fit(clips.skeleton, motions)
 
 
 def make_task(

@@ -99,6 +99,23 @@ def test_files_are_needed(tmp_path):
         prepare([tmp_path / "none.npz"])
 
 
+def test_a_folder_keeps_the_units_of_its_features(files, tmp_path):
+    """They are fitted to motions that JAX draws, and its versions draw otherwise."""
+    options = dict(field="content", merge={"stroll": "walk"}, least=2, fps=30.0)
+    folder = tmp_path / "run"
+    made = emdm_data.prepare(
+        folder, tuple(files), task="action", frames=6, held_out=0.3, **options
+    )
+    with jax.threefry_partitionable(not jax.config.jax_threefry_partitionable):
+        refitted = emdm_data._fit(made.clips, made.train).normalizer
+        found = emdm_data.load_run(folder).representation.normalizer
+    assert np.abs(refitted.mean - made.representation.normalizer.mean).max() > 1e-4
+    for name in ("mean", "std"):
+        np.testing.assert_array_equal(
+            getattr(found, name), getattr(made.representation.normalizer, name)
+        )
+
+
 # --- batches -----------------------------------------------------------------------
 
 FRAMES = 8
