@@ -61,8 +61,10 @@ class Train:
       network: Denoiser (two of table 3).
       width: Channels of a token.
       depth: Layers.
-      token_margin: Frames that neighboring tokens share.
+      frames_per_token: Frames of one token (paper: 1); not of the MLP.
+      token_margin: Frames that neighboring tokens share; not of the MLP.
       token_window: How they are cross-faded.
+      norm: Layer norms after sums ("post", paper) or before branches; not of the MLP.
       attention: "full", or "prefix": computed once per plan.
       noise_levels: Of each window in a step.
       own_levels: Probability of noise on own predictions at lower levels.
@@ -101,8 +103,10 @@ class Train:
     network: Literal["transformer", "mlp", "single_token"] = "transformer"
     width: cli.Optional[int] = None
     depth: cli.Optional[int] = None
+    frames_per_token: cli.Optional[int] = None
     token_margin: cli.Optional[int] = None
     token_window: Literal["hann", "trapezoid"] = "hann"
+    norm: cli.Optional[Literal["post", "pre"]] = None
     attention: cli.Optional[Literal["full", "prefix"]] = None
     noise_levels: cli.Optional[int] = None
     own_levels: cli.Optional[float] = None
@@ -121,7 +125,9 @@ def sizes_of(args: Train) -> dict[str, Any]:
     """Sizes and weights of the model that the arguments describe."""
     given = cli.given(camdm_model.Config, args) | {"num_steps": args.diffusion_steps}
     hidden = {} if args.width is None else {"hidden": 4 * args.width}
-    return camdm_training.PRESETS[args.preset] | given | hidden
+    preset = camdm_training.PRESETS[args.preset]
+    lacking = camdm_model.lacking(args.network)
+    return {k: v for k, v in preset.items() if k not in lacking} | given | hidden
 
 
 def train(args: Train) -> None:

@@ -162,19 +162,33 @@ Network = (
 )
 
 
+_NETWORKS: dict[str, Any] = {
+    "transformer": transformer.CamdmTransformer,
+    "mlp": camdm_network.CamdmMlp,
+    "single_token": camdm_network.SingleTokenTransformer,
+}
+
+
+def lacking(name: str) -> frozenset[str]:
+    """Options of `Config` that the transformer has and the network so named has not."""
+    names = lambda kind: {x.name for x in dataclasses.fields(kind)}  # noqa: E731
+    full, own = names(_NETWORKS["transformer"]), names(_NETWORKS[name])
+    return frozenset((full - own) & names(Config))
+
+
 def network(config: Config) -> Network:
-    """The denoiser's Flax module, with `encode`, `denoise` and their composition."""
-    if config.seam_half_life and config.network != "transformer":
-        raise ValueError(
-            f"seam_half_life is {config.seam_half_life:g}, expected 0 with the network "
-            f"{config.network!r}"
-        )
-    kind = {
-        "transformer": transformer.CamdmTransformer,
-        "mlp": camdm_network.CamdmMlp,
-        "single_token": camdm_network.SingleTokenTransformer,
-    }[config.network]
-    return blocks.sized(kind, config, features=config.num_features)
+    """The denoiser's Flax module, with `encode`, `denoise` and their composition.
+
+    `ValueError` for an option of the transformer that another network does not have.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name in lacking(config.network) and value != field.default:
+            raise ValueError(
+                f"{field.name} is {value}, expected {field.default} with the network "
+                f"{config.network!r}"
+            )
+    return blocks.sized(_NETWORKS[config.network], config, features=config.num_features)
 
 
 @functools.partial(jax.jit, static_argnames="config")

@@ -10,6 +10,7 @@ Source: Chen et al. 2024 (CAMDM), section 4.3 and table 3.
 """
 
 import dataclasses
+from typing import Literal
 
 import flax.linen as nn
 import jax
@@ -104,17 +105,31 @@ class _OneVectorCondition(nn.Module):
 
 
 class SingleTokenTransformer(_OneVectorCondition):
-    """The transformer without separate condition tokens: 1 + 45 tokens."""
+    """The transformer without separate condition tokens: 1 + 45 tokens.
+
+    The attributes are as those of the full network.
+    """
+
+    frames_per_token: int = 1
+    token_margin: int = 0
+    token_window: blocks.Window = "hann"
+    norm: Literal["post", "pre"] = "post"
 
     def setup(self):
         """Makes embeddings and layers."""
         self._setup_condition()
         self.embed_noisy = nn.Dense(self.width)
         self.layers = [
-            blocks.EncoderLayer(self.width, self.heads, self.hidden, self.dropout)
+            blocks.EncoderLayer(
+                self.width, self.heads, self.hidden, self.dropout, self.norm
+            )
             for _ in range(self.depth)
         ]
-        self.out = nn.Dense(self.features)
+        if self.norm == "pre":
+            self.norm_out = nn.LayerNorm(epsilon=1e-5)
+        self.out = nn.Dense(
+            self.features * (self.frames_per_token + 2 * self.token_margin)
+        )
 
     def denoise(
         self,
@@ -129,14 +144,22 @@ class SingleTokenTransformer(_OneVectorCondition):
             blocks.row_of(context.steps, t), context.condition.shape
         )
         first = (context.condition + step)[..., None, :]
-        x = jnp.concatenate([first, self.embed_noisy(x_t)], axis=-2)
+        noisy = self.embed_noisy(blocks.fold_frames(x_t, self.frames_per_token))
+        x = jnp.concatenate([first, noisy], axis=-2)
         positions = blocks.sinusoidal_positions(x.shape[-2], self.width)
         x = blocks.add_rows(x, positions)
         x = self.drop(x, deterministic=not train)
         for i, layer in enumerate(self.layers, start=1):
-            last = self.future if i == self.depth else None
+            last = noisy.shape[-2] if i == self.depth else None
             x = layer(x, train=train, last=last)
-        return self.out(x)
+        if self.norm == "pre":
+            x = self.norm_out(x)
+        return blocks.unfold_frames(
+            self.out(x),
+            self.frames_per_token,
+            margin=self.token_margin,
+            window=self.token_window,
+        )
 
 
 class CamdmMlp(_OneVectorCondition):

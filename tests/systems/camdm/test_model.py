@@ -52,9 +52,21 @@ def many(count, seed=0):
 # Sizes
 
 
-def test_only_the_transformer_goes_on_from_the_past():
-    config = tiny.config(network="mlp", seam_half_life=3.0)
-    with pytest.raises(ValueError, match="seam_half_life is 3, expected 0 .*'mlp'"):
+@pytest.mark.parametrize(
+    "network, option",
+    [
+        ("mlp", {"seam_half_life": 3.0}),
+        ("mlp", {"frames_per_token": 2}),
+        ("mlp", {"norm": "pre"}),
+        ("single_token", {"attention": "prefix"}),
+        ("single_token", {"frame_kernel": 3}),
+    ],
+)
+def test_an_option_that_a_network_does_not_have_is_named(network, option):
+    """Else a configuration would tell of a network that nobody trained."""
+    (name, value), config = *option.items(), tiny.config(network=network, **option)
+    message = f"{name} is {value}, expected .* with the network '{network}'"
+    with pytest.raises(ValueError, match=message):
         camdm_model.network(config)
 
 

@@ -41,8 +41,11 @@ KINDS = {
     ),
     "mlp": camdm_network.CamdmMlp(**SIZES),
     "single token": camdm_network.SingleTokenTransformer(**SIZES),
+    "single token, pre-norm, overlapping": camdm_network.SingleTokenTransformer(
+        **SIZES, frames_per_token=2, token_margin=1, norm="pre"
+    ),
 }
-TRANSFORMERS = [name for name in KINDS if name not in ("mlp", "single token")]
+TRANSFORMERS = [name for name in KINDS if not name.startswith(("mlp", "single"))]
 
 
 def arguments(*batch):
