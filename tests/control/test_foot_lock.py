@@ -218,6 +218,17 @@ def test_no_toe_and_no_ankle_goes_below_the_ground():
     assert found[[3, 7], 1].min() > LOCK.ankle_height - 2e-3
 
 
+def test_a_heel_does_not_sink_under_raised_toes():
+    """Toes above the ankles: held down, they would take the ankles below the ground."""
+    root, joints = stood(0.9), np.asarray(pose(0.9)).copy()
+    joints[[3, 7]] = pitch(-1.9)
+    wanted = toes_of(root, joints)
+    assert (wanted[:, 1] > positions_of(root, joints)[[3, 7], 1] + 0.04).all()
+    wanted[:, 1] = LOCK.toe_height
+    found = positions_of(root, place(root, joints, wanted))
+    assert found[[3, 7], 1].min() > LOCK.ankle_height - 2e-3
+
+
 def test_feet_that_slide_stand():
     motion = drift(0.05)
     found = lock_motion(SKELETON, motion, lock=LOCK)
@@ -247,6 +258,15 @@ def test_a_body_that_creeps_stays_over_its_feet_and_goes_with_a_free_one():
     assert np.linalg.norm(np.diff(free, axis=0), axis=-1).max() * FPS < 0.3
 
 
+def test_a_body_stays_with_its_model_while_a_foot_is_free():
+    motion = drift(0.05)
+    joints = np.asarray(motion.joint_rotation).copy()
+    joints[:, 1:5] = np.asarray(pose(0.9))[1:5]
+    lifted = dataclasses.replace(motion, joint_rotation=jnp.asarray(joints))
+    found = lock_motion(SKELETON, lifted, lock=LOCK)
+    np.testing.assert_array_equal(found.root_position, motion.root_position)
+
+
 def test_a_body_strays_from_its_plan_by_its_reach_at_most():
     motion = drift(0.2, seconds=2.0)
     lock = dataclasses.replace(LOCK, body_reach=0.04, radius=10.0)
@@ -271,6 +291,62 @@ def test_a_lock_ends_at_its_radius_and_begins_anew():
     # It catches up for a while, and stands again.
     again = np.flatnonzero(locked[end:])[0]
     assert 3 <= again <= 12 and locked[end + again :].all()
+
+
+@functools.partial(jax.jit, static_argnames="lock")
+def step_toes(toes, side=None, *, lock=LOCK):
+    """States after each frame of animated toes [frames, feet, 3]."""
+
+    def step(state, now):
+        state = foot_lock.step_lock(state, now, fps=FPS, lock=lock, side=side)
+        return state, state
+
+    return jax.lax.scan(step, foot_lock.init_lock(SKELETON), toes)[1]
+
+
+def both_toes(path, height=0.02):
+    """Two toes, one meter apart, that go along x; float32."""
+    path = np.asarray(path, np.float32)
+    toe = np.stack([path, 0 * path + height, 0 * path], axis=-1)
+    return jnp.asarray(np.stack([toe, toe + np.float32([0, 0, 1])], axis=1))
+
+
+def test_a_toe_comes_to_rest_at_its_lock_as_a_spring_does():
+    """From the speed u that it has: u t exp(-y t) beyond the point, y = 2 ln 2 / h."""
+    speed, frame = 0.3, np.arange(12)
+    found = step_toes(both_toes(speed / FPS * frame)).shown[:, 0, 0]
+    time, rate = (frame[1:] - 1) / FPS, 2 * np.log(2) / LOCK.half_life
+    beyond = speed * time * np.exp(-rate * time)
+    np.testing.assert_allclose(found[1:], speed / FPS + beyond, atol=1e-6)
+
+
+def test_a_heel_that_rises_over_its_point_ends_no_lock():
+    """The radius is that of a circle on the ground."""
+    lock = dataclasses.replace(LOCK, radius=0.1, end_height=1.0)
+    frame = np.arange(40)
+    found = step_toes(both_toes(0 * frame, 0.02 + 0.3 / FPS * frame), lock=lock)
+    assert found.locked[1:].all()
+
+
+def test_of_locks_that_would_cross_the_worse_one_ends():
+    frame = np.arange(30)
+    toes = np.zeros((30, 2, 3), np.float32)
+    toes[..., 1] = 0.02
+    toes[:, 0, 0] = 0.02 + 0.2 / FPS * frame  # it goes aside, the other one stands
+    found = step_toes(jnp.asarray(toes), jnp.array([1.0, 0.0, 0.0]))
+    locked = np.asarray(found.locked)[1:]
+    assert locked[0].all() and locked[:, 1].all() and not locked[:, 0].all()
+
+
+def test_a_toe_that_hurries_after_its_lock_is_off_the_ground():
+    """Released by the radius it moves faster than it is animated, and still stands."""
+    found = step_toes(both_toes(0.3 / FPS * np.arange(45)))
+    shown, contact = np.asarray(found.shown), np.asarray(found.contact)
+    speed = np.linalg.norm(np.diff(shown[..., ::2], axis=0), axis=-1) * FPS
+    free = ~np.asarray(found.locked)[1:] & contact[1:]
+    assert speed[free].max() > 1.0
+    least = 0.02 + 0.035 * (1.0 - np.exp(-np.maximum(speed - 0.15, 0.0)))
+    assert (shown[1:, :, 1] > least - 1e-5)[free].all()
 
 
 def test_nothing_jumps():
@@ -393,6 +469,20 @@ def test_plans_go_on_from_what_is_displayed():
     assert offsets[True] < 0.005 and offsets[False] > 0.05
 
 
+def test_a_new_plan_from_what_is_displayed_ends_no_lock():
+    """Toes are no faster for being where they are displayed, not where animated."""
+    made, start = creeping(0.2, knows=True)
+    made = foot_lock.locked(made, SKELETON, fps=FPS, lock=LOCK)
+
+    def tick(state, i):
+        state, _ = rollout.tick(made, jax.random.key(0), state, i)
+        return state, state.feet.locked
+
+    state = foot_lock.LockedState(inner=start, feet=foot_lock.init_lock(SKELETON))
+    run = jax.jit(lambda s: jax.lax.scan(tick, s, jnp.arange(40))[1])
+    assert run(state)[1:].all()
+
+
 def test_a_controller_displays_locked_feet():
     """A controller that plays a clip: the same as the clip locked on its own."""
     motion = drift(0.05)
@@ -412,6 +502,30 @@ def test_a_controller_displays_locked_feet():
     _, frames = jax.lax.scan(made.advance, start, jnp.zeros(60))
     want = lock_motion(SKELETON, motion, lock=LOCK)
     np.testing.assert_allclose(frames.joint_rotation, want.joint_rotation, atol=1e-6)
+
+
+def test_a_lock_that_is_off_changes_nothing_and_forgets():
+    made, start = creeping(0.1, knows=False)
+    off = foot_lock.locked(
+        made, SKELETON, fps=FPS, lock=LOCK, enabled=jnp.zeros((), bool)
+    )
+    on = foot_lock.locked(made, SKELETON, fps=FPS, lock=LOCK)
+    none = foot_lock.init_lock(SKELETON)
+    state = foot_lock.LockedState(inner=start, feet=none)
+
+    @jax.jit
+    def play(state):
+        step = lambda s, _: on.advance(s, jnp.zeros(()))  # noqa: E731
+        return jax.lax.scan(step, state, None, length=8)[0]
+
+    state = play(state)
+    assert np.all(state.feet.locked)
+    after, shown = jax.jit(off.advance)(state, jnp.zeros(()))
+    _, plain = made.advance(state.inner, jnp.zeros(()))
+    np.testing.assert_array_equal(shown.root_position, plain.root_position)
+    np.testing.assert_array_equal(shown.joint_rotation, plain.joint_rotation)
+    for left, want in zip(*map(jax.tree.leaves, (after.feet, none)), strict=True):
+        np.testing.assert_array_equal(left, want)
 
 
 def test_offsets_are_those_of_the_normal_equations():
@@ -441,6 +555,10 @@ def test_a_clip_is_cleaned():
     toes = tiny.positions(SKELETON, found)[:, jnp.array(SKELETON.feet)]
     speed = np.linalg.norm(np.diff(toes, axis=0), axis=-1) * FPS
     assert speed.max() < 0.005
+    # A fast one that is planted is not lifted.
+    slid = foot_lock.clean_motion(SKELETON, drift(0.45, seconds=0.5), lock=LOCK)
+    low = np.asarray(tiny.positions(SKELETON, slid))[1:-1, np.array(SKELETON.feet), 1]
+    np.testing.assert_allclose(low, 0.025, atol=1e-3)
     # What goes backward at 2 m/s swings: it keeps clear of the ground.
     fast = tiny.positions(
         SKELETON, foot_lock.clean_motion(SKELETON, drift(-2.0), lock=LOCK)

@@ -70,6 +70,20 @@ def test_who_is_beside_a_path_heads_for_it_as_far_ahead_as_he_looks(ahead, meter
     np.testing.assert_allclose(velocity, 2.0 * heading, atol=1e-5)
 
 
+def test_a_path_is_pursued_from_where_a_walker_comes_to():
+    """As by one who stands where he will be when it shows."""
+    path = goals.Path(
+        points=jnp.array([[0.0, 0.0], [0.0, 9.0]]), speed=jnp.full(2, 1.0)
+    )
+    start, velocity = np.array([0.5, 2.0]), np.array([0.8, 1.2])
+    then = walker(start + goals.LAG * velocity)
+    found = goals.pursue(path, walker(start, velocity), jnp.float32(1.8))
+    expected = goals.pursue(path, then, jnp.float32(1.8))
+    np.testing.assert_allclose(found[0], expected[0], atol=1e-5)
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-5)
+    assert float(found[1]) == pytest.approx(2.0 + 1.2 * goals.LAG, abs=0.02)
+
+
 @pytest.mark.parametrize("seconds", [4.0, 6.0, 12.0])
 def test_a_place_is_reached_at_its_time(seconds):
     place = goals.Place(
@@ -202,6 +216,24 @@ def test_nobody_walks_through_a_circle():
     assert np.linalg.norm(positions[-1, 0] - np.array([0.0, 6.0])) < 0.2
 
 
+def test_two_who_meet_give_way_to_the_right():
+    """Who goes along +z has -x to his right."""
+    wanted = jnp.array([[0.0, 1.2], [0.0, -1.2]])
+    both = walker([[0.0, 0.0], [0.0, 3.0]], wanted, wanted / 1.2)
+    found = np.asarray(jax.jit(goals.avoid)(wanted, both))
+    assert found[0, 0] < -0.05 and found[1, 0] > 0.05
+    np.testing.assert_allclose(found[1], -found[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("away, turns", [(5.5, True), (9.0, False)])
+def test_who_sets_out_reckons_with_the_others_half(away, turns):
+    """At 1.2 m/s he meets who does as he does within 3 s if 7.9 m are between them."""
+    wanted = jnp.array([[0.0, 1.2], [0.0, 0.0]])
+    both = walker([[0.0, 0.0], [0.0, away]], np.zeros((2, 2)), [[0.0, 1.0]] * 2)
+    found = jax.jit(goals.avoid)(wanted, both)
+    assert bool(jnp.any(found[0] != wanted[0])) == turns
+
+
 def test_alone_nobody_leaves_his_way():
     wanted = jnp.array([[1.0, 0.5], [0.0, 0.0]])
     far = walker([[0.0, 0.0], [50.0, 0.0]], np.zeros((2, 2)), [[0.0, 1.0]] * 2)
@@ -222,6 +254,8 @@ def test_small_differences_are_not_told():
         np.testing.assert_array_equal(found.velocity, other.velocity)
     turned = make((0.0, 1.0), (1.0, 0.0))
     np.testing.assert_array_equal(same(turned).facing, turned.facing)
+    styled = dataclasses.replace(told, label=jnp.ones(1, jnp.int32))
+    np.testing.assert_array_equal(same(styled).label, [1])
 
 
 def test_numbers_of_goals_and_characters_agree():
@@ -259,6 +293,29 @@ def test_leaders_need_commands_of_all_characters_and_seconds():
     short = jm.commands("straight", model, 2, seconds=0.5)
     with pytest.raises(ValueError, match=r"shape \(2, 15\), expected \(2, 30\)"):
         roll(commands=short)
+
+
+@pytest.mark.parametrize("leader, message", [(2, "0..2"), (-1, "-1..0")])
+def test_leaders_are_characters(leader, message):
+    model = jm.load("walker")
+    goal = goals.Follow(leader=jnp.array([0, leader]), distance=jnp.array([1.5, 1.5]))
+    with pytest.raises(ValueError, match=rf"leaders are in {message}, expected 0..1"):
+        goals.goal_rollouts(
+            model,
+            jax.random.key(0),
+            model.start(2),
+            goal,
+            seconds=0.1,
+            commands=jm.commands("straight", model, 2, seconds=0.1),
+        )
+
+
+def test_swaying_hips_are_averaged_over_a_fifth_of_a_second():
+    """Half of a new speed after 0.1 s, three quarters after 0.2 s."""
+    found = [0.0]
+    for _ in range(6):
+        found.append(goals.averaged(found[-1], 1.0, 30.0))
+    np.testing.assert_allclose([found[3], found[6]], [0.5, 0.75], rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -189,3 +189,18 @@ def test_a_crowd_shares_its_plans(commands):
     value = np.asarray(frame["value"])
     assert value[2] > 10 and 0 <= value[4] < 1 and (value[[0, 1, 3, 5]] == -1).all()
     np.testing.assert_array_equal(crowd.waited, zero)
+
+
+def test_a_crowd_draws_as_a_batch_and_hears_what_needs_no_plan():
+    """Character c draws from fold_in(key, c), whatever its place among the chosen."""
+    zero = jnp.zeros(CHARACTERS, jnp.int32)
+    crowd = Crowd(states=start(CHARACTERS), told=zero, waited=zero)
+    program = jax.jit(lambda k, x, c: crowd_tick(toy(), k, x, c, at_most=2))
+    key = jax.random.key(3)
+    crowd, frame = program(key, crowd, jnp.asarray([0, 1, 0, 0, 1, 0], jnp.int32))
+    for c in (1, 4):
+        own = float(draw(jax.random.fold_in(key, c)))
+        assert frame["value"][c] == pytest.approx(own, abs=1e-6)
+    for command in (np.full(CHARACTERS, 0), np.array([0, 0, 0, 0, 0, 1])):
+        crowd, frame = program(key, crowd, jnp.asarray(command, jnp.int32))
+        np.testing.assert_array_equal(frame["command"], command)

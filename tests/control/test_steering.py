@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxmotion.control import courses, steering
+from jaxmotion.control import courses, frame, rollout, steering
 from jaxmotion.data import selection, windows
 from jaxmotion.diffusion import chain
 from jaxmotion.motion import skeleton, trajectory
@@ -67,6 +67,8 @@ def test_starts_are_of_the_label_and_drawn_evenly():
     np.testing.assert_array_equal(own // 4, labels)
     counts = np.bincount(own, minlength=12)
     assert scipy.stats.chisquare(counts).pvalue > 0.01
+    other = steering.chosen_starts(starts, labels, tuple("abc"), seed=2)["own"]
+    assert 0.7 < np.mean(other != own) < 0.8  # three in four
     with pytest.raises(ValueError, match="labels are in 1..3, expected 0..2"):
         steering.chosen_starts(starts, np.array([1, 3]), tuple("abc"), seed=1)
 
@@ -115,6 +117,7 @@ def test_labels_by_name_and_by_index():
         (("sad",), "unknown label 'sad': the model has calm, brisk"),
         ((2,), r"labels are in 2..2, expected 0..1 \(calm, brisk\)"),
         ((["calm"], 2), "1 labels for 2 characters"),
+        ((["calm"] * 3, 2), "3 labels for 2 characters"),
         ((0.5,), "label is 0.5, expected a name or an index"),
         (("calm", 0), "number of characters is 0"),
     ):
@@ -205,6 +208,49 @@ def test_a_chunk_that_does_not_divide_is_made_smaller():
     _, whole = steered(None)
     _, parts = steered(3)  # of four characters: two at a time
     np.testing.assert_allclose(parts.root_position, whole.root_position, atol=1e-4)
+
+
+def test_the_calmest_of_many_are_kept():
+    """Characters who sway by different widths; the state is width and tick."""
+    one = skeleton.Skeleton(offsets=jnp.zeros((1, 3)), parents=(-1,), names=("root",))
+    width = jnp.array([0.3, 0.1, 0.4, 0.0, 0.5, 0.2, 0.8, 0.7])
+
+    def advance(state, command):
+        width, tick = state
+        shown = frame.Frame(
+            root_position=jnp.array([0.0, 1.0, 0.0]).at[0].set(width * (tick % 2)),
+            joint_rotation=jnp.array([[1.0, 0.0, 0.0, 0.0, 1.0, 0.0]]),
+            desired_velocity=command.velocity,
+            desired_facing=command.facing,
+            planned=jnp.zeros((), bool),
+            fps=30.0,
+        )
+        return (width, tick + 1), shown
+
+    sways = rollout.Controller(
+        plan_level=lambda state, command: jnp.zeros((), jnp.int32),
+        plans=(),
+        advance=advance,
+    )
+    character = steering.Character(
+        skeleton=one,
+        labels=(),
+        fps=30.0,
+        source="tests",
+        params={},
+        method=lambda params: sways,
+        starts=lambda labels, seed: None,
+    )
+    states = width, jnp.zeros(8, jnp.int32)
+    keep = functools.partial(
+        steering.calmest, character, states, np.zeros(8, int), past=5, seconds=1.0
+    )
+    (kept, ticks), frames = keep(number=3)
+    np.testing.assert_allclose(kept, [0.0, 0.1, 0.2], rtol=1e-6)
+    np.testing.assert_array_equal(ticks, 30)
+    assert frames.root_position.shape == (3, 5, 3)
+    with pytest.raises(ValueError, match="starts is 9, expected 1 to 8"):
+        keep(number=9)
 
 
 def test_chunks_of_nobody_are_refused():

@@ -129,6 +129,8 @@ def test_consistency_visits_each_step_once_and_anew():
     )
     found, _ = make(jax.random.key(0), data(), number=T)
     assert sorted(np.asarray(found)[:, 0, 0].tolist()) == list(range(1, T + 1))
+    half, _ = make(jax.random.key(0), data(), number=T // 2)
+    np.testing.assert_array_equal(np.diff(np.sort(half[:, 0, 0])), 2.0)
     one = jax.jit(functools.partial(make, number=1))
     drawn = {float(one(jax.random.key(i), data())[0][0, 0, 0]) for i in range(40)}
     assert drawn == set(range(1, T + 1))
@@ -136,11 +138,16 @@ def test_consistency_visits_each_step_once_and_anew():
 
 @pytest.mark.parametrize("kind", ["chain", "consistency"])
 def test_targets_are_constants_of_the_gradient(kind):
-    """With a student c x_t, the gradient is that of its prediction alone."""
+    """With a student c x_t, the gradient is that of its prediction alone.
+
+    That holds for a teacher with the same c, too.
+    """
     table = schedule.cosine_schedule(T)
+    exact = denoiser(*linear(table))
 
     def off(c):
-        student, teacher = lambda key, x_t, t: c * x_t, denoiser(*linear(table))
+        student = lambda key, x_t, t: c * x_t  # noqa: E731
+        teacher = lambda key, x_t, t: c * exact(key, x_t, t)  # noqa: E731
         found, wanted = make_pairs(kind, table, student, teacher)
         return jnp.sum((found - wanted) ** 2) / 2, (found, wanted)
 

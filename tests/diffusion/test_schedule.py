@@ -368,6 +368,11 @@ def test_schedule_from_betas_rebuilds_a_schedule_and_jits():
     chex.assert_trees_all_close(eager, schedule.cosine_schedule(8), rtol=5e-5)
 
 
+def test_the_last_beta_may_leave_nothing_of_the_sample():
+    table = schedule.schedule_from_betas(jnp.array([0.5, 0.2, 1.0]))
+    np.testing.assert_allclose(table.alpha_bar, [1.0, 0.5, 0.4, 0.0], rtol=1e-6)
+
+
 def test_schedule_is_a_pytree_that_maps_and_jits():
     table = schedule.cosine_schedule(8)
     leaves, treedef = jax.tree.flatten(table)

@@ -64,6 +64,10 @@ def test_the_commanded_path_is_where_the_springs_are():
         velocities.append(v)
     found = alignment.commanded_path(jnp.stack(velocities), 30.0)
     np.testing.assert_allclose(found, jnp.stack(places), atol=2e-3)
+    # Who goes on at one speed has gone a step after the first frame.
+    steady = alignment.commanded_path(jnp.full((9, 2), 1.4), 30.0)
+    line = np.arange(1, 10)[:, None] * [1.4, 1.4] / 30.0
+    np.testing.assert_allclose(steady, line, rtol=1e-5)
 
 
 def test_sway_does_not_count_but_a_side_step_and_a_lag_do():

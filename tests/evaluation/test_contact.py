@@ -168,7 +168,12 @@ def test_a_swinging_foot_is_as_high_as_drawn_frame_by_frame():
         low = np.percentile(high, 10)
         np.testing.assert_allclose(found.low[window], low, atol=1e-6)
         assert found.seconds[window] == pytest.approx(high.size / fps)
-    still = contact.swing_height(
-        jnp.asarray(0.0 * feet), jnp.zeros((2, frames)), fps, ground=0.0
-    )
-    assert not np.any(still.seconds) and not np.any(still.median)
+    # Of a body that stands a foot swings from 0.3 m/s on.
+    for speed, seconds in ((0.0, 0.0), (0.25, 0.0), (0.35, 2 * (frames - 1) / fps)):
+        moved = np.zeros((2, frames, 2, 3))
+        moved[..., 1], moved[..., 2] = 0.1, speed / fps * np.arange(frames)[:, None]
+        still = contact.swing_height(
+            jnp.asarray(moved), jnp.zeros((2, frames)), fps, ground=0.0
+        )
+        np.testing.assert_allclose(still.seconds, seconds, rtol=1e-6)
+        np.testing.assert_allclose(still.median, 0.1 * (seconds > 0), rtol=1e-6)

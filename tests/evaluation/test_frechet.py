@@ -64,6 +64,21 @@ def test_distance_of_singular_covariances():
     assert np.isnan(frechet.frechet_distance_of_rows(a, 1, b, 20))
 
 
+def test_distance_of_covariances_without_a_direction_in_common():
+    """Traces alone: the root of an eigenvalue that is a rounding error would show."""
+    axes = np.linalg.qr(np.random.default_rng(7).normal(size=(64, 64)))[0]
+    a, b = (
+        frechet.Moments(
+            mean=jnp.zeros(64),
+            covariance=jnp.asarray(size * own @ own.T, jnp.float32),
+            count=jnp.array(9.0),
+        )
+        for size, own in ((4.0, axes[:, :8]), (9.0, axes[:, 30:40]))
+    )
+    got = frechet.frechet_distance(a, b)
+    np.testing.assert_allclose(got, 4.0 * 8 + 9.0 * 10, rtol=1e-5)
+
+
 def test_distance_to_itself_is_zero_and_never_negative():
     x = samples(6, 100, 16)
     spread = float(np.trace(np.cov(x, rowvar=False)))

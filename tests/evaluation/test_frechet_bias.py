@@ -123,3 +123,20 @@ def test_subsets_that_do_not_fit_are_refused(sizes):
         frechet_bias.frechet_bias(
             jax.random.key(0), jnp.zeros((10, FEATURES)), STANDARD, sizes=sizes
         )
+
+
+def test_subsets_have_their_size():
+    """Distances of two of four numbers from a normal one are those of some pair."""
+    x = np.array([0.0, 1.0, 10.0, 100.0], np.float32)
+    normal = frechet.Moments(
+        mean=jnp.zeros(1), covariance=jnp.ones((1, 1)), count=jnp.array(9.0)
+    )
+    found = frechet_bias.frechet_bias(
+        jax.random.key(0), jnp.asarray(x[:, None]), normal, sizes=(2, 4), repeats=8
+    ).distances
+    pairs = [[a, b] for i, a in enumerate(x) for b in x[:i]]
+    own = lambda x: np.mean(x) ** 2 + (np.std(x, ddof=1) - 1) ** 2  # noqa: E731
+    known = np.array([own(pair) for pair in pairs])
+    off = np.abs(np.asarray(found[0])[:, None] / known - 1).min(axis=1)
+    assert off.max() < 1e-4
+    np.testing.assert_allclose(found[1], own(x), rtol=1e-4)

@@ -67,6 +67,14 @@ def test_nobody_is_frozen_who_was_told_to_stand(alive):
     assert frozen(still, speed=0.31)
 
 
+def test_nobody_is_frozen_who_was_told_to_stand_for_a_part_of_a_window(alive):
+    goes = (np.arange(FRAMES) // 30 % 2)[:, None]  # every other second
+    still = jnp.asarray(held(alive, 0, 290))
+    assert bool(health.is_frozen(still, told(), fps=FPS))
+    assert not bool(health.is_frozen(still, told() * goes, fps=FPS))
+    assert bool(health.is_frozen(still, told() * goes, fps=FPS, seconds=1.0))
+
+
 def test_breathing_does_not_save_a_statue_but_walking_slowly_does(alive):
     wave = 0.02 * np.sin(np.arange(FRAMES) / FPS)[:, None, None]
     assert frozen(held(alive, 0, 250) + wave * (np.arange(5) > 0)[:, None])

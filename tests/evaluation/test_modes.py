@@ -43,6 +43,14 @@ def test_a_lost_mode_is_counted_at_its_step():
     assert scores["least_modes_covered"] == 8
 
 
+def test_a_mode_with_just_its_share_is_covered():
+    x = np.tile(CENTERS[0], (64, 2, 1))
+    x[0] = CENTERS[1]
+    for share, number in ((1 / 64, 2), (1.5 / 64, 1)):
+        scores = modes.mode_scores(x, CENTERS, sigma=0.1, share=share)
+        assert scores["least_modes_covered"] == number
+
+
 def test_stray_points_cost_their_share():
     x = points(uniform)
     x[: len(x) // 4, 2] = 0.5  # between the modes

@@ -100,3 +100,10 @@ def test_batch_axes(measure):
 def test_one_frame_has_no_displacement():
     with pytest.raises(ValueError, match="expected at least 2"):
         plausibility.skating(jnp.zeros((1, 2, 3)))
+
+
+@pytest.mark.parametrize("height, expected", [(0.25, 100.0), (0.2501, 0.0)])
+def test_a_foot_at_the_tolerance_touches(height, expected):
+    feet = jnp.array([[[0.0, height, 0.0]], [[0.1, height, 0.0]]])
+    found = plausibility.skating(feet, tolerance=0.25)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)

@@ -30,7 +30,7 @@ def test_evidence_is_the_ratio_of_the_densities_of_t(shift):
 def test_evidence_does_not_depend_on_the_unit():
     samples = np.random.default_rng(1).normal(0.5, 1.0, (20, 6))
     found = sequential.log_evidence(samples)
-    for unit in (1e-150, 1e-9, 1e150):
+    for unit in (1e-200, 1e-9, 1e200):  # whose squares are no numbers
         np.testing.assert_allclose(
             sequential.log_evidence(unit * samples), found, atol=1e-6
         )
@@ -63,6 +63,17 @@ def test_intervals_hold_the_mean_at_all_counts_at_once():
         t = scipy.stats.t.interval(0.95, 7, own.mean(), scipy.stats.sem(own))
         assert ends[-1].low < t[0] and t[1] < ends[-1].high
     assert missed / len(samples) < 0.05 + 2 * np.sqrt(0.05 * 0.95 / len(samples))
+
+
+@pytest.mark.parametrize("level", [0.8, 0.95])
+def test_at_the_ends_of_an_interval_the_evidence_is_that_of_one_side(level):
+    """Each side errs with half of the rest: evidence is 2 / (1 - level) there."""
+    samples = np.random.default_rng(4).normal(3.0, 2.0, 9)
+    found = sequential.interval(samples, level=level)
+    ends = [
+        evidence_by_densities(x) for x in (samples - found.low, found.high - samples)
+    ]
+    np.testing.assert_allclose(ends, np.log(2.0 / (1.0 - level)), atol=4e-3)
 
 
 def test_intervals_of_too_few_samples():

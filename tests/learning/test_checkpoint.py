@@ -222,6 +222,10 @@ def test_a_damaged_step_says_which_other_step_counts_without_it(tmp_path):
     where.write_text(json.dumps(value))
     with pytest.raises(checkpoint.CheckpointError, match="2 is corrupt.*step 1 counts"):
         checkpoint.restore(folder, state_of(0))
+    assert checkpoint.load_config(folder) == {}
+    where.write_text(json.dumps(value | {"config": 64 * "0"}))
+    with pytest.raises(checkpoint.CheckpointError, match="config is not.*1 counts"):
+        checkpoint.load_config(folder)
 
 
 def test_a_step_without_checksums_is_read_with_a_warning(tmp_path):
@@ -437,6 +441,7 @@ GARBAGE = {
     "float64 1e300": (dict(a=np.array([1e300])), "field 'a' .*not finite"),
     "text": (dict(a=np.array(["x"])), "field 'a' .*not finite float32"),
     "array in array": ({"a": np.zeros(2), "a/b": np.zeros(2)}, "'a/b' is within"),
+    "array over array": ({"a/b": np.zeros(2), "a": np.zeros(2)}, "'a' is within"),
     "list as config": (dict(config=np.array("[1]")), "'config' is a list"),
     "deep config": (dict(config=np.array("[" * 100_000)), "'config' is missing or no"),
     "pickle": (dict(a=np.array([{}], object)), "field 'a': .*[Oo]bject"),

@@ -18,7 +18,13 @@ import pytest
 
 from jaxmotion.data import clips_io
 from jaxmotion.learning import checkpoint, training
-from jaxmotion.learning.loop import Loop, TrainingDiverged, check_writable, train
+from jaxmotion.learning.loop import (
+    Loop,
+    TrainingDiverged,
+    _Pieces,
+    check_writable,
+    train,
+)
 from jaxmotion.systems.camdm import model as camdm_model
 from tests import mostly_slow, tiny
 
@@ -120,9 +126,10 @@ def test_a_nan_loss_names_the_step_and_the_last_good_checkpoint(tmp_path):
     assert [row["step"] for row in rows(tmp_path)] == [2, 4, 6]
 
 
-def test_a_nan_before_any_checkpoint(tmp_path):
-    run, state, key, data = small_parts(bad_step=1)
-    with pytest.raises(TrainingDiverged, match="step 1.*there is none"):
+@pytest.mark.parametrize("bad_step", [1, 2])  # 2: of a chunk in two pieces
+def test_a_nan_before_any_checkpoint(tmp_path, bad_step):
+    run, state, key, data = small_parts(bad_step=bad_step)
+    with pytest.raises(TrainingDiverged, match=f"at step {bad_step}:.*there is none"):
         train(run, state, key, data, loop=loop_of(tmp_path, 20))
     assert checkpoint.latest_step(tmp_path / "checkpoints") is None
 
@@ -178,6 +185,31 @@ def test_ctrl_c_saves_what_was_reached(tmp_path):
     for _ in range(3):
         expected, _ = run(expected, key, data)
     jax.tree.map(np.testing.assert_array_equal, saved, expected)
+
+
+def test_ctrl_c_within_the_last_chunk_changes_nothing(tmp_path):
+    run, state, key, data = small_parts()
+
+    def interrupted(state, *args):
+        if int(state.step) == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        return run(state, *args)
+
+    settings = loop_of(tmp_path, 6, save_every=50)
+    try:
+        final = train(interrupted, state, key, data, loop=settings)
+    except KeyboardInterrupt:  # it would end the tests
+        pytest.fail("the run was done")
+    assert final.step == 6
+    assert checkpoint.latest_step(tmp_path / "checkpoints") == 6
+
+
+def test_pieces_last_a_second_and_grow_fourfold_at_most():
+    pieces, sizes = _Pieces(1000), []
+    for seconds in (40.0, 0.001, 0.01, 2.0, 30.0):  # the first one is compiled
+        pieces.note(pieces.size, seconds)
+        sizes.append(pieces.size)
+    assert sizes == [1, 4, 16, 8, 1]
 
 
 def test_the_log_forgets_steps_that_no_checkpoint_has(tmp_path):

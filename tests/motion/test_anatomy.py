@@ -137,6 +137,24 @@ def test_elbows_bend_ahead_in_the_t_pose():
         np.testing.assert_allclose(local[:, 0, 2], sign * np.sin(bend), atol=1e-4)
 
 
+def test_a_zero_pose_that_stands_is_believed_also_of_its_feet():
+    """Whatever a motion does: here it stands on the edges of its feet."""
+    skeleton, edges = walker_skeleton(), np.tile(np.eye(3), (6, 22, 1, 1))
+    c, s = np.cos(0.5), np.sin(0.5)
+    for name in ("LeftFoot", "RightFoot"):
+        for joint in range(skeleton.index(name), skeleton.index(name) + 2):
+            edges[:, joint] = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    np.testing.assert_allclose(
+        anatomy.t_pose(skeleton, motion=edges)[1], [np.eye(3)] * 22, atol=1e-6
+    )
+
+
+def test_a_trunk_without_a_head_ends_at_its_last_neck():
+    parents, names = (-1, 0, 1, 2), ("Hips", "Neck", "Neck1", "Neck_end")
+    found = anatomy.find_head(parents, names, ("middle",) * 4, np.arange(4.0))
+    assert found == (2, False)
+
+
 def test_joints_get_mixamo_names():
     names = anatomy.mixamo_names(along_x(), prefix="")
     changed = {"LeftToe": "LeftToeBase", "RightToe": "RightToeBase"}

@@ -29,6 +29,8 @@ def test_layout_goes_through_jit_as_a_static_part():
 def test_bad_layouts_and_parts_are_named():
     with pytest.raises(ValueError, match="'b' is 2..3, expected to start at 1"):
         features.FeatureLayout(fields=(("a", 0, 1), ("b", 2, 3)))
+    with pytest.raises(ValueError, match="'b' is 1..1, .* hold at least one number"):
+        features.feature_layout(a=1, b=0)
     with pytest.raises(ValueError, match="'a' occurs twice"):
         features.FeatureLayout(fields=(("a", 0, 1), ("a", 1, 2)))
     layout = features.feature_layout(a=1, b=2)

@@ -25,6 +25,14 @@ def test_springs_solve_their_differential_equations(half_life, t):
     np.testing.assert_allclose(got, want, rtol=1e-4, atol=5e-5)
 
 
+def test_a_slow_spring_keeps_its_digits_over_a_short_time():
+    for half_life in (30.0, 100.0, 300.0, 1000.0):
+        want = oracle.integrate_velocity_spring(0.0, 1.0, 0.0, 0.0, half_life, 1 / 60)
+        x, v, a = (jnp.float32(n) for n in (0.0, 1.0, 0.0))
+        got = spring.velocity_spring(x, v, a, x, half_life=half_life, dt=1 / 60)
+        np.testing.assert_allclose(got[0], want[0], rtol=1e-5)
+
+
 def test_springs_are_semigroups():
     x, v, a, goal = (jnp.float32(n) for n in (0.3, -1.2, 2.5, 1.7))
     for dt1, dt2 in [(0.1, 0.25), (0.01, 1.0)]:

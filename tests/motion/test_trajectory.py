@@ -310,3 +310,10 @@ def test_so_many_wishes_are_cubic_and_others_as_published():
     # Which wishes are cubic says nothing of how the others are smoothed.
     raw = np.isclose(published.position, course.position, atol=1e-6).all((1, 2))
     assert abs(raw[~cubic_path].mean() - 0.5) < 0.11  # 3.5 deviations of 280
+
+
+def test_who_wants_less_than_two_centimeters_a_second_stands():
+    speeds = np.array([0.0, 0.019, 0.021, 0.1], np.float32)
+    turned = np.stack([0.6 * speeds, -0.8 * speeds], axis=-1)
+    still = trajectory.is_still(jnp.asarray(turned))
+    np.testing.assert_array_equal(still, [True, True, False, False])

@@ -100,6 +100,9 @@ def test_a_stick_walks_as_far_as_it_is_pushed_and_another_one_faces():
     np.testing.assert_allclose(wish.velocity, (0, 1), atol=1e-9)
     np.testing.assert_allclose(wish.facing, (-1, 0), atol=1e-9)
     assert steering.wanted(Inputs(stick=(0.1, 0.0)), Wish(), **more) == Wish()
+    # A gamepad's corners are beyond what is all the way.
+    corner = steering.wanted(Inputs(stick=(-0.9, 0.9)), Wish(), **more)
+    np.testing.assert_allclose(corner.velocity, (2**0.5, 2**0.5), atol=1e-9)
     stands = steering.wanted(Inputs(face=(0.0, -1.0)), Wish(), **more)
     np.testing.assert_allclose(stands.facing, (0, -1), atol=1e-9)
     assert stands.speed == 0

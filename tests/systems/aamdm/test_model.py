@@ -362,6 +362,30 @@ def test_players_are_given_the_generators_frames_through_a_window(
     np.testing.assert_allclose(seen[0], expected, atol=1e-5)
 
 
+def test_the_generators_own_frames_are_constants_of_its_gradient(monkeypatch):
+    """A discriminator that sees only what stands before a frame teaches it nothing."""
+
+    class Generator:
+        def apply(self, variables, x_t, t, previous, latent=None):
+            return jnp.broadcast_to(variables["params"], x_t.shape)
+
+    class Discriminator:
+        def apply(self, variables, x, x_t, t, previous):
+            return jnp.sum(previous, axis=-1)
+
+    monkeypatch.setattr(aamdm_model, "discriminator", lambda config: Discriminator())
+    monkeypatch.setattr(aamdm_model, "network", lambda config: Generator())
+    config = dataclasses.replace(CHANGING, own_previous=1.0, gan_window=5)
+
+    def loss(pace):
+        given = pace, {}, jax.random.key(0), normal(4, 5, 3)
+        return aamdm_loss.generator_loss(*given, config=config, change=CHANGE)[0]
+
+    pace = jnp.array([[1.0, -2.0, 0.5]])
+    assert float(jnp.abs(loss(pace) - loss(2.0 * pace))) > 0.1
+    np.testing.assert_array_equal(jax.grad(loss)(pace), 0.0)
+
+
 # --- levels of noise ----------------------------------------------------------------
 
 

@@ -540,6 +540,44 @@ def test_a_turned_world_gives_the_turned_motion(params, skeleton, whole):
     np.testing.assert_allclose(frames.joint_rotation, moved.joint_rotation, atol=2e-4)
 
 
+# How it starts
+
+
+def test_a_character_starts_with_the_velocity_of_its_poses(skeleton):
+    """Without a plan it would go on so; of more poses the last ones count."""
+    walked = tiny.walk(CONFIG.past, fps=CONFIG.fps)
+    places = np.array([[0.0, 0.9, 0.0], [0.01, 0.9, 0.02], [0.05, 0.9, 0.03]])
+    places = np.concatenate([places, [[0.06, 0.9, 0.12]]]).astype(np.float32)
+    past = dataclasses.replace(walked, root_position=jnp.asarray(places))
+    longer = jax.tree.map(lambda x: jnp.concatenate([x[:2] + 1.0, x]), past)
+    for one in (past, longer):
+        state = camdm_controller.init_state(skeleton, one, config=CONFIG)
+        velocity = np.array([0.06, 0.0, 0.12]) / 3 * CONFIG.fps
+        np.testing.assert_allclose(state.velocity, velocity[::2], rtol=1e-5)
+        ahead = np.arange(1, CONFIG.future + 1)[:, None] / CONFIG.fps
+        plan = places[-1] + ahead * velocity
+        np.testing.assert_allclose(state.plan.root_position, plan, rtol=1e-5)
+
+
+@pytest.mark.parametrize("half_life, seam", [(0.0, 0.2), (3.0, 0.1)])
+def test_who_ships_and_goes_on_from_the_past_has_a_short_seam(
+    skeleton, half_life, seam
+):
+    config = tiny.config(seam_half_life=half_life)
+    walked = tiny.walk(config.past, fps=config.fps)
+    model = camdm_model.Model(
+        config=config,
+        skeleton=skeleton,
+        labels=tiny.STYLES,
+        source="tests",
+        starts=jax.tree.map(lambda x: jnp.stack([x[None]] * 2), walked),
+    )
+    shipped = camdm_controller.character({}, model).method.control
+    assert (shipped.seam, shipped.follow) == (seam, 1.0)
+    given = camdm_controller.character({}, model, control=CONTROL)
+    assert given.method.control is CONTROL
+
+
 # Bad input
 
 

@@ -175,6 +175,13 @@ def test_a_file_may_visit_few_steps_and_offer_all(tmp_path, model, params):
     for wrong in (0, total + 1, True):
         with pytest.raises(ValueError, match=f"{wrong}.*, expected"):
             camdm_controller.load_character(path, steps=wrong)
+    # The chain begins at the last step.
+    with pytest.raises(ValueError, match=rf"in 1..{total}, the last {total}"):
+        camdm_model.with_steps(model, (1, total - 1))
+    # Files from before that field have students, who learned their own steps alone.
+    value = camdm_model.to_json(few)
+    del value["all_steps"]
+    assert not camdm_model.from_json(value, where="here").all_steps
     value = camdm_model.to_json(few) | {"all_steps": 1}
     with pytest.raises(ValueError, match="here: field 'all_steps' is 1, expected true"):
         camdm_model.from_json(value, where="here")

@@ -156,14 +156,19 @@ def accelerations(ball):
     return 30.0**2 * np.linalg.norm(change, axis=-1)
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_at_a_seam_only_a_foot_pushes_the_ball(parts, near):
-    """The next plan has the ball 15 cm aside, and 0.6 m/s slower."""
+@pytest.mark.parametrize(
+    "away, near", [(0.0, True), (0.16, True), (0.21, False), (5.0, False)]
+)
+def test_at_a_seam_only_a_foot_pushes_the_ball(parts, away, near):
+    """The next plan has the ball 15 cm aside, and 0.6 m/s slower.
+
+    It is 11 cm from its center to its surface, and 7 cm from there to a foot's joint.
+    """
     representation, _, _ = parts
     still = jax.tree.map(lambda x: jnp.repeat(x[:1], 26, axis=0), past())
     feet = representation.skeleton.feet
     places = joint_positions(representation.skeleton, still.motion)[0, list(feet)]
-    begin = places[0] if near else jnp.array([0.0, 0.11, 5.0])
+    begin = places[0] + jnp.array([0.0, away, 0.0])
     times = np.arange(-1.0, 25.0)[:, None] / 30.0
     rolls = np.asarray(begin) + times * [0.0, 0.0, 1.2]
     slower = np.asarray(begin) + [0.15, 0.0, 0.0] + times * [0.0, 0.0, 0.6]
@@ -514,6 +519,21 @@ def test_a_lost_ball_rolls_and_is_not_planned(parts):
     # Plans of five frames join, as if they were one.
     np.testing.assert_allclose(frames.extra["ball"][0], rolls, atol=1e-4)
     assert frames.planned[0, 0]
+
+
+def test_a_lost_ball_of_who_is_told_to_stand_is_planned(parts):
+    representation, config, _ = parts
+    state = after_a_kick(config, [0.0, 5.0], [1.5, 0.0])
+    stand = dataclasses.replace(
+        jax.tree.map(lambda x: x[0], commands(1)), velocity=jnp.zeros(2)
+    )
+    plain, fetching = (
+        jax.jit(driver_of(representation, config, control).plans[0])(
+            jax.random.key(0), state, stand
+        )
+        for control in (CONTROL, FETCHES)
+    )
+    np.testing.assert_allclose(fetching.plan.ball, plain.plan.ball, atol=1e-5)
 
 
 def test_nobody_fetches_as_a_skill_that_is_not_there(parts):

@@ -287,6 +287,39 @@ def test_a_ball_that_is_far_away_costs_nothing_of_its_own(
     assert float(terms["ball"]) == float(terms["ball_acceleration"]) == 0.0
 
 
+def test_the_data_say_which_balls_are_near_and_which_feet_stand(
+    scenes, representation, loss_terms, to_features
+):
+    """Who predicts a ball beyond the reach, or no contact, pays for it all the same."""
+
+    def beside(places):
+        moved = scenes.motion.root_position + jnp.asarray([places], jnp.float32)
+        return to_features(dataclasses.replace(scenes, ball=moved))
+
+    frames = scenes.ball.shape[1]
+    near, far = [[0.3, -0.7, 0.4]] * frames, [[1.7, 0.0, 0.0]] * frames
+    x = beside(near)
+    # A control weight of .15, which counts as .2.
+    error = np.array([1.7 * 0.15 / 0.2 - 0.3, 0.7, -0.4])
+    found = float(loss_terms(beside(far), x)["ball"])
+    assert found == pytest.approx(np.mean(error**2), rel=1e-3)
+    # Nothing of a far ball counts, also not beside a near one.
+    comes = far[:6] + near[6:]
+    strays = far[:5] + [[1.9, 0.3, 0.0]] + near[6:]
+    terms = loss_terms(beside(strays), beside(comes))
+    assert float(terms["ball"]) == pytest.approx(0.0, abs=1e-9)
+    assert float(terms["ball_acceleration"]) == pytest.approx(0.0, abs=1e-9)
+    layout = smgdiff_scene.feature_layout(
+        representation.skeleton, representation.joints
+    )
+    ((start, stop),) = [(a, b) for name, a, b in layout.fields if name == "ground"]
+    own, lifted = (
+        float(loss_terms(guess, x)["foot"])
+        for guess in (x, x.at[..., start:stop].set(-9.0))
+    )
+    assert own > 1e-9 and lifted == pytest.approx(own, rel=1e-6)
+
+
 def test_a_shifted_person_costs_its_shift(
     scenes, representation, loss_terms, to_features
 ):
