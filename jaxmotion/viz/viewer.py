@@ -550,6 +550,8 @@ class Session:
             self._loaded[name] = self._models[name]()
         character, tuning = self._loaded[name], self._loaded[name].tuning
         with self._lock:
+            if self.settings.model != name:  # another one was chosen meanwhile
+                return self._program()
             if self._fresh:
                 self._fresh = False
                 self.settings = dataclasses.replace(
@@ -642,12 +644,12 @@ def changed(settings: Settings, name: str, value: Any, state: dict) -> Settings:
         "label": (0, max(len(state["labels"]) - 1, 0)),
         "speed": SPEEDS,
         "characters": (1, MOST_CHARACTERS),
-        "num_steps": (min(state["steps"], default=1), max(state["steps"], default=1)),
         "scale": tuple(state["scales"] or (0.0, 0.0)),
     }
-    kinds = {"label": int, "characters": int, "num_steps": int}
+    kinds = {"label": int, "characters": int}
     choices = {
         "model": state["models"],
+        "num_steps": state["steps"] or [1],
         "foot_lock": [False, True],
         "plan": [False, True],
         "paused": [False, True],

@@ -124,6 +124,7 @@ STATE = {"models": ["a", "b"], "labels": ["x", "y"], "steps": [1, 8], "scales": 
         ("characters", True, "expected 1 to 64"),
         ("model", "c", "expected one of a, b"),
         ("model", ["a"], "expected one of a, b"),
+        ("num_steps", 3, "num_steps is '3', expected one of 1, 8"),
         ("paused", 1, "expected one of False, True"),
         ("color", 1, "unknown setting 'color'"),
     ],
@@ -153,6 +154,7 @@ def test_settings_in_range():
         ('{"held": [], "azimuth": 0, "target": [1]}', "target is wrong"),
         ('{"held": [], "azimuth": 0, "target": [1, true]}', "no finite number"),
         ('{"held": [], "target": null}', "no finite number"),
+        ('{"held": [], "azimuth": 1' + "0" * 400 + "}", "no finite number"),
         ('{"held": [], "azimuth": 0, "path": [1, 2]}', "path is wrong"),
         ('{"held": [], "azimuth": 0, "path": [[1, NaN]]}', "no finite number"),
         (
@@ -390,6 +392,34 @@ def test_a_model_that_cannot_be_loaded_is_told_and_another_one_goes_on():
     session._build()
     session._builder.join()
     assert session.note == ""
+
+
+@pytest.mark.slow
+def test_another_model_may_be_chosen_while_one_loads():
+    chosen, loads = threading.Event(), threading.Event()
+    one, two = strider()[0], strider()[0]
+    tuning = dataclasses.replace(two.tuning, own_steps=3)
+    two = dataclasses.replace(two, tuning=tuning)
+
+    def slow():
+        loads.set()
+        assert chosen.wait(60)
+        return two
+
+    session = viewer.Session({"one": lambda: one, "two": slow})
+    session._build()
+    session._builder.join()
+    session._swap()
+    session.change("model", "two")
+    session._build()
+    assert loads.wait(60)
+    session.change("model", "one")
+    chosen.set()
+    session._builder.join()
+    session._swap()
+    assert session.settings.model == "one" and session._engine.character is one
+    session._build()
+    assert not session._builder.is_alive()  # there is nothing left to make
 
 
 @pytest.mark.slow

@@ -25,10 +25,18 @@ WEB = Path(page.__file__).with_name("web")
 
 def run(module, name, *calls):
     """What a function of a module gives for each tuple of arguments."""
-    message = json.dumps({"module": module, "name": name, "calls": calls})
+    return _node("web.mjs", {"module": module, "name": name, "calls": calls})
+
+
+def tab(*events, hash=""):
+    """What the page says and shows after each event; see `tab.mjs`."""
+    return _node("tab.mjs", {"hash": hash, "events": events})
+
+
+def _node(script, message):
     done = subprocess.run(
-        ["node", str(Path(__file__).with_name("web.mjs")), str(WEB)],
-        input=message,
+        ["node", str(Path(__file__).with_name(script)), str(WEB)],
+        input=json.dumps(message),
         capture_output=True,
         text=True,
     )
@@ -391,3 +399,63 @@ def test_a_zero_pose_that_stands_needs_no_poses():
     poses = np.tile(np.array([1.0, 0, 0, 0, 1, 0], np.float32), (2, 22, 1))
     found = packed.body_arrays(skeleton, poses)["inverse"]
     np.testing.assert_array_equal(found, packed.body_arrays(skeleton)["inverse"])
+
+
+# --- a tab ---------------------------------------------------------------------------
+
+STATE = {
+    **{"model": "walker", "models": ["walker", "runner"], "labels": [], "label": 0},
+    **{"speed": 1.2, "speeds": [0.0, 4.0], "characters": 1, "most_characters": 64},
+    **{"steps": [], "num_steps": 1, "scales": None, "scale": 1.0, "note": "loading"},
+    **{"foot_lock": True, "lockable": True, "plan": False, "planning": True},
+    **{"paused": False, "engine": 0, "fps": 30, "source": "", "recording": False},
+    **{"taken": 0.0, "people": 1},
+}
+THERE = {"labels": ["a", "b", "c"], "steps": [1, 2, 4], "note": "", "num_steps": 4}
+
+
+def settings(found):
+    return [x["set"] for x in found["said"] if "set" in x]
+
+
+def test_a_link_is_asked_for_when_its_model_is_there():
+    """Labels and steps are a model's own: before, no server knows them."""
+    events = [("state", STATE | x) for x in ({}, {"speed": 2.0}, THERE | {"engine": 1})]
+    hash = "#model=walker&label=2&speed=2&num_steps=2&foot_lock=1"
+    first, second, third = tab(*events, hash=hash)
+    assert settings(first) == [{"speed": 2}] and settings(second) == []
+    assert settings(third) == [{"label": 2}, {"num_steps": 2}]
+    # On a server that runs another one, which goes on until the link's is there.
+    running = STATE | THERE | {"engine": 3}
+    loading = running | {"model": "runner", "note": "loading runner"}
+    there = loading | {"engine": 4, "note": ""}
+    events = [("state", x) for x in (running, loading, there, there)]
+    hash = "#model=runner&label=1&foot_lock=0"
+    wants = [[{"model": "runner"}], [], [{"label": 1}, {"foot_lock": False}], []]
+    assert [settings(x) for x in tab(*events, hash=hash)] == wants
+
+
+def test_a_hidden_tab_keeps_no_frames():
+    """No picture takes them there; the last one is shown when it is seen again."""
+    skeleton, joints = tiny.skeleton(), tiny.skeleton().num_joints
+    body = packed.pack(
+        {"skeleton": packed.skeleton_json(skeleton)}, packed.body_arrays(skeleton)
+    )
+
+    def frame(tick):
+        rotations = np.tile([1.0, 0, 0, 0, 1.0, 0], joints)
+        head = [1, tick, 3, 0, 1, joints, 0, 30, 0, 1, 0, 1, 0]
+        return ("frame", [*head, 0.0, 1.0, 0.1 * tick, *rotations.tolist()])
+
+    events = [("state", STATE | THERE), ("body", base64.b64encode(body).decode(), 1)]
+    found = tab(*events, frame(0), ("hidden", True), *map(frame, range(1, 9)))
+    assert [x["shown"] for x in found[-8:]] == list(range(1, 9))
+
+
+def test_a_gamepad_that_is_unplugged_holds_nothing():
+    up, down = {"pressed": False}, {"pressed": True}
+    pad = {"connected": True, "mapping": "standard", "axes": [0, 0, 1, 0]}
+    pad |= {"buttons": [up, up, up, up, down]}
+    plugged, without = tab(("pad", pad), ("pad", None))
+    assert plugged["pad"][1:] == [[1, 0], 1]
+    assert without["pad"] == [None, None, None]

@@ -161,7 +161,8 @@ export class Input {
     const pads = navigator.getGamepads ? [...navigator.getGamepads()] : [];
     const pad = pads.find(p => p && p.connected && p.mapping === "standard");
     if (!pad) {
-      if (this.pads.size || this.pad.stick) { this.pads.clear(); this.pad = {}; this.on.change(); }
+      const held = this.pads.size || Object.values(this.pad).some(Boolean);
+      if (held) { this.pads.clear(); this.pad = {}; this.on.change(); }
       return;
     }
     const down = i => Boolean(pad.buttons[i] && pad.buttons[i].pressed);

@@ -55,6 +55,7 @@ export function start(source) {
   // body: the character's; drawn: what is shown, a dropped file or the body itself.
   let body = null, drawn = null, file = null, number = 0, told = "", trail = [], remembering = 0;
   let frame = null;  // shown: from, to, when it was due
+  let linked = "", awaited = 1;  // of a link: what was asked for, the engine that must be there
   const flat = new Figures();
   const due = [], history = [], arrivals = [], kept = [];
   const spent = window.spent = [];
@@ -111,19 +112,34 @@ export function start(source) {
       $("k_" + name).classList.toggle("on", held.has(name));
     news();
   }
+  // Asks for what a link does and the source did not begin with. Labels and numbers of
+  // steps are a model's own, and it begins with its own foot lock: they come last.
+  function link(state) {
+    const ask = names => {
+      for (const x of names)
+        if (x in hash && hash[x] !== state[x]) say({ set: { [x]: hash[x] } });
+    };
+    if (!linked) {
+      linked = "model";
+      if (state.models.includes(hash.model) && hash.model !== state.model) {
+        awaited = state.engine + 1;
+        ask(["model"]);
+      }
+      ask(["speed", "characters", "plan"]);
+    } else if (linked === "model" && (state.engine >= awaited && !state.note
+      || state.note.startsWith("error"))) {
+      linked = "all";
+      ask(["label", "num_steps", "foot_lock"]);
+    }
+  }
   const on = {
     open() { told = ""; panel.waiting = source.open ? "" : source.waiting; panel.note(); tell(); },
     state(state) {
-      // What a link asks for and the source did not begin with.
-      if (state.model && !on.linked && !source.base) {
-        on.linked = true;
-        const first = HASH.filter(x => x in hash && hash[x] !== state[x]
-          && (x !== "model" || state.models.includes(hash[x])));
-        for (const x of first) say({ set: { [x]: hash[x] } });
-      }
+      if (state.model && !source.base) link(state);  // without a server the player does
       panel.show(state); news();
       // Browsers refuse an address that changes too often, as with a slider.
-      clearTimeout(remembering); remembering = setTimeout(remember, 400);
+      clearTimeout(remembering);
+      if (source.base || linked === "all") remembering = setTimeout(remember, 400);
     },
     body(buffer, engine) {
       body = unpack(buffer); number = engine;
@@ -136,6 +152,7 @@ export function start(source) {
       const found = readFrame(data);
       if (!body || found.engine !== number) return;
       due.push({ ...found, due: time });
+      if (document.hidden) advance(performance.now());  // nobody draws them
       history.push([found.ms, found.plans]); if (history.length > 240) history.shift();
       arrivals.push(performance.now());
       while (arrivals[0] < performance.now() - 2000) arrivals.shift();
