@@ -24,6 +24,7 @@ from jaxmotion.data import procedural, windows
 from jaxmotion.data.builders import smpl
 from jaxmotion.data.clips import Clips
 from jaxmotion.diffusion import chain, schedule
+from jaxmotion.evaluation import timing
 from jaxmotion.learning import model_json, training
 from jaxmotion.motion import pose, trajectory
 from jaxmotion.motion.features import Normalizer, unpack
@@ -593,11 +594,12 @@ def _aamdm_frame(
     follows the last one; without it that is called operation by operation.
     """
     net, table = aamdm_model.network(config), config.table()
-    apply = lambda name: jax.jit(  # noqa: E731
+    jit = functools.partial(jax.jit, compiler_options=timing.compiler_options())
+    apply = lambda name: jit(  # noqa: E731
         lambda *given: net.apply({"params": params[name]}, *given)
     )
     draft, polish = apply("generator"), apply("polisher")
-    decode = jax.jit(lambda x: aamdm_space.to_poses(space, x))
+    decode = jit(lambda x: aamdm_space.to_poses(space, x))
 
     def step(key: Key, x: jax.Array, t: int, previous: jax.Array) -> jax.Array:
         key_net, key_noise = jax.random.split(jax.random.fold_in(key, t))
@@ -619,7 +621,7 @@ def _aamdm_frame(
 
     show = unjitted
     if glue:
-        step, advance = jax.jit(step, static_argnums=2), jax.jit(driver.advance)
+        step, advance = jit(step, static_argnums=2), jit(driver.advance)
         show = lambda state: advance(state, command)  # noqa: E731
 
     def frame(key: Key, state: Any) -> Any:

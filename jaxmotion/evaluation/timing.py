@@ -53,16 +53,18 @@ def matmul_rate(*, size: int = 1024, **options: Any) -> float:
     return 2.0 * size**3 / (float(np.median(times)) / 1000)
 
 
-def compile_program(function: Callable, *arguments: Any) -> tuple[Callable, float]:
-    """A jitted function as a program that cannot compile, and the seconds it took.
-
-    On a CPU vectors are as wide as it has them: XLA's default stops at 256 bits.
-    """
-    options = {}
+def compiler_options() -> dict[str, Any]:
+    """Vectors as wide as a CPU has them: XLA's default stops at 256 bits."""
     if jax.default_backend() == "cpu":
-        options = {"xla_cpu_prefer_vector_width": 512}
+        return {"xla_cpu_prefer_vector_width": 512}
+    return {}
+
+
+def compile_program(function: Callable, *arguments: Any) -> tuple[Callable, float]:
+    """A jitted function as a program that cannot compile, and the seconds it took."""
     start = time.perf_counter()
-    program = function.lower(*arguments).compile(compiler_options=options)
+    lowered = function.lower(*arguments)
+    program = lowered.compile(compiler_options=compiler_options())
     return program, time.perf_counter() - start
 
 

@@ -347,22 +347,24 @@ def save_gif(
     Args:
       title: Above the picture, in one line: shrunk, then elided.
       caption: Below it, small: the source of the data and its license.
-      every: Draw every so many frames; the speed stays true. None for at most 20
-        pictures per second.
+      every: Draw every so many frames, at most 100 pictures per second; the speed stays
+        true. None for at most 20 pictures per second.
       azimuth: Azimuth of the camera, degrees about +y. None for one toward which the
         characters come, all in all.
       elevation: Elevation of the camera, degrees. None for 16, or 28 over a crowd.
       size: Width and height, or the side of a square, pixels.
 
     Raises:
-      ValueError: if `every` is not positive, or the size is too small.
+      ValueError: if `every` or the size is too small.
       OSError: if the file cannot be written.
     """
     every = max(int(np.ceil(stage.fps / 20.0)), 1) if every is None else every
     width, height = (size, size) if isinstance(size, int) else size
-    if every < 1 or min(width, height) < 64:
+    least = max(int(np.ceil(stage.fps / 100.0)), 1)
+    if every < least or min(width, height) < 64:
         raise ValueError(
-            f"every {every}, size {size}: expected every >= 1 and size >= 64 pixels"
+            f"every {every}, size {size}: expected every >= {least} (at {stage.fps:g} "
+            "frames per second) and size >= 64 pixels"
         )
     path = drawing.check_writable(path)
     shown = [("walked", drawing.WALKED, stage.walked)]

@@ -297,8 +297,11 @@ class Page:
                     state = self.session.state()
                     if state["engine"] != body and self.session.skeleton is not None:
                         body = state["engine"]
-                        await asyncio.to_thread(self._pack, body)
-                        await socket.send(json.dumps({"body": body}))
+                        try:
+                            await asyncio.to_thread(self._pack, body)
+                            await socket.send(json.dumps({"body": body}))
+                        except ValueError as error:  # a body that cannot be drawn
+                            client.errors.append(str(error))
                     await socket.send(json.dumps({"state": state}))
                 while client.errors:
                     await socket.send(json.dumps({"error": client.errors.pop(0)}))

@@ -1,3 +1,4 @@
+import dataclasses
 import time
 
 import jax.numpy as jnp
@@ -242,4 +243,8 @@ def test_wrong_options_are_named(tmp_path):
     for bad, message in ((dict(every=0), "every 0"), (dict(size=10), "size 10")):
         with pytest.raises(ValueError, match=message):
             save(tmp_path / "a.gif", **bad)
+    # A GIF counts hundredths of a second: 240 pictures in one would take 2.4 s.
+    fast = samples.circle_stage(dataclasses.replace(samples.circle(8)[0], fps=240.0))
+    with pytest.raises(ValueError, match=r"every 1, .* every >= 3 \(at 240 frames"):
+        save(tmp_path / "a.gif", fast, every=1)
     assert list(tmp_path.iterdir()) == []

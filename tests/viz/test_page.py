@@ -140,6 +140,17 @@ def test_wrong_input_is_answered_in_one_line_and_changes_nothing(served):
         assert receive(one, "frame").size
 
 
+def test_a_body_that_cannot_be_drawn_is_told(served, monkeypatch):
+    def refuse(*_):
+        raise ValueError("300 joints, expected at most 256 for the page")
+
+    monkeypatch.setattr(page.packed, "body_arrays", refuse)
+    monkeypatch.setattr(served.page, "_body", (-1, b""))
+    with served.socket() as one:
+        assert "300 joints" in receive(one, "error")
+        receive(one, "frame")  # all else goes on
+
+
 def test_people_come_and_go(served):
     with served.socket() as stays:
         receive(stays, "frame")

@@ -430,8 +430,9 @@ def test_a_link_is_asked_for_when_its_model_is_there():
     loading = running | {"model": "runner", "note": "loading runner"}
     there = loading | {"engine": 4, "note": ""}
     events = [("state", x) for x in (running, loading, there, there)]
-    hash = "#model=runner&label=1&foot_lock=0"
-    wants = [[{"model": "runner"}], [], [{"label": 1}, {"foot_lock": False}], []]
+    hash = "#model=runner&label=1&scale=0.5&foot_lock=0"
+    last = [{"label": 1}, {"scale": 0.5}, {"foot_lock": False}]
+    wants = [[{"model": "runner"}], [], last, []]
     assert [settings(x) for x in tab(*events, hash=hash)] == wants
 
 

@@ -13,7 +13,9 @@ import { Scene } from "./scene.js";
 const $ = id => document.getElementById(id);
 const GREEN = [0.17, 0.63, 0.17, 0.9], VIOLET = [0.5, 0.36, 0.75, 0.9];
 const ORANGE = [1, 0.5, 0.05, 0.8], BALL = 0.11, KEPT = 10, TRAIL = 600;
-const HASH = ["model", "label", "speed", "num_steps", "foot_lock", "characters", "plan"];
+const HASH = [
+  "model", "label", "speed", "num_steps", "scale", "foot_lock", "characters", "plan",
+];
 
 // What follows "#" in the address: settings by name, and the camera.
 export function readHash(text) {
@@ -129,7 +131,7 @@ export function start(source) {
     } else if (linked === "model" && (state.engine >= awaited && !state.note
       || state.note.startsWith("error"))) {
       linked = "all";
-      ask(["label", "num_steps", "foot_lock"]);
+      ask(["label", "num_steps", "scale", "foot_lock"]);
     }
   }
   const on = {
@@ -349,8 +351,9 @@ export function start(source) {
   function remember() {
     const { state } = panel;
     if (!state || !state.model) return;
-    const text = HASH.map(x => `${x}=${encodeURIComponent(
-      typeof state[x] === "boolean" ? +state[x] : state[x])}`).join("&");
+    const kept = "workers" in hash ? { ...state, workers: hash.workers } : state;
+    const text = [...HASH, "workers"].filter(x => x in kept).map(x => `${x}=${
+      encodeURIComponent(typeof kept[x] === "boolean" ? +kept[x] : kept[x])}`).join("&");
     if (`#${text}` !== location.hash.split("&az=")[0])
       window.history.replaceState(null, "", `#${text}`);
   }

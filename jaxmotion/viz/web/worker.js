@@ -86,10 +86,12 @@ async function choose(name, wish = {}, runtime = null) {
   }
   const next = opened.get(name), { about } = next;
   const label = Number(wish.label) || 0, steps = Number(wish.num_steps);
+  const [low, high] = about.scales || [];
   const given = {
     label: about.labels[label] ? label : 0,
     num_steps: about.steps.includes(steps) ? steps : about.num_steps,
-    scale: about.scale, foot_lock: "foot_lock" in wish ? wish.foot_lock : true,
+    scale: wish.scale >= low && wish.scale <= high ? wish.scale : about.scale,
+    foot_lock: "foot_lock" in wish ? wish.foot_lock : true,
   };
   model = next;
   if (crowd) crowd.close();
