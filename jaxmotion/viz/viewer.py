@@ -268,11 +268,12 @@ class Session:
         self.on_change()
 
     def leave(self, client: Any) -> None:
-        """Somebody left; what he held is let go."""
+        """Somebody left; what he held is let go, and who holds something steers."""
         with self._lock:
             self._inputs.pop(client, None)
             if self._active == client:
-                self._active = None
+                holding = (x for x, held in self._inputs.items() if held.held)
+                self._active = next(holding, None)
         self.on_change()
 
     def steer(self, client: Any, inputs: Inputs) -> None:
@@ -609,6 +610,8 @@ class Session:
                 return
             old, self._engine = self._engine, new
             same = old is not None and old.character is new.character
+            if not same:
+                self.settings = _fitting(self.settings, new.character)
             if not same and self._take is not None:
                 self._end_take(old)
             self.engine_number += 1
@@ -621,6 +624,19 @@ def _worn(dress: Dress | None, roots: Any, rotations: Any) -> tuple[Any, Any]:
     if dress is not None:
         roots, rotations = dress.wear(jnp.asarray(roots), jnp.asarray(rotations))
     return np.asarray(roots), np.asarray(rotations)
+
+
+def _fitting(settings: Settings, character: Character) -> Settings:
+    """Settings that a model has, where they were chosen while it was compiled."""
+    tuning, known = character.tuning, range(max(len(character.labels), 1))
+    if settings.label not in known:
+        settings = dataclasses.replace(settings, label=0)
+    if tuning is None:
+        return settings
+    if settings.num_steps not in tuning.num_steps:
+        settings = dataclasses.replace(settings, num_steps=tuning.own_steps)
+    low, high = tuning.scales
+    return dataclasses.replace(settings, scale=min(max(settings.scale, low), high))
 
 
 def _last(engine: Engine) -> int:

@@ -394,6 +394,28 @@ def test_a_model_that_cannot_be_loaded_is_told_and_another_one_goes_on():
     assert session.note == ""
 
 
+def test_who_still_holds_a_key_steers_when_another_one_leaves():
+    session = viewer.Session({"one": lambda: None})
+    for who in ("one", "two"):
+        session.join(who)
+    ahead = Inputs(held=frozenset({"forward"}))
+    session.steer("one", ahead)
+    for held in ({"left"}, set()):
+        session.steer("two", Inputs(held=frozenset(held)))
+    assert session._active == "two"
+    session.leave("two")
+    assert session._inputs[session._active] == ahead
+
+
+def test_settings_chosen_while_a_model_compiles_are_those_that_it_has():
+    character = strider()[0]
+    wild = viewer.Settings(model="one", label=7, num_steps=20, scale=9.0)
+    found = viewer._fitting(wild, character)
+    assert (found.label, found.num_steps, found.scale) == (0, 8, 2.0)
+    own = viewer.Settings(model="one", label=1, num_steps=3, scale=0.5)
+    assert viewer._fitting(own, character) == own
+
+
 @pytest.mark.slow
 def test_another_model_may_be_chosen_while_one_loads():
     chosen, loads = threading.Event(), threading.Event()

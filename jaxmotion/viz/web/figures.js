@@ -44,16 +44,23 @@ export class Figures {
     }
   }
 
-  // What somebody at (x, z) is told: a head where he is to face, a shaft as he is to go.
-  arrow(x, z, dx, dz, color) {
-    const d = Math.hypot(dx, dz) || 1, f = [dx / d, dz / d], s = [f[1], -f[0]];
-    const at = (ahead, aside) =>
-      [x + f[0] * ahead + s[0] * aside, z + f[1] * ahead + s[1] * aside];
-    const from = 0.42, tip = from + 0.18 + 0.22 * d;
-    if (Math.hypot(dx, dz) > 0.05) {
-      this.triangle(at(from, -0.03), at(from, 0.03), at(tip - 0.16, 0.03), color);
-      this.triangle(at(from, -0.03), at(tip - 0.16, 0.03), at(tip - 0.16, -0.03), color);
+  // What somebody at (x, z) is told: a shaft as he is to go, on it a head that points
+  // where he is to face (a unit vector).
+  arrow(x, z, velocity, facing, color) {
+    const d = Math.hypot(...velocity), goes = d > 0.05;
+    const way = goes ? velocity.map(v => v / d) : facing, from = 0.42;
+    const reach = from + 0.22 * (goes ? d : 0);
+    const at = (origin, along, ahead, aside) => [
+      origin[0] + along[0] * ahead + along[1] * aside,
+      origin[1] + along[1] * ahead - along[0] * aside,
+    ];
+    const shaft = (ahead, aside) => at([x, z], way, ahead, aside);
+    if (goes) {
+      this.triangle(shaft(from, -0.03), shaft(from, 0.03), shaft(reach + 0.02, 0.03), color);
+      this.triangle(shaft(from, -0.03), shaft(reach + 0.02, 0.03),
+        shaft(reach + 0.02, -0.03), color);
     }
-    this.triangle(at(tip - 0.18, -0.1), at(tip - 0.18, 0.1), at(tip, 0), color);
+    const head = (ahead, aside) => at(shaft(reach, 0), facing, ahead, aside);
+    this.triangle(head(0, -0.1), head(0, 0.1), head(0.18, 0), color);
   }
 }

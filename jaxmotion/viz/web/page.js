@@ -312,7 +312,7 @@ export function start(source) {
   function figuresOf(pose) {
     const made = flat.clear(), { to } = frame, [x, , z] = pose.roots;
     made.ribbon(trail, 0.035, ORANGE);
-    const [vx, vz, fx, fz] = to.told, still = Math.hypot(vx, vz) < 0.02;
+    const [vx, vz, fx, fz] = to.told;
     if (to.path.length) {
       const points = [];
       for (let i = 0; i < to.path.length; i += 2) points.push(to.path.slice(i, i + 2));
@@ -320,7 +320,7 @@ export function start(source) {
       made.ribbon([[x + seconds * vx, z + seconds * vz], [x, z]], 0.035, GREEN);
       made.ribbon(points.reverse(), 0.06, VIOLET);
     }
-    made.arrow(x, z, still ? 1e-6 * fx : vx, still ? 1e-6 * fz : vz, GREEN);
+    made.arrow(x, z, [vx, vz], [fx, fz], GREEN);
     [input.from, ...input.path].forEach((point, i, all) => {
       if (!i) return;
       made.ribbon([all[i - 1], all[i - 1], point], 0.05, GREEN);
