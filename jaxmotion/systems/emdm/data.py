@@ -255,12 +255,16 @@ def _decode(record: runs.Run) -> ActionRun:
     field, frames = record.settings["field"], record.settings["frames"]
     parts = [clips_io.load_clips(record.file(name)) for name in _FILES]
     train, held_out = (action_arrays(x, field=field, frames=frames) for x in parts)
-    representation = _fit(parts[0], train)
-    if "normalizer" in record.model:  # older folders have none
-        stored = model_json.normalizer_from_json(
-            record.model["normalizer"], size=representation.num_features
+    clips, where = parts[0], str(record.config)
+    size = 6 * (clips.skeleton.num_joints + 1)
+    decode = functools.partial(model_json.normalizer_from_json, size=size)
+    if "normalizer" in record.model:
+        made = model_json.decode(record.model, where, {"normalizer": decode})
+        representation = Representation(
+            skeleton=clips.skeleton, fps=clips.fps, normalizer=made["normalizer"]
         )
-        representation = dataclasses.replace(representation, normalizer=stored)
+    else:  # an older folder
+        representation = _fit(clips, train)
     return ActionRun(
         record=record,
         clips=selection.concatenate(parts),

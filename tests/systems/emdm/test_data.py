@@ -1,6 +1,7 @@
 """Motions with actions: labels, and how clips are drawn and cut."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -114,6 +115,20 @@ def test_a_folder_keeps_the_units_of_its_features(files, tmp_path):
         np.testing.assert_array_equal(
             getattr(found, name), getattr(made.representation.normalizer, name)
         )
+    # As a folder has it that was made before, and a damaged one.
+    config = folder / "config.json"
+    value = json.loads(config.read_text())
+    kept = value["model"].pop("normalizer")
+    config.write_text(json.dumps(value))
+    fitted = emdm_data.load_run(folder).representation
+    assert fitted.fps == made.representation.fps
+    np.testing.assert_array_equal(
+        fitted.normalizer.mean, made.representation.normalizer.mean
+    )
+    value["model"]["normalizer"] = {"mean": kept["mean"]}
+    config.write_text(json.dumps(value))
+    with pytest.raises(ValueError, match=r"config\.json: field 'normalizer': 'std' is"):
+        emdm_data.load_run(folder)
 
 
 # --- batches -----------------------------------------------------------------------
