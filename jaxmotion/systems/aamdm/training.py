@@ -514,8 +514,10 @@ def load_networks(
 
     The generator takes none where the previous frame is `held` in place of drafts.
 
+    Of networks on their own levels and on all, where both are there, the first count.
+
     `CheckpointError` if a stage is missing or of another kind, `ValueError` if it was
-    trained for another space, or on its own levels and on all.
+    trained for another space.
     """
     own = {"drafts": drafts, "polishes": polishes}
     network = "polisher" if polishes else "generator"
@@ -523,16 +525,12 @@ def load_networks(
         chain_stage(name, predict=predict, levels=levels, **own)
         for levels in ("own", "all")
     ]
-    there = [
+    there = (
         x
         for x in chains
         if checkpoint.latest_step(run.record.checkpoints(f"{x}/{network}")) is not None
-    ]
-    if len(there) > 1:
-        raise ValueError(
-            f"{run.record.folder}: networks in {' and '.join(there)}, expected one"
-        )
-    chain = there[0] if there else chains[-1]
+    )
+    chain = next(there, chains[-1])
     stage = f"{chain}/{network}"
     config = runs.stage_config(run.record, stage, aamdm_model.Config, **own)
     if config.features != space.num_features:
