@@ -117,10 +117,16 @@ class Character:
     @functools.cached_property
     def state_form(self) -> Any:
         """What its states consist of; None for a model that starts from clips only."""
+        form = []
+
+        def leaves() -> Any:
+            form.append(_form(self.start(1)))
+
         try:
-            return _form(self.start(1))
+            jax.eval_shape(leaves)  # compiles nothing
         except ValueError:
             return None
+        return form[0]
 
     def label(self, name: str) -> int:
         """Index of a label; raises `ValueError` that names those there are."""

@@ -144,6 +144,24 @@ def unfold_frames(
     return jnp.einsum("fp,...pd->...fd", jnp.asarray(weights, x.dtype), predictions)
 
 
+def frames_of(
+    net: Any, x: Float[Array, "*batch tokens width"]
+) -> Float[Array, "*batch frames features"]:
+    """Frames that a network's last tokens stand for: its `norm_out` and `out`.
+
+    A network has the first where it norms before its branches, and as attributes what
+    `unfold_frames` asks for.
+    """
+    if net.norm == "pre":
+        x = net.norm_out(x)
+    return unfold_frames(
+        net.out(x),
+        net.frames_per_token,
+        margin=net.token_margin,
+        window=net.token_window,
+    )
+
+
 def gelu(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Exact GELU: x times the normal distribution's probability of less than x.
 

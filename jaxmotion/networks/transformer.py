@@ -249,14 +249,7 @@ class CamdmTransformer(nn.Module):
                 x = layer(x, train=train, last=last, prefix=prefix)
         else:
             x = self._attend_to_all(context, ends, train)
-        if self.norm == "pre":
-            x = self.norm_out(x)
-        frames = blocks.unfold_frames(
-            self.out(x),
-            self.frames_per_token,
-            margin=self.token_margin,
-            window=self.token_window,
-        )
+        frames = blocks.frames_of(self, x)
         if self.frame_kernel:
             frames = frames + self.smooth(frames)
         if context.last is None:

@@ -551,9 +551,8 @@ class Session:
             self._loaded[name] = self._models[name]()
         character, tuning = self._loaded[name], self._loaded[name].tuning
         with self._lock:
-            if self.settings.model != name:  # another one was chosen meanwhile
-                return self._program()
-            if self._fresh:
+            same = self.settings.model == name
+            if same and self._fresh:
                 self._fresh = False
                 self.settings = dataclasses.replace(
                     self.settings,
@@ -563,6 +562,8 @@ class Session:
                     foot_lock=self._foot_locks.get(name, True),
                 )
             settings, key = self.settings, self._wanted_engine()
+        if not same:  # another one was chosen meanwhile
+            return self._program()
         if key not in self._programs:
             many = f"{key[2]} character{'s' * (key[2] > 1)}"
             self._tell(f"compiling {name}: {many}, {key[1]} diffusion steps")

@@ -206,6 +206,13 @@ def test_a_frame_is_packed_as_the_page_reads_it():
     np.testing.assert_array_equal(data[56:], np.arange(12))
 
 
+def build(session):
+    """What its thread does before the next tick, at once."""
+    session._build()
+    session._builder.join()
+    session._swap()
+
+
 class Ticking:
     """A session on a character without a network, ticked by hand."""
 
@@ -221,9 +228,7 @@ class Ticking:
         self.session.join("me")
 
     def load(self):
-        self.session._build()
-        self.session._builder.join()
-        self.session._swap()
+        build(self.session)
         assert self.session.note == ""
 
     def tick(self, *held, times=1, **more):
@@ -378,9 +383,7 @@ def test_a_model_that_cannot_be_loaded_is_told_and_another_one_goes_on():
 
     character = strider()[0]
     session = viewer.Session({"one": lambda: character, "two": broken})
-    session._build()
-    session._builder.join()
-    session._swap()
+    build(session)
     session.change("model", "two")
     session._build()
     session._builder.join()
@@ -418,28 +421,36 @@ def test_settings_chosen_while_a_model_compiles_are_those_that_it_has():
 
 @pytest.mark.slow
 def test_another_model_may_be_chosen_while_one_loads():
-    chosen, loads = threading.Event(), threading.Event()
-    one, two = strider()[0], strider()[0]
-    tuning = dataclasses.replace(two.tuning, own_steps=3)
-    two = dataclasses.replace(two, tuning=tuning)
+    """The page goes on all the while, which asks for the state in each tick."""
+    loads, goes_on = ({x: threading.Event() for x in "bc"} for _ in range(2))
+    models = {name: strider()[0] for name in "abc"}
+    tuning = dataclasses.replace(models["b"].tuning, own_steps=3)
+    models["b"] = dataclasses.replace(models["b"], tuning=tuning)
 
-    def slow():
-        loads.set()
-        assert chosen.wait(60)
-        return two
+    def slow(name):
+        loads[name].set()
+        assert goes_on[name].wait(60)
+        return models[name]
 
-    session = viewer.Session({"one": lambda: one, "two": slow})
-    session._build()
+    session = viewer.Session(
+        {"a": lambda: models["a"], "b": lambda: slow("b"), "c": lambda: slow("c")}
+    )
+    build(session)
+    for name in "bc":
+        session.change("model", name)
+        session._build()
+        if name == "c":
+            goes_on["b"].set()  # while c is wanted
+        assert loads[name].wait(60)
+    asks = threading.Thread(target=session.state, daemon=True)
+    asks.start()
+    asks.join(10)
+    assert not asks.is_alive()
+    session.change("model", "a")
+    goes_on["c"].set()
     session._builder.join()
     session._swap()
-    session.change("model", "two")
-    session._build()
-    assert loads.wait(60)
-    session.change("model", "one")
-    chosen.set()
-    session._builder.join()
-    session._swap()
-    assert session.settings.model == "one" and session._engine.character is one
+    assert session.settings.model == "a" and session._engine.character is models["a"]
     session._build()
     assert not session._builder.is_alive()  # there is nothing left to make
 

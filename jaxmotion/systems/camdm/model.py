@@ -181,9 +181,10 @@ def network(config: Config) -> Network:
 
     `ValueError` for an option of the transformer that another network does not have.
     """
+    missing = lacking(config.network)
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name in lacking(config.network) and value != field.default:
+        if field.name in missing and value != field.default:
             raise ValueError(
                 f"{field.name} is {value}, expected {field.default} with the network "
                 f"{config.network!r}"

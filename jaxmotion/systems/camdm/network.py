@@ -152,14 +152,7 @@ class SingleTokenTransformer(_OneVectorCondition):
         for i, layer in enumerate(self.layers, start=1):
             last = noisy.shape[-2] if i == self.depth else None
             x = layer(x, train=train, last=last)
-        if self.norm == "pre":
-            x = self.norm_out(x)
-        return blocks.unfold_frames(
-            self.out(x),
-            self.frames_per_token,
-            margin=self.token_margin,
-            window=self.token_window,
-        )
+        return blocks.frames_of(self, x)
 
 
 class CamdmMlp(_OneVectorCondition):

@@ -168,14 +168,7 @@ class SequenceGenerator(nn.Module):
         for i, layer in enumerate(self.layers, start=1):
             last = self.num_outputs if i == self.depth else None
             x = layer(x, train=train, last=last, mask=mask)
-        if self.norm == "pre":
-            x = self.norm_out(x)
-        return blocks.unfold_frames(
-            self.out(x),
-            self.frames_per_token,
-            margin=self.token_margin,
-            window=self.token_window,
-        )
+        return blocks.frames_of(self, x)
 
     def __call__(
         self,

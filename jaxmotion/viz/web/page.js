@@ -351,9 +351,9 @@ export function start(source) {
   function remember() {
     const { state } = panel;
     if (!state || !state.model) return;
-    const kept = "workers" in hash ? { ...state, workers: hash.workers } : state;
-    const text = [...HASH, "workers"].filter(x => x in kept).map(x => `${x}=${
-      encodeURIComponent(typeof kept[x] === "boolean" ? +kept[x] : kept[x])}`).join("&");
+    const all = "workers" in hash ? { ...state, workers: hash.workers } : state;
+    const text = [...HASH, "workers"].filter(x => x in all).map(x => `${x}=${
+      encodeURIComponent(typeof all[x] === "boolean" ? +all[x] : all[x])}`).join("&");
     if (`#${text}` !== location.hash.split("&az=")[0])
       window.history.replaceState(null, "", `#${text}`);
   }
