@@ -594,7 +594,8 @@ def _aamdm_frame(
     follows the last one; without it that is called operation by operation.
     """
     net, table = aamdm_model.network(config), config.table()
-    jit = functools.partial(jax.jit, compiler_options=timing.compiler_options())
+    whole = functools.partial(jax.jit, compiler_options=timing.compiler_options())
+    jit = jax.jit if glue else whole  # within another one it has that one's options
     apply = lambda name: jit(  # noqa: E731
         lambda *given: net.apply({"params": params[name]}, *given)
     )
@@ -621,7 +622,7 @@ def _aamdm_frame(
 
     show = unjitted
     if glue:
-        step, advance = jit(step, static_argnums=2), jit(driver.advance)
+        step, advance = whole(step, static_argnums=2), whole(driver.advance)
         show = lambda state: advance(state, command)  # noqa: E731
 
     def frame(key: Key, state: Any) -> Any:

@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -55,6 +56,16 @@ def run_script(name, *arguments):
         env=os.environ
         | {"JAX_PLATFORMS": "cpu", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
     ).stdout
+
+
+@pytest.mark.slow
+def test_a_rollout_stands_beside_python_loops():
+    """Compiled alike; whole steps, or the networks alone, are jitted in them."""
+    small = ["--width", "16", "--runs", "2", "--limit", "1", "--seconds", "0.1"]
+    text = run_script("rollout_batch", "--system", "aamdm", "--characters", "1", *small)
+    rates = re.findall(r"Python loop, ([a-z ]+) jitted: ([0-9.,]+) frames/s", text)
+    assert [name for name, _ in rates] == ["networks", "whole steps"]
+    assert all(float(rate.replace(",", "")) > 0 for _, rate in rates)
 
 
 @pytest.mark.slow
