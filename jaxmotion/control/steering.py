@@ -119,11 +119,14 @@ class Character:
         """What its states consist of; None for a model that starts from clips only."""
         form = []
 
-        def leaves() -> Any:
+        def leaves() -> None:
             form.append(_form(self.start(1)))
 
         try:
-            jax.eval_shape(leaves)  # compiles nothing
+            try:
+                jax.eval_shape(leaves)  # compiles nothing
+            except jax.errors.JAXTypeError:  # starts that compute with NumPy
+                leaves()
         except ValueError:
             return None
         return form[0]

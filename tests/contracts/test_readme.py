@@ -97,13 +97,28 @@ def test_start_commands():
 
 
 def test_links_lead_somewhere():
-    wrong = [
-        f"{path}: {link}"
+    def wrong(path, link):
+        name, _, anchor = link.partition("#")
+        page = (path.parent / name).resolve() if name else path
+        if not page.exists():
+            return True
+        return bool(anchor) and anchor not in anchors(page.read_text(encoding="utf-8"))
+
+    found = {
+        (str(path.relative_to(ROOT)), link)
         for path, text in PAGES.items()
-        for link in re.findall(r"\]\((?!https?:)([^)#]+)\)", text)
-        if not (path.parent / link).exists()
-    ]
-    assert not wrong, wrong
+        for link in re.findall(r"\]\((?!https?:)([^)]+)\)", text)
+        if wrong(path, link)
+    }
+    assert not found
+
+
+def anchors(text):
+    """What a site makes of a page's headings."""
+    heads = re.findall(
+        r"^#+ (.+)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.M
+    )
+    return {re.sub(r"[^\w -]", "", head).lower().replace(" ", "-") for head in heads}
 
 
 def test_scripts_and_options_that_the_text_names():

@@ -17,7 +17,7 @@ from jaxmotion.diffusion import chain
 from jaxmotion.motion import skeleton, trajectory
 from jaxmotion.systems.camdm import controller as camdm_controller
 from jaxmotion.systems.camdm import model as camdm_model
-from tests import samples
+from tests import samples, tiny
 
 LABELS = np.array([0, 1, 1, 0])
 
@@ -71,6 +71,28 @@ def test_starts_are_of_the_label_and_drawn_evenly():
     assert 0.7 < np.mean(other != own) < 0.8  # three in four
     with pytest.raises(ValueError, match="labels are in 1..3, expected 0..2"):
         steering.chosen_starts(starts, np.array([1, 3]), tuple("abc"), seed=1)
+
+
+@pytest.mark.parametrize("library", [np, jnp])
+def test_states_of_another_model_are_told_however_a_model_starts(library):
+    """Starts may compute with NumPy what JAX gave, which cannot be traced."""
+
+    def starts(labels, seed):
+        places = library.asarray(jnp.zeros((len(labels), 3)) + seed)
+        return {"place": jnp.asarray(places)}
+
+    character = steering.Character(
+        skeleton=tiny.skeleton(),
+        labels=(),
+        fps=30.0,
+        source="tests",
+        params={},
+        method=lambda params: None,
+        starts=starts,
+    )
+    steering.check_states(character, character.start(2))
+    with pytest.raises(ValueError, match="states are of another model"):
+        steering.check_states(character, {"place": jnp.zeros((2, 4))})
 
 
 def test_characters_start_in_poses_of_the_models_own(run):
