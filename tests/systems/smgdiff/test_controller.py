@@ -19,8 +19,6 @@ from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.systems.smgdiff import trajectory as smgdiff_trajectory
 from tests import ball_walker, tiny
 
-pytestmark = pytest.mark.slow
-
 CONTROL = smgdiff_controller.Control(apply=5, reuse=4)
 
 
@@ -504,6 +502,7 @@ def test_after_a_kick_he_plans_from_where_he_is(parts):
     np.testing.assert_array_equal(after.past.ball[-1, ::2], [1.0, 2.0])
 
 
+@pytest.mark.slow
 def test_a_lost_ball_rolls_and_is_not_planned(parts):
     representation, config, _ = parts
     driver = driver_of(representation, config, FETCHES)
@@ -521,6 +520,7 @@ def test_a_lost_ball_rolls_and_is_not_planned(parts):
     assert frames.planned[0, 0]
 
 
+@pytest.mark.slow
 def test_a_lost_ball_of_who_is_told_to_stand_is_planned(parts):
     representation, config, _ = parts
     state = after_a_kick(config, [0.0, 5.0], [1.5, 0.0])
