@@ -17,6 +17,7 @@ Example:
 """  # noqa: E501
 
 import dataclasses
+import functools
 import os
 import time
 from pathlib import Path
@@ -32,7 +33,6 @@ from jaxmotion.data import (
     loops,
     mirror,
     resample,
-    selection,
     text_motion,
 )
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips
@@ -189,7 +189,9 @@ def read_own(config: Config) -> Clips:
     from jaxmotion.data import fbx, own
     from jaxmotion.data.builders import base
 
-    read = own.read_bvh if config.source == "bvh" else fbx.read_fbx
+    read = own.read_bvh
+    if config.source == "fbx":  # has curves, not frames
+        read = functools.partial(fbx.read_fbx, fps=config.fps or 30.0)
     table = None
     if config.labels is not None:
         text = base.read_text(str(config.labels), config.labels.read_bytes())
@@ -301,7 +303,7 @@ def prepare(config: Config) -> None:
     if config.source == "procedural":
         from jaxmotion.data import procedural
 
-        data = procedural.make_clips(seed=config.seed)
+        data = procedural.make_clips(fps=config.fps or set_fps, seed=config.seed)
     elif config.source in OWN:
         data = read_own(config)
     else:
@@ -320,7 +322,7 @@ def prepare(config: Config) -> None:
         if config.loops is not None:
             clips = loops.with_loops(clips, seconds=config.loops)
         if config.mirror and not mirrored:
-            clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
+            clips = mirror.with_mirrored(clips)
         clips_io.save_clips(config.out, clips)
         print(describe(clips, config.out))
     print(f"took     {time.time() - start:.1f} s")

@@ -31,7 +31,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxmotion.data.clips import Clips
+from jaxmotion.data import selection
+from jaxmotion.data.clips import Clips, take_clips
 from jaxmotion.motion.skeleton import Motion, Skeleton
 
 _WORLD = np.array([-1.0, 1.0, 1.0])
@@ -51,7 +52,7 @@ _SIDE_PATTERNS = (
         re.IGNORECASE,
     ),
     re.compile(r"(?:^|(?<=[_\-.: ]))[lr](?=$|[_\-.: ])", re.IGNORECASE),
-    re.compile(r"^[lrLR](?=[A-Z])"),
+    re.compile(r"^(?:[lr](?=[A-Z])|[LR](?=[A-Z][a-z]))"),
     re.compile(r"(?<=[a-z])[LR]$"),
 )
 
@@ -101,6 +102,9 @@ def _partners(
     else:
         for joint, name in enumerate(names):
             other = swap_sides(name)
+            # LHAND, too; but a label RUN is none of LUN's.
+            if other == name and name[:1] in ("L", "R"):
+                other = "RL"["LR".index(name[0])] + name[1:]
             if other in names:
                 partner[joint] = names.index(other)
             elif _SIDE_PATTERNS[0].search(name):
@@ -234,9 +238,9 @@ def mirror(
 def mirror_clips(clips: Clips, *, plan: MirrorPlan | None = None) -> Clips:
     """Mirror images of all clips, named "<name>_mirrored", with swapped labels.
 
-    A swapped label that is new to its field is added to the field's names. The plan is
-    by default worked out from the skeleton and all frames; raises what `mirror_plan`
-    does.
+    The image of such an image has the name without it. A swapped label that is new to
+    its field is added to the field's names. The plan is by default worked out from the
+    skeleton and all frames; raises what `mirror_plan` does.
     """
     motion = Motion(
         root_position=clips.root_position,
@@ -258,5 +262,21 @@ def mirror_clips(clips: Clips, *, plan: MirrorPlan | None = None) -> Clips:
         joint_rotation=mirrored.joint_rotation,
         labels=labels,
         label_names=tuple(label_names),
-        clip_names=tuple(f"{name}_mirrored" for name in clips.clip_names),
+        clip_names=tuple(map(_image, clips.clip_names)),
     )
+
+
+def with_mirrored(clips: Clips) -> Clips:
+    """Clips and mirror images of those that have none among them, by their names."""
+    lacking = [i for i, x in enumerate(clips.titles) if _image(x) not in clips.titles]
+    if not lacking:
+        return clips
+    # Clips first, for images may add labels: left of what was only right.
+    part = clips if len(lacking) == clips.num_clips else take_clips(clips, lacking)
+    return selection.concatenate([clips, mirror_clips(part)])
+
+
+def _image(name: str) -> str:
+    """Name of a clip's mirror image."""
+    plain = name.removesuffix("_mirrored")
+    return f"{name}_mirrored" if plain == name else plain

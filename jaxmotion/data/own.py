@@ -235,11 +235,18 @@ def _pieces(
 ) -> list[Motion]:
     """A part of a file, seconds, in pieces of about one length."""
     seconds = len(motion.root_position) / motion.fps
-    if start >= seconds:
+    if start >= seconds or seconds + 1.0 / motion.fps < end < np.inf:
+        until = "on" if end == np.inf else f"to {end:g} s"
         raise ValueError(
-            f"{file}: a part from {start:g} s on, but the file ends at {seconds:.4g} s"
+            f"{file}: a part from {start:g} s {until}, but the file ends at "
+            f"{seconds:.4g} s"
         )
     first, last = (round(x * motion.fps) for x in (start, min(end, seconds)))
+    if last - first < 2:
+        raise ValueError(
+            f"{file}: a part from {start:g} s to {end:g} s has {last - first} frames "
+            f"at {motion.fps:g} per second, expected two or more"
+        )
     count = max(int(np.ceil((last - first) / motion.fps / longest)), 1)
     edges = np.linspace(first, last, count + 1).round().astype(int)
     return [
@@ -282,6 +289,12 @@ def read_labels(name: str, text: str) -> list[tuple[str, float, float, str]]:
             raise ValueError(f"{where} names no {'label' if file else 'file'}")
         if not 0 <= times[0] < times[1]:
             raise ValueError(f"{where}: {times[0]:g} s to {times[1]:g} s is no part")
+        for other, begin, stop, _ in found:
+            if file == other and begin < times[1] and times[0] < stop:
+                raise ValueError(
+                    f"{where}: {times[0]:g} s to {times[1]:g} s is in part that of "
+                    f"another line, {begin:g} s to {stop:g} s"
+                )
         found.append((file, *times, label))
     if not found:
         raise ValueError(f"{name}: no lines after the first")

@@ -1,13 +1,23 @@
 """Parts of clips and clips put together: by label, by chance, one set after another."""
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxmotion.data.clips import Clips, check_skeletons, stretches, take_clips
+
+# What names of clips that show another clip's frames have besides its name.
+_LOOP = re.compile(r"_loop\d+x[\d.]+(?=$|[_@#])")
+_MIRRORED = re.compile(r"_mirrored(?=$|[_@#])")
+
+
+def original(name: str) -> str:
+    """Name of the clip whose frames a mirror image, or a repeated stride, shows."""
+    return _MIRRORED.sub("", _LOOP.sub("", name))
 
 
 def _indices(clips: Clips, field: str, names: Sequence[str]) -> list[int]:
@@ -92,7 +102,9 @@ def split_clips(
 
     Of each label (of `field`) with n clips, round(n * fraction) are held out, but at
     least one stays in the training part and, where n > 1, at least one is held out.
-    Both parts keep the original order; the same seed splits the same clips alike.
+    Mirror images go with their clips and do not count. Repeated strides (of `loops`)
+    are learned from only, and not at all if their clip is held out. Both parts keep the
+    original order; the same seed splits the same clips alike.
 
     `ValueError` if the fraction is out of range, or no label has two clips.
     """
@@ -101,31 +113,55 @@ def split_clips(
     clips.names(field)
     generator = np.random.default_rng(seed)
     labels = np.asarray(clips.labels[field])
+    whole = _originals(clips)
     held_out: list[int] = []
     for label in np.unique(labels):
-        members = np.flatnonzero(labels == label)
-        count = int(np.clip(round(members.size * fraction), 1, members.size - 1))
+        members = whole[labels[whole] == label]
+        count = max(min(max(round(members.size * fraction), 1), members.size - 1), 0)
         held_out += generator.permutation(members)[:count].tolist()
-    train = np.setdiff1d(np.arange(clips.num_clips), held_out)
-    return take_clips(clips, train), take_clips(clips, sorted(held_out))
+    return _parted(clips, np.array(held_out, int))
+
+
+def _originals(clips: Clips) -> Int[np.ndarray, " originals"]:
+    """Clips that show no other one's frames, as do images whose clip is not there."""
+    known = {*clips.titles}
+    found = []
+    for clip, name in enumerate(clips.titles):
+        plain = original(name)
+        if plain == name or (plain not in known and not _LOOP.search(name)):
+            known.add(plain)
+            found.append(clip)
+    return np.array(found, int)
+
+
+def _parted(clips: Clips, held_out: Int[np.ndarray, " held"]) -> tuple[Clips, Clips]:
+    """What is learned from, and what is held out: these and what shows their frames."""
+    names = {original(clips.titles[clip]) for clip in held_out}
+    is_held = np.array([original(name) in names for name in clips.titles])
+    is_held[np.setdiff1d(_originals(clips), held_out)] = False  # of the same name
+    is_loop = np.array([bool(_LOOP.search(name)) for name in clips.titles])
+    train, held = np.flatnonzero(~is_held), np.flatnonzero(is_held & ~is_loop)
+    return take_clips(clips, train), take_clips(clips, held)
 
 
 def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
     """Training clips and those held out by name, both in the original order.
 
-    `ValueError` if a name is unknown, or no clip would be left to train on.
+    Their mirror images are held out with them, their repeated strides are in neither
+    part. `ValueError` if a name is unknown, or no clip would be left to train on.
     """
-    unknown = [name for name in held_out if name not in clips.titles]
+    known = [name for name in clips.titles if not _LOOP.search(name)]
+    unknown = [name for name in held_out if name not in known]
     if unknown:
         raise ValueError(
             f"no clip named {', '.join(map(repr, unknown))}: the clips are "
-            f"{', '.join(clips.titles)}"
+            f"{', '.join(known)}"
         )
-    out = np.isin(np.asarray(clips.titles), held_out)
-    if out.all():
+    names = {original(name) for name in held_out}
+    if names >= {*map(original, clips.titles)}:
         raise ValueError("all clips are held out, expected some to train on")
-    train, rest = np.flatnonzero(~out), np.flatnonzero(out)
-    return take_clips(clips, train), take_clips(clips, rest)
+    held = [i for i in _originals(clips) if original(clips.titles[i]) in names]
+    return _parted(clips, np.array(held, int))
 
 
 def cut(clips: Clips, spans: Sequence[tuple[int, int, int]]) -> Clips:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.data import selection
+from jaxmotion.data import mirror, selection
 from jaxmotion.data.clips import clip_motion, clips_from_motions, take_clips
 from tests.data import samples
 
@@ -171,6 +171,32 @@ def test_split_is_a_stratified_partition(fraction):
     assert sorted(names) == sorted(clips.clip_names)
     count = min(max(round(4 * fraction), 1), 3)
     np.testing.assert_array_equal(np.bincount(held_out.labels["style"]), [count] * 2)
+
+
+def renamed(clips, names):
+    return dataclasses.replace(clips, clip_names=tuple(names))
+
+
+def test_images_and_loops_of_held_out_clips_are_not_learned_from():
+    clips = samples.clips()
+    loops = renamed(clips, [f"{name}_loop3x1.12" for name in clips.clip_names])
+    plain = selection.split_clips(clips, fraction=0.3, seed=3)
+    more = mirror.with_mirrored(selection.concatenate([clips, loops]))
+    assert more.num_clips == 4 * clips.num_clips
+    by_name = selection.split_by_name(more, ("clip5", "clip2_mirrored"))
+    by_chance = selection.split_clips(more, fraction=0.3, seed=3)
+    for held, split in (
+        (("clip2", "clip5"), by_name),
+        (plain[1].clip_names, by_chance),
+    ):
+        images = [f"{name}_mirrored" for name in held]
+        assert sorted(split[1].clip_names) == sorted([*held, *images])
+        assert not {*held} & {selection.original(x) for x in split[0].clip_names}
+        assert split[0].num_clips == 4 * (clips.num_clips - len(held))
+    cut = selection.cut(more, [(0, 1, 3), (17, 1, 3)])
+    assert [*map(selection.original, cut.clip_names)] == ["clip0@1+3", "clip1@1+3"]
+    with pytest.raises(ValueError, match="no clip named 'clip0_loop3x1.12'"):
+        selection.split_by_name(more, ("clip0_loop3x1.12",))
 
 
 def test_split_depends_on_the_seed_only():

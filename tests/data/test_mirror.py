@@ -1,4 +1,5 @@
 import dataclasses
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxmotion.data import mirror
+from jaxmotion.data.clips import take_clips
 from jaxmotion.motion import skeleton as skeletons
 from tests import tiny
 from tests.data import samples
@@ -163,5 +165,35 @@ def test_mirrored_clips_swap_labels_and_get_names():
         found.root_position, np.asarray(clips.root_position) * [-1, 1, 1]
     )
     again = mirror.mirror_clips(found)
+    assert again.clip_names == clips.clip_names
     np.testing.assert_array_equal(again.joint_rotation, clips.joint_rotation)
     np.testing.assert_array_equal(again.labels["content"], clips.labels["content"])
+
+
+def test_only_clips_without_an_image_get_one():
+    clips = samples.clips()
+    both = mirror.with_mirrored(clips)
+    assert both.num_clips == 2 * clips.num_clips
+    assert mirror.with_mirrored(both) is both
+    some = take_clips(both, [0, 1, 8, 10])  # 0 has its image, 2 is one without a clip
+    found = mirror.with_mirrored(some)
+    assert found.clip_names[4:] == ("clip1_mirrored", "clip2")
+    np.testing.assert_array_equal(
+        found.root_position[found.offsets[5] :],
+        clips.root_position[clips.offsets[2] : clips.offsets[3]],
+    )
+
+
+@pytest.mark.parametrize(
+    "name, other",
+    [("RUN", "RUN"), ("LIMP", "LIMP"), ("LHip", "RHip"), ("rKnee", "lKnee")],
+)
+def test_words_in_capitals_name_no_side(name, other):
+    assert mirror.swap_sides(name) == other
+
+
+def test_joints_in_capitals_are_partners():
+    base = samples.skeleton()
+    names = [re.sub("^(L|R)(?:eft|ight)(.*)", r"\1\2", x).upper() for x in base.names]
+    plan = mirror.mirror_plan(dataclasses.replace(base, names=tuple(names)))
+    assert plan.partner == mirror.mirror_plan(base).partner

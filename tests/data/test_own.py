@@ -156,6 +156,10 @@ def test_files_of_several_skeletons_are_refused():
         ("file,start,end,label\na,x,1,w\n", "line 2: start 'x' .* expected seconds"),
         ("file,start,end,label\na,2,1,w\n", "line 2: 2 s to 1 s is no part"),
         ("file,start,end,label\na,0,1,\n", "line 2 names no label"),
+        (
+            "file,start,end,label\na,0,2,w\nb,1,3,w\na,1,,w\n",
+            "line 4: 1 s to inf s is in part that of another line, 0 s to 2 s",
+        ),
     ],
 )
 def test_a_bad_line_of_a_table_is_named(text, message):
@@ -165,7 +169,9 @@ def test_a_bad_line_of_a_table_is_named(text, message):
 
 def test_parts_that_are_not_there_are_named():
     for row, message in (
-        (("a", 9.0, 10.0, "w"), r"a\.bvh: a part from 9 s on, but the file ends at"),
+        (("a", 9.0, np.inf, "w"), r"a\.bvh: a part from 9 s on, but the file ends at"),
+        (("a", 0.2, 10.0, "w"), r"a\.bvh: a part from 0.2 s to 10 s, but the file"),
+        (("a", 0.2, 0.21, "w"), "from 0.2 s to 0.21 s has 0 frames at 30 per second"),
         (("z.bvh", 0.0, 1.0, "w"), "a file 'z.bvh', which is not there"),
     ):
         table = [("a", 0.0, 0.2, "w"), row]

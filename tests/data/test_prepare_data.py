@@ -169,3 +169,27 @@ def test_a_full_disk_under_a_builder_is_one_line_and_leaves_nothing(tmp_path):
     assert status == 1 and "\n" not in line
     assert line.startswith(f"error: cannot write {out.parent}/tfds/lafan1/1.0.0: ")
     assert not [path for path in out.parent.rglob("*") if path.is_file()]
+
+
+def test_what_has_no_frames_is_made_at_the_rate_that_is_asked_for(
+    script, tmp_path, monkeypatch
+):
+    """Generated walks and curves of FBX: in-between frames are computed, not mixed."""
+    rates = []
+
+    def made(**options):
+        rates.append(options["fps"])
+        raise ValueError("enough")
+
+    monkeypatch.setattr("jaxmotion.data.procedural.make_clips", made)
+    monkeypatch.setattr("jaxmotion.data.fbx.read_fbx", lambda *_, **x: made(**x))
+    (tmp_path / "take.fbx").write_bytes(b"")
+    for source in ("procedural", "fbx"):
+        folder = tmp_path if source == "fbx" else None
+        for fps in (60.0, None):
+            config = script.Config(
+                source=source, out=tmp_path / "x.npz", manual_dir=folder, fps=fps
+            )
+            with pytest.raises(ValueError, match="enough"):
+                script.prepare(config)
+    assert rates == [60.0, 30.0] * 2

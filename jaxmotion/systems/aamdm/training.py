@@ -108,7 +108,7 @@ def prepare(
         if labels:
             clips = selection.select(clips, field, labels)
         if mirrored:
-            clips = selection.concatenate([clips, mirror.mirror_clips(clips)])
+            clips = mirror.with_mirrored(clips)
         frames, names = aamdm_data.pose_data(clips, fps=fps)
         skipped = sorted(set(clips.clip_names) - set(names))
         print(f"{len(names)} clips, {frames.num_frames} frames; too short: {skipped}")

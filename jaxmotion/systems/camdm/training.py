@@ -271,7 +271,7 @@ def prepare(
 
     def content() -> runs.Content:
         parts = _splitter(chosen)(data)
-        model = make(with_mirrored(parts[0]) if mirrored else parts[0])
+        model = make(mirror.with_mirrored(parts[0]) if mirrored else parts[0])
         camdm_model.check_clips(model, parts[0], label)
         return runs.Content(
             model=to_json(model),
@@ -291,12 +291,6 @@ def prepare(
     )
 
 
-def with_mirrored(clips: Clips) -> Clips:
-    """Clips and their mirrored copies."""
-    # First, for it may add labels: left of what was only right.
-    return selection.concatenate([clips, mirror.mirror_clips(clips)])
-
-
 def training_windows(
     run: runs.Run, config: camdm_model.Config
 ) -> tuple[Clips, windows.WindowIndex]:
@@ -306,7 +300,7 @@ def training_windows(
     """
     clips = clips_io.load_clips(run.file(_FILES[0]))
     if run.settings["mirror"]:
-        clips = with_mirrored(clips)
+        clips = mirror.with_mirrored(clips)
     index = windows.window_index(clips, config.window, short="skip")
     if power := run.settings["balance"]:
         last = config.past - 1

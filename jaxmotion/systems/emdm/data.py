@@ -206,8 +206,7 @@ def prepare(
         print(f"{field}s left out: {', '.join(left_out) or 'none'}")
         parts = selection.split_clips(clips, fraction=held_out, seed=0, field=field)
         if mirrored:
-            both = [parts[0], mirror.mirror_clips(parts[0])]
-            parts = (selection.concatenate(both), parts[1])
+            parts = (mirror.with_mirrored(parts[0]), parts[1])
         fitted = _fit(parts[0], action_arrays(parts[0], field=field, frames=frames))
         return runs.Content(
             model={

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmotion.data import windows
 from jaxmotion.data.ball_clips import BallClips, cut_scene, take_ball_clips
-from jaxmotion.data.selection import label_speeds
+from jaxmotion.data.selection import label_speeds, original
 from jaxmotion.motion.ball import Scene
 from jaxmotion.systems.smgdiff import scene as smgdiff_scene
 from jaxmotion.typing import Key
@@ -28,7 +28,7 @@ class SceneArrays:
 
 
 def _recording(name: str) -> str:
-    return re.split("[@#]", name, maxsplit=1)[0].removesuffix("_mirrored")
+    return re.split("[@#]", original(name), maxsplit=1)[0]
 
 
 def split(
