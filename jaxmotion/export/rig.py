@@ -12,6 +12,7 @@ import binascii
 import copy
 import dataclasses
 import json
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,14 @@ from jaxmotion.retarget.transfer import Rest
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _FLOAT = 5126
+# What pictures begin with.
+_IMAGES = {
+    "image/png": rb"\x89PNG\r\n\x1a\n",
+    "image/jpeg": rb"\xff\xd8\xff",
+    "image/webp": rb"RIFF....WEBP",
+    "image/ktx2": rb"\xabKTX 20\xbb",
+    "image/vnd-ms.dds": rb"DDS ",
+}
 MESHOPT = "EXT_meshopt_compression"
 _MAX_NODES = 20_000
 
@@ -108,25 +117,15 @@ def index(name: str, value: Any, count: int, what: str) -> int:
     return value
 
 
-def _one_buffer(path: Path, content: dict, data: bytes) -> bytes:
+def _one_buffer(name: str, content: dict, data: bytes) -> bytes:
     """All buffers as one, to which the views in `content` are made to point."""
-    name, starts, whole = str(path), [], bytearray()
+    starts, whole = [], bytearray()
     for number, buffer in enumerate(objects(name, content, "buffers")):
         uri = buffer.get("uri")
         if uri is None:
             found = data
-        elif not isinstance(uri, str):
-            raise ValueError(f"{name}: uri of buffer {number} is no text")
-        elif uri.startswith("data:"):
-            try:
-                found = base64.b64decode(uri.partition(",")[2], validate=True)
-            except (ValueError, binascii.Error):
-                raise ValueError(f"{name}: buffer {number} is no base64") from None
         else:
-            beside = Path(unquote(uri))
-            if beside.is_absolute() or ".." in beside.parts or ":" in uri:
-                raise ValueError(f"{name}: buffer {number} is outside of its folder")
-            found = files.read_bytes(path.parent / beside)
+            found = linked(name, uri, f"buffer {number}")
         size = buffer.get("byteLength")
         if type(size) is not int or not 0 <= size <= len(found):
             raise ValueError(
@@ -143,6 +142,21 @@ def _one_buffer(path: Path, content: dict, data: bytes) -> bytes:
         view |= {"buffer": 0, "byteOffset": offset + starts[which]}
     content["buffers"] = [{"byteLength": len(whole)}]
     return bytes(whole)
+
+
+def linked(name: str, uri: Any, what: str) -> bytes:
+    """What a uri of the file holds: base64, or the name of a file in its folder."""
+    if not isinstance(uri, str):
+        raise ValueError(f"{name}: uri of {what} is no text")
+    if uri.startswith("data:"):
+        try:
+            return base64.b64decode(uri.partition(",")[2], validate=True)
+        except (ValueError, binascii.Error):
+            raise ValueError(f"{name}: {what} is no base64") from None
+    beside = Path(unquote(uri))
+    if beside.is_absolute() or ".." in beside.parts or ":" in uri:
+        raise ValueError(f"{name}: {what} is outside of its folder")
+    return files.read_bytes(Path(name).parent / beside)
 
 
 def array(name: str, content: dict, data: bytes, number: Any) -> np.ndarray:
@@ -331,7 +345,7 @@ def read_rig(path: str | Path) -> Rig:
     needed = content.get("extensionsRequired")
     if isinstance(needed, list) and MESHOPT in needed:  # packs bind matrices, too
         raise ValueError(f"{name}: {MESHOPT}: expected a file that is not packed")
-    data = _one_buffer(path, content, data)
+    data = _one_buffer(name, content, data)
     nodes = objects(name, content, "nodes")
     objects(name, content, "accessors")
     if len(nodes) > _MAX_NODES:
@@ -445,7 +459,10 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def to_glb(rig: Rig, motion: Motion) -> bytes:
-    """The rig's own file with one animation of one character, in place of its own."""
+    """The rig's own file with one animation of one character, in place of its own.
+
+    Pictures that lie beside the rig are packed into it.
+    """
     positions, turned = kinematics(rig.skeleton, motion)
     if not np.isfinite(positions).all() or not np.isfinite(turned).all():
         bad = ~np.isfinite(positions).all(axis=(1, 2))
@@ -455,20 +472,32 @@ def to_glb(rig: Rig, motion: Motion) -> bytes:
     views = content.setdefault("bufferViews", [])
     accessors = content.setdefault("accessors", [])
 
-    def add(values: np.ndarray, kind: str, *, ends: bool = False) -> int:
+    def packed(content: bytes) -> int:
         data.extend(b"\0" * (-len(data) % 4))
-        packed = np.ascontiguousarray(values, "<f4")
-        view = {"buffer": 0, "byteOffset": len(data), "byteLength": packed.nbytes}
+        view = {"buffer": 0, "byteOffset": len(data), "byteLength": len(content)}
         views.append(view)
-        data.extend(packed.tobytes())
+        data.extend(content)
+        return len(views) - 1
+
+    for number, image in enumerate(objects(rig.name, content, "images")):
+        uri = image.get("uri")
+        if uri is not None and not str(uri).startswith("data:"):
+            found = linked(rig.name, image.pop("uri"), f"image {number}")
+            image |= {
+                "bufferView": packed(found),
+                "mimeType": _kind(rig.name, found, number),
+            }
+
+    def add(values: np.ndarray, kind: str, *, ends: bool = False) -> int:
         accessor = {
-            "bufferView": len(views) - 1,
+            "bufferView": packed(np.ascontiguousarray(values, "<f4").tobytes()),
             "componentType": _FLOAT,
-            "count": len(packed),
+            "count": len(values),
             "type": kind,
         }
         if ends:
-            accessor |= {"min": [float(packed[0])], "max": [float(packed[-1])]}
+            first, last = np.float32(values[[0, -1]]).tolist()
+            accessor |= {"min": [first], "max": [last]}
         accessors.append(accessor)
         return len(accessors) - 1
 
@@ -502,6 +531,17 @@ def to_glb(rig: Rig, motion: Motion) -> bytes:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _kind(name: str, image: bytes, number: int) -> str:
+    """Media type of an image's file, which a .glb must state."""
+    for kind, begin in _IMAGES.items():
+        if re.match(begin, image, re.DOTALL):
+            return kind
+    raise ValueError(
+        f"{name}: image {number} is of an unknown kind, expected one of "
+        f"{', '.join(_IMAGES)}"
+    )
 
 
 def _plain(node: dict) -> None:

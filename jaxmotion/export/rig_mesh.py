@@ -6,19 +6,14 @@ no skin but hangs on a joint follows that joint.
 Source: glTF 2.0 specification (Khronos), sections 3.7, 3.8 and 3.9.
 """
 
-import base64
-import binascii
 import dataclasses
-from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion import files
 from jaxmotion.export import rig as rigging
-from jaxmotion.export.rig import Rig, array, index, numbers, objects
+from jaxmotion.export.rig import Rig, array, index, linked, numbers, objects
 from jaxmotion.viz import packed
 
 _TRIANGLES = 4
@@ -77,16 +72,8 @@ def _bytes(rig: Rig, number: int) -> bytes | None:
         if type(size) is not int or not 0 <= size <= len(rig.data) - start:
             raise ValueError(f"{rig.name}: image {number} ends beyond the buffer")
         found = rig.data[start : start + size]
-    elif isinstance(uri, str) and uri.startswith("data:"):
-        try:
-            found = base64.b64decode(uri.partition(",")[2], validate=True)
-        except (ValueError, binascii.Error):
-            raise ValueError(f"{rig.name}: image {number} is no base64") from None
-    elif isinstance(uri, str):
-        beside = Path(unquote(uri))
-        if beside.is_absolute() or ".." in beside.parts or ":" in uri:
-            raise ValueError(f"{rig.name}: image {number} is outside of its folder")
-        found = files.read_bytes(Path(rig.name).parent / beside)
+    elif uri is not None:
+        found = linked(rig.name, uri, f"image {number}")
     else:
         raise ValueError(f"{rig.name}: image {number} has neither a view nor a uri")
     known = found[:8] == b"\x89PNG\r\n\x1a\n" or found[:3] == b"\xff\xd8\xff"

@@ -6,6 +6,7 @@ Namco, O3DE, 3ds Max, links of Unitree's robots), and where those say nothing, o
 shape: chains that leave the trunk, sides, heights. A few lines of JSON say otherwise.
 """
 
+import itertools
 import json
 import re
 from collections.abc import Mapping
@@ -222,9 +223,20 @@ def find_roles(
         )
     legs = [found[side + "UpperLeg"] for side in (LEFT, RIGHT)]
     arms = [found[side + "UpperArm"] for side in (LEFT, RIGHT)]
-    for role, joints in (("hips", legs), ("chest", arms)):
-        if role not in told:
-            found[role] = _lowest_common(skeleton, joints)
+    # Of the trunk, too: legs may hang on a pelvis beside the spine, and arms likewise.
+    top = [found[role] for role in ("head", "neck") if role in found][:1]
+    if "chest" not in told:
+        found["chest"] = _lowest_common(skeleton, [*arms, *top])
+    if "hips" not in told:
+        found["hips"] = _lowest_common(skeleton, [*legs, found["chest"]])
+    trunk = [found["hips"], found["chest"], *top]
+    for lower, upper in itertools.pairwise(trunk):
+        if lower not in anatomy.chain(skeleton.parents, upper):
+            raise ValueError(
+                f"no person: {skeleton.names[upper]!r} is not above the "
+                f"{'hips' if lower == found['hips'] else 'chest'} "
+                f"({skeleton.names[lower]!r})"
+            )
     return {role: skeleton.names[found[role]] for role in ROLES if role in found}
 
 
@@ -259,6 +271,10 @@ def anatomy_of(skeleton: Skeleton, roles: Mapping[str, str]) -> Anatomy:
         for side in (LEFT, RIGHT):
             upper, middle, end = (index[side + part] for part in parts)
             before = [j for j in anatomy.chain(parents, upper) if j not in trunk][:-1]
+            across = anatomy.chain(
+                parents, index[(RIGHT if side == LEFT else LEFT) + parts[0]]
+            )
+            own = [j for j in (*before, upper) if j not in across]
             after = [index[side + "Toes"]] if side + "Toes" in index else []
             made[kind].append(
                 Limb(
@@ -271,7 +287,7 @@ def anatomy_of(skeleton: Skeleton, roles: Mapping[str, str]) -> Anatomy:
                 )
             )
             for j in range(len(parents)):
-                if (*before, upper)[0] in anatomy.chain(parents, j):
+                if own and own[0] in anatomy.chain(parents, j):
                     sides[j] = side
     places = anatomy.zero_pose(skeleton)
     feet = np.mean([places[leg.end] for leg in made["legs"]], axis=0)

@@ -21,6 +21,7 @@ of two bones within reach is met exactly.
 
 import dataclasses
 import functools
+import math
 import operator
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -46,7 +47,7 @@ _REACH, _PULL = 0.9999, 0.005
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Rest:
-    """A skeleton in its T-pose, and what its joints are.
+    """A skeleton in its T-pose, and what its joints are; equal if all values are.
 
     Attributes:
       places: [J, 3] the root at the origin.
@@ -60,6 +61,22 @@ class Rest:
     places: np.ndarray
     turns: np.ndarray
     sole: float
+
+    @functools.cached_property
+    def _value(self) -> tuple[Any, ...]:
+        bones = self.skeleton
+        arrays = (bones.offsets, self.places, self.turns)
+        return (
+            (bones.names, bones.parents, self.anatomy, self.sole),
+            tuple(sorted(self.roles.items())),
+            tuple(np.asarray(x).tobytes() for x in arrays),
+        )
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Rest) and self._value == other._value
+
+    def __hash__(self) -> int:
+        return hash(self._value)
 
     def joint(self, role: str) -> int | None:
         """Index of a role's joint; None where it has none."""
@@ -299,11 +316,12 @@ def two_bones(
     return start + a * (cosine * along + sine * _unit(aside))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class Retarget:
     """Motions of the source to motions of the target; see the module.
 
-    A pure function, one program per shape; it may be jitted and vmapped with more.
+    A pure function that may be jitted and vmapped with more. By itself it is one
+    program per pair of skeletons and power of two of frames, which are filled up.
     """
 
     source: Rest
@@ -334,20 +352,22 @@ class Retarget:
         joint_rotation: Float[Array, "*batch source 6"],
     ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch target 6"]]:
         """Root positions and local rotations of the target, as `Motion` has them."""
-        return self._program(root_position, joint_rotation)
-
-    @functools.cached_property
-    def _program(self) -> Callable[[Array, Array], tuple[Array, Array]]:
-        # Reshapes inside: outside, each would cost as much as the rest.
-        def pose(root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
-            batch = root_position.shape[:-1]
-            root, turns = self._many(
-                root_position.reshape(-1, 3),
-                joint_rotation.reshape(-1, *joint_rotation.shape[-2:]),
+        given = (root_position, joint_rotation)
+        batch = np.shape(root_position)[:-1]
+        number = math.prod(batch)
+        missing = (1 << max(number - 1, 0).bit_length()) - number
+        if missing <= 0 or any(isinstance(x, jax.core.Tracer) for x in given):
+            return _program(self)(*given)
+        padded = (
+            jnp.pad(
+                jnp.reshape(x, (number, *np.shape(x)[len(batch) :])),
+                ((0, missing), *((0, 0),) * (np.ndim(x) - len(batch))),
+                mode="edge",
             )
-            return root.reshape(*batch, 3), turns.reshape(*batch, *turns.shape[1:])
-
-        return jax.jit(pose)
+            for x in given
+        )
+        root, turns = (x[:number] for x in _program(self)(*padded))
+        return root.reshape(*batch, 3), turns.reshape(*batch, *turns.shape[1:])
 
     def _many(self, root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
         """Of many characters, one frame each."""
@@ -649,6 +669,23 @@ def page_json(source: Rest) -> dict[str, Any]:
     numbers = {"ankle": _ANKLE, "leg": _LEG, "heel": _HEEL, "sole": anatomy.SOLE}
     numbers |= {"reach": _REACH, "pull": _PULL}
     return {"source": person, "tables": names.tables(), "numbers": numbers}
+
+
+# Of values, so that a rig that is read again has a program; one is a megabyte.
+@functools.lru_cache(maxsize=16)
+def _program(
+    function: Retarget,
+) -> Callable[[Array, Array], tuple[Array, Array]]:
+    # Reshapes inside: outside, each would cost as much as the rest.
+    def pose(root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
+        batch = root_position.shape[:-1]
+        root, turns = function._many(
+            root_position.reshape(-1, 3),
+            joint_rotation.reshape(-1, *joint_rotation.shape[-2:]),
+        )
+        return root.reshape(*batch, 3), turns.reshape(*batch, *turns.shape[1:])
+
+    return jax.jit(pose)
 
 
 def retarget(

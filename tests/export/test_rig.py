@@ -131,6 +131,44 @@ def test_a_gltf_with_a_buffer_beside_it_and_a_vrm_are_rigs(hero, tmp_path):
     np.testing.assert_array_equal(found.skeleton.offsets, plain.skeleton.offsets)
 
 
+def test_pictures_beside_a_gltf_are_packed_into_what_is_saved(hero, tmp_path):
+    beside = tmp_path / "hero"
+    (beside / "skins").mkdir(parents=True)
+    pictures = {
+        "skins/a skin.png": (b"\x89PNG\r\n\x1a\n-", "image/png"),
+        "b.webp": (b"RIFF\0\n\0\0WEBPVP8", "image/webp"),
+    }
+    content, data = rigs.split(hero.read_bytes())
+    (beside / "hero.bin").write_bytes(data)
+    content["buffers"] = [{"uri": "hero.bin", "byteLength": len(data)}]
+    content["images"] = [{"uri": "data:image/png;base64,AA=="}]
+    for name, (picture, _) in pictures.items():
+        (beside / name).write_bytes(picture)
+        content["images"].append({"uri": name.replace(" ", "%20"), "name": name})
+    (beside / "hero.gltf").write_text(json.dumps(content))
+    skeleton, motion = samples.person(seconds=0.3)
+    save = lambda: jm.save(  # noqa: E731
+        tmp_path / "walk.glb", skeleton, motion, onto=beside / "hero.gltf"
+    )
+    save()
+    made, packed = rigs.split((tmp_path / "walk.glb").read_bytes())
+    assert made["images"][0] == content["images"][0]
+    for image, (name, (picture, kind)) in zip(
+        made["images"][1:], pictures.items(), strict=True
+    ):
+        view = made["bufferViews"][image["bufferView"]]
+        start = view["byteOffset"]
+        assert bytes(packed[start : start + view["byteLength"]]) == picture
+        assert image == {
+            "name": name,
+            "bufferView": image["bufferView"],
+            "mimeType": kind,
+        }
+    (beside / "b.webp").write_bytes(b"GIF89a")
+    with pytest.raises(ValueError, match="image 2 is of an unknown kind, expected one"):
+        save()
+
+
 @pytest.mark.parametrize("version", ["VRMC_vrm", "VRM"])
 @pytest.mark.parametrize("skin", mostly_slow([True, False], [False]))
 def test_a_vrm_says_which_joint_is_which(version, skin, hero, tmp_path):

@@ -255,6 +255,30 @@ def plain(offsets, parents, words):
     )
 
 
+def forked(name="child", convention="Unreal"):
+    """A person whose legs and arms hang on joints beside the spine, and `person`'s own.
+
+    So are those of Character Creator and Daz; the joints are at their parents' places.
+    """
+    base = person(name, convention)
+    words = ("CC_Base_Hip", *base.names[1:], base.names[0], "CC_Base_Shoulders")
+    parents, offsets = list(base.parents), np.asarray(base.offsets).tolist()
+    found = anatomy.find_anatomy(base)
+    for limbs in (found.legs, found.arms):
+        up = parents[limbs[0].first]
+        for limb in limbs:
+            parents[limb.first] = len(parents)
+        parents.append(up)
+        offsets.append([0.0, 0.0, 0.0])
+    tree = tuple(parents)
+    order = sorted(range(len(tree)), key=lambda j: len(anatomy.chain(tree, j)))
+    return base, plain(
+        [offsets[j] for j in order],
+        [order.index(parents[j]) if parents[j] >= 0 else -1 for j in order],
+        tuple(words[j] for j in order),
+    )
+
+
 def vrm(raw, version="VRMC_vrm", *, skin=True):
     """A .glb as a VRM whose joints' names say nothing: its extension says all.
 

@@ -167,6 +167,30 @@ def test_it_is_jitted_and_mapped_over_characters_and_frames():
     np.testing.assert_allclose(one[1], whole.joint_rotation[7], atol=2e-5)
 
 
+def test_other_clips_and_rigs_read_again_compile_nothing(monkeypatch):
+    traced = []
+    many = transfer.Retarget._many
+    monkeypatch.setattr(
+        transfer.Retarget,
+        "_many",
+        lambda self, *given: traced.append(given) or many(self, *given),
+    )
+    skeleton, motion = walk(1.0)
+    for frames in (30, 17, 29):  # filled up to 32
+        part = dataclasses.replace(
+            motion,
+            root_position=motion.root_position[:frames],
+            joint_rotation=motion.joint_rotation[:frames],
+        )
+        function = jm.retarget(skeleton, rigs.person("long arms", "Unreal"))
+        found = function(part)
+        assert found.joint_rotation.shape[:-1] == (frames, skeleton.num_joints)
+    assert len(traced) == 1
+    whole = jax.jit(function.__call__)(motion)
+    np.testing.assert_allclose(found.root_position, whole.root_position[:29], atol=1e-6)
+    assert function != jm.retarget(skeleton, rigs.person("giant", "Unreal"))
+
+
 def test_spines_of_other_numbers_of_joints_turn_as_far():
     skeleton, motion = walk(0.5)
     base = rigs.walker()
@@ -244,6 +268,32 @@ def test_a_root_above_the_hips_is_only_moved():
     )
     expected = np.tile([1.0, 0, 0, 0, 1, 0], (len(made.root_position), 1))
     np.testing.assert_allclose(made.joint_rotation[:, 0], expected, atol=1e-6)
+
+
+def test_limbs_may_hang_on_joints_beside_the_spine():
+    base, forked = rigs.forked()
+    skeleton, motion = walk(0.5)
+    function, plain = jm.retarget(skeleton, forked), jm.retarget(skeleton, base)
+    roles = function.target.roles
+    assert (roles["hips"], roles["chest"]) == (
+        "CC_Base_Hip",
+        plain.target.roles["chest"],
+    )
+    sides = dict(zip(forked.names, function.target.anatomy.sides, strict=True))
+    assert sides["thigh_l"] == "left" and sides["hand_r"] == "right"
+    assert sides["pelvis"] == sides["CC_Base_Shoulders"] == "middle"
+    columns = [forked.index(name) for name in base.names[1:]]
+    np.testing.assert_allclose(
+        places(forked, function(motion))[:, columns],
+        places(base, plain(motion))[:, 1:],
+        atol=1e-4,
+    )
+    for role, joint, line in (
+        ("hips", "pelvis", r"'spine_\d+' is not above the hips \('pelvis'\)"),
+        ("chest", "CC_Base_Shoulders", r"'head' is not above the chest \('CC_Base_S"),
+    ):
+        with pytest.raises(ValueError, match=line):
+            jm.retarget(skeleton, forked, roles={role: joint})
 
 
 def test_bad_bones_are_named():

@@ -60,6 +60,7 @@ RIGS = {
     "an Unreal giant": lambda: rigs.glb(
         rigs.person("giant", "Unreal"), unit=1.0, seed=3
     ),
+    "limbs beside the spine": lambda: rigs.glb(rigs.forked()[1]),
     "VRM 1": lambda: rigs.vrm(rigs.glb(rigs.person("child"))),
     "VRM 0": lambda: rigs.vrm(rigs.glb(rigs.person("child")), "VRM"),
     "a VRM without a skin": lambda: rigs.vrm(

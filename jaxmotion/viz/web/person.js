@@ -91,11 +91,20 @@ export function findRoles(tables, skeleton, told = {}) {
     throw new Error(`no person: missing ${lack}; found ${listed(have) || "nothing"} among `
       + `the joints ${listed(names)}`);
   }
-  for (const [role, part] of [["hips", "UpperLeg"], ["chest", "UpperArm"]]) {
-    if (role in told) continue;
-    const [a, b] = SIDES.map(side => chain(parents, found[side + part]));
-    found[role] = a.filter(j => b.includes(j)).pop();
-  }
+  // Of the trunk, too: legs may hang on a pelvis beside the spine, and arms likewise.
+  const top = ["head", "neck"].filter(role => role in found).map(role => found[role]).slice(0, 1);
+  const lowest = joints => {
+    const [first, ...others] = joints.map(j => chain(parents, j));
+    return first.filter(j => others.every(one => one.includes(j))).pop();
+  };
+  const both = part => SIDES.map(side => found[side + part]);
+  if (!("chest" in told)) found.chest = lowest([...both("UpperArm"), ...top]);
+  if (!("hips" in told)) found.hips = lowest([...both("UpperLeg"), found.chest]);
+  const trunk = [found.hips, found.chest, ...top];
+  for (let i = 1; i < trunk.length; i++)
+    if (!chain(parents, trunk[i]).includes(trunk[i - 1]))
+      throw new Error(`no person: '${names[trunk[i]]}' is not above the `
+        + `${i === 1 ? "hips" : "chest"} ('${names[trunk[i - 1]]}')`);
   return found;
 }
 
