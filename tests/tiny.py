@@ -4,6 +4,7 @@ Made in code with NumPy, so that tests (and the processes they start) need no da
 nothing of the package's own generator.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -31,6 +32,20 @@ def float32(x) -> jax.Array:
     A copy: `device_put` may go on with the memory that it is given.
     """
     return jax.device_put(np.array(x, np.float32))
+
+
+def upturned(motion: Motion, *, seed: int = 0) -> Motion:
+    """With all joints turned by a quarter about x, between turns about z and y.
+
+    There, angles in the order of many BVH files are not unique.
+    """
+    shape = motion.joint_rotation.shape[:-1]
+    generator = np.random.default_rng(seed)
+    z, y = generator.uniform(-np.pi, np.pi, (2, *shape))
+    sign = generator.choice([-1.0, 1.0], shape)
+    spin = _yaw(z)[..., [2, 0, 1], :][..., [2, 0, 1]]  # about z
+    turns = spin @ _pitch(sign * np.pi / 2) @ _yaw(y)
+    return dataclasses.replace(motion, joint_rotation=float32(_columns(turns)))
 
 
 def skeleton() -> Skeleton:

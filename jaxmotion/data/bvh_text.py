@@ -363,8 +363,9 @@ def _joint_lines(bvh: Bvh) -> tuple[list[str], list[int]]:
         indent = "\t" * min(depth, 64)
         kind = "ROOT" if bvh.parents[joint] < 0 else "JOINT"
         channels = bvh.channels[joint]
+        title = re.sub(r"[{}\r\n]+", "_", bvh.names[joint])  # what ends a name
         lines += [
-            f"{indent}{kind} {bvh.names[joint]}",
+            f"{indent}{kind} {title}",
             f"{indent}{{",
             f"{indent}\tOFFSET {_numbers(bvh.offsets[joint])}",
             " ".join([f"{indent}\tCHANNELS", str(len(channels)), *channels]),

@@ -68,9 +68,13 @@ def play(folder: Path, about: dict, label: int) -> tuple[np.ndarray, np.ndarray]
 def bvh(skeleton: dict, fps: float, roots: np.ndarray, rotations: np.ndarray) -> str:
     """Text of a BVH file, in centimeters; angles about z, x and y."""
     x, y = rotations[..., :3], rotations[..., 3:]  # columns of the matrices
-    about_z = np.arctan2(-y[..., 0], y[..., 1])
-    about_x = np.arcsin(np.clip(y[..., 2], -1, 1))
-    about_y = np.arctan2(-x[..., 2], np.cross(x, y)[..., 2])
+    cosine = np.hypot(y[..., 0], y[..., 1])
+    locked = cosine < 1e-6  # a quarter turn about x: those about z and y are one
+    about_z = np.where(
+        locked, np.arctan2(x[..., 1], x[..., 0]), np.arctan2(-y[..., 0], y[..., 1])
+    )
+    about_x = np.arctan2(y[..., 2], cosine)
+    about_y = np.where(locked, 0, np.arctan2(-x[..., 2], np.cross(x, y)[..., 2]))
     angles = np.degrees(np.stack([about_z, about_x, about_y], axis=-1))
     lines, order, parents = ["HIERARCHY"], [], skeleton["parents"]
 

@@ -1,3 +1,4 @@
+import dataclasses
 import io
 import itertools
 import os
@@ -333,6 +334,12 @@ def test_rates_that_are_not_whole_survive(fps):
     # As far as anybody can tell, 0.016 is one of 60.
     for time, decimals, meant in ((0.016, 3, 60.0), (0.016, 6, 62.5), (0.0333, 4, 30)):
         assert bvh.frame_rate(time, decimals) == pytest.approx(meant)
+
+
+def test_names_end_where_others_read_them():
+    named = dataclasses.replace(chain(3), names=("Hips", "Spine {1}", "a\nb"))
+    found = bvh_text.parse_bvh(format_bvh(named))
+    assert found.names == ("Hips", "Spine _1_", "a_b")
 
 
 def test_long_chains_are_written_and_read():

@@ -78,11 +78,11 @@ def test_the_players_bvh_is_the_motion():
     pytest.importorskip("onnxruntime")
     from jaxmotion.export import player
 
-    motion = tiny.walk(4, turn=1.0)
     skeleton = model_json.skeleton_to_json(tiny.skeleton())
-    parts = (np.asarray(motion.root_position), np.asarray(motion.joint_rotation))
-    text = player.bvh(skeleton, motion.fps, *parts)
-    read, found = bvh.motion_from_bvh(bvh_text.parse_bvh(text))
-    assert read.names == tiny.NAMES and found.fps == motion.fps
-    expected = joint_positions(tiny.skeleton(), motion)
-    np.testing.assert_allclose(joint_positions(read, found), expected, atol=1e-4)
+    for motion in (tiny.walk(4, turn=1.0), tiny.upturned(tiny.walk(40))):
+        parts = (np.asarray(motion.root_position), np.asarray(motion.joint_rotation))
+        text = player.bvh(skeleton, motion.fps, *parts)
+        read, found = bvh.motion_from_bvh(bvh_text.parse_bvh(text))
+        assert read.names == tiny.NAMES and found.fps == motion.fps
+        expected = joint_positions(tiny.skeleton(), motion)
+        np.testing.assert_allclose(joint_positions(read, found), expected, atol=1e-4)

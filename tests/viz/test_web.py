@@ -310,17 +310,20 @@ def test_a_packed_body_is_unpacked():
     assert count < len(arrays["positions"]) / 2
 
 
-def takes(frames=20):
-    motion, skeleton = tiny.walk(frames, turn=1.0), tiny.skeleton()
+def takes(frames=20, change=lambda motion: motion):
+    motion, skeleton = change(tiny.walk(frames, turn=1.0)), tiny.skeleton()
     parts = (motion.root_position, motion.joint_rotation)
     return skeleton, motion, [[floats(x) for x in part] for part in parts]
 
 
-def test_the_pages_bvh_is_what_was_shown():
-    skeleton, motion, parts = takes()
+@pytest.mark.parametrize("change", [lambda motion: motion, tiny.upturned])
+def test_the_pages_bvh_is_what_was_shown(change):
+    skeleton, motion, parts = takes(change=change)
     about = packed.skeleton_json(skeleton)
+    about["names"][1] += " {1}"
     (text,) = run("save.js", "bvh", (about, float(motion.fps), *parts))
     read, found = bvh_motion.motion_from_bvh(bvh_text.parse_bvh(text))
+    assert read.names[1] == "LeftUpLeg _1_"
     expected = joint_positions(skeleton, motion)
     np.testing.assert_allclose(joint_positions(read, found), expected, atol=1e-4)
 

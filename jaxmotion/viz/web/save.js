@@ -145,7 +145,7 @@ export function bvh(skeleton, fps, roots, rotations) {
     const isRoot = parents[j] < 0, children = parents.flatMap((up, k) => (up === j ? [k] : []));
     const offset = offsets[j].map(x => (isRoot ? 0 : 100 * x).toFixed(4)).join(" ");
     const place = isRoot ? "6 Xposition Yposition Zposition" : "3";
-    lines.push(`${pad}${isRoot ? "ROOT" : "JOINT"} ${names[j]}`, `${pad}{`,
+    lines.push(`${pad}${isRoot ? "ROOT" : "JOINT"} ${names[j].replace(/[{}\r\n]+/g, "_")}`, `${pad}{`,
       `${pad}  OFFSET ${offset}`, `${pad}  CHANNELS ${place} Zrotation Xrotation Yrotation`);
     for (const k of children) joint(k, pad + "  ");
     if (!children.length)
@@ -157,9 +157,10 @@ export function bvh(skeleton, fps, roots, rotations) {
   roots.forEach((root, f) => {
     const row = [...root].map(x => 100 * x);
     for (const j of order) {
-      const c = columns(rotations[f], 6 * j);
-      row.push(...[Math.atan2(-c[3], c[4]), Math.asin(Math.min(1, Math.max(-1, c[5]))),
-        Math.atan2(-c[2], c[8])].map(x => x * 180 / Math.PI));
+      const c = columns(rotations[f], 6 * j), cosine = Math.hypot(c[3], c[4]);
+      const locked = cosine < 1e-6;  // A quarter turn about x: those about z and y are one.
+      row.push(...[locked ? Math.atan2(c[1], c[0]) : Math.atan2(-c[3], c[4]),
+        Math.atan2(c[5], cosine), locked ? 0 : Math.atan2(-c[2], c[8])].map(x => x * 180 / Math.PI));
     }
     lines.push(row.map(x => x.toFixed(5)).join(" "));
   });
