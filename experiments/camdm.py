@@ -47,12 +47,12 @@ class Train:
       labels: Use only clips of these styles; none: all.
       held_out: Part of the clips kept for evaluation, in (0, 1).
       held_out_clips: Keep these instead, by name.
-      mirror: Add a mirrored copy of each.
+      mirror: Add a mirrored copy of each training clip that has none.
       balance: Draw rare changes more often, up to 1.
       steps: Optimizer steps of the whole run.
       batch: Windows of 55 frames per step.
       optimizer: "muon", "adamw", "radam" or "adam".
-      learning_rate: Its peak.
+      learning_rate: Peak of the rate.
       warmup: Steps in which the rate rises.
       max_norm: Norm to clip gradients to; 0: none.
       ema: Decay of the parameters' average; 0: none.
@@ -63,16 +63,17 @@ class Train:
       depth: Layers.
       frames_per_token: Frames of one token (paper: 1); not of the MLP.
       token_margin: Frames that neighboring tokens share; not of the MLP.
-      token_window: How they are cross-faded.
+      token_window: How neighboring tokens are cross-faded.
       norm: Layer norms after sums ("post", paper) or before branches; not of the MLP.
       attention: "full", or "prefix": computed once per plan.
-      noise_levels: Of each window in a step.
+      noise_levels: Noise levels that a step draws for each window.
       own_levels: Probability of noise on own predictions at lower levels.
-      cubic_wishes: Probability of wanted paths without sway.
+      cubic_wishes: Probability that the wanted path is a cubic curve, without sway.
       seam_half_life: Half-life, frames, of the offset with which plans go on from the
         past; 0: none.
-      frame_kernel: Frames of a last convolution.
-      weight_foot: Of feet that slide while they stand; None for the preset's.
+      frame_kernel: Frames that the last convolution sees.
+      weight_foot: Weight of the loss of standing feet that slide; None for the
+        preset's.
       diffusion_steps: Steps T of the diffusion.
       devices: Devices to split each batch over.
       distributed: One of several processes: "auto", or address, number, index.
@@ -178,7 +179,7 @@ class Distill:
       steps: Optimizer steps of the whole run.
       batch: Windows of 55 frames per step, each noised to every visited step.
       optimizer: "muon", "adamw", "radam" or "adam".
-      learning_rate: Its peak.
+      learning_rate: Peak of the rate.
       warmup: Steps in which the rate rises.
       max_norm: Norm to clip gradients to; 0: none.
       ema: Decay of the parameters' average; 0: none.

@@ -58,7 +58,7 @@ class Stage:
 
     Attributes:
       updates: Done at each row of losses, [rows].
-      seconds: Of training until then, without compiling at the start.
+      seconds: Seconds of training until then, without compiling at the start.
       values: Drawn values, each [rows].
     """
 

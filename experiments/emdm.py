@@ -56,7 +56,7 @@ class Train:
       mirror: Add a mirrored copy of each training clip (actions).
       steps: Updates of each GAN.
       ddpm_steps: Updates of each row without a discriminator.
-      batch: Motions an update.
+      batch: Motions per update.
       width: Channels of a token.
       hidden: Channels of the feed-forward layers.
       dropout: Rate (paper: 0.1).
@@ -66,20 +66,23 @@ class Train:
       discriminator_width: Channels of its first layers.
       diffusion_steps: Steps T of the row "emdm".
       recon: Weight R of the features' error; else 1, or 100.
-      geometry: Of the losses (released: root).
+      geometry: Frame of the losses of joints (released: root).
       fade_geometry: Losses of joints count less at noisy steps (ours).
-      weigh_levels: Of noise in all errors: alike (published), or as the posterior
-        weighs the discriminator's verdict.
-      weight_position: Of joint positions; with actions.
-      weight_velocity: Of frame differences; with actions.
-      weight_position_velocity: Of their displacements; with actions (ours).
-      weight_acceleration: Of their second differences; with actions (ours).
-      weight_foot: Of standing feet that slide; with actions.
-      optimizer: Of generators: muon, or adam at a constant rate (published: 2e-5).
-      learning_rate: Of generators.
-      ddpm_rate: Of rows without a discriminator (Muon).
-      discriminator_rate: Of the discriminator (Adam), which falls as the generator's
-        does (published: constant, 6 times the generator's).
+      weigh_levels: How errors weigh by noise level: alike (published), or as the
+        posterior weighs the discriminator's verdict.
+      weight_position: Weight of the loss of joint positions; with actions.
+      weight_velocity: Weight of the loss of frame differences; with actions.
+      weight_position_velocity: Weight of the loss of joint displacements; with actions
+        (ours).
+      weight_acceleration: Weight of the loss of their second differences; with actions
+        (ours).
+      weight_foot: Weight of the loss of standing feet that slide; with actions.
+      optimizer: Optimizer of generators: muon, or adam at a constant rate (published:
+        2e-5).
+      learning_rate: Peak rate of generators.
+      ddpm_rate: Peak rate of rows without a discriminator (Muon).
+      discriminator_rate: Rate of the discriminator (Adam), which falls as the
+        generator's does (published: constant, 6 times the generator's).
       init: Run folder or exported model to start from (actions); a folder's row of the
         same name.
       alone: Part of a GAN's updates that its generator makes first, without the

@@ -46,7 +46,7 @@ class Config:
       seeds: Trainings by each, of seeds 0, 1, ...
       steps: Updates of each; warm-up over a tenth of them, cosine to a tenth.
       chunk: Updates between two points of a curve.
-      batch: Windows of an update.
+      batch: Windows per update.
       windows: Held-out windows.
     """
 

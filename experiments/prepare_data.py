@@ -37,7 +37,7 @@ from jaxmotion.data import (
 )
 from jaxmotion.data.ball_clips import BallClips, save_ball_clips
 from jaxmotion.data.builders import REGISTRY
-from jaxmotion.data.clips import Clips, clip_motion, clips_from_motions
+from jaxmotion.data.clips import Clips
 from jaxmotion.data.text_motion import TextMotions
 
 # "procedural" generates a styled walker; "bvh" and "fbx" read your own files.
@@ -60,8 +60,9 @@ class Config:
     """Frames per second of the result; other rates are resampled. By default 30, for
     humanact12 its own 20; sets with captions keep theirs."""
     mirror: bool = False
-    """Add the left-right mirror image of every clip (style100: of symmetric styles,
-    under the same label; the others swap left and right in their labels)."""
+    """Add the left-right mirror image of every clip that has none (style100: of
+    symmetric styles, under the same label; the others swap left and right in their
+    labels). The trainings of camdm.py and aamdm.py add them anyway."""
     tfds_dir: Path | None = None
     """Folder of the tensorflow-datasets files; by default tfds beside --out."""
     overwrite: bool = False
@@ -92,10 +93,9 @@ class Config:
     crouches, jumps, pushes or stands, by rule (field "action"); for takes with styles
     such as those of o3de_motion_matching."""
     loops: float | None = None
-    """Add strides at 1.9 m/s and more that end as they begin, repeated, slower and
-    faster, too, so that a model sees people who run on: until each half of a meter per
-    second from 2 m/s to 4.1 can be learned from for so many seconds, when the last
-    tenth of each take is held out."""
+    """Seconds of each half of a meter per second from 2 to 4.1 m/s, for a model that is
+    to see people who run on: what the takes lack is added as strides of theirs,
+    repeated, slower and faster. None comes from the last tenth of a take."""
     cut_fps: float = 20.0
     """Frames per second by which the times of captions cut clips; the released loaders
     take 20 for kit_ml too, whose rate is 12.5."""
@@ -213,24 +213,6 @@ def read_own(config: Config) -> Clips:
     return clips
 
 
-def at_rate(clips: Clips, fps: float) -> Clips:
-    """The clips at another frame rate; themselves if they have it."""
-    if clips.fps == fps:
-        return clips
-    motions = [clip_motion(clips, i) for i in range(clips.num_clips)]
-    return clips_from_motions(
-        [resample.resample(motion, fps) for motion in motions],
-        clips.skeleton,
-        names=clips.clip_names,
-        labels={
-            field: [names[int(i)] for i in np.asarray(clips.labels[field])]
-            for field, names in clips.label_names
-        },
-        label_names=dict(clips.label_names),
-        source=clips.source,
-    )
-
-
 def describe(clips: Clips, path: Path) -> str:
     """Lines with counts of what was written."""
     minutes = clips.num_frames / clips.fps / 60
@@ -316,7 +298,7 @@ def prepare(config: Config) -> None:
         save_ball_clips(config.out, data)
         print(describe_ball(data, config.out))
     else:
-        clips = at_rate(data, config.fps or set_fps or data.fps)
+        clips = resample.resample_clips(data, config.fps or set_fps or data.fps)
         if config.actions:
             clips = actions.cut_actions(clips)
         if config.loops is not None:

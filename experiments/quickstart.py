@@ -1,4 +1,4 @@
-"""From nothing to a steered character in half a minute, without data or training.
+"""From nothing to a steered character in a minute, without data or training.
 
 Steers the shipped model of a real person's locomotion along a course (stand, walk,
 turn, jog, run, stop, crouch) and writes what it does as GIF, HTML and BVH.
@@ -57,7 +57,7 @@ class Config:
       out: Folder for the rollout and metrics.json; of a training also checkpoints.
       characters: Rollouts to measure.
       train: Teach the walker a style first; the options below are its own.
-      steps: Optimizer steps, rounded down to fifties.
+      steps: Optimizer steps, rounded down to a multiple of 50.
       batch: Windows per step.
       minutes: Minutes of walking to generate.
       seconds: Length of the rollout, seconds.

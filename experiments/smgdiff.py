@@ -50,10 +50,10 @@ class Train:
       token_margin: Frames that its neighboring output tokens share; None for the
         preset's.
       attention: "full", or "prefix": computed once per plan; None for the preset's.
-      path_noise: Of a trajectory generator: "bridge", as smooth as paths, for more
+      path_noise: Noise of a trajectory generator: "bridge", as smooth as paths, for more
         steps than one, or "white" (paper); None for the preset's.
       path_soon: Frames to its second target; None for the preset's, 0 for none (paper).
-      noise_levels: Of each window in an update; None for the preset's.
+      noise_levels: Noise levels that an update draws for each window; None for the preset's.
       own_levels: Probability of noise on own predictions at lower levels.
       cubic_wishes: Probability of wanted paths without sway.
       balance: How much more often rare speeds and turns are drawn: 0 as recorded, 1 all

@@ -83,8 +83,10 @@ def test_nonsense_is_refused():
 
 
 @pytest.mark.parametrize("fps", [10.0, 12.5, 30.0, 50.0])
-def test_clips_are_resampled_one_by_one(fps):
+@pytest.mark.parametrize("part", [7, 1 << 16])
+def test_clips_are_resampled_one_by_one(fps, part, monkeypatch):
     """Also those of one frame: none may take frames of its neighbors."""
+    monkeypatch.setattr(resample, "_PART", part)
     motions = [samples.motion(n, i) for i, n in enumerate((1, 10, 1, 4, 10, 4))]
     given = clips_from_motions(
         motions,
@@ -100,6 +102,8 @@ def test_clips_are_resampled_one_by_one(fps):
     np.testing.assert_array_equal(found.labels["style"], given.labels["style"])
     for i, motion in enumerate(motions):
         expected, own = resample.resample(motion, fps), clip_motion(found, i)
+        if fps == 10.0:  # every third frame
+            np.testing.assert_array_equal(own.joint_rotation, expected.joint_rotation)
         assert own.root_position.shape == expected.root_position.shape
         np.testing.assert_allclose(own.root_position, expected.root_position, atol=2e-6)
         np.testing.assert_allclose(
