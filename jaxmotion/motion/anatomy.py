@@ -130,15 +130,22 @@ def find_head(
 
 
 def find_limbs(
-    parents: tuple[int, ...], lengths: np.ndarray, trunk: list[int]
+    parents: tuple[int, ...],
+    lengths: np.ndarray,
+    trunk: list[int],
+    named: tuple[str, ...],
 ) -> tuple[list[Limb], list[Limb]]:
-    """Arms and legs, not sided: legs are what leaves the trunk at its lowest joint."""
-    parts: dict[int, list[int]] = {}
+    """Arms and legs, not sided: legs are what leaves the trunk at its lowest joint.
+
+    Both of a pair may leave it at one joint, if their names tell them apart.
+    """
+    parts: dict[tuple[int, str], list[int]] = {}
     for leaf in (j for j in range(len(parents)) if j not in parents):
         part = [j for j in chain(parents, leaf) if j not in trunk]
-        best = parts.get(part[0], []) if part else None
-        if best is not None and lengths[part].sum() > lengths[best].sum():
-            parts[part[0]] = part
+        if part:
+            best = parts.get((part[0], named[leaf]), [])
+            if lengths[part].sum() > lengths[best].sum():
+                parts[part[0], named[leaf]] = part
     found = [p for p in parts.values() if len(p) > 2 and parents[p[0]] != trunk[-1]]
     lowest = min((trunk.index(parents[part[0]]) for part in found), default=0)
     arms, legs = [], []
@@ -175,7 +182,9 @@ def find_anatomy(skeleton: Skeleton, sides: tuple[str, ...] | None = None) -> An
     lengths[0] = 0.0
     head, has_head = find_head(parents, skeleton.names, named, places[:, 1])
     trunk = chain(parents, 0 if head is None else head)
-    arms, legs = ([], []) if head is None else find_limbs(parents, lengths, trunk)
+    arms, legs = (
+        ([], []) if head is None else find_limbs(parents, lengths, trunk, named)
+    )
     if not (arms and legs):
         return Anatomy(
             trunk=tuple(trunk),
@@ -442,11 +451,12 @@ def mixamo_names(skeleton: Skeleton, *, prefix: str = "mixamorig:") -> tuple[str
         names[found.trunk[-1]] = "Head"
     for limbs, words in (
         (found.arms, ("Shoulder", "Arm", "ForeArm", "Hand")),
-        (found.legs, ("", "UpLeg", "Leg", "Foot")),
+        (found.legs, ("UpLeg", "Leg", "Foot")),
     ):
         for limb in limbs:
             side = limb.side.capitalize()
-            joints = (*limb.before[-1:], limb.upper, limb.middle, limb.end)
+            clavicle = limb.before[-1:] if limbs is found.arms else ()
+            joints = (*clavicle, limb.upper, limb.middle, limb.end)
             for joint, word in zip(joints, words[-len(joints) :], strict=True):
                 names[joint] = side + word
             if limbs is found.legs and limb.after:

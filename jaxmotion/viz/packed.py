@@ -12,7 +12,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmotion.motion.anatomy import find_anatomy
 from jaxmotion.motion.skeleton import Skeleton, global_transforms
 from jaxmotion.viz import mannequin
 
@@ -48,7 +47,7 @@ def body_arrays(
 
     Args:
       poses: Some rotations [frames, joints, 6] as `Motion` has them, which tell how
-        limbs are turned where the zero pose does not stand; see `mannequin.describe`.
+        limbs are turned about themselves; see `mannequin.describe`.
 
     Returns:
       positions [V, 3] float32 in the bind pose, meters, in steps of an eighth of a
@@ -63,10 +62,7 @@ def body_arrays(
     count = len(skeleton.parents)
     if count > 256:
         raise ValueError(f"{count} joints, expected at most 256 for the page")
-    rotations = None
-    # A few standing poses say less than a zero pose that stands.
-    if poses is not None and not find_anatomy(skeleton).upright:
-        rotations = world_turns(skeleton, poses)
+    rotations = None if poses is None else world_turns(skeleton, poses)
     fine = mannequin.describe(skeleton, rotations=rotations)
     crowd = _mesh(mannequin.describe(skeleton, rotations=rotations, detail="crowd"))
     inverse = fine.inverse_bind.reshape(count, 12).astype(np.float32)

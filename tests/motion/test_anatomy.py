@@ -6,6 +6,7 @@ from jaxmotion.data.walker import walker_skeleton
 from jaxmotion.motion import anatomy
 from jaxmotion.motion.rotation import matrix_from_rot6d
 from jaxmotion.motion.skeleton import Motion, Skeleton
+from tests.retarget import rigs
 
 # LaFAN1's convention: all bones along x, the zero pose is no pose of a person.
 BONES = (
@@ -79,6 +80,22 @@ def test_limbs_of_a_person_are_found():
         "RightToeBase",
     ]
     assert found.upright and not anatomy.find_anatomy(along_x()).upright
+
+
+def test_both_legs_and_both_arms_may_leave_the_trunk_at_one_joint():
+    base, forked = rigs.forked("child", "Mixamo")
+    plain, found = anatomy.find_anatomy(base), anatomy.find_anatomy(forked)
+    named = lambda one, limbs: [  # noqa: E731
+        [one.names[j] for j in (x.upper, x.middle, x.end)] for x in limbs
+    ]
+    assert named(forked, found.legs) == named(base, plain.legs)
+    assert named(forked, found.arms) == named(base, plain.arms)
+    columns = [forked.index(name) for name in base.names[1:]]
+    expected = anatomy.t_pose(base)[0][1:]
+    np.testing.assert_allclose(anatomy.t_pose(forked)[0][columns], expected, atol=1e-6)
+    names = anatomy.mixamo_names(forked)
+    assert names[forked.index("mixamorig:LeftUpLeg")] == "mixamorig:LeftUpLeg"
+    assert "mixamorig:Left" not in names
 
 
 def test_a_t_pose_stands_faces_ahead_and_keeps_the_bones():

@@ -18,6 +18,7 @@ from jaxmotion.export import slim, web
 from jaxmotion.motion.skeleton import global_transforms, joint_positions
 from jaxmotion.viz import mannequin, packed, page, viewer
 from tests import tiny
+from tests.viz import samples
 
 pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
 WEB = Path(page.__file__).with_name("web")
@@ -397,7 +398,19 @@ def test_half_precision_constants_are_widened():
     assert base64.b64decode(found["base64"]) == weights.content()
 
 
-def test_a_zero_pose_that_stands_needs_no_poses():
+def test_the_pages_body_is_bound_as_that_of_pictures():
+    """The walker's thighs are half a turn about themselves from its zero pose."""
+    skeleton, motion = samples.person(seconds=1.0, turn=0.0)
+    poses = np.asarray(motion.joint_rotation)
+    found = packed.body_arrays(skeleton, poses[::8])["inverse"]
+    turns = packed.world_turns(skeleton, poses)
+    expected = mannequin.describe(skeleton, rotations=turns).inverse_bind
+    np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=2e-3)
+    untold = packed.body_arrays(skeleton)["inverse"]
+    assert np.abs(found - untold).max() > 1.0
+
+
+def test_poses_of_straight_limbs_say_nothing():
     skeleton = walker.walker_skeleton()
     poses = np.tile(np.array([1.0, 0, 0, 0, 1, 0], np.float32), (2, 22, 1))
     found = packed.body_arrays(skeleton, poses)["inverse"]

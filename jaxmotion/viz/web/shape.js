@@ -23,12 +23,14 @@ function findHead(parents, names, sides, zero) {
 }
 
 // Arms and legs, not sided: legs are what leaves the trunk at its lowest joint.
-function findLimbs(parents, lengths, trunk) {
+// Both of a pair may leave it at one joint, if their names tell them apart.
+function findLimbs(parents, lengths, trunk, sides) {
   const parts = new Map(), reach = part => part.reduce((sum, j) => sum + lengths[j], 0);
   parents.forEach((_, leaf) => {
     if (parents.includes(leaf)) return;
     const part = chain(parents, leaf).filter(j => !trunk.includes(j));
-    if (part.length && reach(part) > reach(parts.get(part[0]) || [])) parts.set(part[0], part);
+    const key = `${part[0]} ${sides[leaf]}`;
+    if (part.length && reach(part) > reach(parts.get(key) || [])) parts.set(key, part);
   });
   const level = part => trunk.indexOf(parents[part[0]]);
   const found = [...parts.values()].filter(
@@ -75,7 +77,7 @@ export function byShape({ names, parents, offsets }, zero, named) {
   const lengths = offsets.map((x, j) => (j ? long(x) : 0));
   const head = findHead(parents, names, named, zero);
   const trunk = chain(parents, head ? head[0] : 0), top = trunk[trunk.length - 1];
-  const { arms, legs } = head ? findLimbs(parents, lengths, trunk) : { arms: [], legs: [] };
+  const { arms, legs } = head ? findLimbs(parents, lengths, trunk, named) : { arms: [], legs: [] };
   if (!arms.length || !legs.length) return {};
   const rise = sub(zero[top], mean(legs.map(leg => zero[leg.end])));
   const upright = rise[1] > 0.8 * long(rise), all = [...arms, ...legs];
