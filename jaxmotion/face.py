@@ -400,8 +400,8 @@ def sample(
     return sampling.sample_motions(model, key, found, chunk=chunk)
 
 
-def _one(frames: Frame | Motion) -> Motion:
-    """The motion of one character; raises for several, or none that can be told."""
+def _one(skeleton: Skeleton, frames: Frame | Motion) -> Motion:
+    """The motion of one character; raises for what is none of this skeleton's."""
     if not isinstance(frames, Frame | Motion):
         raise ValueError(f"frames are a {type(frames).__name__}, expected a Frame")
     shape = frames.root_position.shape
@@ -414,6 +414,20 @@ def _one(frames: Frame | Motion) -> Motion:
     values = (motion.root_position, motion.joint_rotation)
     if not (shape[0] and all(np.isfinite(np.asarray(x)).all() for x in values)):
         raise ValueError(f"{shape[0]} frames: expected one or more that are finite")
+    if not (np.isfinite(motion.fps) and motion.fps > 0):
+        raise ValueError(f"{motion.fps} frames per second: expected a positive rate")
+    columns = np.asarray(motion.joint_rotation, np.float64)
+    if columns.shape[1:] != (skeleton.num_joints, 6):
+        raise ValueError(
+            f"joint_rotation of a frame is {columns.shape[1:]}, expected that of the "
+            f"skeleton, {(skeleton.num_joints, 6)}"
+        )
+    area = np.linalg.norm(np.cross(columns[..., :3], columns[..., 3:]), axis=-1)
+    if not (area > 1e-9).all():
+        frame, joint = np.argwhere(~(area > 1e-9))[0]
+        raise ValueError(
+            f"frame {frame}: the columns of {skeleton.names[joint]!r} are no rotation"
+        )
     return motion
 
 
@@ -441,7 +455,7 @@ def _stage(skeleton: Skeleton, frames: Frame | Motion) -> Stage:
 def _save_bvh(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     from jaxmotion.data import bvh, bvh_text
 
-    bvh_text.write_bvh(path, bvh.bvh_from_motion(skeleton, _one(frames)))
+    bvh_text.write_bvh(path, bvh.bvh_from_motion(skeleton, _one(skeleton, frames)))
 
 
 def _save_gif(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
@@ -459,11 +473,11 @@ def _save_html(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
 def _save_glb(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     from jaxmotion.export import gltf
 
-    gltf.save_glb(path, skeleton, _one(frames))
+    gltf.save_glb(path, skeleton, _one(skeleton, frames))
 
 
 def _save_npz(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
-    motion = _one(frames)
+    motion = _one(skeleton, frames)
     positions = joint_positions(skeleton, motion)
     feet = positions[:, np.array(skeleton.feet, int)]
     feet = jnp.repeat(feet, 2, axis=0) if len(feet) == 1 else feet  # a speed takes two
@@ -482,7 +496,7 @@ def _save_npz(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
 
 
 def _save_csv(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
-    motion = _one(frames)
+    motion = _one(skeleton, frames)
     positions = np.asarray(joint_positions(skeleton, motion))
     head = [f"{name}.{axis}" for name in skeleton.names for axis in "xyz"]
     lines = [",".join(["seconds", *head])]
@@ -619,7 +633,7 @@ def save(
         from jaxmotion.retarget import robot_motion
 
         read = robots.read_robot(robot, roles)
-        made = robot_motion.follow(read, skeleton, _one(frames))
+        made = robot_motion.follow(read, skeleton, _one(skeleton, frames))
         path.parent.mkdir(parents=True, exist_ok=True)
         files.write_arrays(path, made.to_arrays())
         return
@@ -629,14 +643,14 @@ def save(
             f"{', '.join(SAVERS)}"
         )
     if t_pose:
-        skeleton, frames = anatomy.as_t_pose(skeleton, _one(frames))
+        skeleton, frames = anatomy.as_t_pose(skeleton, _one(skeleton, frames))
     if mixamo:
         names = anatomy.mixamo_names(skeleton)
         skeleton = dataclasses.replace(skeleton, names=names)
     if onto is not None:
         if t_pose or mixamo:
             raise ValueError("onto a rig, `t_pose` and `mixamo` say nothing")
-        motion = _one(frames)
+        motion = _one(skeleton, frames)
         if path.suffix.lower() == ".glb" and Path(onto).suffix.lower() in RIGS:
             from jaxmotion.export import rig
 

@@ -127,6 +127,16 @@ def broken(frames):
     return dataclasses.replace(frames, root_position=frames.root_position + NAN)
 
 
+def at(frames, fps):
+    return dataclasses.replace(frames, fps=fps)
+
+
+def flat(frames):
+    """With a joint that is turned nowhere."""
+    turns = frames.joint_rotation.at[2, 3].set(0.0)
+    return dataclasses.replace(frames, joint_rotation=turns)
+
+
 def told(model, states=None, **wrong):
     """A rollout whose commands are wrong in one field, or from given states."""
     commands = jm.commands("forward", model, 2, seconds=0.3)
@@ -180,6 +190,16 @@ def told(model, states=None, **wrong):
         (lambda m, f: jm.save("a.csv", m.skeleton, f[0, :0]), "0 frames: expected one"),
         (lambda m, f: jm.save("a.npz", m.skeleton, broken(f[0])), "that are finite"),
         (lambda m, f: jm.save("a.bvh", m.skeleton, f[0], roles={}), "expected `onto`"),
+        (lambda m, f: jm.save("a.glb", m.skeleton, at(f[0], 0.0)), "0.0 frames per"),
+        (lambda m, f: jm.save("a.bvh", m.skeleton, at(f[0], NAN)), "nan frames per"),
+        (
+            lambda m, f: jm.save("a.csv", jm.load("walker").skeleton, f[0]),
+            r"a frame is \(24, 6\), expected that of the skeleton, \(22, 6\)",
+        ),
+        (
+            lambda m, f: jm.save("a.glb", m.skeleton, flat(f[0])),
+            "frame 2: the columns of '.*' are no rotation",
+        ),
     ],
 )
 def test_wrong_input_is_one_clear_line(model, frames, call, message):

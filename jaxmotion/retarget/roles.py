@@ -196,6 +196,8 @@ def find_roles(
     """
     if isinstance(given, str | Path):
         given = files.read_object(given, what="roles and their joints")
+    if not isinstance(given, Mapping | None):
+        raise ValueError(f"roles are a {type(given).__name__}, expected joints by role")
     given = dict(given or {})
     for role, name in given.items():
         if role not in ROLES:

@@ -1,4 +1,5 @@
 import dataclasses
+import inspect
 import json
 
 import jax.numpy as jnp
@@ -120,6 +121,19 @@ def quadruped():
         parents=tuple(parents),
         names=tuple(names),
     )
+
+
+def test_roles_that_cannot_be_are_refused():
+    base = rigs.walker()
+    for given, message in (
+        (["hips"], "roles are a list, expected joints by role"),
+        ({"hips": 5}, "role hips: no joint 5 among Hips"),
+        ({"chest": "Head"}, r"no person: 'Neck' is not above the chest \('Head'\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            inspect.unwrap(roles.find_roles)(base, given)
+    same = {"hips": "Hips", "chest": "Hips"}  # a body of one piece
+    assert roles.find_roles(base, same) == roles.find_roles(base) | same
 
 
 def test_what_is_no_person_is_refused_in_one_line():
