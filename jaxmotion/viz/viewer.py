@@ -425,6 +425,8 @@ class Session:
             inputs = self._inputs.get(self._active, Inputs())
             self._steps = max(self._steps - 1, 0)
             if self._resets:
+                if self._take:
+                    self.record()
                 self._begin(engine, keep=False)
         wish = self._wanted(inputs, settings.speed, engine.character)
         self._told = settled(self._told, wish, steady=wish == self._wish)

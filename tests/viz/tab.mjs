@@ -1,8 +1,9 @@
 // The page in a tab that is not there: events from the standard input, one after another.
 // Usage: node tab.mjs <folder of the modules> < {"hash", "events": [[name, ...]]}
 // Events are what a source tells ("state", "body", "frame"), "hidden" (true or false) and
-// "pad" (a gamepad, or null). What comes out after each: messages that the page said, the
-// tick that is displayed, and what a gamepad holds.
+// "pad" (a gamepad, or null), "press" (a button's name) and "save" (as .bvh). What comes
+// out after each: messages that the page said, the tick that is displayed, what a gamepad
+// holds, and what was saved.
 
 import { pathToFileURL } from "node:url";
 import { readFileSync } from "node:fs";
@@ -35,6 +36,14 @@ Object.assign(globalThis, {
   addEventListener() {}, matchMedia: () => ({ matches: false }), Option: class {},
   requestAnimationFrame(picture) { pictures.push(picture); },
 });
+const saved = [".glb", ".bvh"].map(textContent => ({ textContent }));
+elements.last = new Proxy({ querySelectorAll: () => saved }, {
+  get: (own, name) => (name in own ? own[name] : any()),
+  set(own, name, value) { own[name] = value; return true; },
+});
+let made = null;
+globalThis.Blob = class { constructor([text]) { made = text; } };
+URL.createObjectURL = URL.revokeObjectURL = () => "";
 globalThis.history = { replaceState() {} };
 Object.defineProperty(globalThis, "navigator", { value: { getGamepads: () => pads } });
 const { start } = await import(pathToFileURL(`${process.argv[2]}/page.js`));
@@ -43,6 +52,8 @@ start({ open: true, say(message) { said.push(message); }, connect(found) { on = 
 const results = events.map(([name, ...given]) => {
   if (name === "hidden") document.hidden = given[0];
   else if (name === "pad") pads = given[0] ? [given[0]] : [];
+  else if (name === "press") elements[given[0]].onclick({ target: element() });
+  else if (name === "save") saved[1].onclick({ target: element() });
   else if (name === "body") {
     const bytes = new Uint8Array(Buffer.from(given[0], "base64"));
     on.body(bytes.buffer, given[1]);
@@ -56,7 +67,7 @@ const results = events.map(([name, ...given]) => {
   const { stick, face, orbit } = window.input.pad;
   return {
     said: said.splice(0), shown: window.shown ? window.shown.tick : null,
-    pad: [stick, face, orbit].map(x => x || null),
+    pad: [stick, face, orbit].map(x => x || null), made,
   };
 });
 process.stdout.write(JSON.stringify(results));

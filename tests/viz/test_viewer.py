@@ -326,6 +326,11 @@ def test_a_take_is_what_was_shown():
     assert take.fps == 30 and not it.session.state()["recording"]
     assert it.shown[-1].ball.shape == (1, 3)
     it.session.record()
+    it.tick(times=2)
+    it.session.reset()  # who is somewhere else is in no take
+    it.tick("forward", times=3)
+    assert it.session.take.root_position.shape == (2, 3)
+    it.session.record()
     it.tick(times=3)
     it.session.change("model", "other")  # of another skeleton, perhaps: the take ends
     it.load()

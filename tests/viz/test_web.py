@@ -452,21 +452,39 @@ def test_a_link_is_asked_for_when_its_model_is_there():
     assert [settings(x) for x in tab(*events, hash=hash)] == wants
 
 
-def test_a_hidden_tab_keeps_no_frames():
-    """No picture takes them there; the last one is shown when it is seen again."""
-    skeleton, joints = tiny.skeleton(), tiny.skeleton().num_joints
-    body = packed.pack(
+def body():
+    """Of the tiny skeleton, as events."""
+    skeleton = tiny.skeleton()
+    content = packed.pack(
         {"skeleton": packed.skeleton_json(skeleton)}, packed.body_arrays(skeleton)
     )
+    return ("state", STATE | THERE), ("body", base64.b64encode(content).decode(), 1)
 
-    def frame(tick):
-        rotations = np.tile([1.0, 0, 0, 0, 1.0, 0], joints)
-        head = [1, tick, 3, 0, 1, joints, 0, 30, 0, 1, 0, 1, 0]
-        return ("frame", [*head, 0.0, 1.0, 0.1 * tick, *rotations.tolist()])
 
-    events = [("state", STATE | THERE), ("body", base64.b64encode(body).decode(), 1)]
-    found = tab(*events, frame(0), ("hidden", True), *map(frame, range(1, 9)))
+def at(tick, z=0.0):
+    joints = tiny.skeleton().num_joints
+    rotations = np.tile([1.0, 0, 0, 0, 1.0, 0], joints)
+    head = [1, tick, 3, 0, 1, joints, 0, 30, 0, 1, 0, 1, 0]
+    return ("frame", [*head, 0.0, 1.0, z, *rotations.tolist()])
+
+
+def test_a_hidden_tab_keeps_no_frames():
+    """No picture takes them there; the last one is shown when it is seen again."""
+    found = tab(*body(), at(0), ("hidden", True), *map(at, range(1, 9)))
     assert [x["shown"] for x in found[-8:]] == list(range(1, 9))
+
+
+@pytest.mark.parametrize("event", [("press", "reset"), at(9, 0.4)])
+def test_what_is_saved_of_the_page_has_no_jumps(event):
+    """Who begins anew, in whatever tab that was told, begins another take."""
+    before = [at(t, 0.05 * t) for t in range(40)]
+    after = [at(40 + t, 0.05 * t) for t in range(10)]
+    saved = tab(*body(), *before, event, *after, ("save",))[-1]["made"]
+    read, found = bvh_motion.motion_from_bvh(bvh_text.parse_bvh(saved))
+    count = 10 + (event[0] == "frame")
+    assert read.names == tiny.NAMES and len(found.root_position) == count
+    steps = np.diff(found.root_position[-10:, 2])
+    np.testing.assert_allclose(steps, 0.05, atol=1e-5)
 
 
 def test_a_gamepad_that_is_unplugged_holds_nothing():

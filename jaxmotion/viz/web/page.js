@@ -13,6 +13,8 @@ import { Scene } from "./scene.js";
 const $ = id => document.getElementById(id);
 const GREEN = [0.17, 0.63, 0.17, 0.9], VIOLET = [0.5, 0.36, 0.75, 0.9];
 const ORANGE = [1, 0.5, 0.05, 0.8], BALL = 0.11, KEPT = 10, TRAIL = 600;
+// Meters in a frame that nobody goes: who was put there is in another take.
+const JUMP = 0.5;
 const HASH = [
   "model", "label", "speed", "num_steps", "scale", "foot_lock", "characters", "plan",
 ];
@@ -63,7 +65,7 @@ export function start(source) {
   const spent = window.spent = [];
   const say = message => source.say(message);
   const panel = new Panel(say, {
-    reset() { input.forget(); trail = []; tell(); },
+    reset() { input.forget(); trail = []; kept.length = 0; tell(); },
     save(suffix) { download(suffix); },
     link() { copyLink(); },
     wear,
@@ -198,6 +200,8 @@ export function start(source) {
       if (last && Math.hypot(x - last[0], z - last[1]) > 2) trail = [];
       if (!last || Math.hypot(x - last[0], z - last[1]) > 0.04) trail.push([x, z]);
       if (trail.length > TRAIL) trail.shift();
+      const was = kept[kept.length - 1];
+      if (was && Math.hypot(x - was[0][0], z - was[0][2]) > JUMP) kept.length = 0;  // anew
       kept.push([to.roots.slice(0, 3), to.rotations.slice(0, 6 * to.joints)]);
       if (kept.length > KEPT * to.fps) kept.shift();
       window.shown = to;
