@@ -119,6 +119,10 @@ def split_clips(
         members = whole[labels[whole] == label]
         count = max(min(max(round(members.size * fraction), 1), members.size - 1), 0)
         held_out += generator.permutation(members)[:count].tolist()
+    if not held_out:
+        raise ValueError(
+            f"no {field} has two clips, expected one to train on and one to hold out"
+        )
     return _parted(clips, np.array(held_out, int))
 
 

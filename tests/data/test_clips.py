@@ -209,6 +209,9 @@ def test_split_depends_on_the_seed_only():
     for fraction in (0.0, 1.0, -1.0, np.nan):
         with pytest.raises(ValueError, match="fraction"):
             selection.split_clips(samples.clips(), fraction=fraction, seed=0)
+    single = take_clips(samples.clips(), [0, 1])
+    with pytest.raises(ValueError, match="no style has two clips, expected one to tr"):
+        selection.split_clips(single, fraction=0.5, seed=0)
 
 
 def test_split_by_name():

@@ -207,6 +207,12 @@ def prepare(
         parts = selection.split_clips(clips, fraction=held_out, seed=0, field=field)
         if mirrored:
             parts = (mirror.with_mirrored(parts[0]), parts[1])
+            new = [x for x in parts[0].names(field) if x not in clips.names(field)]
+            if new:
+                raise ValueError(
+                    f"mirror images would be of {field} {new[0]!r}, of which no clip "
+                    "is held out: leave them out, or give clips of it"
+                )
         fitted = _fit(parts[0], action_arrays(parts[0], field=field, frames=frames))
         return runs.Content(
             model={

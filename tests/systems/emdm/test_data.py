@@ -136,6 +136,28 @@ def test_a_folder_keeps_the_units_of_its_features(files, tmp_path):
 FRAMES = 8
 
 
+def test_images_are_of_actions_of_which_clips_are_held_out(tmp_path):
+    """Otherwise what is made of them could not be judged."""
+    options = dict(field="content", merge={}, least=1, fps=30.0, frames=6)
+    options |= dict(task="action", held_out=0.3, mirrored=True)
+    for number, actions in enumerate(
+        (("turn_left", "turn_left", "walk", "walk"), ("turn_left", "turn_right") * 2)
+    ):
+        path = tmp_path / f"{number}.npz"
+        clips_io.save_clips(path, clips((12, 9, 20, 8), actions))
+        make = lambda: emdm_data.prepare(  # noqa: E731
+            tmp_path / f"run{number}",  # noqa: B023
+            (path,),  # noqa: B023
+            **options,
+        )
+        if number == 0:
+            with pytest.raises(ValueError, match="of content 'turn_right', of which"):
+                make()
+            continue
+        run = make()
+        assert len(run.train.counts) == len(run.held_out.counts) == 2
+
+
 @pytest.fixture(scope="module")
 def arrays():
     """Actions 0..3 are hop, run, stroll and walk or in some other order."""
