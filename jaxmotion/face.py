@@ -498,8 +498,8 @@ def _save_npz(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
 def _save_csv(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
     motion = _one(skeleton, frames)
     positions = np.asarray(joint_positions(skeleton, motion))
-    head = [f"{name}.{axis}" for name in skeleton.names for axis in "xyz"]
-    lines = [",".join(["seconds", *head])]
+    names = [name.replace(",", "_") for name in skeleton.names]  # of a rig, perhaps
+    lines = [",".join(["seconds", *(f"{name}.{x}" for name in names for x in "xyz")])]
     for number, row in enumerate(positions.reshape(len(positions), -1)):
         values = ",".join(f"{value:.4f}" for value in row)
         lines.append(f"{number / motion.fps:.4f},{values}")
@@ -508,6 +508,9 @@ def _save_csv(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
 
 def read_skeleton(path: str | Path) -> transfer.Rest:
     """The skeleton of a rig, for `retarget`: .glb, .gltf, .vrm, .fbx or .bvh.
+
+    A glTF's nodes should stand in the pose in which its mesh was made: trunk, head and
+    feet of one that stands in a frame of an animation stay as bent as they are there.
 
     Raises:
       ModuleNotFoundError: for FBX without the extra [fbx].
@@ -557,10 +560,11 @@ def retarget(
     a clip: `target_motion = retarget(model.skeleton, "hero.glb")(frames.motion)`.
 
     Args:
-      target: A skeleton, or a rig's file; see `read_skeleton`.
-      roles: Joints of some of the target's roles, by the names of
-        `retarget.roles.ROLES`, or a JSON file of them; None for what its names and
-        shape say.
+      target: A skeleton, or a rig's file; see `jaxmotion.face.read_skeleton`. What is
+        above its hips is moved with them and never turns.
+      roles: Joints of some of the target's roles, by the names of `ROLES` (of `from
+        jaxmotion.retarget import roles`), or a JSON file of them; None for what its
+        names and shape say.
       motion: Any second of the source's, where its zero pose does not tell how its
         limbs are turned about themselves: LaFAN1, Bandai Namco, the walker.
 
@@ -600,9 +604,9 @@ def save(
 ) -> None:
     """Writes motion in the format of the suffix.
 
-    .bvh rotations for animation tools; .csv world positions of all joints, meters;
-    .gif a moving picture; .glb a skinned body and its animation (meters, y up), for
-    engines, Blender and browsers; .html a page to turn and play; .npz arrays:
+    .bvh rotations for animation tools, centimeters; .csv world positions of all joints,
+    meters; .gif a moving picture; .glb a skinned body and its animation (meters, y up),
+    for engines, Blender and browsers; .html a page to turn and play; .npz arrays:
     root_position, joint_rotation (6D, two columns), joint_position, foot_contact, and
     the skeleton. Pictures take many characters, the others one, such as `frames[0]`.
 
@@ -610,12 +614,12 @@ def save(
       t_pose: Rotations are against the T-pose instead of the skeleton's own zero pose;
         in .glb they always are.
       mixamo: Joints are named as Mixamo's characters have them.
-      onto: A rig's file (see `read_skeleton`) whose skeleton the motion is brought
-        onto; a .glb is then that rig, animated.
+      onto: A rig's file (see `retarget`) whose skeleton the motion is brought onto; a
+        .glb is then that rig, animated, if it is a .glb, .gltf or .vrm.
       roles: Joints of some of its roles, or bodies of the robot's; see `retarget`.
       robot: MJCF or URDF of a humanoid that the motion is brought onto, 50 frames per
-        second; the .npz is then what mjlab's motion tracking reads (see
-        `retarget.robot_motion.RobotMotion.to_arrays`), with what the robot cannot do.
+        second; the .npz is then what mjlab's motion tracking reads, with what the robot
+        cannot do (see `RobotMotion` of `jaxmotion/retarget/robot_motion.py`).
 
     Raises:
       ModuleNotFoundError: for robots without the extra [robot].

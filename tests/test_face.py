@@ -2,7 +2,9 @@
 
 import csv
 import dataclasses
+import errno
 import inspect
+import os
 
 import chex
 import jax
@@ -388,3 +390,28 @@ def test_shipped_models_lock_their_feet_unless_told_otherwise(model):
         toes = np.asarray(joints)[:, 15:, list(each.skeleton.feet), ::2]
         moved.append(np.linalg.norm(toes - toes[:, :1], axis=-1).max())
     assert moved[0] < 1e-4 < 2e-3 < moved[1], moved
+
+
+@pytest.mark.parametrize("suffix", sorted(face.SAVERS))
+def test_a_full_disk_leaves_the_file_that_was_there(
+    model, frames, suffix, tmp_path, monkeypatch
+):
+    def full(number):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / f"walk{suffix}"
+    path.write_bytes(b"before")
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=f"No space left.*walk{suffix}"):
+        jm.save(path, model.skeleton, frames[0, :2])
+    assert [x.name for x in tmp_path.iterdir()] == [path.name]
+    assert path.read_bytes() == b"before"
+
+
+def test_a_comma_in_a_joints_name_is_no_column(model, frames, tmp_path):
+    names = ("hips, of a rig", *model.skeleton.names[1:])
+    skeleton = dataclasses.replace(model.skeleton, names=names)
+    jm.save(tmp_path / "a.csv", skeleton, frames[0, :2])
+    head, first, *_ = (tmp_path / "a.csv").read_text().splitlines()
+    assert head.startswith("seconds,hips_ of a rig.x,")
+    assert head.count(",") == first.count(",") == 3 * skeleton.num_joints

@@ -7,7 +7,6 @@ shape: chains that leave the trunk, sides, heights. A few lines of JSON say othe
 """
 
 import itertools
-import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,15 +40,15 @@ _WORDS = {
     "LowerLeg": ("lowerleg", "loleg", "calf", "shin", "tibia", "knee", "leg"),
     "Foot": ("ankleroll", "anklepitch", "ankle", "foot"),
     "Toes": ("toebase", "toes", "toe", "ball", "foot"),
-    "Shoulder": ("clavicle", "collar", "shoulder"),
+    "Shoulder": ("clavicle", "collar", "shoulder", "shldr"),
     "UpperArm": (
         *("upperarm", "uparm", "humerus", "arm"),
-        *("shoulderyaw", "shoulderroll", "shoulderpitch", "shoulder"),
+        *("shoulderyaw", "shoulderroll", "shoulderpitch", "shoulder", "shldr"),
     ),
     "LowerArm": ("forearm", "lowerarm", "loarm", "radius", "elbow"),
     "Hand": ("hand", "wristyaw", "wristpitch", "wristroll", "wrist", "palm", "fist"),
 }
-_HEADS, _NECKS = ("head",), ("neck", "lowerneck", "upperneck")
+_HEADS, _NECKS = ("head",), ("neck", "lowerneck", "upperneck", "necklower")
 _NOISE = {
     *("l", "r", "c", "m", "left", "right", "jnt", "joint", "jt", "link", "bone", "bip"),
     *(
@@ -65,7 +64,7 @@ _NOISE = {
         "rig",
         "skel",
     ),
-    *("character", "org"),
+    *("character", "org", "bend"),  # Daz has a lThighBend and a lThighTwist
 }
 _HELPERS = {
     "twist",
@@ -316,18 +315,3 @@ def tables() -> dict[str, Any]:
         "token": _TOKEN.pattern,
         "sides": anatomy.side_patterns(),
     }
-
-
-def to_json(roles: Mapping[str, str]) -> str:
-    """A role and its joint a line, to be edited and given to `find_roles`."""
-    return json.dumps(dict(roles), indent=1)
-
-
-def table(source: Mapping[str, str], target: Mapping[str, str]) -> str:
-    """Whose joint moves whose, a role a line."""
-    wide = max(map(len, ROLES)), max(map(len, source.values()))
-    return "\n".join(
-        f"{role:{wide[0]}}  {source.get(role, '-'):{wide[1]}}  {target.get(role, '-')}"
-        for role in ROLES
-        if role in source or role in target
-    )

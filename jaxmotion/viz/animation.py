@@ -11,6 +11,7 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageColor, ImageDraw, ImageFilter, ImageFont
 
+from jaxmotion import files
 from jaxmotion.viz import camera as cameras
 from jaxmotion.viz import figure as drawing
 from jaxmotion.viz import raster
@@ -395,7 +396,8 @@ def save_gif(
         for frame in frames
     ]
     times = _durations(len(images), every / stage.fps)
-    path.write_bytes(_encoded(images, times))
+    with files.replacing(path) as file:
+        file.write(_encoded(images, times))
 
 
 def save_pictures(
@@ -418,7 +420,8 @@ def save_pictures(
     images = [
         image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images
     ]
-    path.write_bytes(_encoded(images, _durations(len(images), 1.0 / fps)))
+    with files.replacing(path) as file:
+        file.write(_encoded(images, _durations(len(images), 1.0 / fps)))
 
 
 def _encoded(images: list[Image.Image], times: list[int]) -> bytes:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxmotion import files
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.viz import camera as cameras
 from jaxmotion.viz import figure as drawing
@@ -369,4 +370,4 @@ def save_html(
 ) -> None:
     """Writes the page; see there."""
     text = page(stage, title=title, caption=caption)
-    drawing.check_writable(path).write_text(text, encoding="utf-8")
+    files.write_text(drawing.check_writable(path), text)

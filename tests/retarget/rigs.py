@@ -43,16 +43,6 @@ def named(skeleton, convention):
     return dataclasses.replace(skeleton, names=tuple(words))
 
 
-def _both(pattern, limbs):
-    return [pattern.format(side, limb) for side in ("Left", "Right") for limb in limbs]
-
-
-def _in_walkers_order(trunk, arms, legs):
-    half = len(arms) // 2, len(legs) // 2
-    left = [*arms[: half[0]], *arms[half[0] :]]
-    return [*trunk, *left, *legs]
-
-
 _T = ("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head")
 _AM = ("Shoulder", "Arm", "ForeArm", "Hand")
 _LM = ("UpLeg", "Leg", "Foot", "ToeBase")
@@ -63,9 +53,7 @@ def _sided(pattern, words, sides):
 
 
 def _names(trunk, pattern, arms, legs, sides):
-    return _in_walkers_order(
-        trunk, _sided(pattern, arms, sides), _sided(pattern, legs, sides)
-    )
+    return [*trunk, *_sided(pattern, arms, sides), *_sided(pattern, legs, sides)]
 
 
 CONVENTIONS = {
@@ -149,6 +137,13 @@ CONVENTIONS = {
         ("shoulder", "upper_arm", "forearm", "hand"),
         ("thigh", "shin", "foot", "toe"),
         ("L", "R"),
+    ),
+    "Daz": _names(
+        ("hip", "abdomenLower", "abdomenUpper", "chestUpper", "neckLower", "head"),
+        "{}{}",
+        ("Collar", "ShldrBend", "ForearmBend", "Hand"),
+        ("ThighBend", "Shin", "Foot", "Toe"),
+        ("l", "r"),
     ),
     "Unitree": _names(
         ("pelvis", "waist_yaw_link", "waist_roll_link", "torso_link", "neck", "head"),

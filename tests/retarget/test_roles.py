@@ -81,14 +81,10 @@ def test_roles_are_edited_as_json(tmp_path):
         rigs.walker().parents,
         tuple(f"x{j}" for j in range(22)),
     )
-    text = roles.to_json(roles.find_roles(odd))
-    edited = json.loads(text) | {"leftToes": "x16"}
+    edited = roles.find_roles(odd) | {"leftToes": "x16"}
     path = tmp_path / "roles.json"
     path.write_text(json.dumps(edited))
     assert roles.find_roles(odd, path)["leftToes"] == "x16"
-    shown = roles.table(EXPECTED, roles.find_roles(odd))
-    assert len(shown.splitlines()) == len(EXPECTED)
-    assert "leftUpperArm   LeftArm" in shown.replace("  ", "  ")
     for given, message in (
         ({"tail": "x1"}, "unknown role 'tail', expected of hips, chest"),
         ({"head": "skull"}, "role head: no joint 'skull' among x0, x1"),
