@@ -496,8 +496,8 @@ def to_glb(rig: Rig, motion: Motion) -> bytes:
             "type": kind,
         }
         if ends:
-            first, last = np.float32(values[[0, -1]]).tolist()
-            accessor |= {"min": [first], "max": [last]}
+            first, last = np.asarray(values[[0, -1]], np.float32)
+            accessor |= {"min": [float(first)], "max": [float(last)]}
         accessors.append(accessor)
         return len(accessors) - 1
 

@@ -30,6 +30,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxmotion.motion import anatomy, rotation
@@ -356,7 +357,7 @@ class Retarget:
         batch = np.shape(root_position)[:-1]
         number = math.prod(batch)
         missing = (1 << max(number - 1, 0).bit_length()) - number
-        if missing <= 0 or any(isinstance(x, jax.core.Tracer) for x in given):
+        if missing <= 0 or any(isinstance(x, Tracer) for x in given):
             return _program(self)(*given)
         padded = (
             jnp.pad(
