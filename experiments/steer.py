@@ -104,7 +104,7 @@ def dress(args: Config) -> tuple[Callable, Callable]:
             return jaxmotion.save(path, skeleton, motion)
         path.parent.mkdir(parents=True, exist_ok=True)
         with files.replacing(path) as file:
-            file.write(rig.to_glb(found, motion))
+            file.write(rig.to_glb(found, motion, rest=found.rest()))
 
     return wear, save
 

@@ -20,9 +20,11 @@ from urllib.parse import unquote
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from jaxmotion import files
-from jaxmotion.motion.anatomy import kinematics
+from jaxmotion.motion.anatomy import chain, kinematics
 from jaxmotion.motion.skeleton import MAX_METERS, Motion, Skeleton, check_skeleton
 from jaxmotion.retarget import roles as names
 from jaxmotion.retarget import transfer
@@ -41,6 +43,7 @@ _IMAGES = {
 }
 MESHOPT = "EXT_meshopt_compression"
 _MAX_NODES = 20_000
+_SMOOTH = 0.3  # seconds: a root on the ground does not sway with the hips
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -458,15 +461,20 @@ def _quaternions(matrices: np.ndarray) -> np.ndarray:
     return found / np.linalg.norm(found, axis=-1, keepdims=True)
 
 
-def to_glb(rig: Rig, motion: Motion) -> bytes:
+def to_glb(rig: Rig, motion: Motion, *, rest: Rest | None = None) -> bytes:
     """The rig's own file with one animation of one character, in place of its own.
 
-    Pictures that lie beside the rig are packed into it.
+    Pictures that lie beside the rig are packed into it. With its `rest`, a root on the
+    ground that carries the hips goes and turns with them, smoothly and on the ground,
+    as engines want of what they take for the way of a character.
     """
     positions, turned = kinematics(rig.skeleton, motion)
     if not np.isfinite(positions).all() or not np.isfinite(turned).all():
         bad = ~np.isfinite(positions).all(axis=(1, 2))
         raise ValueError(f"frame {int(bad.argmax())} of the motion is not finite")
+    carried = None if rest is None else _carried(rest)
+    if rest is not None and carried is not None:
+        positions, turned = _on_ground(rest, carried, positions, turned, motion.fps)
     world = turned @ rig.turns
     content, data = copy.deepcopy(rig.content), bytearray(rig.data)
     views = content.setdefault("bufferViews", [])
@@ -521,6 +529,15 @@ def to_glb(rig: Rig, motion: Motion) -> bytes:
         track(node, "rotation", _quaternions(np.swapaxes(over, -1, -2) @ world[:, j]))
     root = positions[:, 0] @ back[:3, :3].T + back[:3, 3]
     track(rig.nodes[0], "translation", root)
+    if carried is not None:
+        away = (positions[:, carried] - positions[:, 0])[:, None] @ world[:, 0]
+        node = content["nodes"][rig.nodes[carried]]
+        size = np.linalg.norm(rig.skeleton.offsets[carried])
+        track(
+            rig.nodes[carried],
+            "translation",
+            away[:, 0] * np.linalg.norm(node["translation"]) / size,
+        )
     content["animations"] = [
         {"name": "motion", "samplers": samplers, "channels": channels}
     ]
@@ -531,6 +548,41 @@ def to_glb(rig: Rig, motion: Motion) -> bytes:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(data), b"BIN\0") + bytes(data)
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def _carried(rest: Rest) -> int | None:
+    """The hips, where they hang on a root that stands on the ground; else None."""
+    hips = rest.joint("hips")
+    if hips is None or rest.skeleton.parents[hips] != 0:
+        return None
+    return hips if abs(rest.sole) < 0.2 * rest.leg else None
+
+
+def _on_ground(
+    rest: Rest, hips: int, positions: np.ndarray, turned: np.ndarray, fps: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and turns in which the root follows the hips on the ground."""
+
+    def smooth(x: np.ndarray) -> np.ndarray:
+        # On beyond the ends as before them: else he is held back there.
+        more = min(int(4 * _SMOOTH * fps), len(x) - 1)
+        longer = np.pad(x, ((more, more), (0, 0)), mode="reflect", reflect_type="odd")
+        found = gaussian_filter1d(longer, _SMOOTH * fps, axis=0, mode="nearest")
+        return found[more : more + len(x)]
+
+    ahead = smooth(turned[:, hips, ::2, 2])  # their z axis on the ground
+    yaw = np.arctan2(ahead[:, 0], ahead[:, 1])
+    turn = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0]).as_matrix()
+    level = np.array([1.0, 0.0, 1.0])
+    place = smooth(positions[:, hips] * level) - turn @ (rest.places[hips] * level)
+    place[:, 1] = -rest.sole
+    parents = rest.skeleton.parents
+    own = [j for j in range(len(parents)) if hips not in chain(parents, j)]
+    positions, turned = positions.copy(), turned.copy()
+    away = positions[:, own] - positions[:, :1]
+    positions[:, own] = place[:, None] + away @ np.swapaxes(turn, -1, -2)
+    turned[:, own] = turn[:, None] @ turned[:, own]
+    return positions, turned
 
 
 def _kind(name: str, image: bytes, number: int) -> str:
@@ -566,6 +618,6 @@ def save_onto(
     function = transfer.Retarget(
         transfer.rest(skeleton, rotations=world), rig.rest(roles)
     )
-    content = to_glb(rig, function(motion))
+    content = to_glb(rig, function(motion), rest=function.target)
     with files.replacing(path) as file:
         file.write(content)

@@ -131,6 +131,46 @@ def test_a_gltf_with_a_buffer_beside_it_and_a_vrm_are_rigs(hero, tmp_path):
     np.testing.assert_array_equal(found.skeleton.offsets, plain.skeleton.offsets)
 
 
+def test_a_root_on_the_ground_goes_with_the_hips(tmp_path):
+    """What engines take for the way of a character: level, smooth, facing ahead."""
+    base = rigs.person("child", "Unreal")
+    parents = [-1, *(p + 1 for p in base.parents), 0]
+    offsets = np.concatenate([np.zeros((1, 3)), base.offsets, [[0.2, 0.0, 0.0]]])
+    offsets[1] = [0.0, 0.1 - anatomy.zero_pose(base)[:, 1].min(), 0.05]
+    bones = rigs.plain(offsets, parents, ("root", *base.names, "ik_foot_root"))
+    path = tmp_path / "hero.glb"
+    path.write_bytes(rigs.glb(bones, arms_down=0.0))
+    skeleton, motion = samples.person(seconds=2.0, turn=1.0)
+    jm.save(tmp_path / "walk.glb", skeleton, motion, onto=path)
+    target = rigging.read_rig(path)
+    function = jm.retarget(skeleton, path, motion=motion)
+    expected, turns = anatomy.kinematics(target.skeleton, function(motion))
+    content = pygltflib.GLTF2().load(str(tmp_path / "walk.glb"))
+    index = {name: target.skeleton.index(name) for name in bones.names}
+    body = [j for name, j in index.items() if name not in ("root", "ik_foot_root")]
+    places, yaws = [], []
+    for frame in range(len(expected)):
+        world = worlds(content, frame)
+        found = np.stack([world[node][:3, 3] for node in target.nodes])
+        np.testing.assert_allclose(found[body], expected[frame][body], atol=3e-4)
+        places.append(found[[index["root"], index["ik_foot_root"]]])
+        turn = world[target.nodes[0]][:3, :3]
+        turn = turn / np.linalg.norm(turn, axis=0) @ target.turns[0].T
+        yaws.append(np.arctan2(turn[0, 2], turn[2, 2]))
+        assert turn[1, 1] > 1 - 1e-6
+    (root, carried), yaws = np.swapaxes(places, 0, 1), np.unwrap(yaws)
+    assert np.ptp(root[:, 1]) < 1e-4 and abs(root[0, 1]) < 0.05
+    hips = expected[:, index["pelvis"]]
+    assert np.linalg.norm((root - hips)[:, ::2], axis=-1).max() < 0.1
+    ahead = turns[:, index["pelvis"], :, 2]
+    own = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))
+    assert np.abs(yaws - own).max() < 0.3 and yaws[-1] - yaws[0] > 1.2
+    # It does not sway as the hips do, and what it carries goes with it.
+    bends = [np.abs(np.diff(x, 2))[8:-8].max() for x in (yaws, own)]
+    assert bends[0] < 0.3 * bends[1]
+    np.testing.assert_allclose(np.linalg.norm(carried - root, axis=-1), 0.2, atol=1e-4)
+
+
 def test_pictures_beside_a_gltf_are_packed_into_what_is_saved(hero, tmp_path):
     beside = tmp_path / "hero"
     (beside / "skins").mkdir(parents=True)
