@@ -11,6 +11,7 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
+import itertools
 import re
 import time
 from pathlib import Path
@@ -358,7 +359,11 @@ def sample(args: Sample) -> None:
         scale=args.scale,
         seed=args.seed,
     )
-    for name, (skeleton, motion) in made.items():
+    files: list[str] = []
+    for name, skeleton, motion in made:
+        word = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:60] or "motion"
+        more = (f"{word}_{number}" for number in itertools.count(2))
+        files.append(next(x for x in itertools.chain([word], more) if x not in files))
         reporting.write_rollout(
             out,
             skeleton,
@@ -366,7 +371,7 @@ def sample(args: Sample) -> None:
             None,
             title=f"{name}, {args.row}",
             caption=source,
-            name=re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:60],
+            name=files[-1],
         )
 
 

@@ -130,8 +130,10 @@ def test_actions_are_scored_beside_real_motions(call, actions):
 
 @pytest.mark.slow
 def test_samples_of_actions_are_motions(call, actions, tmp_path):
-    call(f"sample --run {actions} --action run walk --frames 12 --out {tmp_path}")
-    for name in ("run", "walk"):
+    call(f"sample --run {actions} --action run walk run --frames 12 --out {tmp_path}")
+    runs = [(tmp_path / f"{name}.bvh").read_text() for name in ("run", "run_2")]
+    assert runs[0] != runs[1]
+    for name in ("run", "walk", "run_2"):
         motion = bvh_text.read_bvh(tmp_path / f"{name}.bvh")
         assert motion.values.shape[0] == 12
         assert (tmp_path / f"{name}.html").stat().st_size > 1000

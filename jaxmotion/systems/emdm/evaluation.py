@@ -131,10 +131,10 @@ def make_motions(
     frames: int | None = None,
     scale: float | None = None,
     seed: int = 0,
-) -> tuple[dict[str, tuple[Skeleton, Motion]], str]:
-    """Skeleton and motion by action or sentence, and the data's source.
+) -> tuple[list[tuple[str, Skeleton, Motion]], str]:
+    """Name, skeleton and motion for each action or sentence, and the data's source.
 
-    One motion in all where a run has neither.
+    One motion in all, named "motion", where a run has neither.
 
     By default motions have the model's longest length and the paper's guidance.
     `ValueError` if an action is unknown, a text is empty or too long, the length is out
@@ -159,7 +159,8 @@ def make_motions(
             humanml_skeleton.motion_from_joints(joints, run.motions.fps)
             for joints in emdm_text.joints(run, x)
         )
-        return dict(zip(texts, made, strict=True)), run.motions.source
+        found = [(text, *one) for text, one in zip(texts, made, strict=True)]
+        return found, run.motions.source
     run = emdm_data.load_run(folder)
     for action in actions:
         if action not in run.actions:
@@ -172,10 +173,10 @@ def make_motions(
         vectors = emdm_model.action_vectors(numbers, len(run.actions))
     x = _features(record, vectors, **options)
     motions = emdm_features.to_motion(x, run.representation)
-    found = {
-        name: (run.clips.skeleton, jax.tree.map(lambda x, i=i: x[i], motions))
+    found = [
+        (name, run.clips.skeleton, jax.tree.map(lambda x, i=i: x[i], motions))
         for i, name in enumerate(actions or ("motion",))
-    }
+    ]
     return found, run.clips.source
 
 
