@@ -26,6 +26,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from jaxmotion.control import rollout, steering
@@ -365,7 +366,8 @@ def goal_rollouts(
       ValueError: if states are of another model, goals, states, places and commands of
         different numbers of characters or seconds, somebody leads without commands or
         follows nobody, there are commands but no leaders, less than a tick is asked
-        for, circles are of another shape, or a label is none of the model's.
+        for, circles are of another shape, a number of these or of places is not finite,
+        or a label is none of the model's.
     """
     number = jax.tree.leaves(states)[0].shape[0]
     places = jnp.zeros((number, 2)) if places is None else jnp.asarray(places)
@@ -409,6 +411,12 @@ def goal_rollouts(
         raise ValueError(
             f"circles of shape {circles.shape}, expected [circles, 3]: x, z and radius"
         )
+    for what, values in (("places", places), ("circles", circles)):
+        is_told = values is not None and not isinstance(values, Tracer)
+        if is_told and not np.isfinite(np.asarray(values)).all():
+            raise ValueError(
+                f"{what} are not all finite: {np.asarray(values).tolist()}"
+            )
     return _rollouts(
         character.params,
         key,

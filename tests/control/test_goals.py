@@ -280,6 +280,9 @@ def test_shapes_of_places_and_circles_are_told(name):
     given = {"seconds": 1.0, name: jnp.zeros((2, 4))}
     with pytest.raises(ValueError, match=rf"{name} of shape \(2, 4\), expected"):
         roll(model, jax.random.key(0), model.start(2), place, **given)
+    given[name] = jnp.full((2, 2 if name == "places" else 3), jnp.nan)
+    with pytest.raises(ValueError, match=f"{name} are not all finite: .*nan"):
+        roll(model, jax.random.key(0), model.start(2), place, **given)
 
 
 def test_leaders_need_commands_of_all_characters_and_seconds():
