@@ -20,8 +20,6 @@ from urllib.parse import unquote
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
 from jaxmotion import files
 from jaxmotion.motion.anatomy import chain, kinematics
@@ -567,12 +565,16 @@ def _on_ground(
         # On beyond the ends as before them: else he is held back there.
         more = min(int(4 * _SMOOTH * fps), len(x) - 1)
         longer = np.pad(x, ((more, more), (0, 0)), mode="reflect", reflect_type="odd")
-        found = gaussian_filter1d(longer, _SMOOTH * fps, axis=0, mode="nearest")
-        return found[more : more + len(x)]
+        weights = np.exp(-0.5 * (np.arange(-more, more + 1) / (_SMOOTH * fps)) ** 2)
+        weights /= weights.sum()
+        columns = [np.convolve(column, weights, "valid") for column in longer.T]
+        return np.stack(columns, axis=-1)
 
     ahead = smooth(turned[:, hips, ::2, 2])  # their z axis on the ground
     yaw = np.arctan2(ahead[:, 0], ahead[:, 1])
-    turn = Rotation.from_rotvec(yaw[:, None] * [0.0, 1.0, 0.0]).as_matrix()
+    turn = np.tile(np.eye(3), (len(ahead), 1, 1))
+    turn[:, 0, 0] = turn[:, 2, 2] = np.cos(yaw)
+    turn[:, 0, 2], turn[:, 2, 0] = np.sin(yaw), -np.sin(yaw)
     level = np.array([1.0, 0.0, 1.0])
     place = smooth(positions[:, hips] * level) - turn @ (rest.places[hips] * level)
     place[:, 1] = -rest.sole

@@ -156,6 +156,7 @@ class Page:
           is_local: Whether only this machine reaches a host.
         """
         self.session, self._out, self._save = session, out, save
+        self._writing = threading.Lock()
         self._is_local = is_local
         html = (_WEB / "index.html").read_text(encoding="utf-8")
         # Its own entry, in the place of the one that the static page is bundled to.
@@ -345,13 +346,13 @@ class Page:
 
     def _write(self, suffix: str) -> Path:
         """Saves the take under the next free name."""
-        motion, skeleton = self.session.take, self.session.take_skeleton
-        if motion is None:
+        if (take := self.session.take) is None:
             raise ValueError("nothing is recorded yet")
-        number = 1
-        while (path := self._out / f"take_{number:03d}{suffix}").exists():
-            number += 1
-        self._save(path, skeleton, motion)
+        with self._writing:  # people may save at the same time
+            number = 1
+            while (path := self._out / f"take_{number:03d}{suffix}").exists():
+                number += 1
+            self._save(path, *take)
         return path
 
 

@@ -255,8 +255,8 @@ class Session:
         self._tick, self.engine_number = 0, 0
         self._take: list[tuple[np.ndarray, np.ndarray]] | None = None
         self.note = ""
-        self.take: Motion | None = None
-        self.take_skeleton: Any = None
+        # The last take, and whose skeleton it has: one value, for other threads.
+        self.take: tuple[Skeleton, Motion] | None = None
 
     # What people do.
 
@@ -331,11 +331,12 @@ class Session:
                 jnp.asarray(np.stack(x)) for x in zip(*frames, strict=True)
             )
             character = engine.character
-            self.take = Motion(
+            motion = Motion(
                 root_position=root, joint_rotation=rotation, fps=character.fps
             )
             dress = engine.dress
-            self.take_skeleton = character.skeleton if dress is None else dress.skeleton
+            skeleton = character.skeleton if dress is None else dress.skeleton
+            self.take = (skeleton, motion)
 
     def close(self) -> None:
         """Ends `run`."""
@@ -385,7 +386,7 @@ class Session:
                 "most_characters": MOST_CHARACTERS,
                 "note": self.note,
                 "recording": self._take is not None,
-                "taken": 0.0 if self.take is None else _seconds(self.take),
+                "taken": 0.0 if self.take is None else _seconds(self.take[1]),
                 "people": len(self._inputs),
             }
 

@@ -40,8 +40,8 @@ MAY_IMPORT = {
         "data",
         "text",
     },
-    # control: the live page (viewer.py).
-    "viz": {"typing", "motion", "control"},
+    # control: the live page (viewer.py). files: pictures are whole or not there.
+    "viz": {"typing", "files", "motion", "control"},
     "retarget": {"typing", "files", "motion"},
     # Functions and shapes of whatever system; a graph's noise is an input.
     # motion, viz: the skinned body of a .glb.

@@ -316,7 +316,7 @@ def test_a_take_is_saved_as_it_was_shown(tab, served):
     tab.click("#record")
     tab.wait_for_selector("#save button", state="visible", timeout=PATIENCE)
     tab.keyboard.up("a")
-    take = served.session.take
+    _, take = served.session.take
     with tab.expect_download(timeout=PATIENCE) as download:
         tab.click("#save button:has-text('.bvh')")
         tab.click("#saved a", timeout=PATIENCE)

@@ -1,10 +1,12 @@
 """What held keys ask for, the session's ticks, and what it records."""
 
+import concurrent.futures
 import dataclasses
 import json
 import math
 import threading
 import time
+import types
 
 import numpy as np
 import pytest
@@ -311,6 +313,27 @@ def test_more_characters_join_beside_the_first():
     assert np.abs(it.tick().roots[0, ::2]).max() < 0.1
 
 
+def test_people_who_save_at_once_get_a_file_each(tmp_path):
+    together = threading.Barrier(3)
+
+    def save(path, skeleton, motion):
+        time.sleep(0.05)  # while others look for a free name
+        path.write_text(f"{skeleton} {motion}")
+
+    session = types.SimpleNamespace(take=("bones", "walk"))
+    served = page.Page(session, out=tmp_path, save=save, is_local=lambda host: True)
+
+    def one(_):
+        together.wait()
+        return served._write(".bvh").name
+
+    with concurrent.futures.ThreadPoolExecutor(3) as pool:
+        found = [*pool.map(one, range(3))]
+    assert sorted(found) == [f"take_00{i}.bvh" for i in (1, 2, 3)]
+    assert {x.read_text() for x in tmp_path.iterdir()} == {"bones walk"}
+    assert len([*tmp_path.iterdir()]) == 3
+
+
 @pytest.mark.slow
 def test_a_take_is_what_was_shown():
     it = Ticking(ball=True)
@@ -320,7 +343,7 @@ def test_a_take_is_what_was_shown():
     assert it.session.state()["recording"]
     it.session.record()
     it.tick(times=5)
-    take = it.session.take
+    _, take = it.session.take
     want = [x.roots[0] for x in it.shown[10:30]]
     np.testing.assert_allclose(take.root_position, want, atol=1e-6)
     assert take.fps == 30 and not it.session.state()["recording"]
@@ -329,12 +352,12 @@ def test_a_take_is_what_was_shown():
     it.tick(times=2)
     it.session.reset()  # who is somewhere else is in no take
     it.tick("forward", times=3)
-    assert it.session.take.root_position.shape == (2, 3)
+    assert it.session.take[1].root_position.shape == (2, 3)
     it.session.record()
     it.tick(times=3)
     it.session.change("model", "other")  # of another skeleton, perhaps: the take ends
     it.load()
-    assert it.session.take.root_position.shape == (3, 3)
+    assert it.session.take[1].root_position.shape == (3, 3)
     assert not it.session.state()["recording"]
 
 
@@ -362,9 +385,9 @@ def test_another_body_is_worn_at_the_size_of_the_model():
     same = plain.tick("forward", times=20).roots[0]
     np.testing.assert_allclose(walked, same, atol=1e-5)
     # Shown where the model is; recorded in the body's own meters.
-    assert it.session.take_skeleton is half
+    assert it.session.take[0] is half
     np.testing.assert_allclose(
-        it.session.take.root_position[-1], 0.5 * walked, atol=1e-5
+        it.session.take[1].root_position[-1], 0.5 * walked, atol=1e-5
     )
 
 
