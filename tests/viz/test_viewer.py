@@ -6,7 +6,6 @@ import json
 import math
 import threading
 import time
-import types
 
 import numpy as np
 import pytest
@@ -320,7 +319,8 @@ def test_people_who_save_at_once_get_a_file_each(tmp_path):
         time.sleep(0.05)  # while others look for a free name
         path.write_text(f"{skeleton} {motion}")
 
-    session = types.SimpleNamespace(take=("bones", "walk"))
+    session = object.__new__(viewer.Session)
+    session.take = ("bones", "walk")
     served = page.Page(session, out=tmp_path, save=save, is_local=lambda host: True)
 
     def one(_):
