@@ -210,12 +210,19 @@ function materialOf(file, primitive) {
 
 // A PNG's or JPEG's bytes; null for others.
 function imageOf(file, number) {
-  const image = file.item("images", number, "an image");
-  if (image.bufferView === undefined)
+  const { bufferView, uri } = file.item("images", number, "an image");
+  const isHere = typeof uri === "string" && uri.startsWith("data:");
+  if (bufferView === undefined && !isHere)
     refuse(`image ${number} is outside of the file: expected a .glb that holds all of it`);
-  const bytes = file.bytes(image.bufferView).slice();
+  const bytes = bufferView === undefined ? decoded(uri, number) : file.bytes(bufferView).slice();
   const starts = (...head) => head.every((x, i) => bytes[i] === x);
   return starts(0x89, 0x50, 0x4e, 0x47) || starts(0xff, 0xd8, 0xff) ? bytes : null;
+}
+
+function decoded(uri, number) {
+  try {
+    return Uint8Array.from(atob(uri.slice(uri.indexOf(",") + 1)), x => x.charCodeAt(0));
+  } catch { return refuse(`image ${number} is no base64`); }
 }
 
 const srgb = x => 255 * (x < 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);
