@@ -187,9 +187,9 @@ def plan_flops(load: workload.Rollouts) -> int:
 
 
 def processors() -> int:
-    """Accelerators, or cores that this process may use."""
+    """One accelerator, or the cores that this process may use."""
     if jax.default_backend() != "cpu":
-        return jax.device_count()
+        return 1
     known = hasattr(os, "sched_getaffinity")
     return len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
 

@@ -79,6 +79,8 @@ def parse(kind: type[S], description: str | None) -> S:
       ValueError: if the baseline is no report.
     """
     args = tyro.cli(kind, description=description)
+    # Who sets JAX_COMPILATION_CACHE_DIR would be told seconds of reading it.
+    jax.config.update("jax_enable_compilation_cache", False)
     prepare(args)
     return args
 

@@ -147,6 +147,22 @@ def export_page(args: Config) -> None:
     print(f"python -m http.server -d {args.out}")
 
 
+def earlier(folder: Path) -> set[Path]:
+    """What the export before wrote there: graphs, starts and the player.
+
+    `ValueError` if its list is none of an export.
+    """
+    path = folder / "character.json"
+    if not path.exists():
+        return set()
+    graphs = files.read_object(path, what="a character").get("graphs")
+    listed = [*graphs.values()] if isinstance(graphs, dict) else [None]
+    names = [x.get("file") if isinstance(x, dict) else None for x in listed]
+    if not all(isinstance(x, str) and Path(x).name == x for x in names):
+        raise ValueError(f"{path} lists no graphs: expected a folder of its own")
+    return {folder / str(name) for name in (*names, "start.npz", "player.py")}
+
+
 def export(args: Config) -> None:
     """Loads, converts, and writes.
 
@@ -192,7 +208,7 @@ def export(args: Config) -> None:
     else:
         character = jm.load(source, foot_lock=args.foot_lock)
         functions, arguments, facts, starts = steered(character)
-    graphs = {}
+    old, graphs = earlier(args.out), {}
     for name, function in functions.items():
         begun, path = time.perf_counter(), args.out / (name + writer.SUFFIX)
         made = graph.make(name, function, arguments)
@@ -212,6 +228,8 @@ def export(args: Config) -> None:
         "graphs": graphs,
         "versions": runs.versions(),
     }
+    for path in old - {args.out / found["file"] for found in graphs.values()}:
+        path.unlink(missing_ok=True)
     files.write_text(args.out / "character.json", json.dumps(about, indent=1) + "\n")
     if starts:
         files.write_arrays(args.out / "start.npz", starts)

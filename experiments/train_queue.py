@@ -197,6 +197,7 @@ def start(job: Job, core: int) -> Running | None:
         for words in map(shlex.split, job.commands)
         if str(job.folder) in words or not output_of(words).exists()
     ]
+    known = hasattr(os, "sched_setaffinity")
     with (job.folder / "queue.log").open("a") as log, lock:
         process = subprocess.Popen(
             ["sh", "-c", " && ".join(lines)],
@@ -205,9 +206,9 @@ def start(job: Job, core: int) -> Running | None:
             stderr=subprocess.STDOUT,
             pass_fds=[lock.fileno()],
             env=os.environ | {"OMP_NUM_THREADS": "1"},
+            # In the shell, before it starts anything that would keep all cores.
+            preexec_fn=(lambda: os.sched_setaffinity(0, {core})) if known else None,
         )
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(process.pid, {core})
     return Running(job, process, minutes, time.monotonic())
 
 

@@ -337,6 +337,10 @@ def _go(
         needs, starts = jnp.sum(steps / pace, axis=-1), goal.points[..., 0, :]
     else:
         needs = goal.seconds if isinstance(goal, goals.Place) else goal.distance
+    if isinstance(goal, goals.Follow):
+        shape = jnp.broadcast_shapes(goal.leader.shape, goal.distance.shape)
+        goal = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), goal)
+        needs = goal.distance
     if not needs.ndim:
         every = lambda x: jnp.broadcast_to(x, (number, *x.shape))  # noqa: E731
         goal = jax.tree.map(every, goal)

@@ -107,11 +107,11 @@ class Follow:
 
     Attributes:
       leader: Index of another walker; his own: he is led by commands.
-      distance: Meters.
+      distance: Meters; one for all, or one for each.
     """
 
     leader: Int[Array, "*batch"]
-    distance: Float[Array, "*batch"]
+    distance: Float[Array, "*#batch"]
 
 
 Goal = Path | Place | Follow

@@ -364,7 +364,7 @@ def train_all(
                             f"{_last_good(place)}"
                         )
                     _save(place, done, own, one.config)
-    if stop and done < loop.num_steps:
+    if stop:
         places = ", ".join(str(one.folder / "checkpoints") for one in loops)
         raise KeyboardInterrupt(f"stopped at step {done}; saved in {places}")
     return state

@@ -16,8 +16,8 @@ somebody's sticks, {"set": {name: value}}, {"do": "reset" | "step" | "record"} o
 {"save": ".bvh"}.
 
 A browser that reads slowly gets fewer frames, the newest ones, and holds up nobody.
-Only pages from this very server may connect, so no other web site steers, and a name
-that someone points at this machine is not answered.
+Only pages from this very server may connect, so no other web site steers. Where only
+this machine is served, a name that someone points at it is not answered.
 """
 
 import asyncio
@@ -226,14 +226,18 @@ class Page:
 
     def _request(self, connection: Any, request: Any) -> Any:
         """Answers all but the WebSocket's own request, or refuses it."""
-        host = request.headers.get("Host", "")
-        name = urlsplit(f"//{host}").hostname
+        host, origin = (request.headers.get(x) for x in ("Host", "Origin"))
+        host = host or ""
+        try:
+            name = urlsplit(f"//{host}").hostname
+            asked = None if origin is None else urlsplit(origin).netloc
+        except ValueError:  # half a bracket
+            return connection.respond(HTTPStatus.BAD_REQUEST, "no such host\n")
         if self._local and not self._is_local(name):
             return connection.respond(HTTPStatus.FORBIDDEN, "not this host\n")
         path = urlsplit(request.path).path
         if path == "/live":
-            origin = request.headers.get("Origin")
-            if origin is not None and urlsplit(origin).netloc != host:
+            if origin is not None and asked != host:
                 return connection.respond(HTTPStatus.FORBIDDEN, "not this origin\n")
             return None
         if path == "/":
@@ -322,11 +326,14 @@ class Page:
             return
         dress = self.session.dress
         if dress is not None:
-            self._body = engine, dress.packed
+            made = dress.packed
         elif skeleton is not None:
             about = {"skeleton": packed.skeleton_json(skeleton)}
-            arrays = packed.body_arrays(skeleton, poses)
-            self._body = engine, packed.pack(about, arrays)
+            made = packed.pack(about, packed.body_arrays(skeleton, poses))
+        else:
+            return
+        if engine > self._body[0]:  # not that of an engine which is gone by now
+            self._body = engine, made
 
     async def _obey(self, client: "_Client", text: str | bytes) -> None:
         message, session = read_message(text), self.session

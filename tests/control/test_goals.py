@@ -285,6 +285,20 @@ def test_shapes_of_places_and_circles_are_told(name):
         roll(model, jax.random.key(0), model.start(2), place, **given)
 
 
+def test_one_distance_serves_all_who_follow():
+    model = jm.load("walker")
+    commands = jm.commands("straight", model, 2, seconds=0.5)
+    roll = functools.partial(
+        jm.rollout, model, jax.random.key(0), model.start(2), commands=commands
+    )
+    leader = jnp.array([0, 0])
+    each, one = (
+        roll(goal=goals.Follow(leader=leader, distance=distance))
+        for distance in (jnp.array([1.5, 1.5]), jnp.array(1.5))
+    )
+    np.testing.assert_array_equal(one.root_position, each.root_position)
+
+
 def test_leaders_need_commands_of_all_characters_and_seconds():
     model = jm.load("walker")
     goal = goals.Follow(leader=jnp.array([0, 0]), distance=jnp.array([1.5, 1.5]))

@@ -63,6 +63,37 @@ def test_an_export_replaces_its_own_earlier_one_and_nothing_else(script, tmp_pat
     assert not (site / "two").exists()
 
 
+def test_graphs_of_the_export_before_are_taken_away(script, tmp_path, monkeypatch):
+    functions = {name: None for name in ("plan", "advance")}
+    monkeypatch.setattr(script, "steered", lambda character: (functions, {}, {}, {}))
+    monkeypatch.setattr(script.graph, "make", lambda name, *given: name)
+    listed = lambda made, file, **options: {"file": file}  # noqa: E731
+    monkeypatch.setattr(script.graph, "to_json", listed)
+    for writer in script.FORMATS.values():
+        monkeypatch.setattr(writer, "check", lambda: None)
+        write = lambda path, made, **options: path.write_text(made)  # noqa: E731
+        monkeypatch.setattr(writer, "write", write)
+    (tmp_path / "notes.onnx").write_text("not of the export")
+    for name in ("player.py", "start.npz"):
+        (tmp_path / name).write_text("of before")
+    options = {"model": ("one",), "out": tmp_path}
+    script.export(script.Config(**options, format="onnx", batch="4"))
+    functions.pop("plan")
+    functions["tick"] = None
+    script.export(script.Config(**options, format="stablehlo"))
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {
+        "advance.stablehlo",
+        "tick.stablehlo",
+        "character.json",
+        "notes.onnx",
+    }
+    for content in ("{}", '{"graphs": {"plan": {"file": "../plan.onnx"}}}'):
+        (tmp_path / "character.json").write_text(content)
+        with pytest.raises(ValueError, match=r"character.json lists no graphs: exp"):
+            script.export(script.Config(**options, format="stablehlo"))
+
+
 @pytest.mark.parametrize("content", ['{"models": ["one"]}', "[]", "no JSON"])
 def test_an_export_that_lists_no_files_is_left_alone(script, tmp_path, content):
     (tmp_path / "models.json").write_text(content)

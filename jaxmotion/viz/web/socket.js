@@ -14,8 +14,10 @@ class Socket {
         return on.frame(new Float32Array(data), performance.now());
       const message = JSON.parse(data);
       if (message.state) on.state(message.state);
-      if (message.body)
-        on.body(await (await fetch(`/body/${message.body}`)).arrayBuffer(), message.body);
+      if (message.body) {
+        const found = await fetch(`/body/${message.body}`);
+        if (found.ok) on.body(await found.arrayBuffer(), message.body);
+      }
       if (message.error) on.error(message.error);
       if (message.saved) on.saved(message.saved);
     };
