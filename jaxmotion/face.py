@@ -335,12 +335,11 @@ def _go(
         steps = jnp.linalg.norm(jnp.diff(goal.points, axis=-2), axis=-1)
         pace = 0.5 * (goal.speed[..., 1:] + goal.speed[..., :-1])
         needs, starts = jnp.sum(steps / pace, axis=-1), goal.points[..., 0, :]
+    elif isinstance(goal, goals.Place):
+        needs = goal.seconds
     else:
-        needs = goal.seconds if isinstance(goal, goals.Place) else goal.distance
-    if isinstance(goal, goals.Follow):
-        shape = jnp.broadcast_shapes(goal.leader.shape, goal.distance.shape)
-        goal = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), goal)
-        needs = goal.distance
+        leader, needs = jnp.broadcast_arrays(goal.leader, goal.distance)
+        goal = goals.Follow(leader=leader, distance=needs)
     if not needs.ndim:
         every = lambda x: jnp.broadcast_to(x, (number, *x.shape))  # noqa: E731
         goal = jax.tree.map(every, goal)
