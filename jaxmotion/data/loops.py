@@ -168,7 +168,8 @@ def with_loops(clips: Clips, *, seconds: float, held_out: float = 0.1) -> Clips:
     Each half of a meter per second from 2 m/s to 4.1 is then to be learned from for so
     many seconds, its loops as long as each other; one of which the clips have as much
     gets none. Learned from is what is left of a clip when the last part of it is held
-    out, and the second before that; strides come from there. A loop has its clip's
+    out, and the second before that; strides come from there, and loops are learned from
+    whole. A loop has its clip's
     labels, and its name followed by the loop's number and rate: "Run1_loop3x1.12".
     Copies at 0.85, 1.12 and 1.24 times the speed are made where people still move so:
     of runs, up to 4.1 m/s and 1.85 strides per second.
@@ -201,7 +202,7 @@ def with_loops(clips: Clips, *, seconds: float, held_out: float = 0.1) -> Clips:
         and least <= rate * speed <= _FASTEST
     ]
     made = np.bincount([band for _, _, band in copies], minlength=len(_BANDS))
-    each = np.round((missing / np.maximum(made, 1) + fps) / (1.0 - held_out))
+    each = np.round(missing / np.maximum(made, 1))
     lengths = np.where((made > 0) & (missing > 0), each, 0)
     if not lengths.any():
         raise ValueError(

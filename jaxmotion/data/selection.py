@@ -15,6 +15,11 @@ _LOOP = re.compile(r"_loop\d+x[\d.]+(?=$|[_@#])")
 _MIRRORED = re.compile(r"_mirrored(?=$|[_@#])")
 
 
+def is_loop(name: str) -> bool:
+    """Whether a clip so named is a stride, repeated by `loops`."""
+    return bool(_LOOP.search(name))
+
+
 def original(name: str) -> str:
     """Name of the clip whose frames a mirror image, or a repeated stride, shows."""
     return _MIRRORED.sub("", _LOOP.sub("", name))
@@ -132,7 +137,7 @@ def _originals(clips: Clips) -> Int[np.ndarray, " originals"]:
     found = []
     for clip, name in enumerate(clips.titles):
         plain = original(name)
-        if plain == name or (plain not in known and not _LOOP.search(name)):
+        if plain == name or (plain not in known and not is_loop(name)):
             known.add(plain)
             found.append(clip)
     return np.array(found, int)
@@ -143,8 +148,8 @@ def _parted(clips: Clips, held_out: Int[np.ndarray, " held"]) -> tuple[Clips, Cl
     names = {original(clips.titles[clip]) for clip in held_out}
     is_held = np.array([original(name) in names for name in clips.titles])
     is_held[np.setdiff1d(_originals(clips), held_out)] = False  # of the same name
-    is_loop = np.array([bool(_LOOP.search(name)) for name in clips.titles])
-    train, held = np.flatnonzero(~is_held), np.flatnonzero(is_held & ~is_loop)
+    loops = np.array([is_loop(name) for name in clips.titles])
+    train, held = np.flatnonzero(~is_held), np.flatnonzero(is_held & ~loops)
     return take_clips(clips, train), take_clips(clips, held)
 
 
@@ -154,7 +159,7 @@ def split_by_name(clips: Clips, held_out: Sequence[str]) -> tuple[Clips, Clips]:
     Their mirror images are held out with them, their repeated strides are in neither
     part. `ValueError` if a name is unknown, or no clip would be left to train on.
     """
-    known = [name for name in clips.titles if not _LOOP.search(name)]
+    known = [name for name in clips.titles if not is_loop(name)]
     unknown = [name for name in held_out if name not in known]
     if unknown:
         raise ValueError(

@@ -5,6 +5,7 @@ other are nearly the same.
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -79,22 +80,29 @@ def take(data: PoseData, spans: list[tuple[int, int]]) -> PoseData:
     )
 
 
-def split_ends(data: PoseData, fraction: float) -> tuple[PoseData, PoseData]:
+def split_ends(
+    data: PoseData, fraction: float, *, whole: Sequence[bool] = ()
+) -> tuple[PoseData, PoseData]:
     """Holds out a part, in (0, 1), at the end of every clip, and a second before it.
 
-    `ValueError` if it is out of range, or a part would be empty.
+    `whole` says of which clips nothing is held out, as of loops, whose ends were seen
+    before; empty for none. `ValueError` if the part is out of range, or one would be
+    empty.
     """
     if not 0.0 < fraction < 1.0:
         raise ValueError(f"fraction should be between 0 and 1, found {fraction}")
     offsets = np.asarray(data.offsets)
     gap = round(data.fps)
     train, held = [], []
-    for a, b in zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True):
+    spans = zip(offsets[:-1].tolist(), offsets[1:].tolist(), strict=True)
+    for (a, b), keeps in zip(spans, whole or [False] * (len(offsets) - 1), strict=True):
         cut = b - round((b - a) * fraction)
-        if a < cut - gap and cut < b:
+        if keeps:
+            train.append((a, b))
+        elif a < cut - gap and cut < b:
             train.append((a, cut - gap))
             held.append((cut, b))
-    if not train:
+    if not held:
         raise ValueError("no clip is long enough to hold a part of it out")
     return take(data, train), take(data, held)
 

@@ -112,7 +112,8 @@ def prepare(
         frames, names = aamdm_data.pose_data(clips, fps=fps)
         skipped = sorted(set(clips.clip_names) - set(names))
         print(f"{len(names)} clips, {frames.num_frames} frames; too short: {skipped}")
-        parts = aamdm_data.split_ends(frames, held_out)
+        loops = [selection.is_loop(name) for name in names]
+        parts = aamdm_data.split_ends(frames, held_out, whole=loops)
         config = aamdm_embedding.Config(num_joints=clips.skeleton.num_joints, fps=fps)
         return runs.Content(
             model={

@@ -52,6 +52,17 @@ def test_ends_are_held_out_behind_a_second(fps):
     assert train.fps == held_out.fps == fps
 
 
+def test_of_loops_nothing_is_held_out():
+    """What their ends show was seen before."""
+    train, held_out = aamdm_data.split_ends(
+        counted(fps=30.0), 0.2, whole=(False, False, True)
+    )
+    assert parts(train) == [(0, 0, 290), (1, 0, 42), (2, 0, 250)]
+    assert parts(held_out) == [(0, 320, 400), (1, 72, 90)]
+    with pytest.raises(ValueError, match="long enough"):
+        aamdm_data.split_ends(counted(), 0.2, whole=(True, True, True))
+
+
 def test_a_clip_without_room_for_the_gap_is_in_neither_part():
     train, held_out = aamdm_data.split_ends(counted(), 0.5)
     assert [part[0] for part in parts(train)] == [0, 2]
