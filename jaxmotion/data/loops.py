@@ -169,10 +169,9 @@ def with_loops(clips: Clips, *, seconds: float, held_out: float = 0.1) -> Clips:
     many seconds, its loops as long as each other; one of which the clips have as much
     gets none. Learned from is what is left of a clip when the last part of it is held
     out, and the second before that; strides come from there, and loops are learned from
-    whole. A loop has its clip's
-    labels, and its name followed by the loop's number and rate: "Run1_loop3x1.12".
-    Copies at 0.85, 1.12 and 1.24 times the speed are made where people still move so:
-    of runs, up to 4.1 m/s and 1.85 strides per second.
+    whole. A loop has its clip's labels, and its name followed by the loop's number and
+    rate: "Run1_loop3x1.12". Copies at 0.85, 1.12 and 1.24 times the speed are made
+    where people still move so: of runs, up to 4.1 m/s and 1.85 strides per second.
 
     `ValueError` if no clip has such a stride, nothing is to be added, or a hip joint is
     missing.

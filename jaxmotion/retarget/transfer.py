@@ -321,8 +321,9 @@ def two_bones(
 class Retarget:
     """Motions of the source to motions of the target; see the module.
 
-    A pure function that may be jitted and vmapped with more. By itself it is one
-    program per pair of skeletons and power of two of frames, which are filled up.
+    A pure function that may be jitted and vmapped with more. By itself `pose`, for
+    ticks, is one program per pair of skeletons and shape; motions, whose lengths
+    differ, are filled up to a power of two of frames.
     """
 
     source: Rest
@@ -344,7 +345,21 @@ class Retarget:
 
     def __call__(self, motion: Motion) -> Motion:
         """The motion of the target of one of the source's, with whatever axes lead."""
-        root, turns = self.pose(motion.root_position, motion.joint_rotation)
+        given = (motion.root_position, motion.joint_rotation)
+        batch = given[0].shape[:-1]
+        number = math.prod(batch)
+        missing = (1 << max(number - 1, 0).bit_length()) - number
+        if missing <= 0 or any(isinstance(x, Tracer) for x in given):
+            root, turns = self.pose(*given)
+        else:
+            flat = (x.reshape(number, *x.shape[len(batch) :]) for x in given)
+            filled = (
+                jnp.pad(x, ((0, missing), *((0, 0),) * (x.ndim - 1)), mode="edge")
+                for x in flat
+            )
+            root, turns = (x[:number] for x in self.pose(*filled))
+            root = root.reshape(*batch, 3)
+            turns = turns.reshape(*batch, *turns.shape[1:])
         return Motion(root_position=root, joint_rotation=turns, fps=motion.fps)
 
     def pose(
@@ -353,22 +368,7 @@ class Retarget:
         joint_rotation: Float[Array, "*batch source 6"],
     ) -> tuple[Float[Array, "*batch 3"], Float[Array, "*batch target 6"]]:
         """Root positions and local rotations of the target, as `Motion` has them."""
-        given = (root_position, joint_rotation)
-        batch = np.shape(root_position)[:-1]
-        number = math.prod(batch)
-        missing = (1 << max(number - 1, 0).bit_length()) - number
-        if missing <= 0 or any(isinstance(x, Tracer) for x in given):
-            return _program(self)(*given)
-        padded = (
-            jnp.pad(
-                jnp.reshape(x, (number, *np.shape(x)[len(batch) :])),
-                ((0, missing), *((0, 0),) * (np.ndim(x) - len(batch))),
-                mode="edge",
-            )
-            for x in given
-        )
-        root, turns = (x[:number] for x in _program(self)(*padded))
-        return root.reshape(*batch, 3), turns.reshape(*batch, *turns.shape[1:])
+        return _program(self)(root_position, joint_rotation)
 
     def _many(self, root_position: Array, joint_rotation: Array) -> tuple[Array, Array]:
         """Of many characters, one frame each."""
