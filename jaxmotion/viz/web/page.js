@@ -147,7 +147,8 @@ export function start(source) {
     },
     body(buffer, engine) {
       body = unpack(buffer); number = engine;
-      frame = null; due.length = 0; trail = []; kept.length = 0;
+      frame = null; trail = [];
+      for (const one of [due, history, kept]) one.length = 0;
       const worn = file;
       clothe(null);
       if (worn) clothe(worn);

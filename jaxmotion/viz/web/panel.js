@@ -163,10 +163,13 @@ export class Panel {
     });
     pen.strokeStyle = "#20262e"; pen.setLineDash([4, 3]); pen.beginPath();
     pen.moveTo(0, y(budget)); pen.lineTo(w, y(budget)); pen.stroke();
-    const planned = history.filter(x => x[1]).map(x => x[0]).sort((a, b) => a - b);
-    const plan = planned.length ? planned[planned.length >> 1].toFixed(0) : "-";
-    const plans = history.reduce((sum, x) => sum + x[1], 0) * rate / history.length;
-    $("numbers").textContent = `plan ${plan} ms · ${plans.toFixed(1)} plans/s · ` +
-      `${rate.toFixed(0)} of ${fps.toFixed(0)} frames/s`;
+    // Who makes frame after frame has no plans.
+    const planned = history.filter(x => x[1]), all = planned.length ? planned : history;
+    const median = all.map(x => x[0]).sort((a, b) => a - b)[all.length >> 1];
+    const plans = planned.reduce((sum, x) => sum + x[1], 0) * rate / history.length;
+    $("numbers").textContent = (planned.length
+      ? `plan ${median.toFixed(0)} ms · ${plans.toFixed(1)} plans/s · `
+      : `frame ${median.toFixed(1)} ms · `)
+      + `${rate.toFixed(0)} of ${fps.toFixed(0)} frames/s`;
   }
 }
