@@ -14,6 +14,10 @@ CONTENT = {
     "y": [np.int64(3), 4, True, None],
     "text": ("ü", b"\xff\x00"),
     "order": np.asfortranarray(np.arange(6).reshape(2, 3)),
+    "ragged": np.array([[np.arange(2), None, "x"], [1, 2, 3]], object),
+    "words": np.array(["a", "bcd"]),
+    "swapped": np.arange(3, dtype=">i4"),
+    "type": np.dtype("<f4"),
 }
 
 
@@ -24,7 +28,14 @@ def check(found):
         np.testing.assert_array_equal(a, b)
     assert found["y"] == CONTENT["y"]
     assert found["text"] == CONTENT["text"]
-    np.testing.assert_array_equal(found["order"], CONTENT["order"])
+    for name in ("order", "words", "swapped"):
+        np.testing.assert_array_equal(found[name], CONTENT[name])
+        assert found[name].dtype == CONTENT[name].dtype
+    assert found["ragged"].shape == (2, 3)
+    np.testing.assert_array_equal(found["ragged"][0, 0], np.arange(2))
+    assert found["ragged"][0, 1:].tolist() == [None, "x"]
+    assert found["ragged"][1].tolist() == [1, 2, 3]
+    assert found["type"] == np.dtype("<f4")
 
 
 @pytest.mark.parametrize("protocol", range(6))
@@ -110,3 +121,54 @@ def test_damaged_files_are_named(cut):
         read_plain_pickle(pickle.dumps(CONTENT)[:cut], name="x.pkl")
     with pytest.raises(ValueError, match="x.pkl: not a pickle, or a damaged one"):
         read_plain_pickle(b"poses: 1\n", name="x.pkl")
+
+
+class State(Evil):
+    """Pickled as a call whose result is given a state."""
+
+    def __init__(self, function, args, state):
+        self.call = function, args, state
+
+
+RECONSTRUCT = np.empty(0).__reduce__()[0]
+# A type with a field of objects whose flags deny it.
+DENIED = ("V8", False, True), (3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 0)
+
+
+@pytest.mark.parametrize(
+    "evil",
+    [
+        Evil(np.ndarray, (1,), np.dtype("O"), b"A" * 8),
+        Evil(np.ndarray, (1 << 36,), np.dtype("u1")),
+        Evil(np.dtype, "f8,O"),
+        State(np.dtype, *DENIED),
+        State(np.dtype, ("f8",), (*DENIED[1][:5], -1, -1, 0)),
+        State(
+            RECONSTRUCT,
+            (np.ndarray, (0,), b"b"),
+            (1, (2,), np.dtype("O"), False, b"A" * 16),
+        ),
+        State(
+            RECONSTRUCT, (np.ndarray, (0,), b"b"), (1, (9,), np.dtype("O"), False, [1])
+        ),
+        State(
+            RECONSTRUCT, (np.ndarray, (0,), b"b"), (1, (9,), np.dtype("f8"), False, b"")
+        ),
+        RECONSTRUCT,
+    ],
+    ids=lambda evil: str(getattr(evil, "call", "alone"))[:60],
+)
+def test_numpys_functions_are_not_trusted(evil):
+    """Memory of ours, pointers of theirs, and a terabyte out of 100 bytes."""
+    data = pickle.dumps({"poses": [evil]}, 2)
+    with pytest.raises(ValueError, match=r"x\.pkl: "):
+        read_plain_pickle(data, name="x.pkl")
+
+
+def test_arrays_that_hold_each_other_are_read():
+    one, other = np.empty(2, object), [np.arange(3)]
+    one[:] = [other, 1]
+    other.append(one)
+    found = read_plain_pickle(pickle.dumps(one), name="x.pkl")
+    assert found[0][1] is found
+    np.testing.assert_array_equal(found[0][0], np.arange(3))
