@@ -512,8 +512,8 @@ def _save_csv(path: Path, skeleton: Skeleton, frames: Frame | Motion) -> None:
 def read_skeleton(path: str | Path) -> transfer.Rest:
     """The skeleton of a rig, for `retarget`: .glb, .gltf, .vrm, .fbx or .bvh.
 
-    A glTF's nodes should stand in the pose in which its mesh was made: trunk, head and
-    feet of one that stands in a frame of an animation stay as bent as they are there.
+    Of a glTF whose nodes stand in a frame of an animation, it is the skeleton in the
+    pose in which its mesh was made.
 
     Raises:
       ModuleNotFoundError: for FBX without the extra [fbx].

@@ -2,7 +2,9 @@
 
 A file is read as JSON and bytes, without a package; what is not known of it here
 (materials, textures, extensions) is written back as it was. A rig's zero pose
-is its nodes' rest pose; joints' axes there are those of the world.
+is its nodes' rest pose, or that in which its mesh was bound, where the nodes stand in
+another (many files are saved in a frame of an animation); joints' axes there are those
+of the world.
 
 Source: glTF 2.0 specification (Khronos), sections 3.5 to 3.7 and 4.4; VRM 0 and 1.
 """
@@ -41,6 +43,7 @@ _IMAGES = {
 }
 MESHOPT = "EXT_meshopt_compression"
 _MAX_NODES = 20_000
+_POSED = 2.0  # degrees that a joint may stand from how its mesh was bound
 _SMOOTH = 0.3  # seconds: a root on the ground does not sway with the hips
 
 
@@ -334,6 +337,99 @@ def _vrm_roles(content: dict) -> dict[str, int]:
     return found
 
 
+def _bound(
+    name: str, content: dict, data: bytes, parents: list[int]
+) -> dict[int, np.ndarray]:
+    """World matrices in which meshes were bound, of joints that stand otherwise.
+
+    Bind matrices tell them but for a common frame, which is the world's, that above the
+    skeleton or a mesh's, whichever has the joints turned least; where all have them
+    turned far, the first joint stands as it is. Empty where bones would be of other
+    lengths: then these matrices tell something else.
+    """
+    nodes, found = objects(name, content, "nodes"), {}
+    world = world_of(name, nodes, parents)
+    skins = objects(name, content, "skins")
+    for joint in {joint for skin in skins for joint in skin["joints"]}:
+        _rotation(name, joint, world[joint])
+    for number in sorted(range(len(skins)), key=lambda i: -len(skins[i]["joints"])):
+        joints = skins[number]["joints"]
+        if "inverseBindMatrices" not in skins[number]:
+            continue
+        inverse = array(name, content, data, skins[number]["inverseBindMatrices"])
+        if inverse.shape[1] != 16 or len(inverse) < len(joints):
+            continue  # who draws the mesh says so
+        inverse = np.swapaxes(inverse[: len(joints)].reshape(-1, 4, 4), 1, 2)
+        now = np.stack([world[joint] for joint in joints])
+        if not (np.abs(inverse) < MAX_METERS).all() or np.any(
+            np.abs(np.linalg.det(inverse)) < 1e-12
+        ):
+            continue
+        bind = np.linalg.inv(inverse)
+        top = min(range(len(joints)), key=lambda i: len(_path(parents, joints[i])))
+        above = parents[joints[top]]
+        frames = [
+            np.eye(4),
+            world[above] if above >= 0 else np.eye(4),
+            *(world[n] for n, node in enumerate(nodes) if node.get("skin") == number),
+        ]
+        bones = [
+            (i, joints.index(parents[joint]))
+            for i, joint in enumerate(joints)
+            if parents[joint] in joints
+        ]
+        upper = np.array(bones, int).reshape(-1, 2)
+
+        def lengths(at: np.ndarray, upper: np.ndarray = upper) -> np.ndarray:
+            return np.linalg.norm(
+                at[upper[:, 0], :3, 3] - at[upper[:, 1], :3, 3], axis=1
+            )
+
+        long = lengths(now)
+        for tried in (frames, [now[top] @ inverse[top]]):
+            fits = []
+            for frame in tried:
+                at = frame @ bind
+                off = np.abs(lengths(at) - long) / np.maximum(long, long.mean())
+                if len(bones) and np.mean(off <= 0.05) >= 0.9:
+                    fits.append((float(_angles(at, now).mean()), at))
+            turned, at = min(fits, key=lambda x: x[0], default=(180.0, now))
+            if turned < 60.0:
+                break
+        if turned < 180.0:
+            found = {**dict(zip(joints, at, strict=True)), **found}
+    far = [_angles(at[None], world[joint][None]) for joint, at in found.items()]
+    return found if far and np.max(far) > _POSED else {}
+
+
+def _angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Degrees between the axes of matrices [J, 4, 4]."""
+
+    def axes(at: np.ndarray) -> np.ndarray:
+        return at[:, :3, :3] / np.linalg.norm(at[:, :3, :3], axis=1, keepdims=True)
+
+    trace = np.einsum("jrc,jrc->j", axes(one), axes(other))
+    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+def _stand(name: str, content: dict, data: bytes, parents: list[int]) -> None:
+    """Has the nodes stand in the pose in which meshes were bound, in place."""
+    nodes, bound = content["nodes"], _bound(name, content, data, parents)
+    if not bound:
+        return
+    local = [_local(name, number, node) for number, node in enumerate(nodes)]
+    world: dict[int, np.ndarray] = {}
+    for number in sorted(range(len(nodes)), key=lambda n: len(_path(parents, n))):
+        above = world[parents[number]] if parents[number] >= 0 else np.eye(4)
+        world[number] = bound.get(number, above @ local[number])
+        if number in bound:
+            own = np.linalg.inv(above) @ world[number]
+            nodes[number]["matrix"] = own.T.reshape(16).tolist()
+            for part in ("translation", "rotation", "scale"):
+                nodes[number].pop(part, None)
+            _plain(nodes[number])
+
+
 def read_rig(path: str | Path) -> Rig:
     """A character of a .glb, .gltf or .vrm file.
 
@@ -353,6 +449,8 @@ def read_rig(path: str | Path) -> Rig:
         raise ValueError(f"{name}: {len(nodes)} nodes, more than {_MAX_NODES}")
     upper = parents_of(name, nodes)
     joints = _joints(name, content, upper)
+    if not _vrm_roles(content):  # whose rest pose is a T-pose
+        _stand(name, content, data, upper)
     world = world_of(name, nodes, upper)
     turns = np.stack([_rotation(name, joint, world[joint]) for joint in joints])
     above = np.eye(4) if upper[joints[0]] < 0 else world[upper[joints[0]]]

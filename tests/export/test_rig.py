@@ -72,6 +72,79 @@ def test_a_rig_is_read_where_pygltflib_has_its_joints(hero):
     assert abs(found.sole - 0.0579) < 0.004
 
 
+def skinned(path, frame):
+    """Vertices [V, 3] of a file of one skin in a frame."""
+    content = pygltflib.GLTF2().load(str(path))
+    skin, world = content.skins[0], worlds(content, frame)
+    bind = accessor(content, skin.inverseBindMatrices).reshape(-1, 4, 4)
+    moves = np.stack([world[j] for j in skin.joints]) @ np.swapaxes(bind, 1, 2)
+    found = []
+    for part in content.meshes[0].primitives:
+        get = lambda name: accessor(content, getattr(part.attributes, name))  # noqa: B023, E731
+        four = np.concatenate([get("POSITION"), get("POSITION")[:, :1] * 0 + 1], 1)
+        joints, weights = moves[get("JOINTS_0")], get("WEIGHTS_0")
+        found.append(np.einsum("vk,vkrc,vc->vr", weights, joints, four)[:, :3])
+    return np.concatenate(found)
+
+
+def test_a_rig_saved_in_a_frame_of_an_animation_is_as_its_mesh(tmp_path):
+    raw = rigs.glb(rigs.person("child"))
+    (tmp_path / "one.glb").write_bytes(raw)
+    (tmp_path / "posed.glb").write_bytes(rigs.posed(raw))
+    one, posed = (rigging.read_rig(tmp_path / f"{x}.glb") for x in ("one", "posed"))
+    bent = pygltflib.GLTF2().load(str(tmp_path / "posed.glb"))
+    stands = np.stack([worlds(bent)[node][:3, 3] for node in one.nodes])
+    stands = stands - stands[0] - anatomy.zero_pose(one.skeleton)
+    assert np.abs(stands).max() > 0.1
+    np.testing.assert_allclose(posed.skeleton.offsets, one.skeleton.offsets, atol=1e-5)
+    assert posed.sole == pytest.approx(one.sole, abs=1e-5)
+    skeleton, motion = samples.person(seconds=0.2)
+    for name in ("one", "posed"):
+        jm.save(
+            tmp_path / f"{name} walks.glb",
+            skeleton,
+            motion,
+            onto=tmp_path / f"{name}.glb",
+        )
+    found, expected = (
+        skinned(tmp_path / f"{x} walks.glb", 5) for x in ("posed", "one")
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def distances(rig):
+    places = anatomy.zero_pose(rig.skeleton)
+    return np.linalg.norm(places[:, None] - places, axis=-1)
+
+
+def test_what_bind_matrices_cannot_tell_is_left_as_it_stands(tmp_path):
+    raw = rigs.glb(rigs.person("child"), unit=1.0, turn=0.0)
+    (tmp_path / "one.glb").write_bytes(raw)
+    expected = distances(rigging.read_rig(tmp_path / "one.glb"))
+
+    def changed(change):
+        content, data = rigs.split(rigs.posed(raw, spread=8.0))
+        bind = rigs.values(content, data, content["skins"][0]["inverseBindMatrices"])
+        change(np.swapaxes(bind.reshape(-1, 4, 4), 1, 2))
+        (tmp_path / "other.glb").write_bytes(rigs.joined(content, data))
+        return distances(rigging.read_rig(tmp_path / "other.glb"))
+
+    # In axes that nothing in the file has: those of the first joint, as it stands.
+    turn = Rotation.from_rotvec([2.0, 2.0, 2.0]).as_matrix()
+
+    def turned(bind):
+        bind[:, :3, :3] = bind[:, :3, :3] @ turn
+
+    np.testing.assert_allclose(changed(turned), expected, atol=1e-4)
+    stands = changed(lambda bind: None)
+    np.testing.assert_allclose(stands, expected, atol=1e-4)
+
+    def shorter(bind):
+        bind[:, :3, 3] *= 0.5
+
+    assert np.abs(changed(shorter) - expected).max() > 0.02
+
+
 def test_the_users_own_mesh_walks(hero, tmp_path):
     skeleton, motion = samples.person(seconds=1.0)
     jm.save(tmp_path / "walk.glb", skeleton, motion, onto=hero)

@@ -232,6 +232,64 @@ def glb(skeleton, *, arms_down=45.0, seed=0, unit=100.0, turn=90.0):
     content["scenes"][0]["nodes"] = [count, count + 1]
     content["skins"][0].pop("skeleton", None)
     content["extras"] = {"made": "in the tests"}
+    _bind(content, data)
+    return joined(content, data)
+
+
+def values(content, data, number):
+    """An accessor's values [count, width], of which changes are kept."""
+    accessor = content["accessors"][number]
+    kind = {5121: "u1", 5123: "<u2", 5126: "<f4"}[accessor["componentType"]]
+    width = {"VEC3": 3, "VEC4": 4, "MAT4": 16}[accessor["type"]]
+    view = content["bufferViews"][accessor["bufferView"]]
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    assert "byteStride" not in view
+    found = np.frombuffer(data, kind, width * accessor["count"], start)
+    return found.reshape(-1, width)
+
+
+def _bind(content, data):
+    """Binds the mesh in the pose in which the nodes stand."""
+    nodes, skin = content["nodes"], content["skins"][0]
+    world = []
+    for joint in skin["joints"]:
+        at = np.eye(4)
+        for node in _up(nodes, joint):
+            at = _matrix(nodes[node]) @ at
+        world.append(at)
+    bind = values(content, data, skin["inverseBindMatrices"])
+    moves = np.array(world) @ np.swapaxes(bind.reshape(-1, 4, 4), 1, 2)
+    for part in content["meshes"][0]["primitives"]:
+        get = lambda name: values(content, data, part["attributes"][name])  # noqa: B023, E731
+        which, weights = get("JOINTS_0"), get("WEIGHTS_0")
+        mixed = np.einsum("vk,vkrc->vrc", weights, moves[which])
+        for name, last in (("POSITION", 1.0), ("NORMAL", 0.0)):
+            rows = get(name)
+            four = np.concatenate([rows, np.full((len(rows), 1), last)], axis=1)
+            placed = np.einsum("vrc,vc->vr", mixed, four)[:, :3]
+            if not last:
+                placed /= np.linalg.norm(placed, axis=1, keepdims=True)
+            rows[:] = placed
+        accessor = content["accessors"][part["attributes"]["POSITION"]]
+        places = get("POSITION").astype(float)
+        accessor |= {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
+    back = np.swapaxes(np.linalg.inv(world), 1, 2).reshape(-1, 16)
+    back[:, 3::4] = np.array([0, 0, 0, 1])
+    bind[:] = back
+
+
+def posed(raw, spread=12.0, seed=0):
+    """The same file, saved in a frame of an animation: its nodes stand anyhow."""
+    content, data = split(raw)
+    draw, nodes = np.random.default_rng(seed), content["nodes"]
+    for number, joint in enumerate(content["skins"][0]["joints"]):
+        turn = Rotation.from_rotvec(np.radians(spread) * draw.normal(size=3))
+        own = Rotation.from_quat(nodes[joint]["rotation"]) * turn
+        nodes[joint]["rotation"] = own.as_quat().tolist()
+        if number == 0:
+            nodes[joint]["translation"] = (
+                1.1 * np.array(nodes[joint]["translation"]) + 0.3
+            ).tolist()
     return joined(content, data)
 
 

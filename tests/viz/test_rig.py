@@ -57,6 +57,7 @@ def by_shape():
 
 RIGS = {
     "a Mixamo child in an A-pose": lambda: rigs.glb(rigs.person("child")),
+    "in a frame of an animation": lambda: rigs.posed(rigs.glb(rigs.person("child"))),
     "an Unreal giant": lambda: rigs.glb(
         rigs.person("giant", "Unreal"), unit=1.0, seed=3
     ),

@@ -3,6 +3,8 @@
 // and its meshes in that pose as one, with base colors and their textures. Whatever is
 // wrong is an Error in one line.
 
+import { mean1 } from "./linear.js";
+
 const ARRAYS = {
   5120: Int8Array, 5121: Uint8Array, 5122: Int16Array, 5123: Uint16Array,
   5125: Uint32Array, 5126: Float32Array,
@@ -11,6 +13,7 @@ const WIDTHS = { SCALAR: 1, VEC2: 2, VEC3: 3, VEC4: 4, MAT4: 16 };
 const PACKED = ["KHR_draco_mesh_compression", "EXT_meshopt_compression"];
 const TRIANGLES = 4, MAGIC = 0x46546c67, TEXT = 0x4e4f534a, BINARY = 0x004e4942;
 const MOST_JOINTS = 256;
+const POSED = 2;  // degrees that a joint may stand from how its mesh was bound
 
 function refuse(line) { throw new Error(line); }
 
@@ -142,6 +145,77 @@ function tree({ nodes }) {
     }
   });
   return { parents, world };
+}
+
+// A matrix's inverse, if it only moves, turns and scales evenly; else null.
+function inverse(m) {
+  const axes = [0, 4, 8].map(c => m.slice(c, c + 3)), size = axes.map(a => a.reduce((s, x) => s + x * x, 0));
+  if (!m.every(x => Math.abs(x) < 1e6) || !(Math.min(...size) > 1e-12)) return null;
+  const made = new Array(16).fill(0);
+  axes.forEach((a, c) => a.forEach((x, k) => { made[4 * k + c] = x / size[c]; }));
+  for (let r = 0; r < 3; r++)
+    made[12 + r] = -(made[r] * m[12] + made[4 + r] * m[13] + made[8 + r] * m[14]);
+  made[15] = 1;
+  return made;
+}
+
+// Degrees between the axes of two matrices.
+function angle(a, b) {
+  let trace = 0;
+  for (const c of [0, 4, 8]) {
+    const [x, y] = [a, b].map(m => m.slice(c, c + 3)), long = Math.hypot(...x) * Math.hypot(...y);
+    trace += (x[0] * y[0] + x[1] * y[1] + x[2] * y[2]) / long;
+  }
+  return Math.acos(Math.min(1, Math.max(-1, (trace - 1) / 2))) * 180 / Math.PI;
+}
+
+// World matrices of all nodes with the joints as meshes were bound, where they stand
+// otherwise (files are saved in a frame of an animation): `_bound` of `export/rig.py`.
+function bound(file, parents, world) {
+  const found = new Map(), { skins, nodes } = file;
+  const order = skins.map((_, i) => i).sort((a, b) => skins[b].joints.length - skins[a].joints.length);
+  for (const number of order) {
+    const { joints, inverseBindMatrices } = skins[number];
+    if (inverseBindMatrices === undefined) continue;
+    const { values, width, count } = file.values(inverseBindMatrices);
+    if (width !== 16 || count < joints.length) continue;
+    const backs = joints.map((_, j) => [...values.subarray(16 * j, 16 * j + 16)]);
+    const bind = backs.map(inverse), now = joints.map(joint => world[joint]);
+    if (bind.includes(null)) continue;
+    const deep = joints.map(joint => { let n = 0; for (let at = joint; at >= 0; at = parents[at]) n++; return n; });
+    const top = deep.indexOf(Math.min(...deep)), above = parents[joints[top]];
+    const frames = [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]];
+    if (above >= 0) frames.push(world[above]);
+    nodes.forEach((node, n) => { if (node.skin === number) frames.push(world[n]); });
+    const bones = joints.map((joint, i) => [i, joints.indexOf(parents[joint])]).filter(([, up]) => up >= 0);
+    if (!bones.length) continue;
+    const lengths = at => bones.map(([i, up]) =>
+      Math.hypot(...[12, 13, 14].map(k => at[i][k] - at[up][k])));
+    const long = lengths(now), usual = mean1(long);
+    let best = { turned: 180 };
+    for (const tried of [frames, [product(now[top], backs[top])]]) {
+      best = { turned: 180 };
+      for (const frame of tried) {
+        const at = bind.map(m => product(frame, m));
+        const fit = lengths(at).filter((x, i) => Math.abs(x - long[i]) <= 0.05 * Math.max(long[i], usual));
+        const turned = mean1(at.map((m, i) => angle(m, now[i])));
+        if (fit.length >= 0.9 * bones.length && turned < best.turned) best = { turned, at };
+      }
+      if (best.turned < 60) break;
+    }
+    if (best.at) joints.forEach((joint, i) => { if (!found.has(joint)) found.set(joint, best.at[i]); });
+  }
+  if (![...found].some(([joint, at]) => angle(at, world[joint]) > POSED)) return world;
+  const made = [];
+  const stand = node => {
+    if (!made[node]) {
+      const up = parents[node], own = local(nodes[node], node);
+      made[node] = found.get(node) || (up < 0 ? own : product(stand(up), own));
+    }
+    return made[node];
+  };
+  nodes.forEach((_, node) => stand(node));
+  return made;
 }
 
 // Whether a world matrix only moves, turns and scales evenly, as a joint's should.
@@ -354,8 +428,10 @@ export function readRig(buffer) {
 }
 
 function readFile(file) {
-  const { parents, world } = tree(file), joints = jointsOf(file, parents);
-  for (const joint of joints) check(world[joint], joint);
+  const { parents, world: stands } = tree(file), joints = jointsOf(file, parents);
+  for (const joint of joints) check(stands[joint], joint);
+  // A VRM's rest pose is a T-pose.
+  const world = Object.keys(vrmRoles(file)).length ? stands : bound(file, parents, stands);
   if (parents[joints[0]] >= 0) check(world[parents[joints[0]]], parents[joints[0]]);
   const places = joints.map(joint => world[joint].slice(12, 15)), names = [];
   for (const joint of joints) {
