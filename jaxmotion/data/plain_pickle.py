@@ -53,7 +53,7 @@ class _Array:
     __hash__ = None  # type: ignore[assignment]
 
     def __init__(self, kind: Any, shape: Any, code: Any):
-        self.array = np.zeros(0)
+        self.array: Any = np.zeros(0)
 
     def __setstate__(self, state: tuple) -> None:
         _, shape, kind, in_columns, raw = state
@@ -74,7 +74,7 @@ def _scalar(kind: _Type, raw: Any) -> np.generic:
     return value
 
 
-def _from_buffer(raw: Any, kind: _Type, shape: Any, order: str) -> np.ndarray:
+def _from_buffer(raw: Any, kind: _Type, shape: Any, order: Any) -> np.ndarray:
     return kind.values(raw).reshape(shape, order=order)
 
 
