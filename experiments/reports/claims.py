@@ -26,6 +26,7 @@ class Source:
       file: Path below that folder.
       commands: "{run}" stands for the folder.
       title: What it answers, for a first training that is stored.
+      chosen_on: Seeds of trainings that its recipe was chosen on: they decide no claim.
       name: "system/table": its part of experiments/papers, and its file in
         experiments/results.
     """
@@ -34,6 +35,7 @@ class Source:
     file: str
     commands: tuple[str, ...]
     title: str = ""
+    chosen_on: tuple[int, ...] = ()
     name: str = ""
 
 
@@ -250,7 +252,8 @@ def read_paper(system: registry.System) -> Paper:
         sources = {
             name: Source(
                 name=f"{system.name}/{name}",
-                **value | {"commands": tuple(value["commands"])},
+                **value
+                | {key: tuple(value.get(key, ())) for key in ("commands", "chosen_on")},
             )
             for name, value in whole.pop("source").items()
         }

@@ -39,6 +39,7 @@ RULE = (
     "most. What comes first stands. It is **not run** if a row was not measured, and "
     f"else **not decided**; after {MAX_TRAININGS} trainings it stays so, and its "
     "interval says how large a difference may be.",
+    "Trainings that a row's recipe was chosen on decide nothing.",
     "One training decides nothing, for intervals over its replications, clips or "
     "rollouts do not hold what another seed would change.",
     "Where the larger is claimed to be so many times the smaller, the difference is "
@@ -152,6 +153,23 @@ def printed(value: Stated) -> float | None:
       The value; None if the paper prints none.
     """
     return value[0] if isinstance(value, tuple) else value
+
+
+def _unseen(found: Found) -> Found:
+    """Without the trainings that a recipe was chosen on."""
+    made = dict(found)
+    for source, measured in found.items():
+        if measured is None or not source.chosen_on:
+            continue
+        kept = [
+            x
+            for x in measured.trainings
+            if x is not None and not {*x.seeds} & {*source.chosen_on}
+        ]
+        made[source] = (
+            dataclasses.replace(kept[0], again=tuple(kept[1:])) if kept else None
+        )
+    return made
 
 
 def _paired(table: Table, rows: list[Row], found: Found) -> Found:
@@ -288,7 +306,7 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     """
     column = table.column(claim.column)
     rows = [table.row(name) for name in claim.rows]
-    found = _paired(table, rows, found)
+    found = _paired(table, rows, _unseen(found))
     cells = {row.name: cells_of(table, row, column, found) for row in rows}
     absent = [name for name, own in cells.items() if not any(own)]
     present = [row for row in rows if row.name not in absent]

@@ -523,6 +523,13 @@ def test_rows_of_two_runs_pair_by_seed_and_data(load, tmp_path):
     # Of one training each, nothing is paired.
     made = decided(((0,), (7,)), "xx")
     assert (made.verdict, made.trainings) == ("not decided", 1)
+    # What a recipe was chosen on decides nothing.
+    sources[1] = dataclasses.replace(sources[1], chosen_on=(1, 2))
+    rows = (table.rows[0], dataclasses.replace(table.rows[1], source=sources[1]))
+    table = dataclasses.replace(table, rows=rows)
+    made = decided(((0, 1, 2, 3), (0, 1, 2, 3)), "xx")
+    assert (made.verdict, made.trainings) == ("not decided", 2)
+    assert decided(((1, 2), (1, 2)), "xx").verdict == "not run"
 
 
 # --- a report -----------------------------------------------------------------------
