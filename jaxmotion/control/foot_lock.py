@@ -421,12 +421,13 @@ def _place(
             bend=-safe_normalize(bend, jnp.array([1.0, 0.0, 0.0])),
             lock=lock,
         )
-        new = new.at[joints[:3]].set(solved)
+        new = new.at[joints[:3]].set(solved.astype(new.dtype))
     changed = sorted({joint for chain in chains for joint in chain[:3]})
     index = jnp.array(changed)
     parents = jnp.array([skeleton.parents[joint] for joint in changed])
     local = jnp.swapaxes(new[parents], -1, -2) @ new[index]
-    return joint_rotation.at[index].set(rot6d_from_matrix(local))
+    found = rot6d_from_matrix(local).astype(joint_rotation.dtype)
+    return joint_rotation.at[index].set(found)
 
 
 def lock_frame(
@@ -522,8 +523,8 @@ def clean_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motio
     steps = jnp.diff(toes, axis=0) * motion.fps
     speed = jnp.sqrt(jnp.sum(steps**2, axis=-1) + 1e-12)
     least = least_heights(jnp.where(planted, 0.0, speed), lock=lock)
-    wanted = toes.at[..., ::2].add(toe_offsets(toes, planted))
-    wanted = wanted.at[:-1, :, 1].max(least)
+    wanted = toes.at[..., ::2].add(toe_offsets(toes, planted).astype(toes.dtype))
+    wanted = wanted.at[:-1, :, 1].max(least.astype(toes.dtype))
     place = jax.vmap(functools.partial(_place, skeleton, lock=lock))
     rotations = place(places, turns, motion.joint_rotation, wanted)
     return dataclasses.replace(motion, joint_rotation=rotations)

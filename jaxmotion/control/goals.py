@@ -45,8 +45,9 @@ from jaxmotion.motion.trajectory import Command
 from jaxmotion.typing import Key, Params
 
 # A path is looked at so many meters ahead at least; the nearest point of it is sought
-# within so many meters of the last one.
-NEAREST, REACH = 0.25, 1.0
+# within so many meters of the last one. Points a meter farther along it count as so
+# much farther away: where it goes back the way it came, the way there comes first.
+NEAREST, REACH, LATER = 0.25, 1.0, 0.01
 # Nobody is asked to go slower or faster, m/s, but to stop, nor to slow down below the
 # last: standing, `locomotion_fast` does not begin at .2 to .45 m/s.
 SLOWEST, FASTEST, CREEP = 0.6, 3.5, 0.45
@@ -142,7 +143,7 @@ def pursue(
     here = walker.position + LAG * walker.velocity
     ways = way + jnp.linspace(0.0, REACH, 41)
     points, _, length = _along(path, ways)
-    near = jnp.argmin(_length(points - here[None]))
+    near = jnp.argmin(_length(points - here[None]) + LATER * (ways - way))
     way = jnp.minimum(ways[near], length)
     _, speed, _ = _along(path, way)
     goal, _, _ = _along(path, way + jnp.maximum(ahead * speed, NEAREST))

@@ -37,7 +37,12 @@ class Route:
 
 
 def routed(route: Route, waypoints: tuple[Point, ...], position: Point) -> Route:
-    """The route along waypoints, at most `MOST`, for a character at a position."""
+    """The route along waypoints, for a character at a position.
+
+    `ValueError` for more than `MOST`.
+    """
+    if len(waypoints) > MOST:
+        raise ValueError(f"{len(waypoints)} waypoints, expected at most {MOST}")
     old = route.points[1:]
     if not waypoints:
         return Route()

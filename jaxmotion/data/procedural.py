@@ -56,14 +56,15 @@ def follow_commands(
         facing, rate = spring.facing_spring(facing, rate, command.facing, **times)
         return (x, v, a, facing, rate), (x, facing)
 
-    zero = jnp.zeros(2)
-    start = (zero, zero, zero, commands.facing[0], jnp.zeros(()))
+    kind = commands.velocity.dtype
+    zero = jnp.zeros(2, kind)
+    start = (zero, zero, zero, commands.facing[0], jnp.zeros((), kind))
     return jax.lax.scan(move, start, commands)[1]
 
 
 def _check_fps(fps: float) -> None:
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"fps is {fps}, expected a positive number")
+    if not (np.isfinite(fps) and fps >= 10.0):  # steps are of six frames at least
+        raise ValueError(f"fps is {fps}, expected at least 10")
 
 
 def _check_commands(commands: Command) -> None:
@@ -93,8 +94,8 @@ def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> 
     Commands are velocity and facing (unit) of each frame, two at least; labels are
     ignored. Speeds above the gait's max_speed look rushed; far above, legs are too
     short for the steps. `ValueError` for a command that is not finite or a facing not
-    of length one (names the frame), a rate that is not positive, or steps that legs do
-    not reach.
+    of length one (names the frame), a rate below 10, or steps that legs do not
+    reach.
     """
     _check_fps(fps)
     _check_commands(commands)

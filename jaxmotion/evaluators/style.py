@@ -270,7 +270,12 @@ class StyleEvaluator:
 def fit(
     key: Key, clips: Clips, *, field: str, num_steps: int = 1500, batch: int = 128
 ) -> StyleEvaluator:
-    """Trains the evaluator of styles (`field`) on windows every 10 frames."""
+    """Trains the evaluator of styles (`field`) on windows every 10 frames.
+
+    `ValueError` unless clips have 30 frames per second.
+    """
+    if clips.fps != 30.0:
+        raise ValueError(f"clips of {clips.fps:g} frames per second, expected 30")
     found = eval_windows(clips, stride=10, field=field)
     config = Config(
         num_classes=len(clips.names(field)),

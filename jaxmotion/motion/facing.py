@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmotion.motion import ground
+from jaxmotion.motion.rotation import safe_normalize
 from jaxmotion.motion.skeleton import Skeleton, from_root
 
 # Left and right hip joint in lower case, without separators and rig prefix.
@@ -122,5 +123,6 @@ def body_facing(
     across = 0.0
     for left, right in (hip_joints(skeleton), shoulders):
         gap = positions[..., left, :] - positions[..., right, :]
-        across += gap / jnp.linalg.norm(gap, axis=-1, keepdims=True)
+        # Collar bones of CMU begin at one point.
+        across += safe_normalize(gap, jnp.zeros(3, gap.dtype))
     return facing_from_across(across)

@@ -29,6 +29,7 @@ from jaxmotion.files import open_regular
 # PyTorch's storages, the types of safetensors and ONNX -> NumPy's; bfloat16 is the
 # upper half of a float32.
 _BFLOAT16 = "bfloat16"
+_MAX_NAMES = 1_000_000
 _TORCH = {
     "FloatStorage": "<f4",
     "DoubleStorage": "<f8",
@@ -110,7 +111,7 @@ def read_weights(path: str | os.PathLike) -> dict[str, Any]:
     else:
         read, what = _read_archive, "PyTorch's"
     try:
-        content = _plain(read(path), path)
+        content = _plain(read(path), path)[0]
     # Damaged bytes make unpickler, zipfile and NumPy raise almost anything.
     except Exception as error:
         said = str(error).splitlines() or [type(error).__name__]
@@ -135,18 +136,29 @@ def arrays(content: dict[str, Any]) -> dict[str, Stored]:
     return found
 
 
-def _plain(value: Any, path: str, name: str = "", above: tuple[int, ...] = ()) -> Any:
-    """Records with named attributes as dictionaries; a cycle ends in None."""
+def _plain(
+    value: Any, path: str, name: str = "", seen: dict[int, Any] | None = None
+) -> tuple[Any, int]:
+    """Records with named attributes as dictionaries, and how many values they name.
+
+    A cycle ends in None. A dictionary that many share is refused where it has more
+    names than any file of weights: 40 small ones, each twice in the next, have 2^40.
+    """
+    seen = {} if seen is None else seen
     if isinstance(value, Stored):
-        return Stored(value.shape, lambda: _read(value, path, name))
+        return Stored(value.shape, lambda: _read(value, path, name)), 1
     if isinstance(value, Record) and isinstance(value.state, dict):
         value = value.state
     if not isinstance(value, dict):
-        return value
-    if id(value) in above:
-        return None
-    above = (*above, id(value))
-    return {str(key): _plain(x, path, str(key), above) for key, x in value.items()}
+        return value, 1
+    if id(value) not in seen:
+        seen[id(value)] = None, 1
+        parts = {str(key): _plain(x, path, str(key), seen) for key, x in value.items()}
+        count = 1 + sum(count for _, count in parts.values())
+        if count > _MAX_NAMES:
+            raise ValueError(f"more than {_MAX_NAMES} names")
+        seen[id(value)] = {key: x for key, (x, _) in parts.items()}, count
+    return seen[id(value)]
 
 
 def _read(stored: Stored, path: str, name: str) -> np.ndarray:

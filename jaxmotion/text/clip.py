@@ -29,7 +29,7 @@ from jaxmotion.text import files
 from jaxmotion.typing import Params
 
 START, END = "<|startoftext|>", "<|endoftext|>"
-_BATCH = 64
+_BATCHES = 1, 8, 64
 _STEP = 16  # lengths are multiples of it, so that few are compiled
 
 # Attribute of the network -> field of the text tower's config.
@@ -54,6 +54,7 @@ _MODULES = {
     "norm_out": "text_model.final_layer_norm",
     "projection": "text_projection",
 }
+_LAYERS = "text_model.encoder.layers."
 _IN_LAYER = {
     "query": "self_attn.q_proj",
     "key": "self_attn.k_proj",
@@ -131,6 +132,8 @@ def load_clip(folder: str | os.PathLike) -> ClipModel:
     network = network.clone(end_of_text=end)
     params = _take_weights(weights, stored, network)
     digest = zlib.crc32(vocabulary.read_bytes())
+    if network.heads * _OPENAI_HEAD != network.width:  # which no array's shape tells
+        digest = zlib.crc32(str(network.heads).encode(), digest)
     for leaf in jax.tree.leaves(params):
         digest = zlib.crc32(np.asarray(leaf).tobytes(), digest)
     return ClipModel(
@@ -194,7 +197,7 @@ def _keys(network: ClipText) -> Iterator[tuple[tuple, str, tuple[int, ...], bool
         *modules, kind = (str(entry.key) for entry in path)
         if len(modules) == 2:
             layer = modules[0].removeprefix("layers_")
-            stem = f"text_model.encoder.layers.{layer}.{_IN_LAYER[modules[1]]}"
+            stem = f"{_LAYERS}{layer}.{_IN_LAYER[modules[1]]}"
         else:
             stem = _MODULES[modules[0]]
         transposed = kind == "kernel"  # a linear layer of PyTorch is [out, in]
@@ -215,7 +218,7 @@ def _read_openai(path: Path) -> tuple[ClipText, dict[str, Stored]]:
             named["text_projection.weight"] = _part(stored, slice(None), turned=True)
         elif not prefix and rest:
             layer, _, inner = rest.partition(".")
-            stem = f"text_model.encoder.layers.{layer}"
+            stem = f"{_LAYERS}{layer}"
             module, _, kind = inner.rpartition(".")
             if inner.startswith("attn.in_proj_"):  # the three one below the other
                 rows = stored.shape[0] // 3
@@ -261,6 +264,9 @@ def _part(stored: Stored, rows: slice, *, turned: bool = False) -> Stored:
 def _take_weights(path: Path, stored: dict[str, Stored], network: ClipText) -> Params:
     """Parameters of the network, float32."""
     params, wrong = {}, []
+    layers = {key.split(".")[3] for key in stored if key.startswith(_LAYERS)}
+    if len(layers) > network.depth:
+        wrong.append(f"{len(layers)} layers, expected {network.depth}")
     for modules, key, shape, transposed in _keys(network):
         if key not in stored:
             wrong.append(f"{key} is missing")
@@ -341,10 +347,11 @@ def encode(
     # Whole batches of like and few lengths: little padding, few programs to compile.
     lengths = 1 + np.sum(ids != network.end_of_text, axis=-1)
     order = np.argsort(lengths, kind="stable")
-    for first in range(0, len(ids), _BATCH):
-        rows = order[first : first + _BATCH]
+    size = next((n for n in _BATCHES if len(ids) <= n), _BATCHES[-1])
+    for first in range(0, len(ids), size):
+        rows = order[first : first + size]
         tokens = min(-(-lengths[rows[-1]] // _STEP) * _STEP, network.context)
-        batch = np.full((min(len(ids), _BATCH), tokens), network.end_of_text, np.int32)
+        batch = np.full((size, tokens), network.end_of_text, np.int32)
         part = ids[rows, :tokens]
         batch[: len(rows), : part.shape[1]] = part
         found = _forward(model.params, jnp.asarray(batch), network=network)

@@ -56,6 +56,19 @@ def test_a_path_that_crosses_itself_is_walked_to_its_end():
     assert abs(np.median(speed[60:-120]) - 1.4) < 0.05 and speed[-1] < 0.05
 
 
+@pytest.mark.parametrize("speed, near", [(0.8, 0.35), (1.4, 0.53)])
+def test_a_path_that_goes_back_the_way_it_came_is_walked_to_its_turning_point(
+    speed, near
+):
+    """Points of the way back are as near as those of the way there."""
+    points = jnp.array([[0.0, 0.0], [0.0, 5.0], [0.0, 0.0]])
+    path = goals.Path(points=points, speed=jnp.full(3, speed))
+    wish = lambda own, way, _: goals.pursue(path, own, way)  # noqa: E731
+    positions, _ = walk(wish, walker([0.0, 0.0]), 20.0)
+    assert np.linalg.norm(positions - np.array([0.0, 5.0]), axis=1).min() < near
+    assert np.linalg.norm(positions[-1]) < 0.1
+
+
 @pytest.mark.parametrize(
     "ahead, meters", [(0.1, goals.NEAREST), (0.35, 0.7), (0.8, 1.6)]
 )

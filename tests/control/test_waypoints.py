@@ -49,3 +49,8 @@ def test_who_ends_where_he_begins_goes_all_the_way():
     for corner in corners:
         assert np.linalg.norm(places - np.array(corner), axis=1).min() < 0.45
     assert np.linalg.norm(places[-1]) < 0.15 and wishes[-1].speed == 0
+
+
+def test_more_waypoints_than_a_route_holds_are_told():
+    with pytest.raises(ValueError, match="33 waypoints, expected at most 32"):
+        waypoints.routed(waypoints.Route(), ((0.0, 1.0),) * 33, (0.0, 0.0))

@@ -1,13 +1,15 @@
 import dataclasses
 import functools
+import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxmotion.control import courses
+from jaxmotion.control import courses, foot_lock
 from jaxmotion.data import gaits, procedural
+from jaxmotion.data.clips import clip_motion
 from jaxmotion.motion.skeleton import Motion
 from tests import mostly_slow, tiny
 
@@ -313,6 +315,7 @@ def test_random_commands_stand_walk_turn_and_strafe():
         (dict(gaits={}), "0 gaits"),
         (dict(fps=0.0), "fps is 0.0"),
         (dict(fps=-30.0), "fps is -30.0"),
+        (dict(fps=0.2), "fps is 0.2, expected at least 10"),
     ],
 )
 def test_bad_arguments_are_named(bad, message):
@@ -332,6 +335,17 @@ def test_bad_commands_are_named():
         procedural.walk(still(1), gait)
     with pytest.raises(ValueError, match="fps is -1"):
         procedural.walk(still(9), gait, fps=-1.0)
+
+
+@pytest.mark.slow
+def test_clips_and_the_lock_of_clips_in_double_precision():
+    with jax.enable_x64(True), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        clips = procedural.make_clips(minutes=0.1)
+        motion = clip_motion(clips, 0)
+        lock = foot_lock.FootLock()
+        found = foot_lock.clean_motion(clips.skeleton, motion, lock=lock)
+        assert np.isfinite(np.asarray(found.joint_rotation)).all()
 
 
 def test_a_gait_is_data():

@@ -1,5 +1,6 @@
 """The evaluator sees limbs and nothing else, and learns to tell styles."""
 
+import dataclasses
 import functools
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxmotion.data import procedural
 from jaxmotion.evaluators import style as style_evaluator
 from jaxmotion.motion import features, trajectory
 from jaxmotion.motion.skeleton import Motion, Skeleton
@@ -160,3 +162,10 @@ def test_the_released_input_names_the_joints_that_it_needs():
     )
     with pytest.raises(ValueError, match="needs the joints hips, neck, .* has Hips, "):
         style_evaluator.released_joints(skeleton)
+
+
+def test_windows_of_another_rate_are_not_learned_from():
+    """Of 60 frames, which at 60 per second are half as long."""
+    clips = dataclasses.replace(procedural.make_clips(minutes=0.2), fps=60.0)
+    with pytest.raises(ValueError, match="60 frames per second, expected 30"):
+        style_evaluator.fit(jax.random.key(0), clips, field="style")

@@ -59,6 +59,15 @@ def test_facing_turns_with_the_root():
     np.testing.assert_allclose(got, np.stack([np.sin(yaw), np.cos(yaw)], -1), atol=1e-6)
 
 
+def test_collar_bones_that_begin_at_one_point_count_for_nothing():
+    """As CMU's do."""
+    skeleton = biped(("LeftUpLeg", "RightUpLeg", "LeftShoulder", "RightShoulder"))
+    hips = [[0.1, 1.0, 0.0], [-0.1, 1.0, 0.0]]
+    positions = jnp.array([*hips, [0.0, 1.5, 0.0], [0.0, 1.5, 0.0]])
+    found = facing.body_facing(skeleton, positions)
+    np.testing.assert_allclose(found, [0.0, 1.0], atol=1e-6)
+
+
 def test_facing_of_hips_above_each_other_is_finite():
     across = jnp.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     np.testing.assert_array_equal(facing.facing_from_across(across), [[0, 1]] * 2)

@@ -30,6 +30,19 @@ def refused(path, message):
     assert "\n" not in str(caught.value)
 
 
+def test_dictionaries_that_share_their_parts_are_walked_once(tmp_path):
+    """Each of 60 holds the one before twice: 2^60 names in a kilobyte."""
+    torch = pytest.importorskip("torch")
+    content = {"x": torch.zeros(1)}
+    for _ in range(60):
+        content = {"a": content, "b": content}
+    torch.save(content, tmp_path / "x.pt")
+    refused(tmp_path / "x.pt", "x.pt.*more than 1000000 names")
+    content = {"x": torch.ones(1)}
+    torch.save({"a": content, "b": content}, tmp_path / "x.pt")
+    assert set(found_in(tmp_path / "x.pt")) == {"a.x", "b.x"}
+
+
 @pytest.fixture
 def torch():
     return pytest.importorskip("torch")

@@ -195,6 +195,29 @@ def test_fingerprint_changes_with_weights_and_tokenizer(written):
         file.write("\n")
     prints.add(clip.load_clip(folder).fingerprint)
     assert len(prints) == 3
+    # Of as many heads as the arrays allow, others make other vectors.
+    heads = {}
+    for number in (1, 2, 4):
+        rewrite(folder, num_attention_heads=number)
+        model = clip.load_clip(folder)
+        heads[model.fingerprint] = clip.encode(model, TEXTS[:1])
+    assert len(heads) == 3
+    assert np.ptp(np.stack(list(heads.values())), axis=0).max() > 1e-3
+
+
+def test_layers_that_a_config_does_not_have_are_told(written):
+    folder, _ = written
+    rewrite(folder, num_hidden_layers=1)
+    with pytest.raises(ValueError, match="layers, expected 1"):
+        clip.load_clip(folder)
+
+
+def test_few_programs_encode_few_texts(written):
+    model = clip.load_clip(written[0])
+    before = clip._forward._cache_size()
+    for number in range(2, 9):
+        clip.encode(model, ["turns left"] * number)
+    assert clip._forward._cache_size() - before <= 1
 
 
 SIZES = dict(width=64, depth=2, context=24, dimensions=7)

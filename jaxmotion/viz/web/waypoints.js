@@ -4,7 +4,7 @@
 import { ARRIVE, NEAR, speedOf } from "./steer.js";
 
 export const MOST = 32;
-const NEAREST = 0.25, REACH = 1, PARTS = 40, THERE = 0.05, LAG = 0.25;
+const NEAREST = 0.25, REACH = 1, LATER = 0.01, PARTS = 40, THERE = 0.05, LAG = 0.25;
 const away = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1]);
 
 // The velocity of who moved so in a tick, m/s; hips sway, so over .2 s.
@@ -35,7 +35,7 @@ export function along({ points, way }, last, { position, velocity, speed, ahead 
   };
   const here = position.map((x, i) => x + LAG * velocity[i]);
   const ways = [...Array(PARTS + 1).keys()].map(i => way + i * REACH / PARTS);
-  const gaps = ways.map(far => away(at(far), here));
+  const gaps = ways.map(far => away(at(far), here) + LATER * (far - way));
   way = Math.min(ways[gaps.indexOf(Math.min(...gaps))], length);
   const left = length - way + (way >= length ? away(end, here) : 0);
   const ends = length - way < NEAR && away(end, position) < NEAR && !speedOf(last);
