@@ -3,10 +3,11 @@
 Materials are their base color and its texture; all else of them is left out. What has
 no skin but hangs on a joint follows that joint.
 
-Source: glTF 2.0 specification (Khronos), sections 3.7, 3.8 and 3.9.
+Source: glTF 2.0 specification (Khronos), sections 3.7, 3.8 and 3.9; EXT_texture_webp.
 """
 
 import dataclasses
+import re
 from typing import Any
 
 import jax.numpy as jnp
@@ -26,7 +27,7 @@ class Part:
 
     Attributes:
       first, count: Corners in `RigMesh.faces`.
-      image: A PNG or JPEG file; None for none.
+      image: A PNG, JPEG or WebP file; None for none.
       cut: Least opacity of a pixel that is drawn; 0 draws all.
     """
 
@@ -61,7 +62,7 @@ class RigMesh:
 
 
 def _bytes(rig: Rig, number: int) -> bytes | None:
-    """An image's file; None if it is of another kind than PNG or JPEG."""
+    """An image's file; None if it is of another kind than PNG, JPEG or WebP."""
     images = objects(rig.name, rig.content, "images")
     image = images[index(rig.name, number, len(images), "an image")]
     uri = image.get("uri")
@@ -76,7 +77,7 @@ def _bytes(rig: Rig, number: int) -> bytes | None:
         found = linked(rig.name, uri, f"image {number}")
     else:
         raise ValueError(f"{rig.name}: image {number} has neither a view nor a uri")
-    known = found[:8] == b"\x89PNG\r\n\x1a\n" or found[:3] == b"\xff\xd8\xff"
+    known = re.match(rb"\x89PNG\r\n\x1a\n|\xff\xd8\xff|RIFF....WEBP", found, re.DOTALL)
     return found if known else None
 
 
@@ -104,6 +105,9 @@ def _material(
         return color, None, uv, cut
     textures = objects(rig.name, rig.content, "textures")
     source = textures[index(rig.name, texture.get("index"), len(textures), "a texture")]
+    packed = source.get("extensions")
+    packed = packed.get("EXT_texture_webp") if isinstance(packed, dict) else None
+    source = packed if isinstance(packed, dict) else source
     image = _bytes(rig, source["source"]) if "source" in source else None
     return color, image, f"TEXCOORD_{texture.get('texCoord', 0)}", cut
 

@@ -15,6 +15,7 @@ from tests.export.test_rig import worlds
 from tests.retarget import rigs
 
 PNG = b"\x89PNG\r\n\x1a\n and the rest"
+WEBP = b"RIFF\x10\x00\x00\x00WEBP and the rest"
 
 
 @pytest.fixture(scope="module")
@@ -91,14 +92,17 @@ def test_what_the_page_is_given_moves_as_the_rig_does(hero):
     assert len(content) > 10_000 and about["parts"][0][2] is None
 
 
-def test_colors_images_and_what_hangs_on_a_joint(hero, tmp_path):
+@pytest.mark.parametrize("image", [PNG, WEBP], ids=["PNG", "WebP"])
+def test_colors_images_and_what_hangs_on_a_joint(image, hero, tmp_path):
     def change(content, data):
         data += b"\0" * (-len(data) % 4)
-        view = {"buffer": 0, "byteOffset": len(data), "byteLength": len(PNG)}
+        view = {"buffer": 0, "byteOffset": len(data), "byteLength": len(image)}
         content["bufferViews"].append(view)
         views = len(content["bufferViews"])
-        content["images"] = [{"bufferView": views - 1, "mimeType": "image/png"}]
+        content["images"] = [{"bufferView": views - 1}]
         content["textures"] = [{"source": 0}]
+        if image == WEBP:
+            content["textures"] = [{"extensions": {"EXT_texture_webp": {"source": 0}}}]
         look = {"baseColorFactor": [0.5, 0.0, 1.0, 1.0]}
         look["baseColorTexture"] = {"index": 0}
         for part in content["meshes"][0]["primitives"]:
@@ -110,16 +114,16 @@ def test_colors_images_and_what_hangs_on_a_joint(hero, tmp_path):
         hand = next(n for n in content["nodes"] if n["name"] == "mixamorig:LeftHand")
         hand.setdefault("children", []).append(len(content["nodes"]))
         content["nodes"].append({"name": "sword", "mesh": 0})
-        content["buffers"][0]["byteLength"] = len(data) + len(PNG)
-        return data + PNG
+        content["buffers"][0]["byteLength"] = len(data) + len(image)
+        return data + image
 
     rig = changed(tmp_path, hero, change)
     mesh = rig_mesh.rig_mesh(rig)
-    assert mesh.parts[0].image == PNG and mesh.parts[0].cut == pytest.approx(0.4)
+    assert mesh.parts[0].image == image and mesh.parts[0].cut == pytest.approx(0.4)
     # sRGB of half the light is 188.
     np.testing.assert_allclose(255 * mesh.colors[0], [188, 0, 255, 255], atol=1)
     about, arrays = rig_mesh.page_body(rig, mesh, 1.0)
-    assert bytes(arrays["image.0"]) == PNG
+    assert bytes(arrays["image.0"]) == image
     assert {part[2] for part in about["parts"]} == {"image.0"}
     half = len(mesh.positions) // 2
     hand = rig.skeleton.names.index("mixamorig:LeftHand")

@@ -111,11 +111,15 @@ def test_a_dropped_rig_moves_as_retarget_moves_it(name, tmp_path):
     assert np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))).max() < 0.1
 
 
-@pytest.mark.parametrize("uri, line", [("iVBORw0KGgo=", None), ("?", "no base64")])
+@pytest.mark.parametrize(
+    "uri, line",
+    [("iVBORw0KGgo=", None), ("UklGRhAAAABXRUJQ", None), ("?", "no base64")],
+)
 def test_a_picture_may_stand_in_the_text(uri, line):
     content, rest = rigs.split(rigs.glb(rigs.person("child")))
     content["images"] = [{"uri": f"data:image/png;base64,{uri}"}]
-    content["textures"] = [{"source": 0}]
+    webp = {"extensions": {"EXT_texture_webp": {"source": 0}}}
+    content["textures"] = [webp if uri.startswith("Uk") else {"source": 0}]
     look = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
     content["materials"] = [look for _ in content["materials"]]
     for part in content["meshes"][0]["primitives"]:

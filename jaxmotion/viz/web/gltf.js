@@ -277,20 +277,22 @@ function materialOf(file, primitive) {
   const mode = material.alphaMode ?? "OPAQUE";
   const cut = mode === "OPAQUE" ? 0 : mode === "MASK" ? material.alphaCutoff ?? 0.5 : 0.3;
   if (!texture) return { color, image: null, uv, cut };
-  const { source } = file.item("textures", texture.index, "a texture");
+  const about = file.item("textures", texture.index, "a texture");
+  const { source } = about.extensions?.EXT_texture_webp ?? about;
   const image = source === undefined ? null : source;
   return { color, image, uv: `TEXCOORD_${texture.texCoord ?? 0}`, cut };
 }
 
-// A PNG's or JPEG's bytes; null for others.
+// A PNG's, JPEG's or WebP's bytes; null for others.
 function imageOf(file, number) {
   const { bufferView, uri } = file.item("images", number, "an image");
   const isHere = typeof uri === "string" && uri.startsWith("data:");
   if (bufferView === undefined && !isHere)
     refuse(`image ${number} is outside of the file: expected a .glb that holds all of it`);
   const bytes = bufferView === undefined ? decoded(uri, number) : file.bytes(bufferView).slice();
-  const starts = (...head) => head.every((x, i) => bytes[i] === x);
-  return starts(0x89, 0x50, 0x4e, 0x47) || starts(0xff, 0xd8, 0xff) ? bytes : null;
+  const has = (at, ...head) => head.every((x, i) => bytes[at + i] === x);
+  return has(0, 0x89, 0x50, 0x4e, 0x47) || has(0, 0xff, 0xd8, 0xff)
+    || (has(0, 0x52, 0x49, 0x46, 0x46) && has(8, 0x57, 0x45, 0x42, 0x50)) ? bytes : null;
 }
 
 function decoded(uri, number) {

@@ -191,7 +191,7 @@ export class Scene {
     return { array, kind: wide ? gl.UNSIGNED_INT : gl.UNSIGNED_SHORT, parts: drawn, free };
   }
 
-  // A PNG or JPEG as a texture, white until the browser has read it.
+  // A PNG, JPEG or WebP as a texture, white until the browser has read it.
   image(bytes) {
     const gl = this.gl, made = texture(gl, gl.LINEAR);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 1, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE,
