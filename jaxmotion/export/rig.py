@@ -356,14 +356,18 @@ def _bound(
         joints = skins[number]["joints"]
         if "inverseBindMatrices" not in skins[number]:
             continue
-        inverse = array(name, content, data, skins[number]["inverseBindMatrices"])
+        try:
+            inverse = array(name, content, data, skins[number]["inverseBindMatrices"])
+        except ValueError:
+            continue  # whoever draws the mesh says what is wrong
         if inverse.shape[1] != 16 or len(inverse) < len(joints):
-            continue  # who draws the mesh says so
+            continue
         inverse = np.swapaxes(inverse[: len(joints)].reshape(-1, 4, 4), 1, 2)
         now = np.stack([world[joint] for joint in joints])
-        if not (np.abs(inverse) < MAX_METERS).all() or np.any(
-            np.abs(np.linalg.det(inverse)) < 1e-12
-        ):
+        size = np.linalg.norm(inverse[:, :3, :3], axis=1)
+        if not (np.abs(inverse) < MAX_METERS).all() or not (size > 1e-6).all():
+            continue
+        if not (np.linalg.det(inverse[:, :3, :3] / size[:, None]) > 0.9).all():
             continue
         bind = np.linalg.inv(inverse)
         top = min(range(len(joints)), key=lambda i: len(_path(parents, joints[i])))
@@ -385,13 +389,16 @@ def _bound(
                 at[upper[:, 0], :3, 3] - at[upper[:, 1], :3, 3], axis=1
             )
 
+        if not bones:
+            continue
         long = lengths(now)
         for tried in (frames, [now[top] @ inverse[top]]):
             fits = []
             for frame in tried:
                 at = frame @ bind
-                off = np.abs(lengths(at) - long) / np.maximum(long, long.mean())
-                if len(bones) and np.mean(off <= 0.05) >= 0.9:
+                off = np.abs(lengths(at) - long)
+                same = off <= 0.05 * np.maximum(long, np.mean(long))
+                if np.mean(same) >= 0.9:
                     fits.append((float(_angles(at, now).mean()), at))
             turned, at = min(fits, key=lambda x: x[0], default=(180.0, now))
             if turned < 60.0:

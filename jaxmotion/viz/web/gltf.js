@@ -151,6 +151,9 @@ function tree({ nodes }) {
 function inverse(m) {
   const axes = [0, 4, 8].map(c => m.slice(c, c + 3)), size = axes.map(a => a.reduce((s, x) => s + x * x, 0));
   if (!m.every(x => Math.abs(x) < 1e6) || !(Math.min(...size) > 1e-12)) return null;
+  const [x, y, z] = axes, volume = x[0] * (y[1] * z[2] - y[2] * z[1])
+    + x[1] * (y[2] * z[0] - y[0] * z[2]) + x[2] * (y[0] * z[1] - y[1] * z[0]);
+  if (!(volume > 0.9 * Math.sqrt(size[0] * size[1] * size[2]))) return null;
   const made = new Array(16).fill(0);
   axes.forEach((a, c) => a.forEach((x, k) => { made[4 * k + c] = x / size[c]; }));
   for (let r = 0; r < 3; r++)
