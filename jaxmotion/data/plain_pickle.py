@@ -7,6 +7,7 @@ is refused before it is looked up. Nor are those NumPy's own, which trust what t
 NumPy 1 and 2 are read.
 """
 
+import dataclasses
 import io
 import math
 import pickle
@@ -22,10 +23,11 @@ def _encode(text: str, encoding: str) -> bytes:
     return text.encode("latin1")
 
 
+@dataclasses.dataclass(init=False)
 class _Type:
-    """Stands for a `numpy.dtype` of numbers, text or objects."""
+    """Stands for a `numpy.dtype` of numbers, text or objects; no key, like an array."""
 
-    __hash__ = None  # type: ignore[assignment]
+    dtype: np.dtype
 
     def __init__(self, code: Any, align: Any = False, copy: Any = True):
         self.dtype = np.dtype(str(code))
@@ -47,13 +49,14 @@ class _Type:
         return np.frombuffer(raw, self.dtype)
 
 
+@dataclasses.dataclass(init=False)
 class _Array:
-    """Stands for an array until the file is read."""
+    """Stands for an array until the file is read; not hashable, as that is not."""
 
-    __hash__ = None  # type: ignore[assignment]
+    array: np.ndarray
 
     def __init__(self, kind: Any, shape: Any, code: Any):
-        self.array: Any = np.zeros(0)
+        self.array = np.zeros(0)
 
     def __setstate__(self, state: tuple) -> None:
         _, shape, kind, in_columns, raw = state
@@ -62,8 +65,11 @@ class _Array:
         if kind.dtype.hasobject:
             if not isinstance(raw, list) or len(raw) != math.prod(shape):
                 raise pickle.UnpicklingError(f"objects of the shape {shape}")
-            self.array = np.empty(shape, object, order="F" if in_columns else "C")
-            self.array.flat = raw
+            # One by one: lists among them are objects, too. In rows, however stored.
+            values = np.empty(len(raw), object)
+            for i, one in enumerate(raw):
+                values[i] = one
+            self.array = values.reshape(shape)
         else:
             values = kind.values(raw).copy()
             self.array = values.reshape(shape, order="F" if in_columns else "C")
@@ -109,11 +115,11 @@ class _PlainUnpickler(pickle.Unpickler):
         return (lambda *given: found(*given)) if callable(found) else found
 
 
-def _plain(value: Any, seen: dict[int, Any]) -> Any:
+def _plain(value: Any, seen: set[int]) -> Any:
     """With arrays and types in the places of what stands for them."""
     if isinstance(value, _Array):
         if value.array.dtype.hasobject and id(value) not in seen:
-            seen[id(value)] = value
+            seen.add(id(value))
             flat = value.array.reshape(-1)
             for i, one in enumerate(flat):
                 flat[i] = _plain(one, seen)
@@ -125,10 +131,9 @@ def _plain(value: Any, seen: dict[int, Any]) -> Any:
     if isinstance(value, tuple):
         return tuple(_plain(one, seen) for one in value)
     if isinstance(value, (list, dict)) and id(value) not in seen:
-        seen[id(value)] = value
-        for key, one in [
-            *(enumerate(value) if isinstance(value, list) else value.items())
-        ]:
+        seen.add(id(value))
+        items = enumerate(value) if isinstance(value, list) else value.items()
+        for key, one in list(items):
             value[key] = _plain(one, seen)
     return value
 
@@ -141,7 +146,9 @@ def read_plain_pickle(data: bytes, *, name: str) -> Any:
     file that is damaged, or names anything beyond NumPy arrays; it is not run.
     """
     try:
-        return _plain(_PlainUnpickler(io.BytesIO(data), encoding="latin1").load(), {})
+        return _plain(
+            _PlainUnpickler(io.BytesIO(data), encoding="latin1").load(), set()
+        )
     except _Refused as error:
         raise ValueError(
             f"{name}: the pickle asks for {error}, expected only numbers, text, "

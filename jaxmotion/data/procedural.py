@@ -63,8 +63,9 @@ def follow_commands(
 
 
 def _check_fps(fps: float) -> None:
-    if not (np.isfinite(fps) and fps >= 10.0):  # steps are of six frames at least
-        raise ValueError(f"fps is {fps}, expected at least 10")
+    # Steps have six frames at least: below, they are too long for the legs.
+    if not (np.isfinite(fps) and fps >= 8.0):
+        raise ValueError(f"fps is {fps}, expected at least 8")
 
 
 def _check_commands(commands: Command) -> None:
@@ -94,7 +95,7 @@ def walk(commands: Command, gait: Gait, *, fps: float = 30.0, seed: int = 0) -> 
     Commands are velocity and facing (unit) of each frame, two at least; labels are
     ignored. Speeds above the gait's max_speed look rushed; far above, legs are too
     short for the steps. `ValueError` for a command that is not finite or a facing not
-    of length one (names the frame), a rate below 10, or steps that legs do not
+    of length one (names the frame), a rate below 8, or steps that legs do not
     reach.
     """
     _check_fps(fps)

@@ -43,7 +43,9 @@ _IMAGES = {
 }
 MESHOPT = "EXT_meshopt_compression"
 _MAX_NODES = 20_000
-_POSED = 2.0  # degrees that a joint may stand from how its mesh was bound
+# Degrees: joints may stand so far from how a mesh was bound; turned farther on average,
+# they are seen from another frame.
+_POSED, _FAR = 2.0, 60.0
 _SMOOTH = 0.3  # seconds: a root on the ground does not sway with the hips
 
 
@@ -338,7 +340,11 @@ def _vrm_roles(content: dict) -> dict[str, int]:
 
 
 def _bound(
-    name: str, content: dict, data: bytes, parents: list[int]
+    name: str,
+    content: dict,
+    data: bytes,
+    parents: list[int],
+    world: dict[int, np.ndarray],
 ) -> dict[int, np.ndarray]:
     """World matrices in which meshes were bound, of joints that stand otherwise.
 
@@ -348,7 +354,6 @@ def _bound(
     lengths: then these matrices tell something else.
     """
     nodes, found = objects(name, content, "nodes"), {}
-    world = world_of(name, nodes, parents)
     skins = objects(name, content, "skins")
     for joint in {joint for skin in skins for joint in skin["joints"]}:
         _rotation(name, joint, world[joint])
@@ -382,31 +387,30 @@ def _bound(
             for i, joint in enumerate(joints)
             if parents[joint] in joints
         ]
-        upper = np.array(bones, int).reshape(-1, 2)
-
-        def lengths(at: np.ndarray, upper: np.ndarray = upper) -> np.ndarray:
-            return np.linalg.norm(
-                at[upper[:, 0], :3, 3] - at[upper[:, 1], :3, 3], axis=1
-            )
-
         if not bones:
             continue
-        long = lengths(now)
+        long = _lengths(now, bones)
         for tried in (frames, [now[top] @ inverse[top]]):
             fits = []
             for frame in tried:
                 at = frame @ bind
-                off = np.abs(lengths(at) - long)
+                off = np.abs(_lengths(at, bones) - long)
                 same = off <= 0.05 * np.maximum(long, np.mean(long))
                 if np.mean(same) >= 0.9:
                     fits.append((float(_angles(at, now).mean()), at))
             turned, at = min(fits, key=lambda x: x[0], default=(180.0, now))
-            if turned < 60.0:
+            if turned < _FAR:
                 break
         if turned < 180.0:
             found = {**dict(zip(joints, at, strict=True)), **found}
     far = [_angles(at[None], world[joint][None]) for joint, at in found.items()]
     return found if far and np.max(far) > _POSED else {}
+
+
+def _lengths(at: np.ndarray, bones: list[tuple[int, int]]) -> np.ndarray:
+    """Of bones between matrices [J, 4, 4]."""
+    lower, upper = np.transpose(bones)
+    return np.linalg.norm(at[lower, :3, 3] - at[upper, :3, 3], axis=1)
 
 
 def _angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -419,22 +423,29 @@ def _angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
 
 
-def _stand(name: str, content: dict, data: bytes, parents: list[int]) -> None:
-    """Has the nodes stand in the pose in which meshes were bound, in place."""
-    nodes, bound = content["nodes"], _bound(name, content, data, parents)
+def _stand(
+    name: str,
+    content: dict,
+    data: bytes,
+    parents: list[int],
+    world: dict[int, np.ndarray],
+) -> dict[int, np.ndarray]:
+    """World matrices of nodes, in place made to stand as meshes were bound."""
+    nodes, bound = content["nodes"], _bound(name, content, data, parents, world)
     if not bound:
-        return
+        return world
     local = [_local(name, number, node) for number, node in enumerate(nodes)]
-    world: dict[int, np.ndarray] = {}
+    made: dict[int, np.ndarray] = {}
     for number in sorted(range(len(nodes)), key=lambda n: len(_path(parents, n))):
-        above = world[parents[number]] if parents[number] >= 0 else np.eye(4)
-        world[number] = bound.get(number, above @ local[number])
+        above = made[parents[number]] if parents[number] >= 0 else np.eye(4)
+        made[number] = bound.get(number, above @ local[number])
         if number in bound:
-            own = np.linalg.inv(above) @ world[number]
+            own = np.linalg.inv(above) @ made[number]
             nodes[number]["matrix"] = own.T.reshape(16).tolist()
             for part in ("translation", "rotation", "scale"):
                 nodes[number].pop(part, None)
             _plain(nodes[number])
+    return world_of(name, nodes, parents)
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -456,9 +467,9 @@ def read_rig(path: str | Path) -> Rig:
         raise ValueError(f"{name}: {len(nodes)} nodes, more than {_MAX_NODES}")
     upper = parents_of(name, nodes)
     joints = _joints(name, content, upper)
-    if not _vrm_roles(content):  # whose rest pose is a T-pose
-        _stand(name, content, data, upper)
     world = world_of(name, nodes, upper)
+    if not _vrm_roles(content):  # whose rest pose is a T-pose
+        world = _stand(name, content, data, upper, world)
     turns = np.stack([_rotation(name, joint, world[joint]) for joint in joints])
     above = np.eye(4) if upper[joints[0]] < 0 else world[upper[joints[0]]]
     if upper[joints[0]] >= 0:

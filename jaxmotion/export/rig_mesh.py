@@ -105,9 +105,9 @@ def _material(
         return color, None, uv, cut
     textures = objects(rig.name, rig.content, "textures")
     source = textures[index(rig.name, texture.get("index"), len(textures), "a texture")]
-    packed = source.get("extensions")
-    packed = packed.get("EXT_texture_webp") if isinstance(packed, dict) else None
-    source = packed if isinstance(packed, dict) else source
+    more = source.get("extensions")
+    webp = more.get("EXT_texture_webp") if isinstance(more, dict) else None
+    source = webp if isinstance(webp, dict) else source
     image = _bytes(rig, source["source"]) if "source" in source else None
     return color, image, f"TEXCOORD_{texture.get('texCoord', 0)}", cut
 

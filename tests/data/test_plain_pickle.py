@@ -165,6 +165,22 @@ def test_numpys_functions_are_not_trusted(evil):
         read_plain_pickle(data, name="x.pkl")
 
 
+def test_objects_of_any_kind_and_order_are_read():
+    lists, columns = np.empty(2, object), np.empty((2, 2), object, order="F")
+    lists[:] = [[1, 2], [3]], [4]
+    columns[0] = [np.arange(2), "x"]
+    columns[1] = [[5, 6], 7]
+    alone = np.empty((), object)
+    alone[()] = {"a": np.arange(3)}
+    for protocol in (0, 2, 5):
+        data = pickle.dumps([lists, columns, alone], protocol)
+        found = read_plain_pickle(data, name="x.pkl")
+        assert found[0].tolist() == [[[1, 2], [3]], [4]]
+        np.testing.assert_array_equal(found[1][0, 0], np.arange(2))
+        assert found[1].T[1].tolist() == ["x", 7] and found[1][1, 0] == [5, 6]
+        np.testing.assert_array_equal(found[2][()]["a"], np.arange(3))
+
+
 def test_arrays_that_hold_each_other_are_read():
     one, other = np.empty(2, object), [np.arange(3)]
     one[:] = [other, 1]

@@ -315,7 +315,7 @@ def test_random_commands_stand_walk_turn_and_strafe():
         (dict(gaits={}), "0 gaits"),
         (dict(fps=0.0), "fps is 0.0"),
         (dict(fps=-30.0), "fps is -30.0"),
-        (dict(fps=0.2), "fps is 0.2, expected at least 10"),
+        (dict(fps=0.2), "fps is 0.2, expected at least 8"),
     ],
 )
 def test_bad_arguments_are_named(bad, message):

@@ -13,7 +13,9 @@ const WIDTHS = { SCALAR: 1, VEC2: 2, VEC3: 3, VEC4: 4, MAT4: 16 };
 const PACKED = ["KHR_draco_mesh_compression", "EXT_meshopt_compression"];
 const TRIANGLES = 4, MAGIC = 0x46546c67, TEXT = 0x4e4f534a, BINARY = 0x004e4942;
 const MOST_JOINTS = 256;
-const POSED = 2;  // degrees that a joint may stand from how its mesh was bound
+// Degrees: joints may stand so far from how a mesh was bound; turned farther on average,
+// they are seen from another frame.
+const POSED = 2, FAR = 60;
 
 function refuse(line) { throw new Error(line); }
 
@@ -204,7 +206,7 @@ function bound(file, parents, world) {
         const turned = mean1(at.map((m, i) => angle(m, now[i])));
         if (fit.length >= 0.9 * bones.length && turned < best.turned) best = { turned, at };
       }
-      if (best.turned < 60) break;
+      if (best.turned < FAR) break;
     }
     if (best.at) joints.forEach((joint, i) => { if (!found.has(joint)) found.set(joint, best.at[i]); });
   }
