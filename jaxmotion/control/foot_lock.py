@@ -57,7 +57,7 @@ from jaxtyping import Array, Bool, Float
 from jaxmotion.control import sampling
 from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character, Method, Tuning
-from jaxmotion.motion.rotation import rot6d_from_matrix, safe_normalize
+from jaxmotion.motion.rotation import product, rot6d_from_matrix, safe_normalize
 from jaxmotion.motion.rotation_vector import to_matrix
 from jaxmotion.motion.skeleton import Motion, Skeleton, global_transforms
 from jaxmotion.motion.spring import spring
@@ -321,7 +321,7 @@ def _swing(start: Array, end: Array) -> Array:
     x, y, z = cross
     zero = jnp.zeros_like(x)
     skew = jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
-    return jnp.eye(3) + skew + skew @ skew / jnp.maximum(1.0 + cosine, 1e-3)
+    return jnp.eye(3) + skew + product(skew, skew) / jnp.maximum(1.0 + cosine, 1e-3)
 
 
 def solve_leg(
@@ -372,9 +372,9 @@ def solve_leg(
     look = _swing(animated - ankle, toe - reached)
     return jnp.stack(
         [
-            swing @ opened @ rotations[0],
-            swing @ lower @ rotations[1],
-            look @ rotations[2],
+            product(product(swing, opened), rotations[0]),
+            product(product(swing, lower), rotations[1]),
+            product(look, rotations[2]),
         ]
     )
 
@@ -425,7 +425,7 @@ def _place(
     changed = sorted({joint for chain in chains for joint in chain[:3]})
     index = jnp.array(changed)
     parents = jnp.array([skeleton.parents[joint] for joint in changed])
-    local = jnp.swapaxes(new[parents], -1, -2) @ new[index]
+    local = product(jnp.swapaxes(new[parents], -1, -2), new[index])
     found = rot6d_from_matrix(local).astype(joint_rotation.dtype)
     return joint_rotation.at[index].set(found)
 

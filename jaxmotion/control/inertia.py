@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Num
 
 from jaxmotion.motion import rotation, rotation_vector
+from jaxmotion.motion.rotation import product
 from jaxmotion.motion.skeleton import Motion
 from jaxmotion.motion.spring import spring
 
@@ -114,11 +115,12 @@ def _position_seam(past: Array, chunk: Array, fps: float) -> tuple[Array, Array]
 def _rotation_seam(past: Array, chunk: Array, fps: float) -> tuple[Array, Array]:
     """As `_position_seam`, for rotation vectors of displayed times target inverse."""
     first, second = chunk[..., 0, :, :, :], chunk[..., 1, :, :, :]
-    back = first @ jnp.swapaxes(second, -1, -2)
-    before = back @ first
-    inverse = [jnp.swapaxes(target, -1, -2) for target in (before, back @ before)]
-    now = rotation_vector.from_matrix(past[..., -1, :, :, :] @ inverse[0])
-    earlier = rotation_vector.from_matrix(past[..., -2, :, :, :] @ inverse[1])
+    times_inverse = lambda a, b: product(a, jnp.swapaxes(b, -1, -2))  # noqa: E731
+    back = times_inverse(first, second)
+    before = product(back, first)
+    of_last = times_inverse(past[..., -1, :, :, :], before)
+    of_other = times_inverse(past[..., -2, :, :, :], product(back, before))
+    now, earlier = map(rotation_vector.from_matrix, (of_last, of_other))
     return now, (now - rotation_vector.nearest(earlier, now)) * fps
 
 
@@ -164,7 +166,7 @@ def inertialize(
     turn = rotation_vector.to_matrix(jnp.moveaxis(turn, -2, -3))
     # Frames beyond the end keep their very numbers, not Gram-Schmidt's copy of them.
     is_faded = (times < duration)[:, None, None] if half_life is None else True
-    rot6d = rotation.rot6d_from_matrix(turn @ target)
+    rot6d = rotation.rot6d_from_matrix(product(turn, target))
     return dataclasses.replace(
         chunk,
         root_position=chunk.root_position + offset,

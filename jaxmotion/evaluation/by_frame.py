@@ -46,8 +46,8 @@ def place_sums(
     weights = jnp.ones(values.shape) if weights is None else weights
     # What is left out may be no number.
     counted = jnp.where((place >= 0) & (place < num_places), values * weights, 0.0)
-    total = jnp.einsum("...fp,...f->p", at, counted)
-    return jnp.stack([total, jnp.einsum("...fp,...f->p", at, weights)])
+    sums = functools.partial(jnp.einsum, "...fp,...f->p", at, precision="highest")
+    return jnp.stack([sums(counted), sums(weights)])
 
 
 @functools.partial(jax.jit, static_argnames=("feet", "num_places"))

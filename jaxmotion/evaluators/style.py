@@ -106,7 +106,7 @@ def released_input(
     positions = joint_positions(skeleton, motion)
     turn = rotation.matrix_from_facing(body_facing(skeleton, positions))
     local = positions[..., joints, :] - positions[..., :1, :]
-    x, y, z = jnp.moveaxis(jnp.einsum("...ji,...kj->...ki", turn, local), -1, 0)
+    x, y, z = jnp.moveaxis(rotation.product(local, turn), -1, 0)
     local = jnp.stack([z, y, -x], axis=-1)  # from facing +z
     return local.reshape(*local.shape[:-2], -1)
 
@@ -121,9 +121,9 @@ def window_input(
     """
     positions = joint_positions(skeleton, motion)
     facing = trajectory.root_trajectory(skeleton, motion).facing
-    turn = jnp.swapaxes(rotation.matrix_from_facing(facing), -1, -2)
+    turn = rotation.matrix_from_facing(facing)
     local = positions - positions[..., :1, :]
-    local = jnp.einsum("...ij,...kj->...ki", turn, local)
+    local = rotation.product(local, turn)
     local = local.at[..., 0, 1].set(positions[..., 0, 1])
     return local.reshape(*local.shape[:-2], -1)
 

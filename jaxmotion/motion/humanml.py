@@ -140,7 +140,7 @@ def _chain_rotations(joints: Array, facing: Array, layout: Layout) -> Array:
     first = {chain[1] for chain in layout.chains}
     before = [0 if j in first else p for j, p in enumerate(layout.parents)][1:]
     inverse = jnp.swapaxes(every[..., jnp.array(before), :, :], -1, -2)
-    return rotation.rot6d_from_matrix(jnp.matmul(inverse, world, precision="highest"))
+    return rotation.rot6d_from_matrix(rotation.product(inverse, world))
 
 
 @jax.jit

@@ -22,6 +22,7 @@ from jaxmotion.motion import rotation
 from jaxmotion.motion.facing import plain_names
 from jaxmotion.motion.humanml import minimal_swing
 from jaxmotion.motion.humanml_layout import HUMANML3D
+from jaxmotion.motion.rotation import product
 from jaxmotion.motion.skeleton import Motion, Skeleton
 
 SMPL_JOINTS = (
@@ -125,11 +126,6 @@ def _children(joint: int) -> list[int]:
     return [c for c, parent in enumerate(HUMANML3D.parents) if parent == joint]
 
 
-def _times(a: Array, b: Array) -> Array:
-    """Product of rotations in full precision."""
-    return jnp.matmul(a, b, precision="highest")
-
-
 def _fan_rotation(rest: Array, seen: Array) -> Array:
     """Least-squares rotation [F, 3, 3] of vectors at rest [N, 3] onto seen [F, N, 3].
 
@@ -138,9 +134,9 @@ def _fan_rotation(rest: Array, seen: Array) -> Array:
     covariance = jnp.einsum("fni,nj->fij", seen, rest, precision="highest")
     left, _, right = jnp.linalg.svd(covariance)
     # The nearest orthogonal matrix that does not mirror.
-    sign = jnp.where(jnp.linalg.det(_times(left, right)) < 0, -1.0, 1.0)
+    sign = jnp.where(jnp.linalg.det(product(left, right)) < 0, -1.0, 1.0)
     last = left[..., :, 2:] * sign[:, None, None]
-    return _times(jnp.concatenate([left[..., :, :2], last], axis=-1), right)
+    return product(jnp.concatenate([left[..., :, :2], last], axis=-1), right)
 
 
 def _mean_offsets(bones: Array) -> Array:
@@ -181,16 +177,16 @@ def motion_from_joints(
         below = jnp.swapaxes(above, -1, -2)
         here = positions[:, 0]
         if parent >= 0:
-            here = placed[parent] + _times(above, offsets[joint][:, None])[..., 0]
+            here = placed[parent] + product(above, offsets[joint][:, None])[..., 0]
         children = jnp.array(_children(joint), jnp.int32)
         seen = positions[:, children] - here[:, None]
         turn = identity
         if len(children) == 1:
-            aim = _times(below, rotation.safe_normalize(seen[:, 0], up)[..., None])
+            aim = product(below, rotation.safe_normalize(seen[:, 0], up)[..., None])
             turn = minimal_swing(jnp.asarray(_REST)[children], aim[..., 0])
         elif len(children) > 1:
-            turn = _times(below, _fan_rotation(offsets[children], seen))
-        world.append(_times(above, turn))
+            turn = product(below, _fan_rotation(offsets[children], seen))
+        world.append(product(above, turn))
         local.append(turn)
         placed.append(here)
     rot6d = rotation.rot6d_from_matrix(jnp.stack(local, axis=-3))

@@ -60,7 +60,7 @@ def _central(step: Float[Array, "steps *shape"]) -> Float[Array, "steps+1 *shape
 
 def _angular(matrix: Array, fps: float) -> Array:
     """Angular velocity in the axes of the parent, radians per second."""
-    turn = matrix[1:] @ jnp.swapaxes(matrix[:-1], -1, -2)
+    turn = rotation.product(matrix[1:], jnp.swapaxes(matrix[:-1], -1, -2))
     return _central(rotation_vector.from_matrix(turn) * fps)
 
 
@@ -88,7 +88,7 @@ def _local(skeleton: Skeleton, motion: Motion, bone: Trajectory) -> tuple[Array,
     bones = jnp.broadcast_to(skeleton.offsets, (len(root), *skeleton.offsets.shape))
     matrix = rotation.matrix_from_rot6d(motion.joint_rotation)
     facing = rotation.matrix_from_facing(bone.facing)
-    turned = jnp.swapaxes(facing, -1, -2) @ matrix[:, 0]
+    turned = rotation.product(jnp.swapaxes(facing, -1, -2), matrix[:, 0])
     return bones.at[:, 0].set(hips), matrix.at[:, 0].set(turned)
 
 
@@ -149,9 +149,9 @@ def character_transforms(
     local = rotation.matrix_from_rot6d(rot6d)
     positions, turns = [position[..., 0, :]], [local[..., 0, :, :]]
     for joint, parent in enumerate(parents[1:], start=1):
-        arm = turns[parent] @ position[..., joint, :, None]
+        arm = rotation.product(turns[parent], position[..., joint, :, None])
         positions.append(positions[parent] + arm[..., 0])
-        turns.append(turns[parent] @ local[..., joint, :, :])
+        turns.append(rotation.product(turns[parent], local[..., joint, :, :]))
     return jnp.stack(positions, axis=-2), jnp.stack(turns, axis=-3)
 
 
@@ -216,7 +216,8 @@ def place(
     root = jnp.stack([planar[..., 0], hips[..., 1], planar[..., 1]], axis=-1)
     rot6d = parts["rotation"].reshape(*poses.shape[:-1], num_joints, 6)
     matrix = rotation.matrix_from_rot6d(rot6d)
-    turned = rotation.matrix_from_facing(frame.facing) @ matrix[..., 0, :, :]
+    facing = rotation.matrix_from_facing(frame.facing)
+    turned = rotation.product(facing, matrix[..., 0, :, :])
     matrix = matrix.at[..., 0, :, :].set(turned)
     return root, rotation.rot6d_from_matrix(matrix)
 

@@ -246,8 +246,9 @@ def from_root(
     for child in chain:
         parent = skeleton.parents[child]
         if parent > 0:
-            turn = turn @ rotation.matrix_from_rot6d(joint_rotation[..., parent, :])
-        vector = vector + turn @ skeleton.offsets[child]
+            own = rotation.matrix_from_rot6d(joint_rotation[..., parent, :])
+            turn = rotation.product(turn, own)
+        vector = vector + rotation.product(turn, skeleton.offsets[child])
     return vector
 
 

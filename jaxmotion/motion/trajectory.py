@@ -269,9 +269,9 @@ def smooth_course(
             jnp.where(chosen, fit, other)
             for chosen, other in zip(fitted, (matrix, turn), strict=True)
         )
-    path = matrix @ course.position
+    path = smooth(course.position, matrix)
     path = path + (course.position[last] - path[last])[None]
-    facings = safe_normalize(turn @ course.facing, jnp.array([0.0, 1.0]))
+    facings = safe_normalize(smooth(course.facing, turn), jnp.array([0.0, 1.0]))
     return Trajectory(position=path, facing=facings)
 
 
@@ -279,7 +279,8 @@ def smooth(
     x: Float[Array, "*batch frames n"], matrix: Float[Array, "frames frames"]
 ) -> Float[Array, "*batch frames n"]:
     """Filters along time with a matrix whose row f holds the weights of frame f."""
-    return jax.numpy.einsum("fg,...gn->...fn", matrix, x)
+    # In full precision also where matrix products are rounded by default.
+    return jnp.einsum("fg,...gn->...fn", matrix, x, precision="highest")
 
 
 def integrate_path(

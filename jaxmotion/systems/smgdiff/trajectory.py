@@ -144,11 +144,13 @@ def noise_space(
     kinds = lambda x: x.reshape(config.future, 2, 2)  # noqa: E731
 
     def decode(z: Array) -> Array:
-        away = jnp.einsum("kfn,nkc->fkc", sines, kinds(z))
+        away = jnp.einsum("kfn,nkc->fkc", sines, kinds(z), precision="highest")
         return middle + away.reshape(middle.shape)
 
     def encode(x: Array) -> Array:
-        return jnp.einsum("knf,fkc->nkc", inverse, kinds(x - middle)).reshape(x.shape)
+        away = kinds(x - middle)
+        z = jnp.einsum("knf,fkc->nkc", inverse, away, precision="highest")
+        return z.reshape(x.shape)
 
     return decode, encode
 
