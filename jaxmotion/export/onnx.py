@@ -73,7 +73,7 @@ def content(graph: Graph, *, batch: Batch = None) -> bytes:
     if batch is not None:
         model = _over_characters(model, graph, batch)
     model.producer_name = "jaxmotion"
-    onnx.checker.check_model(model)
+    onnx.checker.check_model(model, full_check=True)
     _try(model, graph, batch)
     return model.SerializeToString()
 
@@ -326,7 +326,12 @@ def _scan(eqn: core.JaxprEqn, consts: list, carry: list, rows: list) -> list:
 
 
 def _prune(body: Any) -> set[str]:
-    """Takes constants out that nothing reads; returns the names that are read."""
+    """Takes out constants that nothing reads, and shapes within.
+
+    The converter states some of them wrong, and runtimes infer all. Returns the names
+    that are read.
+    """
+    del body.value_info[:]
     read = {value.name for value in body.output}
     for node in body.node:
         read.update(node.input)

@@ -2,11 +2,11 @@
 
 Roles have the names of VRM's humanoid bones. They are read off the joints' names, in
 the words of the common rigs (Unreal, Mixamo, VRM, SMPL, HumanIK, CMU, LaFAN1, Bandai
-Namco, O3DE, 3ds Max, links of Unitree's robots), and where those say nothing, off the
-shape: chains that leave the trunk, sides, heights. A few lines of JSON say otherwise.
+Namco, O3DE, 3ds Max, Blender, links of Unitree's robots), and where those say nothing,
+off the shape: chains that leave the trunk, sides, heights. A few lines of JSON say
+otherwise.
 """
 
-import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -126,7 +126,24 @@ def _by_names(skeleton: Skeleton) -> dict[str, int]:
                 del found[side + "Shoulder"]
     first("head", MIDDLE, _HEADS)
     first("neck", MIDDLE, _NECKS)
+    if "head" not in found and "neck" not in found:
+        found |= _top_of_spine(skeleton, read, found)
     return found
+
+
+def _top_of_spine(
+    skeleton: Skeleton, read: list[tuple[str, str]], found: Mapping[str, int]
+) -> dict[str, int]:
+    """Neck and head of a spine whose numbers go on beyond the chest (Blender's)."""
+    arms = [found[s + "UpperArm"] for s in (LEFT, RIGHT) if s + "UpperArm" in found]
+    if len(arms) < 2:
+        return {}
+    chest = _lowest_common(skeleton, arms)
+    spine = [j for j, have in enumerate(read) if have == (MIDDLE, "spine")]
+    above = [j for j in spine if chest in anatomy.chain(skeleton.parents, j)[:-1]]
+    if chest not in spine or len(above) < 2:
+        return {}
+    return {"neck": above[0], "head": above[-1]}
 
 
 def _in_order(skeleton: Skeleton, found: Mapping[str, int]) -> bool:
@@ -230,13 +247,13 @@ def find_roles(
         found["chest"] = _lowest_common(skeleton, [*arms, *top])
     if "hips" not in told:
         found["hips"] = _lowest_common(skeleton, [*legs, found["chest"]])
-    trunk = [found["hips"], found["chest"], *top]
-    for lower, upper in itertools.pairwise(trunk):
-        if lower not in anatomy.chain(skeleton.parents, upper):
+    hung = [("hips", joint) for joint in (*legs, found["chest"])]
+    hung += [("chest", joint) for joint in (*top, *arms)]
+    for role, joint in hung:
+        if found[role] not in anatomy.chain(skeleton.parents, joint):
             raise ValueError(
-                f"no person: {skeleton.names[upper]!r} is not above the "
-                f"{'hips' if lower == found['hips'] else 'chest'} "
-                f"({skeleton.names[lower]!r})"
+                f"no person: {skeleton.names[joint]!r} does not hang on the {role} "
+                f"({skeleton.names[found[role]]!r})"
             )
     return {role: skeleton.names[found[role]] for role in ROLES if role in found}
 
@@ -261,7 +278,10 @@ def _listed(names: list[str] | tuple[str, ...]) -> str:
 
 
 def anatomy_of(skeleton: Skeleton, roles: Mapping[str, str]) -> Anatomy:
-    """Trunk and limbs of a skeleton whose roles are known."""
+    """Trunk and limbs of a skeleton whose roles are known.
+
+    `ValueError` if all limbs hang on one joint that is not above the feet.
+    """
     parents = skeleton.parents
     index = {role: skeleton.names.index(name) for role, name in roles.items()}
     top = index.get("head", index.get("neck", index["chest"]))
@@ -293,13 +313,19 @@ def anatomy_of(skeleton: Skeleton, roles: Mapping[str, str]) -> Anatomy:
     places = anatomy.zero_pose(skeleton)
     feet = np.mean([places[leg.end] for leg in made["legs"]], axis=0)
     rise = places[top] - feet
+    upright = bool(rise[1] > 0.8 * np.linalg.norm(rise))
+    if len(trunk) < 2 and not upright:
+        raise ValueError(
+            f"no person: arms and legs hang on {skeleton.names[top]!r} alone, without "
+            "a spine, so nothing tells which way is up"
+        )
     return Anatomy(
         trunk=tuple(trunk),
         has_head="head" in index,
         arms=tuple(made["arms"]),
         legs=tuple(made["legs"]),
         sides=tuple(sides),
-        upright=bool(rise[1] > 0.8 * np.linalg.norm(rise)),
+        upright=upright,
     )
 
 

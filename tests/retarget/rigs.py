@@ -132,7 +132,7 @@ CONVENTIONS = {
         ("L", "R"),
     ),
     "Blender": _names(
-        ("spine", "spine.001", "spine.002", "spine.003", "spine.004", "head"),
+        ("spine", "spine.001", "spine.002", "spine.003", "spine.004", "spine.006"),
         "{1}.{0}",
         ("shoulder", "upper_arm", "forearm", "hand"),
         ("thigh", "shin", "foot", "toe"),
@@ -306,6 +306,23 @@ def plain(offsets, parents, words):
     return Skeleton(
         offsets=jnp.asarray(offsets, jnp.float32), parents=tuple(parents), names=words
     )
+
+
+def loose():
+    """A rig of Blender of which only the joints that deform were written.
+
+    Limbs hang on the root, on the ground, and not on the spine, which does, too.
+    """
+    base = person("child", "Blender")
+    places, _ = anatomy.kinematics(base, still(base))
+    found = anatomy.find_anatomy(base)
+    tops = [(*limb.before, limb.upper)[0] for limb in (*found.arms, *found.legs)]
+    tops += [0]
+    parents = [0 if j in tops else up + 1 for j, up in enumerate(base.parents)]
+    offsets = np.asarray(base.offsets).copy()
+    low = np.array([0.0, places[0, :, 1].min(), 0.0])
+    offsets[tops] = places[0, tops] - low
+    return plain([[0, 0, 0], *offsets.tolist()], (-1, *parents), ("root", *base.names))
 
 
 def forked(name="child", convention="Unreal"):

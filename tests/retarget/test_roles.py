@@ -22,12 +22,21 @@ def test_joints_are_found_by_the_words_of_each_tool(convention):
     same = {role: rigs.walker().names.index(name) for role, name in EXPECTED.items()}
     for role, name in found.items():
         assert skeleton.names.index(name) == same[role], role
-    # Robots have no clavicles, Blender's neck is a spine.
-    lacking = {
-        "Unitree": {"leftShoulder", "rightShoulder"},
-        "Blender": {"neck"},
-    }
-    assert set(EXPECTED) - set(found) == lacking.get(convention, set())
+    robots_lack = {"leftShoulder", "rightShoulder"}
+    lacking = robots_lack if convention == "Unitree" else set()
+    assert set(EXPECTED) - set(found) == lacking
+
+
+def test_a_spine_that_ends_at_the_arms_is_no_neck():
+    words = list(rigs.CONVENTIONS["Blender"])
+    base = rigs.named(rigs.walker(), "Blender")
+    cut = [j for j, name in enumerate(words) if name != "spine.006"]
+    short = rigs.plain(
+        np.asarray(base.offsets)[cut],
+        [cut.index(base.parents[j]) if base.parents[j] >= 0 else -1 for j in cut],
+        tuple(words[j] for j in cut),
+    )
+    assert not {"neck", "head"} & {*roles.find_roles(short)}
 
 
 @pytest.mark.parametrize("make", [rigs.walker, along_x])
@@ -124,7 +133,7 @@ def test_roles_that_cannot_be_are_refused():
     for given, message in (
         (["hips"], "roles are a list, expected joints by role"),
         ({"hips": 5}, "role hips: no joint 5 among Hips"),
-        ({"chest": "Head"}, r"no person: 'Neck' is not above the chest \('Head'\)"),
+        ({"chest": "Head"}, r"no person: 'Neck' does not hang on the chest \('Head'\)"),
     ):
         with pytest.raises(ValueError, match=message):
             inspect.unwrap(roles.find_roles)(base, given)

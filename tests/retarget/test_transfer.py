@@ -289,8 +289,12 @@ def test_limbs_may_hang_on_joints_beside_the_spine():
         atol=1e-4,
     )
     for role, joint, line in (
-        ("hips", "pelvis", r"'spine_\d+' is not above the hips \('pelvis'\)"),
-        ("chest", "CC_Base_Shoulders", r"'head' is not above the chest \('CC_Base_S"),
+        ("hips", "pelvis", r"'spine_\d+' does not hang on the hips \('pelvis'\)"),
+        (
+            "chest",
+            "CC_Base_Shoulders",
+            r"'head' does not hang on the chest \('CC_Base_S",
+        ),
     ):
         with pytest.raises(ValueError, match=line):
             jm.retarget(skeleton, forked, roles={role: joint})

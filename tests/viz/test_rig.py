@@ -57,7 +57,9 @@ def by_shape():
 
 RIGS = {
     "a Mixamo child in an A-pose": lambda: rigs.glb(rigs.person("child")),
-    "in a frame of an animation": lambda: rigs.posed(rigs.glb(rigs.person("child"))),
+    "in a frame of an animation": lambda: rigs.posed(
+        rigs.glb(rigs.person("child", "Blender"))
+    ),
     "an Unreal giant": lambda: rigs.glb(
         rigs.person("giant", "Unreal"), unit=1.0, seed=3
     ),
@@ -212,6 +214,23 @@ def test_what_cannot_be_worn_is_refused_in_one_line(hero):
     lines += ["no binary glTF: expected a .glb or .vrm"] * 2
     for said, line in zip(refused(*files), lines, strict=True):
         assert said and line in said and "\n" not in said and len(said) < 900
+
+
+def test_limbs_that_hang_elsewhere_are_refused_as_by_retarget(tmp_path):
+    for told in ({}, {"hips": "spine"}):
+        content, rest = rigs.split(rigs.glb(rigs.loose()))
+        if told:
+            bones = {"hips": {"node": rigs.loose().names.index(told["hips"])}}
+            content["extensions"] = {"VRMC_vrm": {"humanoid": {"humanBones": bones}}}
+        (tmp_path / "a.glb").write_bytes(rigs.joined(content, rest))
+        with pytest.raises(ValueError, match="no person: ") as caught:
+            rigging.read_rig(tmp_path / "a.glb").rest()
+        (line,) = refused((tmp_path / "a.glb").read_bytes())
+        assert str(caught.value).endswith(f"a.glb: {line}")
+        reason = (
+            "'thigh.L' does not hang on the hips" if told else "hang on 'root' alone"
+        )
+        assert reason in line
 
 
 @pytest.mark.slow

@@ -33,6 +33,12 @@ function read(tables, name) {
   return [side, word];
 }
 
+// The lowest joint that all are below, or are.
+function lowest(parents, joints) {
+  const [first, ...others] = joints.map(j => chain(parents, j));
+  return first.filter(j => others.every(one => one.includes(j))).pop();
+}
+
 function byNames(tables, { names, parents }) {
   const have = names.map(name => read(tables, name)), found = {};
   const first = (role, side, words) => {
@@ -53,6 +59,13 @@ function byNames(tables, { names, parents }) {
   }
   first("head", MIDDLE, tables.heads);
   first("neck", MIDDLE, tables.necks);
+  if ("head" in found || "neck" in found) return found;
+  // Blender's spine goes on with its numbers beyond the chest.
+  const arms = SIDES.map(side => found[side + "UpperArm"]).filter(j => j !== undefined);
+  const spine = names.flatMap((_, j) => have[j][0] === MIDDLE && have[j][1] === "spine" ? [j] : []);
+  const chest = arms.length < 2 ? -1 : lowest(parents, arms);
+  const over = spine.filter(j => j !== chest && below(chest, j));
+  if (spine.includes(chest) && over.length > 1) [found.neck, found.head] = [over[0], over.at(-1)];
   return found;
 }
 
@@ -93,18 +106,15 @@ export function findRoles(tables, skeleton, told = {}) {
   }
   // Of the trunk, too: legs may hang on a pelvis beside the spine, and arms likewise.
   const top = ["head", "neck"].filter(role => role in found).map(role => found[role]).slice(0, 1);
-  const lowest = joints => {
-    const [first, ...others] = joints.map(j => chain(parents, j));
-    return first.filter(j => others.every(one => one.includes(j))).pop();
-  };
   const both = part => SIDES.map(side => found[side + part]);
-  if (!("chest" in told)) found.chest = lowest([...both("UpperArm"), ...top]);
-  if (!("hips" in told)) found.hips = lowest([...both("UpperLeg"), found.chest]);
-  const trunk = [found.hips, found.chest, ...top];
-  for (let i = 1; i < trunk.length; i++)
-    if (!chain(parents, trunk[i]).includes(trunk[i - 1]))
-      throw new Error(`no person: '${names[trunk[i]]}' is not above the `
-        + `${i === 1 ? "hips" : "chest"} ('${names[trunk[i - 1]]}')`);
+  if (!("chest" in told)) found.chest = lowest(parents, [...both("UpperArm"), ...top]);
+  if (!("hips" in told)) found.hips = lowest(parents, [...both("UpperLeg"), found.chest]);
+  const hung = [...[...both("UpperLeg"), found.chest].map(j => ["hips", j]),
+    ...[...top, ...both("UpperArm")].map(j => ["chest", j])];
+  for (const [role, j] of hung)
+    if (!chain(parents, j).includes(found[role]))
+      throw new Error(`no person: '${names[j]}' does not hang on the ${role} `
+        + `('${names[found[role]]}')`);
   return found;
 }
 
@@ -140,7 +150,7 @@ function zeroPose({ parents, offsets }) {
   return zero;
 }
 
-function anatomy({ parents, offsets }, roles) {
+function anatomy({ names, parents, offsets }, roles) {
   const top = roles.head ?? roles.neck ?? roles.chest, trunk = chain(parents, top);
   const limbs = (parts, after) => SIDES.map(side => {
     const [upper, middle, end] = parts.map(part => roles[side + part]);
@@ -151,7 +161,11 @@ function anatomy({ parents, offsets }, roles) {
   const zero = zeroPose({ parents, offsets });
   const arms = limbs(ARM), legs = limbs(LEG, "Toes");
   const rise = sub(zero[top], mean(legs.map(leg => zero[leg.end])));
-  return { trunk, arms, legs, zero, upright: rise[1] > 0.8 * long(rise) };
+  const upright = rise[1] > 0.8 * long(rise);
+  if (trunk.length < 2 && !upright)
+    throw new Error(`no person: arms and legs hang on '${names[top]}' alone, without a spine, `
+      + "so nothing tells which way is up");
+  return { trunk, arms, legs, zero, upright };
 }
 
 // Places and turns where it stands with its arms level to the sides, facing +z.
