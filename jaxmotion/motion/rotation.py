@@ -26,7 +26,7 @@ def safe_normalize(
     square = jnp.sum(x * x, axis=-1, keepdims=True)
     is_zero = square < _TINY
     length = jnp.sqrt(jnp.where(is_zero, 1.0, square))
-    return jnp.where(is_zero, fallback, x / length)
+    return jnp.where(is_zero, jnp.asarray(fallback, x.dtype), x / length)
 
 
 def _dot(a: Array, b: Array) -> Array:

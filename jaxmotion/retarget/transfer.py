@@ -684,7 +684,9 @@ def _program(
             root_position.reshape(-1, 3),
             joint_rotation.reshape(-1, *joint_rotation.shape[-2:]),
         )
-        return root.reshape(*batch, 3), turns.reshape(*batch, *turns.shape[1:])
+        root = root.reshape(*batch, 3).astype(root_position.dtype)
+        turns = turns.reshape(*batch, *turns.shape[1:])
+        return root, turns.astype(joint_rotation.dtype)
 
     return jax.jit(pose)
 

@@ -1028,6 +1028,9 @@ def describe(
     places, turns = _bind_pose(skeleton, found, sides, rotations)
     places = places.round(5).astype(np.float32)
     mesh = _mesh(places.tobytes(), skeleton.parents, found, detail)
+    for value in vars(mesh).values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False  # others get the same mesh
     return dataclasses.replace(mesh, bind_rotation=turns.astype(np.float32))
 
 

@@ -228,6 +228,14 @@ def test_yaw_turns_z_toward_x():
     np.testing.assert_allclose(rotation.matrix_from_facing(facing), expected, atol=1e-6)
 
 
+def test_a_fallback_in_double_precision_makes_no_doubles():
+    with jax.enable_x64(True):
+        ahead = jnp.array([0.0, 1.0])
+        assert ahead.dtype == jnp.float64
+        found = rotation.safe_normalize(jnp.ones(2, jnp.float32), ahead)
+    assert found.dtype == jnp.float32
+
+
 def test_safe_normalize():
     fallback = jnp.array([0.0, 1.0])
     x = jnp.array([[3.0, 4.0], [0.0, 0.0], [1e-3, 0.0]])

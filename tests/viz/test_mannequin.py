@@ -116,6 +116,13 @@ def test_a_person_has_a_persons_measures(make):
     assert 3_000 < len(made.vertices) < 6_500
 
 
+def test_what_all_share_nobody_changes():
+    body = mannequin.describe(walker_skeleton())
+    assert body.vertices is mannequin.describe(walker_skeleton()).vertices
+    with pytest.raises(ValueError, match="read-only"):
+        body.vertices[:] *= 2.0
+
+
 def test_weights_are_at_most_four_and_sum_to_one():
     for make in (*PEOPLE, tail, one_joint):
         made = mannequin.describe(make())
