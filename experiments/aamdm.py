@@ -10,10 +10,9 @@ Examples:
 import dataclasses
 import time
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import jax
-import tyro
 from baselines import rows, tables
 
 from jaxmotion import cli, reporting
@@ -379,21 +378,14 @@ def levels(args: Levels) -> None:
     reporting.write_table(out, table, report, (run.source,))
 
 
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Rollout, tyro.conf.subcommand("rollout")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Levels, tyro.conf.subcommand("levels")]
-)
-
-
-def main() -> None:
-    """Parses the command line and runs the command."""
-    args = cli.check(tyro.cli(Command, description=__doc__))
-    run = {Train: train, Evaluate: evaluate, Rollout: rollout, Export: export}
-    (run | {Levels: levels})[type(args)](args)
+COMMANDS = {
+    "train": (Train, train),
+    "evaluate": (Evaluate, evaluate),
+    "rollout": (Rollout, rollout),
+    "export": (Export, export),
+    "levels": (Levels, levels),
+}
 
 
 if __name__ == "__main__":
-    cli.start(main)
+    cli.start(lambda: cli.run(COMMANDS, __doc__))

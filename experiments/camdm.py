@@ -11,9 +11,7 @@ Examples:
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
-import tyro
+from typing import Any, Literal
 
 from jaxmotion import cli, reporting
 from jaxmotion.control.courses import Course
@@ -433,29 +431,15 @@ def import_weights(args: Import) -> None:
     )
 
 
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Distill, tyro.conf.subcommand("distill")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Rollout, tyro.conf.subcommand("rollout")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-)
-
-
-def main() -> None:
-    """Parses the command line and runs the command."""
-    args = cli.check(tyro.cli(Command, description=__doc__))
-    run = {
-        Train: train,
-        Distill: distill,
-        Evaluate: evaluate,
-        Rollout: rollout,
-        Export: export,
-        Import: import_weights,
-    }
-    run[type(args)](args)
+COMMANDS = {
+    "train": (Train, train),
+    "distill": (Distill, distill),
+    "evaluate": (Evaluate, evaluate),
+    "rollout": (Rollout, rollout),
+    "export": (Export, export),
+    "import": (Import, import_weights),
+}
 
 
 if __name__ == "__main__":
-    cli.start(main)
+    cli.start(lambda: cli.run(COMMANDS, __doc__))

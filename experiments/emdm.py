@@ -15,9 +15,7 @@ import itertools
 import re
 import time
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
+from typing import Literal
 
 from jaxmotion import cli, reporting
 from jaxmotion.evaluation import by_frame
@@ -476,22 +474,15 @@ def export(args: Export) -> None:
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
 
 
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Sample, tyro.conf.subcommand("sample")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Levels, tyro.conf.subcommand("levels")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-)
-
-
-def main() -> None:
-    """Parses the command line and runs the command."""
-    args = cli.check(tyro.cli(Command, description=__doc__))
-    run = {Train: train, Evaluate: evaluate, Sample: sample, Export: export}
-    (run | {Levels: levels, Import: import_weights})[type(args)](args)
+COMMANDS = {
+    "train": (Train, train),
+    "evaluate": (Evaluate, evaluate),
+    "sample": (Sample, sample),
+    "export": (Export, export),
+    "levels": (Levels, levels),
+    "import": (Import, import_weights),
+}
 
 
 if __name__ == "__main__":
-    cli.start(main)
+    cli.start(lambda: cli.run(COMMANDS, __doc__))

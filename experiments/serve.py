@@ -44,7 +44,7 @@ class Config:
     seed: int = 0
 
 
-async def listen(args: Config, characters: simulation.Simulation) -> None:
+async def listen(args: Config, characters: simulation.Characters) -> None:
     """Serves until SIGINT or SIGTERM."""
     stop = cli.until_stopped()
     server = Server(characters, limits=Limits(clients=args.max_clients), seed=args.seed)
@@ -53,7 +53,7 @@ async def listen(args: Config, characters: simulation.Simulation) -> None:
     print("closed", flush=True)
 
 
-def load(run: str, data: Path | None) -> simulation.Simulation:
+def load(run: str, data: Path | None) -> simulation.Characters:
     """A model's characters; of clips only what a start needs is kept."""
     clips = None if data is None else clips_io.load_clips(data)
     character = steering.steered(jaxmotion.load(run), what=run)

@@ -12,10 +12,9 @@ Examples:
 import dataclasses
 import time
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-import tyro
 
 from jaxmotion import cli, reporting
 from jaxmotion.evaluation import by_frame
@@ -371,20 +370,13 @@ def export(args: Export) -> None:
     print(f"wrote {args.out}, {args.out.stat().st_size / 1e6:.1f} MB: {model.source}")
 
 
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Rollout, tyro.conf.subcommand("rollout")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-)
-
-
-def main() -> None:
-    """Parses the command line and runs the command."""
-    args = cli.check(tyro.cli(Command, description=__doc__))
-    run = {Train: train, Evaluate: evaluate, Rollout: rollout, Export: export}
-    run[type(args)](args)
+COMMANDS = {
+    "train": (Train, train),
+    "evaluate": (Evaluate, evaluate),
+    "rollout": (Rollout, rollout),
+    "export": (Export, export),
+}
 
 
 if __name__ == "__main__":
-    cli.start(main)
+    cli.start(lambda: cli.run(COMMANDS, __doc__))

@@ -3,12 +3,14 @@
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import ipaddress
+import operator
 import os
 import signal
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -128,6 +130,19 @@ def check(args: Arguments) -> Arguments:
                 option = field.name.replace("_", "-")
                 raise ValueError(f"--{option} is {one}, expected a number in {limits}")
     return args
+
+
+def run(commands: Mapping[str, tuple[type, Callable[[Any], None]]], text: str) -> None:
+    """Parses the command line of a script of several commands, and runs one.
+
+    By their names, each has the dataclass of its options and what it does.
+    """
+    kinds = [
+        Annotated[kind, tyro.conf.subcommand(name)]
+        for name, (kind, _) in commands.items()
+    ]
+    args = check(tyro.cli(functools.reduce(operator.or_, kinds), description=text))
+    dict(commands.values())[type(args)](args)
 
 
 def given(kind: type, args: Any) -> dict[str, Any]:

@@ -208,7 +208,7 @@ def hello_line(simulation: Any) -> bytes:
     """The first line of a connection.
 
     Args:
-      simulation: A `simulation.Simulation`.
+      simulation: A `simulation.Characters`.
 
     Returns:
       One line.

@@ -26,7 +26,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from serving import protocol
-from serving.simulation import Simulation, first_command
+from serving.simulation import Characters, first_command
 
 # A piece of input; none counts for less than a line.
 _READ = 4096
@@ -81,7 +81,7 @@ class Server:
     """Serves a simulation until it is told to stop."""
 
     def __init__(
-        self, simulation: Simulation, *, limits: Limits | None = None, seed: int
+        self, simulation: Characters, *, limits: Limits | None = None, seed: int
     ) -> None:
         """Opens nothing yet.
 

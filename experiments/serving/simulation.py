@@ -1,6 +1,6 @@
 """What a server simulates: characters of a model, one state per client."""
 
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,47 +13,18 @@ from jaxmotion.motion import trajectory
 from serving.protocol import Command
 
 
-class Simulation(Protocol):
-    """One kind of character, of which each client has its own state.
-
-    Attributes:
-      fps: Ticks per second.
-      joints: Names of the joints.
-      parents: Parent of each joint; -1 for the root.
-      offsets: Position of each joint in its parent's frame, meters, [joints, 3].
-      labels: Names of the styles or skills.
-    """
-
-    fps: float
-    joints: tuple[str, ...]
-    parents: tuple[int, ...]
-    offsets: np.ndarray
-    labels: tuple[str, ...]
-
-    def start(self, seed: int) -> Any:
-        """State of a new character; the seed is of all that is random about it."""
-
-    def step(
-        self, state: Any, command: Command, n: int
-    ) -> tuple[Any, dict[str, np.ndarray]]:
-        """The next tick of a character.
-
-        Args:
-          state: From `start` or the last `step`, which may use up its buffers.
-          command: What its client wants.
-          n: Number of the tick; none comes twice.
-
-        Returns:
-          The next state, and the pose to show: "root" [3], "rotations" [joints, 6],
-          perhaps more, such as "ball" [3].
-        """
-
-
 class Characters:
-    """A model's characters, whatever its system; see `Simulation` for the fields.
+    """A model's characters, whatever its system, of which each client has one.
 
     All clients share one compiled program, in which the parameters are constants. The
     states' buffers are donated to it.
+
+    Attributes:
+      fps: Ticks per second.
+      labels: Names of the styles or skills.
+      joints: Names of the joints.
+      parents: Parent of each joint; -1 for the root.
+      offsets: Position of each joint in its parent's frame, meters, [joints, 3].
     """
 
     def __init__(self, character: Character, *, clips: Any = None) -> None:
@@ -87,7 +58,15 @@ class Characters:
     def step(
         self, state: tuple[int, Any], command: Command, n: int
     ) -> tuple[tuple[int, Any], dict[str, np.ndarray]]:
-        """The next tick of a character."""
+        """The next tick of a character, and the pose to show.
+
+        Args:
+          state: From `start` or the last `step`, which may use up its buffers.
+          command: What its client wants.
+          n: Number of the tick; none comes twice.
+
+        The pose has "root" [3], "rotations" [joints, 6], perhaps "ball" [3].
+        """
         seed, inner = state
         label = self.labels.index(command.label) if self.labels else 0
         inner, frame = self._tick(
@@ -107,12 +86,12 @@ def _shown(frame: Frame) -> dict[str, jax.Array]:
     return found if ball is None else found | {"ball": ball}
 
 
-def first_command(simulation: Simulation) -> Command:
+def first_command(simulation: Characters) -> Command:
     """What a character does before its client says anything: stand and face +z."""
     return Command(label=simulation.labels[0] if simulation.labels else None)
 
 
-def warm(simulation: Simulation) -> None:
+def warm(simulation: Characters) -> None:
     """Compiles all that a tick may need, and runs it once; before anyone waits."""
     # A first plan, none, one for another velocity, one for each change of label.
     first = first_command(simulation)

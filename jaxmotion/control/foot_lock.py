@@ -57,7 +57,7 @@ from jaxtyping import Array, Bool, Float
 from jaxmotion.control import sampling
 from jaxmotion.control.rollout import Controller
 from jaxmotion.control.steering import Character, Method, Tuning
-from jaxmotion.motion.rotation import product, rot6d_from_matrix, safe_normalize
+from jaxmotion.motion.rotation import length, product, rot6d_from_matrix, safe_normalize
 from jaxmotion.motion.rotation_vector import to_matrix
 from jaxmotion.motion.skeleton import Motion, Skeleton, global_transforms
 from jaxmotion.motion.spring import spring
@@ -290,7 +290,7 @@ def _move_body(state: LockState, *, fps: float, lock: FootLock) -> LockState:
     """The body on its way to where its feet are locked: part 3 of the module's text."""
     pull = jnp.mean((state.point - state.animated)[:, ::2], axis=0)
     goal = state.body + pull
-    goal = goal * jnp.minimum(1.0, lock.body_reach / _length(goal))
+    goal = goal * jnp.minimum(1.0, lock.body_reach / length(goal))
     body, velocity = spring(
         state.body,
         state.body_velocity,
@@ -299,10 +299,6 @@ def _move_body(state: LockState, *, fps: float, lock: FootLock) -> LockState:
         dt=1.0 / fps,
     )
     return dataclasses.replace(state, body=body, body_velocity=velocity)
-
-
-def _length(x: Array) -> Array:
-    return jnp.sqrt(jnp.sum(x * x, axis=-1) + 1e-12)
 
 
 def _angle(cosine: Array) -> Array:
@@ -341,8 +337,8 @@ def solve_leg(
     hip, knee, ankle, animated = positions
     goal = ankle + toe - animated
     goal = goal.at[1].set(jnp.maximum(goal[1], lock.ankle_height))
-    thigh, shank = _length(knee - hip), _length(ankle - knee)
-    before, asked = _length(ankle - hip), _length(goal - hip)
+    thigh, shank = length(knee - hip), length(ankle - knee)
+    before, asked = length(ankle - hip), length(goal - hip)
     # The last centimeters of stretch are approached, never reached; a leg that is
     # animated straighter than that may stay so.
     start = jnp.maximum(thigh + shank - lock.softness, before)
@@ -360,7 +356,7 @@ def solve_leg(
     own = jnp.cross(ankle - hip, knee - hip) / (thigh * shank)
     along = (ankle - hip) / before
     spare = bend - jnp.sum(bend * along) * along
-    sine = _length(own)
+    sine = length(own)
     axis = safe_normalize(
         jnp.where(sine > 0.02, own, own + (1.0 - sine / 0.02) * spare), bend
     )
@@ -381,7 +377,8 @@ def solve_leg(
 
 def place_toes(
     skeleton: Skeleton,
-    root_position: Float[Array, "3"],
+    positions: Float[Array, "joints 3"],
+    rotations: Float[Array, "joints 3 3"],
     joint_rotation: Float[Array, "joints 6"],
     toes: Float[Array, "feet 3"],
     *,
@@ -392,20 +389,6 @@ def place_toes(
     Only hips, knees and ankles differ. Places are in the world, meters; none lower than
     that of a standing toe is taken.
     """
-    positions, rotations = global_transforms(skeleton, root_position, joint_rotation)
-    return _place(skeleton, positions, rotations, joint_rotation, toes, lock=lock)
-
-
-def _place(
-    skeleton: Skeleton,
-    positions: Float[Array, "joints 3"],
-    rotations: Float[Array, "joints 3 3"],
-    joint_rotation: Float[Array, "joints 6"],
-    toes: Float[Array, "feet 3"],
-    *,
-    lock: FootLock,
-) -> Float[Array, "joints 6"]:
-    """`place_toes` of a pose whose world positions and rotations are known."""
     chains = legs(skeleton)
     # Knees bend about the line between the hips, so that the shank goes back.
     hips = [chain[0] for chain in chains]
@@ -453,7 +436,7 @@ def lock_frame(
         level = (hips[0] - hips[1]) * jnp.array([1.0, 0.0, 1.0])
         side = safe_normalize(level, jnp.array([1.0, 0.0, 0.0]))
     state = step_lock(state, toes, fps=fps, lock=lock, side=side)
-    shown = _place(skeleton, places, turns, joint_rotation, state.shown, lock=lock)
+    shown = place_toes(skeleton, places, turns, joint_rotation, state.shown, lock=lock)
     return state, root_position, shown
 
 
@@ -525,7 +508,7 @@ def clean_motion(skeleton: Skeleton, motion: Motion, *, lock: FootLock) -> Motio
     least = least_heights(jnp.where(planted, 0.0, speed), lock=lock)
     wanted = toes.at[..., ::2].add(toe_offsets(toes, planted).astype(toes.dtype))
     wanted = wanted.at[:-1, :, 1].max(least.astype(toes.dtype))
-    place = jax.vmap(functools.partial(_place, skeleton, lock=lock))
+    place = jax.vmap(functools.partial(place_toes, skeleton, lock=lock))
     rotations = place(places, turns, motion.joint_rotation, wanted)
     return dataclasses.replace(motion, joint_rotation=rotations)
 

@@ -40,6 +40,7 @@ from jaxmotion.control.steering import (
     Character,
 )
 from jaxmotion.motion import ground
+from jaxmotion.motion.rotation import length
 from jaxmotion.motion.spring import Scalar
 from jaxmotion.motion.trajectory import Command
 from jaxmotion.typing import Key, Params
@@ -118,13 +119,9 @@ class Follow:
 Goal = Path | Place | Follow
 
 
-def _length(vector: Array) -> Array:
-    return jnp.sqrt(jnp.sum(jnp.square(vector), axis=-1) + 1e-12)
-
-
 def _along(path: Path, way: Array) -> tuple[Array, Array, Array]:
     """Point and speed of a path after a way along it, meters, and its whole length."""
-    steps = _length(jnp.diff(path.points, axis=0))
+    steps = length(jnp.diff(path.points, axis=0))
     marks = jnp.concatenate([jnp.zeros(1), jnp.cumsum(steps)])
     point = jnp.stack(
         [jnp.interp(way, marks, path.points[:, i]) for i in (0, 1)], axis=-1
@@ -142,13 +139,13 @@ def pursue(
     """
     here = walker.position + LAG * walker.velocity
     ways = way + jnp.linspace(0.0, REACH, 41)
-    points, _, length = _along(path, ways)
-    near = jnp.argmin(_length(points - here[None]) + LATER * (ways - way))
-    way = jnp.minimum(ways[near], length)
+    points, _, whole = _along(path, ways)
+    near = jnp.argmin(length(points - here[None]) + LATER * (ways - way))
+    way = jnp.minimum(ways[near], whole)
     _, speed, _ = _along(path, way)
     goal, _, _ = _along(path, way + jnp.maximum(ahead * speed, NEAREST))
     # Slower to the end.
-    left = length - way + _length(path.points[-1] - here) * (way >= length)
+    left = whole - way + length(path.points[-1] - here) * (way >= whole)
     speed = jnp.minimum(speed, left / ARRIVE)
     speed = jnp.where(left < THERE, 0.0, speed)
     heading = ground.unit(goal - here, walker.facing)
@@ -175,7 +172,7 @@ def arrive(
     Told to slow down, he goes on as he was for `coast` seconds.
     """
     gap = place.position - walker.position - coast * walker.velocity
-    distance, left = _length(gap), place.seconds - seconds
+    distance, left = length(gap), place.seconds - seconds
     slow, fast = jnp.float32(SLOWEST), jnp.float32(FASTEST)
 
     def halve(ends: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
@@ -187,7 +184,7 @@ def arrive(
         ), None
 
     (_, speed), _ = jax.lax.scan(halve, (slow, fast), None, length=16)
-    moving = _length(walker.velocity) > 0.5 * SLOWEST
+    moving = length(walker.velocity) > 0.5 * SLOWEST
     waits = ~moving & (_seconds_to(distance, slow) < left)
     there = distance < jnp.where(moving, THERE, 2 * THERE)
     least = jnp.where(moving, CREEP, SLOWEST * (distance > BESIDE))
@@ -207,10 +204,10 @@ def follow(
     back = ground.unit(leader.velocity, ground.unit(gap))
     wish = leader.velocity + (gap - distance * back) / ARRIVE
     # Who is near enough to one who stands stands, too.
-    rest = _length(leader.velocity) < 0.5 * SLOWEST
-    slack = _length(gap) - distance
+    rest = length(leader.velocity) < 0.5 * SLOWEST
+    slack = length(gap) - distance
     wish = jnp.where(rest, ground.unit(gap) * slack / ARRIVE, wish)
-    speed = jnp.minimum(_length(wish), FASTEST)
+    speed = jnp.minimum(length(wish), FASTEST)
     speed = jnp.where(rest & (slack < 2 * THERE), 0.0, speed)
     return speed * ground.unit(wish, walker.facing)
 
@@ -243,7 +240,7 @@ def avoid(
     """
     number = len(wanted)
     turns = jnp.linspace(-jnp.pi, jnp.pi, _ANGLES, endpoint=False)
-    speed = jnp.maximum(_length(wanted), SLOWEST)[:, None, None]
+    speed = jnp.maximum(length(wanted), SLOWEST)[:, None, None]
     base = speed * ground.unit(wanted, walkers.facing)[:, None]
     shape = (number, _ANGLES)
     turned = ground.turn(
@@ -271,7 +268,7 @@ def avoid(
         danger = jnp.where(soon < HORIZON, FEAR / soon, 0.0)
         # To the right, if both sides are as good.
         side = wanted[i, 0] * choices[:, 1] - wanted[i, 1] * choices[:, 0]
-        return danger + _length(choices - wanted[i][None]) - 0.02 * jnp.sign(side)
+        return danger + length(choices - wanted[i][None]) - 0.02 * jnp.sign(side)
 
     costs = jax.vmap(penalty)(jnp.arange(number), choices)
     best = jnp.argmin(costs, axis=1)
@@ -321,7 +318,7 @@ def hold(told: Command, wanted: Command) -> Command:
     New commands cost new plans: directions count from `steering.HEADING_STEP` on,
     speeds from `steering.SPEED_STEP` on, and to stop at once.
     """
-    old, new = _length(told.velocity), _length(wanted.velocity)
+    old, new = length(told.velocity), length(wanted.velocity)
     stops = (new < 1e-3) != (old < 1e-3)
     turned = jnp.abs(ground.angle_from_to(told.velocity, wanted.velocity))
     faced = jnp.abs(ground.angle_from_to(told.facing, wanted.facing))
@@ -471,7 +468,7 @@ def _rollouts(
         )
         if avoiding:
             clear = avoid(velocity, walkers, circles)
-            moved = _length(clear - velocity)[:, None] > 1e-3
+            moved = length(clear - velocity)[:, None] > 1e-3
             facing = jnp.where(moved, ground.unit(clear, walkers.facing), facing)
             velocity = clear
         told = hold(told, Command(velocity=velocity, facing=facing, label=labels))

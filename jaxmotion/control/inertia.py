@@ -29,7 +29,6 @@ from jaxtyping import Array, Float, Num
 from jaxmotion.motion import rotation, rotation_vector
 from jaxmotion.motion.rotation import product
 from jaxmotion.motion.skeleton import Motion
-from jaxmotion.motion.spring import spring
 
 Scalar = float | Num[Array, ""]
 _TINY = 1e-12
@@ -81,7 +80,6 @@ def decay(
     t: Float[Array, " frames"],
     *,
     duration: Scalar,
-    half_life: Scalar | None = None,
 ) -> Float[Array, "*batch frames n"]:
     """Offset vectors at many times, the same in every coordinate system.
 
@@ -89,16 +87,11 @@ def decay(
       v: Velocities of the offsets x, units per second.
       t: Seconds since, not negative.
       duration: Of the quintic, seconds.
-      half_life: If given, seconds: the offset decays as a critically damped spring,
-        which never quite ends, and `duration` is not used.
 
-    Source: Bollo 2018; the spring: orangeduck's Motion-Matching, spring.h.
+    Source: Bollo 2018.
     """
     length, unit, along, across = (y[..., None, :] for y in _along_and_across(x, v))
     t = t.reshape((1,) * (x.ndim - 1) + (-1, 1))
-    if half_life is not None:
-        x, v = x[..., None, :], v[..., None, :]
-        return spring(x, v, jnp.zeros_like(x), half_life=half_life, dt=t)[0]
     zero = jnp.zeros_like(across)
     return quintic(length, along, t, duration=duration) * unit + quintic(
         zero, across, t, duration=duration
@@ -130,7 +123,6 @@ def inertialize(
     chunk: Motion,
     *,
     duration: Scalar = 0.2,
-    half_life: Scalar | None = None,
 ) -> Motion:
     """A chunk of motion that continues what was displayed, position and velocity.
 
@@ -140,7 +132,6 @@ def inertialize(
     Args:
       chunk: The frames that follow, of the same skeleton.
       duration: Seconds until the chunk is displayed as it is.
-      half_life: If given, seconds: fades as a critically damped spring does instead.
 
     Raises:
       ValueError: if either has fewer than two frames, or their fps differ.
@@ -157,7 +148,7 @@ def inertialize(
         raise ValueError(f"past has {past.fps} fps, the chunk {chunk.fps}")
     frames = chunk.root_position.shape[-2]
     times = jnp.arange(1, frames + 1, dtype=chunk.root_position.dtype) / chunk.fps
-    fade = functools.partial(decay, t=times, duration=duration, half_life=half_life)
+    fade = functools.partial(decay, t=times, duration=duration)
 
     offset = fade(*_position_seam(past.root_position, chunk.root_position, chunk.fps))
     last_two = rotation.matrix_from_rot6d(past.joint_rotation[..., -2:, :, :])
@@ -165,7 +156,7 @@ def inertialize(
     turn = fade(*_rotation_seam(last_two, target, chunk.fps))
     turn = rotation_vector.to_matrix(jnp.moveaxis(turn, -2, -3))
     # Frames beyond the end keep their very numbers, not Gram-Schmidt's copy of them.
-    is_faded = (times < duration)[:, None, None] if half_life is None else True
+    is_faded = (times < duration)[:, None, None]
     rot6d = rotation.rot6d_from_matrix(product(turn, target))
     return dataclasses.replace(
         chunk,

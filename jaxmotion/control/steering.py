@@ -288,7 +288,7 @@ def steered_rollouts(
     if chunk is not None:
         if chunk < 1:
             raise ValueError(f"chunks of {chunk} characters, expected 1 or more")
-        chunk = max(size for size in range(1, chunk + 1) if number % size == 0)
+        chunk = _divisor(number, chunk)
     return _rollouts(
         character.params,
         key,
@@ -298,7 +298,11 @@ def steered_rollouts(
         method=character.method,
         chunk=chunk,
         mesh=mesh,
-    )
+    )[1]
+
+
+def _divisor(number: int, most: int) -> int:
+    return max(size for size in range(1, most + 1) if number % size == 0)
 
 
 def calmest(
@@ -326,12 +330,15 @@ def calmest(
         seconds=seconds,
         fps=character.fps,
     )
-    states, frames = _stand(
+    states, frames = _rollouts(
         character.params,
         jax.random.key(seed),
         states,
         commands,
+        jnp.int32(0),
         method=character.method,
+        chunk=_divisor(len(labels), 4),
+        mesh=None,
     )
     frames = frames[:, -past:]
     positions = joint_positions(character.skeleton, frames.motion)
@@ -353,13 +360,6 @@ def chosen_starts(
     return jax.tree.map(lambda x: x[labels, which], starts)
 
 
-@functools.partial(jax.jit, static_argnames="method")
-def _stand(
-    params: Params, key: Key, states: Any, commands: Command, *, method: Method
-) -> tuple[Any, Frame]:
-    return rollout.rollout(method(params), key, states, commands, chunk=4)
-
-
 @functools.partial(jax.jit, static_argnames=("method", "chunk", "mesh"))
 def _rollouts(
     params: Params,
@@ -371,10 +371,9 @@ def _rollouts(
     method: Method,
     chunk: int | None,
     mesh: Mesh | None,
-) -> Frame:
-    run = rollout.rollout
+) -> tuple[Any, Frame]:
     more: dict[str, Any] = dict(first=first, chunk=chunk, mesh=mesh)
-    return run(method(params), key, states, commands, **more)[1]
+    return rollout.rollout(method(params), key, states, commands, **more)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -26,17 +26,6 @@ class TrajectoryError(NamedTuple):
 
 
 @jax.jit
-def heading_error(
-    expected: Float[Array, "*batch 2"], actual: Float[Array, "*batch 2"]
-) -> Float[Array, "*batch"]:
-    """Signed angle from the expected direction to the actual one, wrapped.
-
-    In [-pi, pi] radians, positive from +z toward +x; directions (x, z) have any length.
-    """
-    return ground.angle_from_to(expected, actual)
-
-
-@jax.jit
 def trajectory_error(
     wanted_velocity: Float[Array, "*batch frames 2"],
     position: Float[Array, "*batch frames 2"],
@@ -64,7 +53,7 @@ def trajectory_error(
         jnp.linalg.norm(actual, axis=-1), jnp.linalg.norm(wanted, axis=-1)
     )
     is_used = speed >= min_speed
-    angle = jnp.where(is_used, jnp.abs(heading_error(wanted, actual)), 0.0)
+    angle = jnp.where(is_used, jnp.abs(ground.angle_from_to(wanted, actual)), 0.0)
     count = jnp.sum(is_used, axis=-1)
     return TrajectoryError(
         error=jnp.sum(angle, axis=-1) / jnp.maximum(count, 1),
@@ -80,7 +69,7 @@ def orientation_error(
 
     Source: Chen et al. 2024 (CAMDM), sec. 4.1, metric 6; wrapped.
     """
-    return jnp.mean(jnp.abs(heading_error(wanted, actual)), axis=-1)
+    return jnp.mean(jnp.abs(ground.angle_from_to(wanted, actual)), axis=-1)
 
 
 @jax.jit

@@ -93,20 +93,10 @@ def frechet_bias(
     each = jnp.repeat(jnp.asarray(sizes), repeats)
     keys = jax.random.split(key, each.shape[0])
     distances = jax.lax.map(distance, (keys, each))
-    extrapolated, slope = _line(1.0 / each.astype(distances.dtype), distances)
+    slope, extrapolated = jnp.polyfit(1.0 / each.astype(distances.dtype), distances, 1)
     return BiasCheck(
         sizes=jnp.asarray(sizes, distances.dtype),
         distances=distances.reshape(len(sizes), repeats),
         extrapolated=extrapolated,
         slope=slope,
     )
-
-
-def _line(
-    x: Float[Array, " points"], y: Float[Array, " points"]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Value at x = 0 and slope of the line of least squares."""
-    x_mean, y_mean = jnp.mean(x), jnp.mean(y)
-    gap = x - x_mean
-    slope = jnp.sum(gap * (y - y_mean)) / jnp.sum(gap * gap)
-    return y_mean - slope * x_mean, slope

@@ -29,6 +29,11 @@ def safe_normalize(
     return jnp.where(is_zero, jnp.asarray(fallback, x.dtype), x / length)
 
 
+def length(x: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """Length of vectors, 1e-6 of a zero one, whose gradient is zero there."""
+    return jnp.sqrt(jnp.sum(x * x, axis=-1) + _TINY)
+
+
 def _dot(a: Array, b: Array) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 

@@ -250,10 +250,3 @@ def from_root(
             turn = rotation.product(turn, own)
         vector = vector + rotation.product(turn, skeleton.offsets[child])
     return vector
-
-
-def joint_velocities(
-    positions: Float[Array, "*batch frames joints 3"], fps: float
-) -> Float[Array, "*batch frames-1 joints 3"]:
-    """Forward differences of world positions in meters, meters per second."""
-    return (positions[..., 1:, :, :] - positions[..., :-1, :, :]) * fps

@@ -82,16 +82,13 @@ def is_still(velocity: Float[Array, "*batch 2"]) -> Bool[Array, "*batch"]:
     return jnp.sum(velocity**2, axis=-1) < STILL**2
 
 
-def root_trajectory(
-    skeleton: Skeleton, motion: Motion, *, hips: tuple[int, int] | None = None
-) -> Trajectory:
+def root_trajectory(skeleton: Skeleton, motion: Motion) -> Trajectory:
     """Path of the root and the facing of the hips in every frame, world.
 
-    Hips are found by name (else `ValueError`) if not given.
+    Hips are found by name (else `ValueError`).
     Source: Chen et al. 2024 (CAMDM), released code: facing from the hips only.
     """
-    hips = hip_joints(skeleton) if hips is None else hips
-    facing = hip_facing(skeleton, motion.joint_rotation, hips=hips)
+    facing = hip_facing(skeleton, motion.joint_rotation, hips=hip_joints(skeleton))
     return Trajectory(position=motion.root_position[..., ::2], facing=facing)
 
 
@@ -143,10 +140,8 @@ def desired_trajectory(
     return Trajectory(position=position, facing=facing)
 
 
-@functools.partial(jax.jit, static_argnames=("num_frames", "reuse", "mirror_facing"))
-def extend(
-    trajectory: Trajectory, num_frames: int, *, reuse: int, mirror_facing: bool = False
-) -> Trajectory:
+@functools.partial(jax.jit, static_argnames=("num_frames", "reuse"))
+def extend(trajectory: Trajectory, num_frames: int, *, reuse: int) -> Trajectory:
     """Heuristic future trajectory extension: (1) of this module, block by block.
 
     Args:
@@ -154,8 +149,9 @@ def extend(
       num_frames: Frames to add (zero returns the path as it is).
       reuse: K, how many points are reflected at a time, 1 .. F-1. The paper uses 15,
         the released code 23 of 45.
-      mirror_facing: Copy the facing of each reflected point, as the paper says;
-        else the last facing is held, as the released code does.
+
+    The last facing is held, as the released code does; the paper copies those of the
+    reflected points.
 
     `ValueError` if `reuse` is not in that range, or `num_frames` is negative.
 
@@ -173,11 +169,19 @@ def extend(
         end = position[..., -1:, :]
         back = slice(-2, -2 - reuse, -1)
         position = jnp.concatenate([position, 2 * end - position[..., back, :]], -2)
-        last = facing[..., back, :]
-        held = jnp.broadcast_to(facing[..., -1:, :], last.shape)
-        facing = jnp.concatenate([facing, last if mirror_facing else held], axis=-2)
+        facing = jnp.concatenate([facing, *[facing[..., -1:, :]] * reuse], axis=-2)
     total = frames + num_frames
     return Trajectory(position=position[..., :total, :], facing=facing[..., :total, :])
+
+
+def rest_of(
+    plan: Trajectory, cursor: Int[Array, ""], num_frames: int, *, reuse: int
+) -> Trajectory:
+    """So many frames of a plan's path from `cursor` on, extended where it ends."""
+    # A plan may come late, until all frames were displayed.
+    own = extend(plan, num_frames, reuse=reuse)
+    cut = lambda x: jax.lax.dynamic_slice_in_dim(x, cursor, num_frames)  # noqa: E731
+    return jax.tree.map(cut, own)
 
 
 @jax.jit

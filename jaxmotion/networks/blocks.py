@@ -144,6 +144,19 @@ def unfold_frames(
     return jnp.einsum("fp,...pd->...fd", jnp.asarray(weights, x.dtype), predictions)
 
 
+def set_up_layers(net: Any, *, activation: Literal["gelu", "selu"] = "gelu") -> None:
+    """Gives a network its `layers`, and what `frames_of` asks for, in its `setup`."""
+    net.layers = [
+        EncoderLayer(
+            net.width, net.heads, net.hidden, net.dropout, net.norm, activation
+        )
+        for _ in range(net.depth)
+    ]
+    if net.norm == "pre":
+        net.norm_out = nn.LayerNorm(epsilon=1e-5)
+    net.out = nn.Dense(net.features * (net.frames_per_token + 2 * net.token_margin))
+
+
 def frames_of(
     net: Any, x: Float[Array, "*batch tokens width"]
 ) -> Float[Array, "*batch frames features"]:

@@ -95,7 +95,27 @@ def continuing(
     return frames + fades * offset[..., None, :]
 
 
-class CamdmTransformer(nn.Module):
+class Denoising(nn.Module):
+    """A denoiser of the future in two parts, `encode` and `denoise`."""
+
+    def __call__(
+        self,
+        x_t: Float[Array, "*batch future features"],
+        t: Int[Array, "*#batch"],
+        past: Float[Array, "*batch past features"],
+        path: Float[Array, "*batch future 2"],
+        facing: Float[Array, "*batch future 6"],
+        label: Int[Array, "*batch"],
+        keep_past: Bool[Array, "*batch"],
+        *,
+        train: bool = False,
+    ) -> Float[Array, "*batch future features"]:
+        """`encode`, then `denoise`; training needs rngs={"dropout": key}."""
+        context = self.encode(past, path, facing, label, keep_past, train=train)
+        return self.denoise(context, x_t, t, train=train)
+
+
+class CamdmTransformer(Denoising):
     """The denoiser.
 
     Attributes:
@@ -146,17 +166,7 @@ class CamdmTransformer(nn.Module):
         self.embed_facing = nn.Dense(self.width)
         self.embed_past = nn.Dense(self.width)
         self.embed_noisy = nn.Dense(self.width)
-        self.layers = [
-            blocks.EncoderLayer(
-                self.width, self.heads, self.hidden, self.dropout, self.norm
-            )
-            for _ in range(self.depth)
-        ]
-        if self.norm == "pre":
-            self.norm_out = nn.LayerNorm(epsilon=1e-5)
-        self.out = nn.Dense(
-            self.features * (self.frames_per_token + 2 * self.token_margin)
-        )
+        blocks.set_up_layers(self)
         if self.frame_kernel:
             self.smooth = nn.Conv(
                 self.features,
@@ -280,22 +290,6 @@ class CamdmTransformer(nn.Module):
         for i, layer in enumerate(self.layers[1:], start=2):
             x = layer(x, train=train, last=outputs if i == self.depth else None)
         return x
-
-    def __call__(
-        self,
-        x_t: Float[Array, "*batch future features"],
-        t: Int[Array, "*#batch"],
-        past: Float[Array, "*batch past features"],
-        path: Float[Array, "*batch future 2"],
-        facing: Float[Array, "*batch future 6"],
-        label: Int[Array, "*batch"],
-        keep_past: Bool[Array, "*batch"],
-        *,
-        train: bool = False,
-    ) -> Float[Array, "*batch future features"]:
-        """`encode`, then `denoise`; training needs rngs={"dropout": key}."""
-        context = self.encode(past, path, facing, label, keep_past, train=train)
-        return self.denoise(context, x_t, t, train=train)
 
     def positions(self) -> Float[Array, "tokens width"]:
         """Position codes, one row a token, in the order of the module's docstring."""

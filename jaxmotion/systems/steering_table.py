@@ -41,6 +41,7 @@ from jaxmotion.evaluation.by_frame import ByFrame, Sums
 from jaxmotion.evaluation.table import Cell, Row, Rows
 from jaxmotion.evaluators.style import contact_height, in_batches
 from jaxmotion.motion import trajectory
+from jaxmotion.motion.ground import angle_from_to
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.motion.spring import Scalar
 from jaxmotion.motion.trajectory import Command
@@ -143,7 +144,7 @@ def _window_metrics(
     names = ("slide_speed", "slide_seconds", "skate_ratio", "jerk", "orientation_error")
     facing = trajectory.root_trajectory(skeleton, x.motion).facing
     raised = feet.at[..., 1].add(-ground.rest)
-    turn = alignment.heading_error(facing[..., 0, :], facing[..., -1, :])
+    turn = angle_from_to(facing[..., 0, :], facing[..., -1, :])
     return {name: metrics[name] for name in names} | {
         "turn": jnp.rad2deg(jnp.abs(turn)),
         "crossings": contact.leg_crossings(feet, facing, fps),
@@ -209,7 +210,7 @@ def _measure(
     told = jnp.broadcast_to(facing, hips.shape)
 
     def still_to_turn(facing: Array) -> Array:
-        return jnp.rad2deg(jnp.abs(alignment.heading_error(told, facing)))
+        return jnp.rad2deg(jnp.abs(angle_from_to(told, facing)))
 
     values = {
         "speed": alignment.steady_speed(path, fps, reach=reach),

@@ -10,7 +10,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 from jaxmotion.control import inertia
-from jaxmotion.control.foot_lock import FootLock, clean_motion, place_toes
+from jaxmotion.control.foot_lock import FootLock, clean_motion
 from jaxmotion.data.walker import walker_skeleton
 from jaxmotion.motion import humanml, humanml_skeleton, pose, skeleton, trajectory
 from jaxmotion.motion.humanml_layout import HUMANML3D
@@ -60,9 +60,6 @@ TRACED = {
         JOINTS, HUMANML3D
     ),
     "humanml_skeleton": lambda: humanml_skeleton.motion_from_joints(JOINTS, 20.0)[1],
-    "foot_lock.place_toes": lambda: place_toes(
-        BODY, jnp.zeros(3), MOTION.joint_rotation[0], jnp.zeros((2, 3)), lock=FootLock()
-    ),
     "foot_lock.clean_motion": lambda: clean_motion(BODY, MOTION, lock=FootLock()),
     "inertia.inertialize": lambda: inertia.inertialize(MOTION, MOTION),
     "smgdiff.trajectory.noise_space": path_noise,

@@ -15,6 +15,7 @@ from jaxmotion.motion.skeleton import (
     Motion,
     Skeleton,
     forward_kinematics,
+    global_transforms,
 )
 from tests import tiny
 
@@ -96,7 +97,10 @@ def lock_motion(skeleton, motion, *, lock):
     return dataclasses.replace(motion, root_position=root, joint_rotation=rotations)
 
 
-solve = jax.jit(functools.partial(foot_lock.place_toes, SKELETON, lock=LOCK))
+@jax.jit
+def solve(root, joints, toes):
+    placed = global_transforms(SKELETON, root, joints)
+    return foot_lock.place_toes(SKELETON, *placed, joints, toes, lock=LOCK)
 
 
 def place(root, joints, toes):

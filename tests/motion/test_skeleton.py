@@ -17,7 +17,6 @@ from jaxmotion.motion.skeleton import (
     from_root,
     global_transforms,
     joint_positions,
-    joint_velocities,
 )
 from tests.reference import motion as reference
 from tests.tiny import float32
@@ -278,27 +277,6 @@ def test_joint_positions_of_a_motion(skeleton):
     doubled = jax.jit(lambda m: jax.tree.map(lambda a: 2.0 * a, m))(motion)
     assert doubled.fps == 60.0
     np.testing.assert_allclose(doubled.root_position, 2.0 * root, rtol=1e-6)
-
-
-def test_velocities_of_straight_and_of_turning_motion():
-    fps, frames = 30.0, 61
-    time = np.arange(frames) / fps
-    speed = np.array([[1.0, 0.0, -0.5], [0.0, 2.0, 0.0]])
-    straight = time[:, None, None] * speed + np.array([5.0, 0.0, 1.0])
-    found = joint_velocities(float32(straight), fps)
-    assert found.shape == (frames - 1, 2, 3)
-    np.testing.assert_allclose(found, np.broadcast_to(speed, found.shape), atol=5e-5)
-    # On a circle the chord's speed is r * omega * sinc(omega dt / 2).
-    omega, radius = 3.0, 0.8
-    circle = (
-        radius
-        * np.stack([np.sin(omega * time), 0 * time, np.cos(omega * time)], axis=-1)[
-            :, None
-        ]
-    )
-    speeds = jnp.linalg.norm(joint_velocities(float32(circle), fps), axis=-1)
-    chord = 2 * radius * np.sin(omega / fps / 2) * fps
-    np.testing.assert_allclose(speeds, chord, rtol=1e-5)
 
 
 def test_skeleton_is_a_static_structure(skeleton):

@@ -142,15 +142,11 @@ def test_curvature_of_an_arc_flips_at_each_block():
     )
 
 
-def test_extension_holds_or_mirrors_the_facing():
+def test_extension_holds_the_facing():
     angles = np.linspace(-1.0, 1.0, 6)
     given = path(np.zeros((6, 2)), angles)
     held = trajectory.extend(given, 4, reuse=4)
     np.testing.assert_allclose(held.facing[6:], directions([1.0] * 4), atol=1e-6)
-    mirrored = trajectory.extend(given, 4, reuse=4, mirror_facing=True)
-    np.testing.assert_allclose(
-        mirrored.facing[6:], directions(angles[4:0:-1]), atol=1e-6
-    )
 
 
 def test_extension_refuses_impossible_lengths():

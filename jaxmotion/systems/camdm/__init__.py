@@ -16,9 +16,8 @@ and the released variant is a named option, but for what the list names.
 * plans after the start: not guided; released code: the first 2 are guided, in
   `RELEASED`.
 * points that HFTE reflects: 15; released code: 23, in `RELEASED`.
-* facing of those points: the last one is held, as released (the paper copies theirs:
-  `trajectory.extend(mirror_facing=True)`, which no run-time uses); released code: the
-  same.
+* facing of those points: the last one is held, as released (the paper copies theirs);
+  released code: the same.
 * new plan: when the command changes, or after 15 frames; released code: every 15
   frames, in `RELEASED`.
 * exponent of the blend of positions: 0.7, as in the released scene (the paper has

@@ -259,14 +259,8 @@ def wanted_trajectory(
         desired = dataclasses.replace(desired, position=desired.position + pull)
     if not control.extend:
         return desired
-    own = trajectory.extend(
-        trajectory.root_trajectory(skeleton, state.plan),
-        config.future,  # a plan may come late, until all frames were displayed
-        reuse=control.reuse,
-    )
-    ahead = jax.tree.map(
-        lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, config.future), own
-    )
+    own = trajectory.root_trajectory(skeleton, state.plan)
+    ahead = trajectory.rest_of(own, state.cursor, config.future, reuse=control.reuse)
     return trajectory.blend(
         ahead,
         desired,

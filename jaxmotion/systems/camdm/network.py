@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.networks import blocks
+from jaxmotion.networks.transformer import Denoising
 
 
 @jax.tree_util.register_dataclass
@@ -44,7 +45,7 @@ def flatten_condition(
     return jnp.concatenate(flat, axis=-1)
 
 
-class _OneVectorCondition(nn.Module):
+class _OneVectorCondition(Denoising):
     """Shared part: label and frame streams to one vector, embeddings of the steps."""
 
     features: int
@@ -87,22 +88,6 @@ class _OneVectorCondition(nn.Module):
             steps=self.embed_time(self.num_steps),
         )
 
-    def __call__(
-        self,
-        x_t: Float[Array, "*batch future features"],
-        t: Int[Array, "*#batch"],
-        past: Float[Array, "*batch past features"],
-        path: Float[Array, "*batch future 2"],
-        facing: Float[Array, "*batch future 6"],
-        label: Int[Array, "*batch"],
-        keep_past: Bool[Array, "*batch"],
-        *,
-        train: bool = False,
-    ) -> Float[Array, "*batch future features"]:
-        """`encode`, then `denoise`; arguments as there."""
-        context = self.encode(past, path, facing, label, keep_past)
-        return self.denoise(context, x_t, t, train=train)
-
 
 class SingleTokenTransformer(_OneVectorCondition):
     """The transformer without separate condition tokens: 1 + 45 tokens.
@@ -119,17 +104,7 @@ class SingleTokenTransformer(_OneVectorCondition):
         """Makes embeddings and layers."""
         self._setup_condition()
         self.embed_noisy = nn.Dense(self.width)
-        self.layers = [
-            blocks.EncoderLayer(
-                self.width, self.heads, self.hidden, self.dropout, self.norm
-            )
-            for _ in range(self.depth)
-        ]
-        if self.norm == "pre":
-            self.norm_out = nn.LayerNorm(epsilon=1e-5)
-        self.out = nn.Dense(
-            self.features * (self.frames_per_token + 2 * self.token_margin)
-        )
+        blocks.set_up_layers(self)
 
     def denoise(
         self,

@@ -95,17 +95,7 @@ class SequenceGenerator(nn.Module):
         if self.latent:
             self.embed_latent = LatentMlp(self.width)
         self.embed_noisy = nn.Dense(self.width)
-        self.layers = [
-            blocks.EncoderLayer(
-                self.width, self.heads, self.hidden, self.dropout, self.norm, "selu"
-            )
-            for _ in range(self.depth)
-        ]
-        if self.norm == "pre":
-            self.norm_out = nn.LayerNorm(epsilon=1e-5)
-        self.out = nn.Dense(
-            self.features * (self.frames_per_token + 2 * self.token_margin)
-        )
+        blocks.set_up_layers(self, activation="selu")
         self.drop = nn.Dropout(self.dropout)
 
     @property

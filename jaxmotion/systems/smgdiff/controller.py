@@ -49,6 +49,7 @@ from jaxmotion.diffusion import chain
 from jaxmotion.diffusion.schedule import spread_steps
 from jaxmotion.motion import ground, trajectory
 from jaxmotion.motion.ball import Scene, rolled
+from jaxmotion.motion.rotation import length
 from jaxmotion.motion.skeleton import Skeleton, joint_positions
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import guidance as smgdiff_guidance
@@ -197,7 +198,7 @@ def init_state(skeleton: Skeleton, past: Scene, *, config: Config) -> PlayerStat
 def _away(state: PlayerState) -> Float[Array, ""]:
     """How far he is from the ball, on the ground."""
     gap = state.past.ball[-1] - state.past.motion.root_position[-1]
-    return jnp.linalg.norm(gap[::2])
+    return length(gap[::2])
 
 
 def fetching(
@@ -220,7 +221,7 @@ def fetching(
 
     number = round(_FORESEEN * fps)
     coming = rolled(ball, fps, num_frames=number, deceleration=control.deceleration)
-    speed = jnp.maximum(jnp.linalg.norm(command.velocity), _RUN)
+    speed = jnp.maximum(length(command.velocity), _RUN)
     frames = jnp.round(away / speed * fps).astype(jnp.int32)
     gap = coming[jnp.clip(frames, 1, number) - 1, ::2] - here
     speed = jnp.minimum(speed, away / ARRIVE)
@@ -277,18 +278,16 @@ def in_time(
     played in thirds, those of 3.5 m/s make 3.8.
     """
     moved = wish.past.position[-1] - wish.past.position[-2]
-    now, asked = jnp.linalg.norm(moved) * fps, jnp.linalg.norm(wish.velocity)
+    now, asked = length(moved) * fps, length(wish.velocity)
     most = (asked + jnp.maximum(asked, now)) / 2 * num_frames / fps
-    length = jnp.linalg.norm(path.position[num_frames - 1])
-    part = jnp.minimum(most / jnp.maximum(length, 1e-6), 1.0)
+    part = jnp.minimum(most / length(path.position[num_frames - 1]), 1.0)
     part = jnp.where(trajectory.is_still(wish.velocity), 1.0, part)
     return dataclasses.replace(path, position=part * path.position)
 
 
-def _at_most(vector: Float[Array, "2"], length: Array) -> Float[Array, "2"]:
+def _at_most(vector: Float[Array, "2"], most: Array) -> Float[Array, "2"]:
     """The vector, made shorter if it is longer than so much."""
-    found = jnp.maximum(jnp.linalg.norm(vector), 1e-6)
-    return vector * jnp.minimum(length / found, 1.0)
+    return vector * jnp.minimum(most / length(vector), 1.0)
 
 
 def walkable(wish: Wish, *, soon: int, fps: float, control: Control) -> Wish:
@@ -306,7 +305,7 @@ def walkable(wish: Wish, *, soon: int, fps: float, control: Control) -> Wish:
     def within(velocity: Array, part: float = 1.0) -> Array:
         if control.agile == 0:
             return velocity
-        most = part * (control.agile + control.agile * jnp.linalg.norm(moved))
+        most = part * (control.agile + control.agile * length(moved))
         onward = ground.unit(moved + 0.25 * velocity)
         change = velocity - moved
         faster = jnp.maximum(jnp.sum(change * onward), 0.0) * onward
@@ -349,7 +348,7 @@ def wanted_trajectory(
         seconds = config.future / config.fps
         returned = 1.0 - 0.5 ** (seconds / control.follow)
         velocity += returned / seconds * (state.anchor - frame.origin)
-        most = control.hurry * jnp.linalg.norm(command.velocity)
+        most = control.hurry * length(command.velocity)
         velocity = _at_most(velocity, most)
     wish = Wish(
         past=trajectory.to_local(past, frame),
@@ -373,14 +372,8 @@ def wanted_trajectory(
         still = trajectory.is_still(command.velocity)
         facing = jnp.where(still, turned, wanted.facing)
         wanted = dataclasses.replace(wanted, facing=facing)
-    own = trajectory.extend(
-        trajectory.root_trajectory(skeleton, state.plan.motion),
-        config.future,  # a plan may come late, until all frames were displayed
-        reuse=control.reuse,
-    )
-    ahead = jax.tree.map(
-        lambda x: jax.lax.dynamic_slice_in_dim(x, state.cursor, config.future), own
-    )
+    own = trajectory.root_trajectory(skeleton, state.plan.motion)
+    ahead = trajectory.rest_of(own, state.cursor, config.future, reuse=control.reuse)
     return trajectory.blend(
         trajectory.to_local(ahead, frame),
         wanted,
@@ -458,7 +451,7 @@ def join(
     first = jax.tree.map(lambda x: x[:2], motion)
     feet = joint_positions(representation.skeleton, first)
     feet = feet[:, jnp.array(representation.joints)]
-    away = jnp.linalg.norm(feet - past.ball[None, -1:], axis=-1)
+    away = length(feet - past.ball[None, -1:])
     touched = jnp.min(away) < representation.radius + _TOUCH_MARGIN
     drift = jnp.where(touched, 0.0, (moved - step) * fps)
     times = jnp.arange(1, chunk.ball.shape[0] + 1, dtype=offset.dtype) / fps
@@ -482,7 +475,7 @@ def advance(
     )
     here = now.motion.root_position[0, ::2]
     away = state.anchor + command.velocity / config.fps - here
-    away /= jnp.maximum(jnp.linalg.norm(away) / control.leash, 1.0)
+    away /= jnp.maximum(length(away) / control.leash, 1.0)
     anchor = jnp.where(trajectory.is_still(command.velocity), here, here + away)
     frame = Frame(
         root_position=now.motion.root_position[0],

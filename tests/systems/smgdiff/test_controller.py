@@ -376,6 +376,18 @@ def asked(now, then=(1.4, 0.0), **control):
     return smgdiff_controller.walkable(wish, soon=6, fps=30.0, control=control)
 
 
+@pytest.mark.parametrize("then", [(0.0, 0.0), (1.4, 0.0)])
+def test_gradients_of_the_wish_are_finite_for_who_stands(then):
+    def far(velocity):
+        still = jnp.zeros(2)
+        wish = asked(still, velocity, agile=2.0, answer=0.1)
+        path = jax.tree.map(lambda x: jnp.tile(x[-1:], (12, 1)), wish.past)
+        path = smgdiff_controller.in_time(path, wish, num_frames=6, fps=30.0)
+        return jnp.sum(path.position) + jnp.sum(wish.velocity) + jnp.sum(wish.soon)
+
+    assert np.isfinite(jax.grad(far)(jnp.asarray(then))).all()
+
+
 @pytest.mark.parametrize("half_life", [0.05, 0.1, 0.3])
 def test_the_second_target_is_on_the_way_to_what_is_commanded(half_life):
     now, then = np.array([1.2, 0.5]), np.array([1.4, 0.0])
