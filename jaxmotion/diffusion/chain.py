@@ -22,6 +22,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmotion.diffusion import schedule as _schedule
@@ -89,7 +90,8 @@ def reverse_chain(
       stop: Step at which the result lies, 0 = clean; static.
 
     Raises:
-      ValueError: unless start >= stop >= 0, both integers.
+      ValueError: unless start >= stop >= 0, both integers; for a sample that a
+        `Multistep` is to walk.
 
     Source: Ho et al. 2020, alg. 2.
     """
@@ -97,6 +99,8 @@ def reverse_chain(
     def body(x_t: Any, t: Array) -> tuple[Any, None]:
         return step(jax.random.fold_in(key, t), x_t, t), None
 
+    if isinstance(step, Multistep) and isinstance(x, Array | np.ndarray):
+        raise ValueError("x is a sample, expected step.init(x): or use sample_from")
     x = jax.tree.map(jnp.asarray, x)
     return jax.lax.scan(body, x, _countdown(start, stop))[0]
 
@@ -168,7 +172,7 @@ def ancestral_step(
             own = jax.random.normal(key_noise, x_t.shape, x_t.dtype)
         else:
             own = noise[t - 1]
-        return mean + jnp.sqrt(variance) * own
+        return mean + _schedule.deviation(variance) * own
 
     return step
 
@@ -193,13 +197,15 @@ def ddim_step(
         key_denoise, key_noise = jax.random.split(key)
         x_0 = denoise(key_denoise, x_t, t).astype(x_t.dtype)
         predicted_noise = _schedule.noise_from_x0(schedule, x_0, x_t, t)
-        variance = jnp.square(eta) * _schedule.posterior(schedule, x_0, x_t, t).variance
+        posterior = _schedule.posterior(schedule, x_0, x_t, t).variance
+        variance = jnp.square(eta) * posterior
         rest = schedule.one_minus_alpha_bar[t - 1].astype(x_t.dtype) - variance
         # Rounding may leave the difference just below zero.
-        direction = jnp.sqrt(jnp.maximum(rest, 0.0)) * predicted_noise
+        direction = _schedule.deviation(rest) * predicted_noise
         noise = jax.random.normal(key_noise, x_t.shape, x_t.dtype)
         clean = _schedule.q_sample(schedule, x_0, t - 1, jnp.zeros_like(x_0))
-        return clean + direction + jnp.sqrt(variance) * noise
+        # The posterior's own: at eta = 0 the root of their product has no gradient.
+        return clean + direction + eta * _schedule.deviation(posterior) * noise
 
     return step
 
@@ -238,19 +244,26 @@ def dpm_solver_step(schedule: Schedule, denoise: Denoiser) -> Multistep:
 
     Source: Lu et al. 2022, "DPM-Solver++", alg. 2, with its first-order last step.
     """
-    log_ratio = 0.5 * schedule.log_snr
+
+    def log_ratio(t: Array) -> Array:
+        log, rest = schedule.log_alpha_bar[t], schedule.one_minus_alpha_bar[t]
+        return 0.5 * (log - jnp.log(rest))
 
     def step(key: Key, state: SolverState, t: Int[Array, ""], /) -> SolverState:
         x_t, dtype = state.x, state.x.dtype
         key_denoise, _ = jax.random.split(key)
         x_0 = denoise(key_denoise, x_t, t).astype(dtype)
-        h, h_before = log_ratio[t - 1] - log_ratio[t], log_ratio[t] - log_ratio[t + 1]
-        second = state.known & (t > 1)
+        is_last = t == 1
+        # The last step has none: it would be infinite, and so its gradient.
+        h = log_ratio(jnp.maximum(t - 1, 1)) - log_ratio(t)
+        h_before = log_ratio(t) - log_ratio(t + 1)
+        second = state.known & ~is_last
         share = jnp.where(second, h / (2.0 * jnp.where(second, h_before, 1.0)), 0.0)
         line = x_0 + share.astype(dtype) * (x_0 - state.x_0)
         alpha_bar, rest = schedule.alpha_bar[t - 1], schedule.one_minus_alpha_bar
-        keep = jnp.sqrt(rest[t - 1] / rest[t]).astype(dtype)
-        take = (-jnp.sqrt(alpha_bar) * jnp.expm1(-h)).astype(dtype)
+        keep = _schedule.deviation(rest[t - 1] / rest[t]).astype(dtype)
+        gone = jnp.where(is_last, 1.0, -jnp.expm1(-h))
+        take = (jnp.sqrt(alpha_bar) * gone).astype(dtype)
         x = keep * x_t + take * line
         return SolverState(x=x, x_0=x_0, known=jnp.ones_like(state.known))
 

@@ -57,7 +57,8 @@ def posterior_sample(
 ) -> Float[Array, "*shape"]:
     """Draws x_{t-1} given x_t and (a prediction of) x_0, t in 1..T; x_0 at t = 1."""
     mean, variance = _schedule.posterior(schedule, x_0, x_t, t)
-    return mean + jnp.sqrt(variance) * jax.random.normal(key, x_t.shape, x_t.dtype)
+    noise = jax.random.normal(key, x_t.shape, x_t.dtype)
+    return mean + _schedule.deviation(variance) * noise
 
 
 @jax.jit

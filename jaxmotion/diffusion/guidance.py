@@ -138,10 +138,11 @@ def dsg_step(
 
         gradient, x_0 = jax.grad(value, has_aux=True)(x_t)
         mean, variance = _schedule.posterior(schedule, x_0, x_t, t)
-        drawn = jnp.sqrt(variance) * jax.random.normal(key_noise, x_t.shape, x_t.dtype)
+        noise = jax.random.normal(key_noise, x_t.shape, x_t.dtype)
+        drawn = _schedule.deviation(variance) * noise
         zero = jnp.zeros_like(x_t)
         typical = _schedule.posterior(schedule, zero, zero, jnp.maximum(t, 2)).variance
-        sigma = jnp.sqrt(typical)
+        sigma = _schedule.deviation(typical)
         if last_sigma is not None:
             sigma = jnp.where(t == 1, jnp.asarray(last_sigma, x_t.dtype), sigma)
         radius = jnp.sqrt(x_t.size).astype(x_t.dtype) * sigma

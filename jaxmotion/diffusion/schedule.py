@@ -368,6 +368,12 @@ def x0_from_noise(
     return (x_t - spread * noise) / signal
 
 
+def deviation(variance: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Square root, 0 of what is below; its gradient is 0, not infinite, at 0."""
+    some = variance > 0.0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1.0)), 0.0)
+
+
 def _alpha(schedule: Schedule, t: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
     """1 - beta_t, from logs: beta near 1 has lost the digits of the difference."""
     return jnp.exp(schedule.log_alpha_bar[t] - schedule.log_alpha_bar[t - 1])
@@ -379,7 +385,8 @@ def _marginal(
     """Factors of x_0 and of the noise in x_t, shaped to broadcast against x."""
     t = jnp.clip(t, 0, schedule.num_steps)
     log = schedule.log_alpha_bar[t]
-    return _expand(jnp.exp(0.5 * log), x), _expand(jnp.sqrt(jnp.abs(jnp.expm1(log))), x)
+    spread = deviation(jnp.abs(jnp.expm1(log)))
+    return _expand(jnp.exp(0.5 * log), x), _expand(spread, x)
 
 
 def _expand(

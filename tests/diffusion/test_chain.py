@@ -278,6 +278,33 @@ def test_gradients_flow_through_the_chain():
     np.testing.assert_allclose(gradient, expected, rtol=1e-2)
 
 
+@pytest.mark.parametrize("num_steps", [1, 4])
+@pytest.mark.parametrize("make", ["ancestral", "ddim", "dpm"])
+def test_gradients_flow_through_the_schedule_and_eta(make, num_steps):
+    def end(scale, eta):
+        table = schedule.schedule_from_betas(scale * beta)
+        step = {
+            "ancestral": lambda: chain.ancestral_step(table, tanh_denoiser),
+            "ddim": lambda: chain.ddim_step(table, tanh_denoiser, eta=eta),
+            "dpm": lambda: chain.dpm_solver_step(table, tanh_denoiser),
+        }[make]()
+        x = chain.sample_from(step, jax.random.key(0), start, start=num_steps)
+        return jnp.sum(x**2)
+
+    with jax.enable_x64(True):
+        beta = schedule.cosine_schedule(num_steps).beta[1:]
+        start = jnp.asarray(random(0), beta.dtype)
+        run = jax.jit(end)
+        for eta in (0.0, 0.5, 1.0):
+            at = jnp.array([0.9, eta])
+            found = jax.jit(jax.grad(lambda at: end(*at)))(at)
+            shifts = 1e-5 * np.eye(2)
+            wanted = [(run(*(at + x)) - run(*(at - x))) / 2e-5 for x in shifts]
+            np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-8)
+        if num_steps > 1:
+            assert np.abs(found[0]) > 1e-3
+
+
 def test_half_precision_network_in_a_float32_chain():
     def half(key, x_t, t):
         return tanh_denoiser(key, x_t.astype(jnp.bfloat16), t)
@@ -293,6 +320,12 @@ def test_bad_range_of_steps(run, start, stop):
     step = chain.ancestral_step(schedule.cosine_schedule(T), tanh_denoiser)
     with pytest.raises(ValueError, match=f"start={start}, stop={stop}"):
         run(step, jax.random.key(0), random(0), start=start, stop=stop)
+
+
+def test_a_multistep_walks_no_sample():
+    step = chain.dpm_solver_step(schedule.cosine_schedule(T), tanh_denoiser)
+    with pytest.raises(ValueError, match=r"x is a sample, expected step.init\(x\)"):
+        chain.reverse_chain(step, jax.random.key(0), random(0), start=T)
 
 
 @pytest.mark.parametrize("eta", [-0.1, 1.5])
