@@ -10,6 +10,7 @@ import contextlib
 import contextvars
 import dataclasses
 import json
+import os
 import signal
 import sys
 import tempfile
@@ -30,6 +31,11 @@ from jaxmotion import files
 from jaxmotion.learning import checkpoint
 from jaxmotion.learning.training import Info
 from jaxmotion.typing import Key
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 # What a user waits for before the first step, on two CPU cores.
 COMPILING = "compiling the training step, about 40 s (once)"
@@ -131,6 +137,29 @@ def _held_interrupt() -> Iterator[list[int]]:
         yield seen
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keeps other trainings out of a folder; a kill opens it again.
+
+    Where the system has no such locks (Windows, some network disks) all come in.
+    """
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(handle)
+        raise ValueError(f"{folder}: another training is under way here") from None
+    except OSError:
+        pass
+    try:
+        yield
+    finally:
+        os.close(handle)
 
 
 def read_losses(path: Path) -> list[dict[str, Any]]:
@@ -267,8 +296,8 @@ def train(
 
     Raises:
       TrainingDiverged: if a loss is not finite; nothing of that chunk is saved.
-      ValueError: if more steps are done than asked for, or a line of `losses.jsonl`
-        is no row.
+      ValueError: if more steps are done than asked for, another training is under way
+        in the folder, or a line of `losses.jsonl` is no row.
       OSError: if the folder cannot be written; names the last good checkpoint.
       KeyboardInterrupt: after Ctrl-C, when the state is saved.
     """
@@ -301,11 +330,21 @@ def train_all(
                 f"{one.folder}: has {done} steps, expected at most the "
                 f"{one.num_steps} to train"
             )
-        (one.folder / "losses.jsonl").parent.mkdir(parents=True, exist_ok=True)
+        one.folder.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as held:
         if first:
-            _forget_lost_steps(one.folder / "losses.jsonl", done)
-    if done >= loop.num_steps:
-        return state
+            for one in loops:
+                held.enter_context(_alone(one.folder))
+                _forget_lost_steps(one.folder / "losses.jsonl", done)
+        return state if done >= loop.num_steps else _run(training, loops, part)
+
+
+def _run(
+    training: Training, loops: Sequence[Loop], part: Callable[[Any, int], Any]
+) -> Any:
+    """`train_all`, in folders that nobody else trains in."""
+    loop, state = training.loop, training.state
+    done, first = int(state.step), jax.process_index() == 0
     stop, asked, pieces = False, 0, _Pieces(loop.chunk)
     began = time.perf_counter()
     if first:

@@ -270,6 +270,19 @@ def test_a_finished_run_is_not_compiled_again(tmp_path, capsys):
         train(never, final, key, data, loop=loop_of(tmp_path, 2))
 
 
+def test_two_trainings_do_not_share_a_folder(tmp_path):
+    run, state, key, data = small_parts()
+    loop = loop_of(tmp_path, 4)
+
+    def meanwhile(*given):
+        with pytest.raises(ValueError, match="another training is under way here"):
+            train(run, *small_parts()[1:], loop=loop)
+        return run(*given)
+
+    train(meanwhile, state, key, data, loop=loop)
+    assert [row["step"] for row in rows(tmp_path)] == [2, 4]
+
+
 @pytest.mark.parametrize("field", ["num_steps", "chunk", "save_every"])
 def test_zero_is_refused_before_the_first_chunk(tmp_path, field):
     """save_every=0 divided by zero after it, and the chunk was lost."""

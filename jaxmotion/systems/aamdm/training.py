@@ -109,6 +109,7 @@ def prepare(
             clips = selection.select(clips, field, labels)
         if mirrored:
             clips = mirror.with_mirrored(clips)
+        print(f"making frames of {clips.num_clips} clips", flush=True)
         frames, names = aamdm_data.pose_data(clips, fps=fps)
         skipped = sorted(set(clips.clip_names) - set(names))
         print(f"{len(names)} clips, {frames.num_frames} frames; too short: {skipped}")
