@@ -618,8 +618,9 @@ def save(
         in .glb they always are.
       mixamo: Joints are named as Mixamo's characters have them.
       onto: A rig's file (see `retarget`) whose skeleton the motion is brought onto; a
-        .glb is then that rig, animated, if it is a .glb, .gltf or .vrm. A root bone on
-        the ground that carries its hips goes and turns with them, level and smoothly.
+        .glb is then that rig, animated, if it is a .glb, .gltf or .vrm, and a root bone
+        on the ground that carries its hips goes and turns with them, level and
+        smoothly. What is written is as large as the rig, whose units are meters.
       roles: Joints of some of its roles, or bodies of the robot's; see `retarget`.
       robot: MJCF or URDF of a humanoid that the motion is brought onto, 50 frames per
         second; the .npz is then what mjlab's motion tracking reads, with what the robot

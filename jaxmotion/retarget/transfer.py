@@ -111,6 +111,8 @@ def rest(
       sole: How far below the ankle joints the ground is when a foot is flat; None for
         an adult's.
 
+    Where the skeleton names no feet they are its toes, or else its ankles.
+
     `ValueError` as `roles.find_roles`, or if a bone of a limb has no length.
     """
     roles = names.find_roles(skeleton, given)
@@ -123,6 +125,9 @@ def rest(
                     f"the bone from {skeleton.names[a]!r} to {skeleton.names[b]!r} has "
                     "no length"
                 )
+    if not skeleton.feet:
+        feet = [(*leg.after[:1], leg.end)[0] for leg in found.legs]
+        skeleton = dataclasses.replace(skeleton, feet=tuple(feet))
     made = Rest(
         skeleton=skeleton,
         roles=roles,

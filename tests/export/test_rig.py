@@ -176,7 +176,9 @@ def test_the_users_own_mesh_walks(hero, tmp_path):
     assert -0.01 < skinned(tmp_path / "walk.glb", 13)[:, 1].min() < 0.02
 
 
-@pytest.mark.parametrize("suffix", mostly_slow([".bvh", ".npz", ".csv"], [".bvh"]))
+@pytest.mark.parametrize(
+    "suffix", mostly_slow([".bvh", ".npz", ".csv"], [".bvh", ".npz"])
+)
 def test_other_formats_have_the_rigs_skeleton(hero, tmp_path, suffix):
     skeleton, motion = samples.person(seconds=0.3)
     jm.save(tmp_path / f"a{suffix}", skeleton, motion, onto=hero)
@@ -186,6 +188,13 @@ def test_other_formats_have_the_rigs_skeleton(hero, tmp_path, suffix):
         # And a BVH is a rig, too.
         target = jm.retarget(skeleton, tmp_path / "a.bvh").target
         assert abs(target.leg - rigging.read_rig(hero).rest().leg) < 1e-3
+    if suffix == ".npz":
+        arrays = np.load(tmp_path / "a.npz")
+        assert [str(x).split(":")[-1] for x in arrays["feet"]] == [
+            "LeftToeBase",
+            "RightToeBase",
+        ]
+        assert arrays["foot_contact"].shape == (len(arrays["root_position"]), 2)
 
 
 def test_a_gltf_with_a_buffer_beside_it_and_a_vrm_are_rigs(hero, tmp_path):
