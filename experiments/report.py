@@ -1,8 +1,7 @@
 """The tables of the four papers beside what was measured here; their claims decided.
 
 Gathers what the `evaluate` commands (and step_sweep.py) left in run folders, and writes
-report.md, report.json and a picture of each table. What was not run is named with the
-command that would run it.
+report.md and report.json. What was not run is named with the command that would run it.
 
 With --keep it stores what one evaluation left behind in experiments/results instead, and
 with --write-docs it writes the tables, plots and figures of all pages from there.
@@ -126,7 +125,7 @@ def report(args: Config) -> None:
     print(f"{len(writing.ABSENT)} of the papers' results cannot be run here")
     for absent in writing.ABSENT:
         print(f"  {absent.paper}, {absent.what}: {absent.reason}")
-    print(f"wrote report.md, report.json and pictures to {args.out}")
+    print(f"wrote report.md and report.json to {args.out}")
 
 
 def keep_and_write(args: Config) -> None:

@@ -223,16 +223,14 @@ def section(
     decided: Decided,
     found: Found,
     commands: Commands,
-    picture: str | None,
 ) -> list[str]:
-    """Lines of one table: values, picture, sources and claims.
+    """Lines of one table: values, sources and claims.
 
     Args:
       table: The table.
       decided: All claims.
       found: All that was measured.
       commands: What makes each source.
-      picture: File name; None where nothing was measured.
 
     Returns:
       The lines.
@@ -245,8 +243,6 @@ def section(
     )
     lines += ["", "Here: " + "; ".join(notes) + ".", ""]
     lines += _sources(table, found, commands)
-    if picture is not None:
-        lines += [f"![{table.name}]({picture})", ""]
     return lines + [*_claims(table, decided, found), ""]
 
 

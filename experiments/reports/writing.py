@@ -1,21 +1,15 @@
-"""Writes report.md, report.json and a picture of each table."""
+"""Writes report.md and report.json."""
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jaxmotion import files
-from jaxmotion.evaluation import columns
 from jaxmotion.evaluation.statistics import Spread
-from jaxmotion.evaluation.table import Cell
 from jaxmotion.systems import registry
-from jaxmotion.viz import plots
 from reports import markdown, verdicts
-from reports.claims import FOLDER, Column, Stated, Table, read_paper
+from reports.claims import FOLDER, Column, Table, read_paper
 from reports.results import Found, provenance
 
 PAPERS = tuple(
@@ -36,76 +30,6 @@ EVALUATED = {
     for row in table.rows
     if any(column.evaluated for column in table.columns)
 }
-
-
-def _ends(
-    cell: Cell | None, spread: Spread | None, column: Column
-) -> tuple[float, float, float]:
-    """Value and interval: over trainings, or else over replications of one."""
-    if spread is not None:
-        return float(spread.mean), *verdicts.interval(spread)
-    if cell is None:
-        return (math.nan,) * 3
-    if column.kind == "count" and cell.samples:
-        return cell.value, *verdicts.wilson(cell.value, cell.samples)
-    return cell.value, *(math.nan if x is None else x for x in (cell.low, cell.high))
-
-
-def _printed(value: Stated) -> tuple[float, float, float]:
-    if isinstance(value, tuple):
-        return value[0], value[0] - value[1], value[0] + value[1]
-    return (math.nan if value is None else value), math.nan, math.nan
-
-
-def draw(path: Path, table: Table, found: Found) -> None:
-    """Draws a table's values beside the paper's.
-
-    Args:
-      path: The picture.
-      table: The table.
-      found: All that was measured.
-    """
-    panels = []
-    for place, column in enumerate(table.columns):
-        here = [
-            _ends(
-                verdicts.cell_of(table, row, column, found),
-                verdicts.over_trainings(table, row, column, found),
-                column,
-            )
-            for row in table.rows
-        ]
-        target = 0 if column.better == "real" else None
-        panels.append(
-            plots.Panel(
-                title=f"{column.name} {columns.ARROWS[column.better]}",
-                left=np.array([_printed(row.paper[place]) for row in table.rows]),
-                right=np.array(here),
-                target=target,
-            )
-        )
-    names = tuple(row.name.removesuffix(" (not in the paper)") for row in table.rows)
-    title = f"{table.name}: {table.title}"
-    plots.write_dots(
-        path,
-        names,
-        tuple(panels),
-        sources=("paper", "here"),
-        absent=("not given", "not measured"),
-        title=title,
-    )
-
-
-def picture_of(table: Table) -> str:
-    """File name of a table's picture.
-
-    Args:
-      table: The table.
-
-    Returns:
-      The name.
-    """
-    return re.sub(r"[^a-z0-9]+", "_", table.name.lower()).strip("_") + ".png"
 
 
 def _spread_json(spread: Spread | None) -> dict[str, Any] | None:
@@ -200,7 +124,6 @@ def _lines(
     decided: markdown.Decided,
     found: Found,
     commands: markdown.Commands,
-    pictures: dict[str, str],
     made: Any,
 ) -> list[str]:
     lines = ["# The papers' tables, and what is measured here", ""]
@@ -208,9 +131,8 @@ def _lines(
         "In tables the paper's value stands above in italics, and below it what was "
         "measured here: where there are several trainings their mean, with its 95 % "
         "interval over these; and the first training's value, with its interval over "
-        "replications and number of samples. Pictures show the former where there is "
-        "one. Columns are to be "
-        "lower ↓, higher ↑, or near recorded motion →.",
+        "replications and number of samples. Columns are to be lower ↓, higher ↑, or "
+        "near recorded motion →.",
         "",
         "How claims are decided:",
         "",
@@ -223,8 +145,7 @@ def _lines(
     for paper in PAPERS:
         lines += [f"## {paper.system.title}", "", f"{paper.system.paper}.", ""]
         for table in paper.tables:
-            picture = pictures.get(table.name)
-            lines += markdown.section(table, decided, found, commands, picture)
+            lines += markdown.section(table, decided, found, commands)
     lines += ["## What cannot be run here", "", *markdown.absent_lines(ABSENT)]
     lines += ["## Where the values come from", ""]
     lines += markdown.source_lines(found, EVALUATED)
@@ -251,14 +172,8 @@ def write(
         for table in TABLES
         for claim in table.claims
     ]
-    pictures = {}
-    for table in TABLES:
-        measured = any(not markdown.why_not(table, row, found) for row in table.rows)
-        if measured:
-            pictures[table.name] = picture_of(table)
-            draw(out / pictures[table.name], table, found)
     whole = _json(decided, found, commands, made)
     files.write_text(out / "report.json", json.dumps(whole, indent=1))
-    lines = _lines(decided, found, commands, pictures, made)
+    lines = _lines(decided, found, commands, made)
     files.write_text(out / "report.md", "\n".join(lines) + "\n")
     return decided

@@ -198,9 +198,7 @@ def _role(eqn: core.JaxprEqn) -> str:
         return "plain"
     if name == "jit":
         return "normal" if eqn.params["name"] == _NORMAL else "call"
-    carried = eqn.invars[eqn.params.get("num_consts", 0) :]
-    carried = carried[: eqn.params.get("num_carry", 0)]
-    if name == "scan" and not any(_is_key(x) for x in carried):
+    if name == "scan" and not any(map(_is_key, loop_parts(eqn, eqn.invars)[1])):
         return "loop"
     raise ValueError(
         f"a key goes into {name!r}: expected normal noise, split, fold_in, and loops "
@@ -209,10 +207,20 @@ def _role(eqn: core.JaxprEqn) -> str:
 
 
 def loop_parts(eqn: core.JaxprEqn, values: list) -> tuple[list, list, list]:
-    """Constants, carry and rows of a loop's equation."""
-    first = eqn.params["num_consts"]
-    second = first + eqn.params["num_carry"]
-    return values[:first], values[first:second], values[second:]
+    """Constants, carry and rows of a loop's equation.
+
+    Told by their ranks, as rows have an axis less within the loop: what a trace calls
+    the numbers of them changes from one release of JAX to another.
+    """
+
+    def number(outer: list, inner: list) -> int:
+        pairs = zip(outer, inner, strict=True)
+        return sum(x.aval.ndim == y.aval.ndim for x, y in pairs)
+
+    body = eqn.params["jaxpr"].jaxpr
+    rows = number(eqn.invars, body.invars)
+    first = rows - number(eqn.outvars, body.outvars)
+    return values[:first], values[first:rows], values[rows:]
 
 
 def _order(eqn: core.JaxprEqn) -> dict[str, Any]:
