@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
@@ -215,18 +215,12 @@ def import_weights(args: Import) -> None:
     show(Show(file=args.out))
 
 
-Command = (
-    Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Show, tyro.conf.subcommand("show")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-)
-
-
-def main() -> None:
-    """Parses the command line and runs the command."""
-    args = cli.check(tyro.cli(Command, description=__doc__))
-    {Train: train, Show: show, Import: import_weights}[type(args)](args)
+COMMANDS = {
+    "train": (Train, train),
+    "show": (Show, show),
+    "import": (Import, import_weights),
+}
 
 
 if __name__ == "__main__":
-    cli.start(main)
+    cli.start(lambda: cli.run(COMMANDS, __doc__))

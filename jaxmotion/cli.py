@@ -132,16 +132,24 @@ def check(args: Arguments) -> Arguments:
     return args
 
 
-def run(commands: Mapping[str, tuple[type, Callable[[Any], None]]], text: str) -> None:
-    """Parses the command line of a script of several commands, and runs one.
+Commands = Mapping[str, tuple[type, Callable[[Any], None]]]
 
-    By their names, each has the dataclass of its options and what it does.
-    """
+
+def kind_of(commands: Commands) -> Any:
+    """What `tyro` reads for a script of several commands: one of their options."""
     kinds = [
         Annotated[kind, tyro.conf.subcommand(name)]
         for name, (kind, _) in commands.items()
     ]
-    args = check(tyro.cli(functools.reduce(operator.or_, kinds), description=text))
+    return functools.reduce(operator.or_, kinds)
+
+
+def run(commands: Commands, text: str) -> None:
+    """Parses the command line of a script of several commands, and runs one.
+
+    By their names, each has the dataclass of its options and what it does.
+    """
+    args = check(tyro.cli(kind_of(commands), description=text))
     dict(commands.values())[type(args)](args)
 
 

@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 import tyro
 
+from jaxmotion import cli
+
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = {
@@ -80,7 +82,8 @@ def test_commands_parse(words, monkeypatch):
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
-        kind = getattr(module, "Command", None) or module.Config
+        several = getattr(module, "COMMANDS", None)
+        kind = cli.kind_of(several) if several else module.Config
         parsed = tyro.cli(kind, args=arguments)
     finally:
         del sys.modules[spec.name]
