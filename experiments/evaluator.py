@@ -222,5 +222,10 @@ COMMANDS = {
 }
 
 
+def main() -> None:
+    """Parses the command line and runs the command."""
+    cli.run(COMMANDS, __doc__)
+
+
 if __name__ == "__main__":
-    cli.start(lambda: cli.run(COMMANDS, __doc__))
+    cli.start(main)

@@ -50,7 +50,9 @@ def train(args: Config, command: list[str]) -> None:
     """Trains all seeds by a system's own command."""
     system, *options = command
     script = importlib.import_module(system)
-    each = cli.check(tyro.cli(script.Command, args=options, prog=f"{system}.py"))
+    each = cli.check(
+        tyro.cli(cli.kind_of(script.COMMANDS), args=options, prog=f"{system}.py")
+    )
     if each.distributed or getattr(each, "devices", 1) > 1:
         raise ValueError("--distributed, --devices: one device trains several seeds")
     if each.seed != type(each).seed:
