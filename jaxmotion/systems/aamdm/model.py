@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 from jaxmotion.diffusion import chain, guidance
 from jaxmotion.diffusion import schedule as tables
 from jaxmotion.diffusion.schedule import Schedule
-from jaxmotion.networks import mlp
+from jaxmotion.networks import blocks, mlp
 from jaxmotion.typing import Denoiser, Key, Objective, Params
 
 SYSTEM = "aamdm"
@@ -170,8 +170,13 @@ def draft(
 
     `change` is as in `to_frame`.
     """
-    weights = network(config).layout(params, config.features)
-    return _denoiser(weights, previous, config, change, config.latent)
+
+    def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
+        latent = jax.random.normal(key, (*x_t.shape[:-1], config.latent), x_t.dtype)
+        found = blocks.apply(params, network(config), x_t, t, previous, latent)
+        return to_frame(found, previous, change)
+
+    return denoise
 
 
 def polish(
@@ -182,8 +187,13 @@ def polish(
     change: Float[Array, " features"] | None = None,
 ) -> Denoiser:
     """The diffusion model as a denoiser; `change` is as in `to_frame`."""
-    weights = network(config).layout(params, config.features)
-    return _denoiser(weights, previous, config, change, 0)
+
+    def denoise(key: Key, x_t: Array, t: Array, /) -> Array:
+        del key  # deterministic
+        found = blocks.apply(params, network(config), x_t, t, previous)
+        return to_frame(found, previous, change)
+
+    return denoise
 
 
 def _denoiser(
@@ -193,7 +203,7 @@ def _denoiser(
     change: Float[Array, " features"] | None,
     latent: int,
 ) -> Denoiser:
-    """A network of weights laid out, with so many channels of a latent."""
+    """`draft` or, without channels of a latent, `polish`, of weights laid out."""
     net = network(config)
     context = net.encode(weights, previous)
 
