@@ -241,14 +241,21 @@ def holds(claim: Claim, values: Sequence[float]) -> float:
     return difference if claim.margin is None else claim.margin - abs(difference)
 
 
+def _compared(table: Table, claim: Claim, pair: tuple[str, str]) -> list[Row]:
+    """The rows of a comparison, and that which they are to be near to."""
+    names = (*pair, claim.toward) if claim.toward else pair
+    return [table.row(name) for name in names]
+
+
 def _differences(
     table: Table, claim: Claim, found: Found
 ) -> dict[tuple[str, str], np.ndarray]:
     """Claimed differences of pairs of rows, one per training that has both."""
     made, column = {}, table.column(claim.column)
     for pair in claim.pairs:
-        names = (*pair, claim.toward) if claim.toward else pair
-        cells = [cells_of(table, table.row(name), column, found) for name in names]
+        rows = _compared(table, claim, pair)
+        own = _paired(table, rows, found)
+        cells = [cells_of(table, row, column, own) for row in rows]
         values = [
             [cell.value for cell in trained]
             for trained in zip(*cells, strict=False)
@@ -306,12 +313,15 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     """
     column = table.column(claim.column)
     rows = [table.row(name) for name in claim.rows]
-    found = _paired(table, rows, _unseen(found))
+    found = _unseen(found)
     cells = {row.name: cells_of(table, row, column, found) for row in rows}
     absent = [name for name, own in cells.items() if not any(own)]
-    present = [row for row in rows if row.name not in absent]
-    if reason := _incomparable(table, column, present, found):
-        return Decision(verdict="not decided", reason=reason)
+    for pair in claim.pairs:
+        compared = _compared(table, claim, pair)
+        present = [row for row in compared if row.name not in absent]
+        own = _paired(table, compared, found)
+        if reason := _incomparable(table, column, present, own):
+            return Decision(verdict="not decided", reason=reason)
     differences = _differences(table, claim, found)
     trainings = min(x.size for x in differences.values())
     decision = functools.partial(Decision, differences=differences, trainings=trainings)

@@ -531,6 +531,34 @@ def test_rows_of_two_runs_pair_by_seed_and_data(load, tmp_path):
     assert decided(((1, 2), (1, 2)), "xx").verdict == "not run"
 
 
+def test_a_comparison_has_the_trainings_of_its_own_two_rows(load, tmp_path):
+    claims, verdicts = load("reports.claims"), load("reports.verdicts")
+    results = load("reports.results")
+    seeds = {"a": range(4), "b": range(4), "c": range(1, 3)}
+    rows, found = [], {}
+    for run, own in seeds.items():
+        source = claims.Source(run=run, file="m.json", commands=("make {run}",))
+        paths = [tmp_path / run / str(seed) / "m.json" for seed in own]
+        for path, seed in zip(paths, own, strict=True):
+            value = {"it": seed + 10.0 * (run != "a")}
+            measured(load, path, value, seeds={"training": [seed]})
+        rows.append(claims.Row(name=run, here="it", paper=(1.0,), source=source))
+        found[source] = results.read_trainings(paths)
+    table = claims.Table(
+        paper="P",
+        number="1",
+        title="t",
+        source=rows[0].source,
+        columns=(claims.Column(name="FID", here="fid", better="lower"),),
+        rows=tuple(rows),
+    )
+    pairs = (("a", "b"), ("a", "c"))
+    claim = claims.Claim(words="w", column="FID", pairs=pairs, where="here")
+    made = verdicts.decide(table, claim, found)
+    assert [x.tolist() for x in made.differences.values()] == [[10.0] * 4, [10.0] * 2]
+    assert made.trainings == 2
+
+
 # --- a report -----------------------------------------------------------------------
 
 SWEEP = {
