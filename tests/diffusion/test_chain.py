@@ -278,8 +278,13 @@ def test_gradients_flow_through_the_chain():
     np.testing.assert_allclose(gradient, expected, rtol=1e-2)
 
 
-@pytest.mark.parametrize("num_steps", [1, 4])
-@pytest.mark.parametrize("make", ["ancestral", "ddim", "dpm"])
+@pytest.mark.parametrize(
+    ("make", "num_steps"),
+    mostly_slow(
+        [(make, steps) for make in ("ancestral", "ddim", "dpm") for steps in (1, 4)],
+        [("ddim", 4)],
+    ),
+)
 def test_gradients_flow_through_the_schedule_and_eta(make, num_steps):
     def end(scale, eta):
         table = schedule.schedule_from_betas(scale * beta)

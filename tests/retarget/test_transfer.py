@@ -300,6 +300,18 @@ def test_limbs_may_hang_on_joints_beside_the_spine():
             jm.retarget(skeleton, forked, roles={role: joint})
 
 
+def test_feet_are_toes_or_else_ankles_where_the_skeleton_names_none():
+    base = dataclasses.replace(rigs.person("child"), feet=())
+    for names in (base.names, [x.replace("ToeBase", "Tip") for x in base.names]):
+        skeleton = dataclasses.replace(base, names=tuple(names))
+        found = transfer.rest(skeleton).skeleton.feet
+        part = "ToeBase" if skeleton.names == base.names else "Foot"
+        sides = [f"mixamorig:{side}{part}" for side in ("Left", "Right")]
+        assert [skeleton.names[joint] for joint in found] == sides
+    named = rigs.person("child")
+    assert transfer.rest(named).skeleton.feet == named.feet
+
+
 def test_bad_bones_are_named():
     base = rigs.walker()
     offsets = np.asarray(base.offsets).copy()
