@@ -298,6 +298,7 @@ def test_shapes_of_places_and_circles_are_told(name):
         roll(model, jax.random.key(0), model.start(2), place, **given)
 
 
+@pytest.mark.slow
 def test_one_distance_serves_all_who_follow():
     model = jm.load("walker")
     commands = jm.commands("straight", model, 2, seconds=0.5)

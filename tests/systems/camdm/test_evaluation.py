@@ -149,6 +149,7 @@ def test_planted_feet_score_as_planted_in_both_rows():
         assert rows[name]["trajectory_error"].value < 35.0
 
 
+@pytest.mark.slow
 def test_without_repeats_there_is_no_diversity():
     assert "pose_variance" not in evaluated("standing")[0]["rollouts"]
 
