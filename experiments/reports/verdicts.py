@@ -248,13 +248,12 @@ def _compared(table: Table, claim: Claim, pair: tuple[str, str]) -> list[Row]:
 
 
 def _differences(
-    table: Table, claim: Claim, found: Found
+    table: Table, claim: Claim, found: dict[tuple[str, str], Found]
 ) -> dict[tuple[str, str], np.ndarray]:
     """Claimed differences of pairs of rows, one per training that has both."""
     made, column = {}, table.column(claim.column)
-    for pair in claim.pairs:
+    for pair, own in found.items():
         rows = _compared(table, claim, pair)
-        own = _paired(table, rows, found)
         cells = [cells_of(table, row, column, own) for row in rows]
         values = [
             [cell.value for cell in trained]
@@ -316,13 +315,16 @@ def decide(table: Table, claim: Claim, found: Found) -> Decision:
     found = _unseen(found)
     cells = {row.name: cells_of(table, row, column, found) for row in rows}
     absent = [name for name, own in cells.items() if not any(own)]
-    for pair in claim.pairs:
+    paired = {
+        pair: _paired(table, _compared(table, claim, pair), found)
+        for pair in claim.pairs
+    }
+    for pair, own in paired.items():
         compared = _compared(table, claim, pair)
         present = [row for row in compared if row.name not in absent]
-        own = _paired(table, compared, found)
         if reason := _incomparable(table, column, present, own):
             return Decision(verdict="not decided", reason=reason)
-    differences = _differences(table, claim, found)
+    differences = _differences(table, claim, paired)
     trainings = min(x.size for x in differences.values())
     decision = functools.partial(Decision, differences=differences, trainings=trainings)
     hold, fail = when_decided(list(differences.values()), margin=claim.margin)

@@ -244,19 +244,16 @@ def dpm_solver_step(schedule: Schedule, denoise: Denoiser) -> Multistep:
 
     Source: Lu et al. 2022, "DPM-Solver++", alg. 2, with its first-order last step.
     """
-
-    def log_ratio(t: Array) -> Array:
-        log, rest = schedule.log_alpha_bar[t], schedule.one_minus_alpha_bar[t]
-        return 0.5 * (log - jnp.log(rest))
+    # Of steps 1..T: that of clean data is infinite, and so is its gradient.
+    log_ratio = 0.5 * jax.tree.map(lambda x: x[1:], schedule).log_snr
 
     def step(key: Key, state: SolverState, t: Int[Array, ""], /) -> SolverState:
         x_t, dtype = state.x, state.x.dtype
         key_denoise, _ = jax.random.split(key)
         x_0 = denoise(key_denoise, x_t, t).astype(dtype)
         is_last = t == 1
-        # The last step has none: it would be infinite, and so its gradient.
-        h = log_ratio(jnp.maximum(t - 1, 1)) - log_ratio(t)
-        h_before = log_ratio(t) - log_ratio(t + 1)
+        h = log_ratio[jnp.maximum(t - 2, 0)] - log_ratio[t - 1]
+        h_before = log_ratio[t - 1] - log_ratio[t]
         second = state.known & ~is_last
         share = jnp.where(second, h / (2.0 * jnp.where(second, h_before, 1.0)), 0.0)
         line = x_0 + share.astype(dtype) * (x_0 - state.x_0)

@@ -1028,9 +1028,6 @@ def describe(
     places, turns = _bind_pose(skeleton, found, sides, rotations)
     places = places.round(5).astype(np.float32)
     mesh = _mesh(places.tobytes(), skeleton.parents, found, detail)
-    for value in vars(mesh).values():
-        if isinstance(value, np.ndarray):
-            value.flags.writeable = False  # others get the same mesh
     return dataclasses.replace(mesh, bind_rotation=turns.astype(np.float32))
 
 
@@ -1071,7 +1068,7 @@ def _mesh(
     weights /= weights.sum(axis=1, keepdims=True)
     normals = values[:, 3:6]
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return Mannequin(
+    made = Mannequin(
         vertices=values[:, :3].astype(np.float32),
         normals=normals.astype(np.float32),
         faces=faces.astype(np.int32),
@@ -1082,6 +1079,10 @@ def _mesh(
         bind_position=places.astype(np.float32),
         bind_rotation=np.tile(np.eye(3, dtype=np.float32), (len(places), 1, 1)),
     )
+    for value in vars(made).values():
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False  # others get the same mesh
+    return made
 
 
 def _focus(
