@@ -271,6 +271,7 @@ def test_who_is_told_one_path_starts_at_its_first_point():
     np.testing.assert_allclose(frames.root_position[:, 0, ::2], [(1, 2)] * 2, atol=0.1)
 
 
+@pytest.mark.slow
 def test_goals_are_told_in_a_line(model, monkeypatch):
     """A place each, from a place each; and what is not told follows from the goal."""
     place = jm.place([(2, 3), (0, 3)], facing=(90, 0), seconds=4.0)

@@ -96,6 +96,7 @@ def zeros(path, size: int, *, name: str = "a.npy") -> None:
             file.write(piece)
 
 
+@pytest.mark.slow
 def test_bombs_are_refused_before_they_unpack(tmp_path):
     zeros(tmp_path / "bomb.npz", 300 * 2**20)
     assert (tmp_path / "bomb.npz").stat().st_size < 400_000

@@ -402,6 +402,7 @@ def test_gradients_are_finite_everywhere():
     assert np.isfinite(np.asarray(straight(toes_of(stood(), pose(0.0))))).all()
 
 
+@pytest.mark.slow
 def test_many_are_each_alone():
     motions = [drift(0.05), drift(0.3)]
     both = jax.tree.map(lambda *x: jnp.stack(x), *motions)

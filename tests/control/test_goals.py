@@ -38,6 +38,7 @@ def walk(wish, start, seconds, *, memory=0.0):
     return map(np.asarray, jax.lax.scan(step, (start, memory), ticks)[1])
 
 
+@pytest.mark.slow
 def test_a_path_that_crosses_itself_is_walked_to_its_end():
     turn = np.linspace(0, 2 * np.pi, 80)
     points = 3.0 * np.stack([np.sin(2 * turn), 2 * np.sin(turn)], axis=1)

@@ -206,6 +206,7 @@ def test_the_step_of_the_chain_is_the_users_choice(run):
     np.testing.assert_allclose(rotations(step=chain.dpm_solver_step), ddim, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_second_call_compiles_nothing(run):
     """Other commands, start poses and keys of the same shapes."""
     steered(None)

@@ -194,6 +194,7 @@ def test_path_and_facing_are_the_springs_of_a_first_order_reference():
     np.testing.assert_allclose(facing, np.asarray(commands.facing), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [2.0, 3.0, 5.0, 9.0])
 @pytest.mark.parametrize("course", COURSES)
 def test_too_fast_is_an_error_or_still_exact(course, speed):

@@ -82,6 +82,7 @@ def test_nonsense_is_refused():
         resample.resample(empty, 60.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fps", [10.0, 12.5, 30.0, 50.0])
 @pytest.mark.parametrize("part", [7, 1 << 16])
 def test_clips_are_resampled_one_by_one(fps, part, monkeypatch):

@@ -121,6 +121,7 @@ def test_noise_is_of_the_steps_own_size():
     np.testing.assert_allclose(np.std(x_t, axis=(1, 2)), s, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_consistency_visits_each_step_once_and_anew():
     table = schedule.cosine_schedule(T)
     steps = denoiser(np.zeros(T + 1), np.arange(T + 1))  # predicts t

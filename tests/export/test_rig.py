@@ -87,6 +87,7 @@ def skinned(path, frame):
     return np.concatenate(found)
 
 
+@pytest.mark.slow
 def test_a_rig_saved_in_a_frame_of_an_animation_is_as_its_mesh(tmp_path):
     raw = rigs.glb(rigs.person("child"))
     (tmp_path / "one.glb").write_bytes(raw)

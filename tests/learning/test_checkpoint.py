@@ -359,6 +359,7 @@ def test_export_and_import(tmp_path):
     checkpoint.check_params(path, checkpoint.import_params(path)[0], deep)
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_of_an_export_is_noticed_or_changes_nothing(tmp_path):
     path = tmp_path / "model.npz"
     params = state_of(3, width=64).params

@@ -52,6 +52,7 @@ def rows(folder):
     return [{k: v for k, v in row.items() if k != "steps_per_second"} for row in found]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shifts", mostly_slow([False, True], [True]))
 def test_each_is_what_it_is_alone(tmp_path, shifts):
     """States, losses, checkpoints of two stages; with constants of their own, too."""
@@ -108,6 +109,7 @@ def test_what_is_equal_is_there_once(tmp_path, monkeypatch):
     assert shapes[1][-1] == [(2, 2)]
 
 
+@pytest.mark.slow
 def test_they_go_on_from_their_checkpoints(tmp_path):
     def both(folder, **more):
         starts = [

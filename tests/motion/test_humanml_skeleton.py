@@ -146,6 +146,7 @@ def errors(positions):
     return np.linalg.norm(found - positions, axis=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", mostly_slow(range(3), [0]))
 def test_rigid_bodies_are_followed_exactly(seed):
     assert errors(rigid_clip(seed)).max() < 2e-5

@@ -47,6 +47,7 @@ def test_another_size_moves_as_a_scaled_copy():
     assert np.linalg.norm(found - expected, axis=-1).max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("body", rigs.BODIES)
 def test_planted_feet_stay_planted_and_out_of_the_ground(body):
     skeleton, motion = walk(seconds=3.0)
@@ -150,6 +151,7 @@ def test_two_bones_reach_as_an_optimizer_does():
             assert (middle - start) @ pole > best - 2e-3
 
 
+@pytest.mark.slow
 def test_it_is_jitted_and_mapped_over_characters_and_frames():
     skeleton, motion = walk(1.0)
     function = jm.retarget(skeleton, rigs.person("giant"))
@@ -253,6 +255,7 @@ def test_twist_bones_take_their_part_and_fingers_stay():
     np.testing.assert_allclose(angle("LeftIndex", "LeftHand"), 0.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_root_above_the_hips_is_only_moved():
     base = rigs.person("giant", "Unreal")
     names = ("root", *base.names)

@@ -155,6 +155,7 @@ def test_who_does_as_told_has_no_errors():
     assert len(found.by_plan[goes]["jerk"]) == 15
 
 
+@pytest.mark.slow
 def test_a_circle_beside_the_path_is_as_far_off_as_it_is():
     found = table("figure_eight", aside=0.1)
     row = "figure eight at 1 m/s"

@@ -272,6 +272,7 @@ def test_it_is_quick_the_first_time_and_kept():
     assert made.vertices is mannequin.describe(walker_skeleton()).vertices
 
 
+@pytest.mark.slow
 def test_it_is_the_same_in_another_process():
     code = (
         "from jaxmotion.data.walker import walker_skeleton as w;"

@@ -386,6 +386,7 @@ def test_following_returns_to_the_commanded_path(skeleton, use):
 # Seams
 
 
+@pytest.mark.slow
 def test_seams_are_continuous_in_position_and_velocity(skeleton, monkeypatch):
     """A plan that jumps by 0.1 m and turns by 0.3 rad, at two rates of frames.
 

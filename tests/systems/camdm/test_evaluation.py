@@ -154,6 +154,7 @@ def test_without_repeats_there_is_no_diversity():
     assert "pose_variance" not in evaluated("standing")[0]["rollouts"]
 
 
+@pytest.mark.slow
 def test_diversity_is_zero_for_characters_that_do_the_same():
     run = parts()[0]
     same = jax.tree.map(lambda x: jnp.repeat(x[::2], 2, axis=0), walked())

@@ -100,6 +100,7 @@ def test_files_are_needed(tmp_path):
         prepare([tmp_path / "none.npz"])
 
 
+@pytest.mark.slow
 def test_a_folder_keeps_the_units_of_its_features(files, tmp_path):
     """They are fitted to motions that JAX draws, and its versions draw otherwise."""
     options = dict(field="content", merge={"stroll": "walk"}, least=2, fps=30.0)
