@@ -1,4 +1,4 @@
-"""Products of rotations and of positions are in full precision on every machine.
+"""Products of rotations, positions and Muon are in full precision on every machine.
 
 By default GPUs round the factors of a float32 product of matrices to ten bits.
 """
@@ -12,6 +12,7 @@ from jax.extend.core import jaxprs_in_params
 from jaxmotion.control import inertia
 from jaxmotion.control.foot_lock import FootLock, clean_motion
 from jaxmotion.data.walker import walker_skeleton
+from jaxmotion.learning import training
 from jaxmotion.motion import humanml, humanml_skeleton, pose, skeleton, trajectory
 from jaxmotion.motion.humanml_layout import HUMANML3D
 from jaxmotion.motion.skeleton import Motion
@@ -63,6 +64,9 @@ TRACED = {
     "foot_lock.clean_motion": lambda: clean_motion(BODY, MOTION, lock=FootLock()),
     "inertia.inertialize": lambda: inertia.inertialize(MOTION, MOTION),
     "smgdiff.trajectory.noise_space": path_noise,
+    "training.orthogonalize": lambda: training.orthogonalize(
+        JOINTS[0], jnp.ones((5, 3))
+    ),
 }
 
 
