@@ -41,7 +41,8 @@ def frechet_cell(
     """Fréchet distance to the reference, of random subsets of equal size.
 
     The interval is over the `repeats` subsets of `count` windows (the same for all
-    rows), not over clips; there is none where a subset is all there is.
+    rows), and allows for what they share, not for what windows of one clip do. There is
+    none where a subset is all there is.
     """
     if count == len(feature):
         repeats = 1
@@ -52,7 +53,7 @@ def frechet_cell(
         chosen = generator.choice(len(feature), count, replace=False)
         own = frechet.moments(jnp.asarray(feature[chosen]))
         found.append(frechet.frechet_distance(own, target))
-    return table.cell(jnp.stack(found))
+    return table.cell(jnp.stack(found), part=count / len(feature))
 
 
 def unbiased_cells(

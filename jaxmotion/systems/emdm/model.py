@@ -134,6 +134,11 @@ class Config:
                 f"frames is {self.frames}, expected a multiple of frames_per_token "
                 f"({self.frames_per_token})"
             )
+        if self.discriminator_network == "mlp" and self.discriminator_width % 64:
+            raise ValueError(
+                f"discriminator_width is {self.discriminator_width}, expected a "
+                'multiple of 64 with the discriminator_network "mlp"'
+            )
         if self.discriminator_network == "temporal" and self.frames < 8:
             raise ValueError(
                 f"frames is {self.frames}, a temporal discriminator expects 8 or more"

@@ -31,10 +31,11 @@ def situation(
     *,
     representation: Representation,
     config: Config,
-) -> tuple[Condition, Float[Array, "future features"]]:
-    """What a plan is made for at a moment of a recording, and the future features.
+) -> tuple[Condition, Float[Array, "window features"]]:
+    """What a plan is made for at a moment of a recording, and the window's features.
 
-    Window (past and future frames) and the wanted path are in the world.
+    Window (past and future frames) and the wanted path are in the world. The
+    condition's contacts come from its past alone, as in use.
     """
     last = config.past - 1
     past = jax.tree.map(lambda x: x[: config.past], window)
@@ -48,7 +49,7 @@ def situation(
         label=label,
         ball=local.ball[last],
     )
-    return condition, smgdiff_scene.to_features(local, representation)[config.past :]
+    return condition, smgdiff_scene.to_features(local, representation)
 
 
 def example(
@@ -58,7 +59,7 @@ def example(
     *,
     representation: Representation,
     config: Config,
-) -> tuple[Condition, Float[Array, "future features"]]:
+) -> tuple[Condition, Float[Array, "window features"]]:
     """One training example from one window (world), as a user might have asked."""
     course = trajectory.root_trajectory(representation.skeleton, window.motion)
     wanted = smooth_course(key, course, last=config.past - 1, cubic=config.cubic_wishes)
@@ -85,12 +86,12 @@ def loss(
     size = labels.shape[0]
     key_example, key_noise = jax.random.split(key)
     keys = jax.random.split(key_example, size)
-    condition, x_0 = jax.vmap(
+    condition, recorded = jax.vmap(
         lambda k, w, c: example(k, w, c, representation=representation, config=config)
     )(keys, windows, labels)
     predictions = losses.predict_clean(
         key_noise,
-        x_0,
+        recorded[:, config.past :],
         condition.arguments(),
         apply=functools.partial(
             network(config).apply, {"params": params}, train=config.dropout > 0
@@ -100,15 +101,15 @@ def loss(
         own=config.own_levels,
     )
     seen = losses.OVER_SEAM if config.seam_half_life else 0
-    past = condition.past[:, config.past - seen :]
+    recorded = recorded[:, config.past - seen :]
 
     def joined(x: Array) -> Array:
-        return jnp.concatenate([past, x], axis=-2)
+        return jnp.concatenate([recorded[:, :seen], x], axis=-2)
 
     terms = functools.partial(
         loss_terms, representation=representation, rotation=config.weight_rotation
     )
-    each = jax.vmap(lambda x: terms(joined(x), joined(x_0)))(predictions)
+    each = jax.vmap(lambda x: terms(joined(x), recorded))(predictions)
     return losses.weighted(each, config)
 
 

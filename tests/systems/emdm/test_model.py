@@ -314,6 +314,7 @@ def test_conditions_that_do_not_fit_are_refused(width, lengths, message):
         (dict(condition="text", condition_size=0), "at least 1 for.*'text'"),
         (dict(frames_per_token=4), r"frames is 6.*multiple of.*\(4\)"),
         (dict(discriminator_network="temporal"), "frames is 6.*expects 8 or more"),
+        (dict(discriminator_width=32), "discriminator_width is 32.*multiple of 64"),
         (dict(discriminator_from=5), r"discriminator_from is 5.*num_steps \(4\)"),
         (dict(alpha_bar=(0.9, 0.5, 0.1)), r"alpha_bar is .*expected 4 falling"),
         (dict(alpha_bar=(0.9, 0.5, 0.5, 0.1)), "expected 4 falling"),

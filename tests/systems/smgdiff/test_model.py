@@ -361,7 +361,17 @@ def test_a_person_who_trembles_costs_second_differences(
 
 
 def test_losses_reach_over_the_seam(scenes, representation, config, monkeypatch):
-    """Beside the last two past frames, a prediction of zeros is as wrong as it is."""
+    """Beside the last two past frames, a prediction of zeros is as wrong as it is.
+
+    They stand in the past, and leave from its last frame on.
+    """
+    stood = lambda x: x.at[:, :4].set(x[:, 3:4])  # noqa: E731
+    motion = dataclasses.replace(
+        scenes.motion,
+        root_position=stood(scenes.motion.root_position).at[:, 4:, 0].add(0.05),
+        joint_rotation=stood(scenes.motion.joint_rotation),
+    )
+    scenes = dataclasses.replace(scenes, motion=motion)
 
     class Zeros:
         def apply(self, variables, *args, method, train, rngs):
@@ -433,7 +443,7 @@ def test_training_lowers_the_loss(scenes, representation, config, params):
 def test_an_example_is_the_window_itself(scenes, representation, config):
     """Past and future of the features; the last past frame is the origin."""
     scene: Scene = jax.tree.map(lambda x: x[1], scenes)
-    condition, future = smgdiff_loss.example(
+    condition, found = smgdiff_loss.example(
         jax.random.key(0),
         scene,
         jnp.int32(1),
@@ -441,7 +451,7 @@ def test_an_example_is_the_window_itself(scenes, representation, config):
         config=config,
     )
     whole = smgdiff_scene.to_features(scene, representation)
-    np.testing.assert_allclose(future, whole[4:], atol=1e-4)
+    np.testing.assert_allclose(found, whole, atol=1e-4)
     # All but the contacts, which for the last past frame need the next one.
     np.testing.assert_allclose(condition.past[:, :38], whole[:4, :38], atol=1e-4)
     np.testing.assert_allclose(condition.ball, scene.ball[3], atol=1e-5)
