@@ -1,12 +1,11 @@
 """Names for the shapes and callables that the packages share; no logic.
 
 A key is a typed key of `jax.random.key`. `"*shape"` is one sample of any shape with
-any leading batch axes. Callables are protocols, so that a plain function or a closure
-fits without inheriting from anything.
+any leading batch axes.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 from jaxtyping import Array, Float, Int
 from jaxtyping import Key as _Key
@@ -33,48 +32,16 @@ class Exported(NamedTuple):
     gives: tuple[str, ...]
 
 
-@runtime_checkable
-class Denoiser(Protocol):
-    """Predicts the clean sample from a noisy one.
-
-    It takes a key, so that a stochastic denoiser (a denoising-diffusion GAN that draws
-    a latent) is no special case. A deterministic one ignores it.
-    """
-
-    def __call__(
-        self, key: Key, x_t: Float[Array, "*shape"], t: Int[Array, ""], /
-    ) -> Float[Array, "*shape"]:
-        """Maps x_t at step t (1..T) to a prediction of x_0."""
-        ...
-
-
-@runtime_checkable
-class ConditionalDenoiser(Protocol):
-    """A denoiser that takes its condition as an argument (for classifier-free use)."""
-
-    def __call__(
-        self, key: Key, x_t: Float[Array, "*shape"], t: Int[Array, ""], cond: Any, /
-    ) -> Float[Array, "*shape"]:
-        """Maps x_t at step t (1..T), given cond, to a prediction of x_0."""
-        ...
-
-
-@runtime_checkable
-class Step(Protocol):
-    """One step of the reverse chain: x_t -> x_{t-1}.
-
-    x is a sample, or for a step that looks back a pytree of the sample and its history.
-    """
-
-    def __call__(self, key: Key, x_t: Any, t: Int[Array, ""], /) -> Any:
-        """Maps x_t at step t (1..T) to x_{t-1}."""
-        ...
-
-
-@runtime_checkable
-class Objective(Protocol):
-    """A scalar that guidance makes small."""
-
-    def __call__(self, x_0: Float[Array, "*shape"], /) -> Float[Array, ""]:
-        """Maps a clean sample to the objective's value."""
-        ...
+# Maps x_t at step t (1..T) to a prediction of x_0. It takes a key, so that a stochastic
+# denoiser (a denoising-diffusion GAN that draws a latent) is no special case; a
+# deterministic one ignores it.
+Denoiser = Callable[[Key, Float[Array, "*shape"], Int[Array, ""]], Array]
+# The same, of a condition, too (for guidance without a classifier).
+ConditionalDenoiser = Callable[
+    [Key, Float[Array, "*shape"], Int[Array, ""], Any], Array
+]
+# Maps x_t at step t (1..T) to x_{t-1}: samples, or for a step that looks back pytrees
+# of a sample and its history.
+Step = Callable[[Key, Any, Int[Array, ""]], Any]
+# A scalar of a clean sample, which guidance makes small.
+Objective = Callable[[Float[Array, "*shape"]], Float[Array, ""]]

@@ -3,7 +3,7 @@
 import dataclasses
 import typing
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import jax
 from jaxtyping import Array, Float, Int
@@ -29,15 +29,9 @@ class GanState:
         return self.generator.step
 
 
-@runtime_checkable
-class GanLoss(Protocol):
-    """A loss of one player, given the other's parameters, which it leaves alone."""
-
-    def __call__(
-        self, params: Params, other: Params, key: Key, batch: Any, /
-    ) -> tuple[Float[Array, ""], Info]:
-        """Returns the loss and named values to report."""
-        ...
+# Of one player's parameters and the other's, which it leaves alone, a key and a batch:
+# the loss, and named values to report.
+GanLoss = Callable[[Params, Params, Key, Any], tuple[Float[Array, ""], Info]]
 
 
 def make_gan_update(

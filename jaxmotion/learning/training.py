@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import typing
 from collections.abc import Callable
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -36,24 +36,10 @@ class TrainState:
     opt_state: Any
 
 
-@runtime_checkable
-class Loss(Protocol):
-    """A loss that training makes small."""
-
-    def __call__(
-        self, params: Params, key: Key, batch: Any, /
-    ) -> tuple[Float[Array, ""], Info]:
-        """Returns the loss and named values to report."""
-        ...
-
-
-@runtime_checkable
-class Update(Protocol):
-    """One optimizer step."""
-
-    def __call__(self, state: Any, key: Key, batch: Any, /) -> tuple[Any, Info]:
-        """Returns the next state and named values to report."""
-        ...
+# Of parameters, a key and a batch: the loss, and named values to report.
+Loss = Callable[[Params, Key, Any], tuple[Float[Array, ""], Info]]
+# One optimizer step, of a state, a key and a batch: the next state, and such values.
+Update = Callable[[Any, Key, Any], tuple[Any, Info]]
 
 
 def _adam(rate: optax.ScalarOrSchedule) -> Optimizer:
