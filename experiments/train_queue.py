@@ -83,12 +83,13 @@ class Job:
     def measured(self, name: str) -> Path:
         """Where a file is: in the run folder, or as it was stored."""
         path, kept = self.files[name], stored.FOLDER / f"{name}.json"
-        return path if path.is_file() or not stored.is_measured(kept) else kept
+        there = results.is_whole(path) or not stored.is_measured(kept)
+        return path if there else kept
 
     @property
     def done(self) -> bool:
         """Whether nothing is missing."""
-        return all(self.measured(name).is_file() for name in self.files)
+        return all(results.is_whole(self.measured(name)) for name in self.files)
 
 
 def sources_of(args: Config) -> dict[str, list[Source]]:

@@ -81,8 +81,11 @@ def write_table(
     """Writes metrics.json and table.md (folder made if missing), prints the table.
 
     The report is what belongs beside it: arguments, versions, hardware, bounds. Notes
-    are lines below the table.
+    are lines below the table, which also say what is not trained to its end.
     """
+    for stage, how in report.get("training", {}).items():
+        if "of" in how:
+            notes += (f"{stage} has {how['steps']} of {how['of']} updates.",)
     whole = report | {"rows": table.to_json(rows)}
     files.write_text(folder / "metrics.json", json.dumps(whole, indent=1))
     text = "\n\n".join([table.to_markdown(rows), *notes])
@@ -221,7 +224,10 @@ def provenance(arguments: Any = None) -> dict[str, Any]:
 
 
 def _training(folder: Path) -> dict[str, Any]:
-    """Seeds and other settings of a run's stages, and fingerprints of its data."""
+    """Seeds and other settings of a run's stages, and fingerprints of its data.
+
+    A stage that is not trained to its end has the "steps" that it made "of" how many.
+    """
     seeds, settings, models = set(), {}, {}
     for place in sorted(folder.glob("**/checkpoints")):
         with contextlib.suppress(checkpoint.CheckpointError):
@@ -230,6 +236,9 @@ def _training(folder: Path) -> dict[str, Any]:
             if "seed" in how:
                 stage = place.parent.relative_to(folder).as_posix()
                 seeds.add(how.pop("seed"))
+                done, steps = checkpoint.latest_step(place) or 0, how.get("steps", 0)
+                if done < steps:
+                    how |= {"steps": done, "of": steps}
                 settings[stage], models[stage] = how, config.get("model")
     config = files.read_object(folder / "config.json", what="expected a run folder")
     return {

@@ -63,7 +63,8 @@ def test_a_run_folder_says_what_was_trained_on_what(tmp_path):
     (tmp_path / "config.json").write_text('{"files": {"train.npz": "f00d"}}')
     for stage, seed in (("motion", 3), ("deep/er", 3), ("other", 5)):
         how = {"model": {"width": 8}, "training": {"seed": seed, "steps": 9}}
-        checkpoint.save(tmp_path / stage / "checkpoints", 1, {"x": np.ones(2)}, how)
+        done = 4 if stage == "other" else 9
+        checkpoint.save(tmp_path / stage / "checkpoints", done, {"x": np.ones(2)}, how)
     # Neither a stage that is made without training nor one that has just begun.
     checkpoint.save(tmp_path / "space" / "checkpoints", 0, {"x": np.ones(2)}, {})
     (tmp_path / "begun" / "checkpoints").mkdir(parents=True)
@@ -74,9 +75,13 @@ def test_a_run_folder_says_what_was_trained_on_what(tmp_path):
     (tmp_path / "other" / "losses.jsonl").write_text("[]\n")
     found = json.loads(json.dumps(reporting.provenance(Arguments(tmp_path))))
     assert found["seeds"] == {"training": [3, 5]}
-    assert found["training"] == dict.fromkeys(
-        ("motion", "deep/er", "other"), {"steps": 9}
-    )
+    assert found["training"] == {
+        "motion": {"steps": 9},
+        "deep/er": {"steps": 9},
+        "other": {"steps": 4, "of": 9},
+    }
     assert found["models"] == dict.fromkeys(found["training"], {"width": 8})
     assert found["data"] == {"train.npz": "f00d"}
     assert found["minutes"] == {"motion": 2.0}
+    reporting.write_table(tmp_path, {}, found)
+    assert (tmp_path / "table.md").read_text().endswith("other has 4 of 9 updates.\n")

@@ -66,6 +66,14 @@ class Measured:
         return tuple(str(found[name]) for name in names)
 
 
+def is_whole(path: Path) -> bool:
+    """Whether a file is there, and all that it measured was trained to its end."""
+    if not path.is_file():
+        return False
+    stages = json.loads(path.read_text()).get("training") or {}
+    return not any("of" in x for x in stages.values())
+
+
 # What each source's file holds; None where there is no file.
 Found = dict[Source, Measured | None]
 
@@ -226,8 +234,12 @@ def _data(about: dict[str, Any], evaluator: Any) -> str:
 def _training(stages: Any) -> str:
     if not isinstance(stages, dict):
         return NOT_RECORDED
-    lengths = {k: x.get("steps") for k, x in stages.items() if isinstance(x, dict)}
-    parts = [f"{name} {steps} updates" for name, steps in lengths.items() if steps]
+    lengths = {
+        k: f"{x.get('steps')}" + (f" of {x['of']}" if "of" in x else "")
+        for k, x in stages.items()
+        if isinstance(x, dict) and x.get("steps")
+    }
+    parts = [f"{name} {steps} updates" for name, steps in lengths.items()]
     return ", ".join(parts) or NOT_RECORDED
 
 

@@ -238,6 +238,14 @@ def test_a_job_has_the_commands_of_its_run_with_its_seed(load, tmp_path):
     assert dataclasses.replace(job, files={}).done
 
 
+def test_a_training_that_was_looked_at_before_its_end_is_not_done(load, tmp_path):
+    path = tmp_path / "metrics.json"
+    job = load("train_queue").Job("x", tmp_path, (), {"x/x": path})
+    for stage, done in (({"steps": 9}, True), ({"steps": 4, "of": 9}, False)):
+        path.write_text(json.dumps({"training": {"motion": stage}, "rows": {}}))
+        assert job.done == done
+
+
 @pytest.mark.slow
 def test_what_is_stored_is_not_made_again_and_what_runs_share_is_made_once(
     queue, tmp_path
