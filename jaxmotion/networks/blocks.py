@@ -18,6 +18,7 @@ tokens that do not change between steps, and can skip the rows that nobody reads
 """
 
 import dataclasses
+import functools
 from typing import Any, Literal, NamedTuple
 
 import flax.linen as nn
@@ -141,7 +142,10 @@ def unfold_frames(
         return x.reshape(*batch, tokens * n, features)
     weights = unfold_weights(tokens, n, margin=margin, window=window)
     predictions = x.reshape(*batch, tokens * (n + 2 * margin), features)
-    return jnp.einsum("fp,...pd->...fd", jnp.asarray(weights, x.dtype), predictions)
+    # Places among them, in meters: GPUs would round each to ten bits, another way in
+    # every frame.
+    mixed = functools.partial(jnp.einsum, "fp,...pd->...fd", precision="highest")
+    return mixed(jnp.asarray(weights, x.dtype), predictions)
 
 
 def set_up_layers(net: Any, *, activation: Literal["gelu", "selu"] = "gelu") -> None:

@@ -16,6 +16,7 @@ from jaxmotion.learning import training
 from jaxmotion.motion import humanml, humanml_skeleton, pose, skeleton, trajectory
 from jaxmotion.motion.humanml_layout import HUMANML3D
 from jaxmotion.motion.skeleton import Motion
+from jaxmotion.networks import blocks
 from jaxmotion.systems.smgdiff import trajectory as paths
 
 FRAMES = 12
@@ -64,6 +65,9 @@ TRACED = {
     "foot_lock.clean_motion": lambda: clean_motion(BODY, MOTION, lock=FootLock()),
     "inertia.inertialize": lambda: inertia.inertialize(MOTION, MOTION),
     "smgdiff.trajectory.noise_space": path_noise,
+    "blocks.unfold_frames": lambda: blocks.unfold_frames(
+        jnp.ones((4, 18)), 2, margin=2
+    ),
     "training.orthogonalize": lambda: training.orthogonalize(
         JOINTS[0], jnp.ones((5, 3))
     ),
