@@ -234,7 +234,7 @@ def train(args: Train) -> None:
             polisher=budget(steps, windows, constant=args.constant_rate or None),
             generator=adversarial,
             baseline=budget(
-                args.window_steps if name in ("mvae", "lmm") else args.amdm_steps,
+                args.amdm_steps if name.startswith("amdm") else args.window_steps,
                 optimizer="adamw",
                 learning_rate=1e-3,
             ),

@@ -5,9 +5,11 @@ projector maps wanted path features to the frame of the data that fits them best
 
 Source: Holden et al. 2020, "Learned Motion Matching", and its released code: three
 linear layers in the stepper, five in the projector, queries with noise of a random
-size. Differs: the projector looks at the path alone (there also at feet and hips), it
-is asked at random moments, on average every 0.2 s (there every 0.1 s), and its frame
-is taken up by half instead of by inertialized blending.
+size. Differs: by default the projector looks at the path alone, as AAMDM's paper says
+of it, and its frame is taken up by half. With `own` channels it looks at feet and hips,
+too, as published, and its frame is taken up whole; there features are a part of a
+frame, here a network reads them of it, and poses are not blended by inertia. It is
+asked at random moments, on average every 0.2 s (there every 0.1 s).
 """
 
 import dataclasses
@@ -16,9 +18,13 @@ import functools
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
+from jaxmotion.motion import pose
+from jaxmotion.motion.skeleton import Skeleton
 from jaxmotion.systems.aamdm.controller import Stepper
+from jaxmotion.systems.aamdm.data import PoseData
+from jaxmotion.systems.aamdm.embedding import character_positions
 from jaxmotion.typing import Key, Params
 
 
@@ -31,6 +37,8 @@ class Config:
       width: Channels of a hidden layer (released code 512).
       weight_velocity: Weight of the differences of frames against the frames.
       queries: Path features, the first channels of a frame; 0 for no projector.
+      own: Features of feet and hips, which follow a frame in its windows and its
+        database; 15 as published, 0 for none.
       projections: Probability a frame that the projector is asked.
     """
 
@@ -38,6 +46,7 @@ class Config:
     width: int = 512
     weight_velocity: float = 0.1
     queries: int = 0
+    own: int = 0
     projections: float = 1 / 12
 
 
@@ -56,22 +65,51 @@ class Mlp(nn.Module):
         return nn.Dense(self.features)(x)
 
 
-def _nets(config: Config) -> tuple[Mlp, Mlp]:
+def _nets(config: Config) -> tuple[Mlp, Mlp, Mlp]:
+    """Stepper, projector, and what reads feet and hips of a frame."""
     return (
         Mlp(config.features, config.width, 3),
         Mlp(config.features, config.width, 5),
+        Mlp(config.own, config.width, 3),
     )
+
+
+def own_features(data: PoseData, skeleton: Skeleton) -> Float[Array, "frames 15"]:
+    """Where feet are, how fast they and the hips move, from the character, weighed.
+
+    Source: Holden et al. 2020, released code: in deviations of each of the five, and
+    feet's places by 0.75.
+    """
+    points = character_positions(data.poses, skeleton.parents)
+    points = points[:, jnp.array([*skeleton.feet, 0])]
+    moving = pose.point_velocities(
+        data.poses, points, num_joints=skeleton.num_joints, fps=data.fps
+    )
+    # A clip's last frame moves as the one before it.
+    last = data.offsets[1:] - 1
+    moving = jnp.concatenate([moving, moving[-1:]])
+    moving = moving.at[last].set(moving[last - 1])
+    parts = [*jnp.swapaxes(points[:, :2], 0, 1), *jnp.swapaxes(moving, 0, 1)]
+    weights = (0.75, 0.75, 1.0, 1.0, 1.0)
+    scaled = [
+        weight * (x - jnp.mean(x, axis=0)) / jnp.mean(jnp.std(x, axis=0))
+        for weight, x in zip(weights, parts, strict=True)
+    ]
+    return jnp.concatenate(scaled, axis=-1)
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def init(key: Key, config: Config) -> Params:
     """Initial parameters."""
     key_s, key_p = jax.random.split(key)
-    net, projector = _nets(config)
+    net, projector, reader = _nets(config)
     params = {"stepper": net.init(key_s, jnp.zeros(config.features))["params"]}
     if config.queries:
-        query = jnp.zeros(config.queries)
+        query = jnp.zeros(config.queries + config.own)
         params["projector"] = projector.init(key_p, query)["params"]
+    if config.own:
+        key_r = jax.random.fold_in(key, 2)
+        params["reader"] = reader.init(key_r, jnp.zeros(config.features))["params"]
     return params
 
 
@@ -87,15 +125,20 @@ def stepper(params: Params, *, config: Config, change: Array | None = None) -> S
     With a goal for the path features, the projector's frame is asked for at some ticks.
     `change` is the deviation of each channel's changes, in which they are predicted.
     """
-    projector = _nets(config)[1]
+    _, projector, reader = _nets(config)
+    taken = 1.0 if config.own else 0.5
 
     def step(key: Key, previous: Array, goal: Array | None = None) -> Array:
         frame = _next(params, previous, config, change)
         if goal is None:
             return frame
-        fitting = projector.apply({"params": params["projector"]}, goal)
+        query = goal
+        if config.own:
+            own = reader.apply({"params": params["reader"]}, frame)
+            query = jnp.concatenate([goal, own], axis=-1)
+        fitting = projector.apply({"params": params["projector"]}, query)
         asked = jax.random.bernoulli(key, config.projections)
-        return jnp.where(asked, 0.5 * (frame + fitting), frame)
+        return jnp.where(asked, (1 - taken) * frame + taken * fitting, frame)
 
     return Stepper(step)
 
@@ -111,16 +154,17 @@ def loss(
 ):
     """Mean squared error over windows that start with one frame of the data.
 
-    With a database of frames, the projector's error is added: noisy path features of
-    the first frames against the frames that fit them best.
+    With a database of frames, the projector's error is added: noisy features of the
+    first frames against the frames that fit them best.
     """
-    _, own = jax.lax.scan(
+    own, windows = windows[:, 0, config.features :], windows[..., : config.features]
+    _, made = jax.lax.scan(
         lambda x, _: (_next(params, x, config, change),) * 2,
         windows[:, 0],
         None,
         windows.shape[1] - 1,
     )
-    whole = jnp.concatenate([windows[:, :1], jnp.swapaxes(own, 0, 1)], axis=1)
+    whole = jnp.concatenate([windows[:, :1], jnp.swapaxes(made, 0, 1)], axis=1)
     error = whole - windows
     if change is not None:
         error = error / change.reshape(1, 1, -1)
@@ -130,12 +174,19 @@ def loss(
     if database is None:
         return total, {"value": value}
     key_size, key_noise = jax.random.split(key)
-    paths = windows[:, 0, : config.queries]
-    size = jax.random.uniform(key_size, (len(paths), 1))
-    query = paths + size * jax.random.normal(key_noise, paths.shape)
-    known = database[:, : config.queries]
+    database, theirs = jnp.split(database, [config.features], axis=1)
+    exact = jnp.concatenate([windows[:, 0, : config.queries], own], axis=1)
+    size = jax.random.uniform(key_size, (len(exact), 1))
+    query = exact + size * jax.random.normal(key_noise, exact.shape)
+    known = jnp.concatenate([database[:, : config.queries], theirs], axis=1)
     distance = jnp.sum(known**2, axis=1)[None] - 2.0 * query @ known.T
     nearest = database[jnp.argmin(distance, axis=1)]
-    found = _nets(config)[1].apply({"params": params["projector"]}, query)
+    _, projector, reader = _nets(config)
+    found = projector.apply({"params": params["projector"]}, query)
     projection = jnp.mean(jnp.abs(found - nearest))
-    return total + projection, {"value": value, "projection": projection}
+    told = {"value": value, "projection": projection}
+    if config.own:
+        read = reader.apply({"params": params["reader"]}, windows[:, 0])
+        told["reading"] = jnp.mean(jnp.square(read - own))
+        total = total + told["reading"]
+    return total + projection, told

@@ -11,7 +11,8 @@ frame               2 and 3 as published: networks predict the frame instead of 
 amdm5, amdm200      AMDM in the full pose space
 amdm5_embedded ...  the same in the embedded space
 mvae                Motion VAE in the full pose space
-lmm                 Learned Motion Matching in the embedded space
+lmm                 Learned Motion Matching in the embedded space, asked by the path
+lmm_feet            the same, asked by feet and hips, too
 """
 
 import dataclasses
@@ -20,6 +21,7 @@ import re
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 
 from baselines import amdm, lmm, mvae
 from jaxmotion.learning import runs
@@ -44,14 +46,17 @@ ALL = (*TABLE_1, *TABLE_2, "full_pose", "amdm200")
 # Rows by the paper's recipe, and some that it does not have.
 MORE = (
     *("frame", *(f"{name}_frame" for name in TABLE_2), "full_pose_frame"),
-    *("amdm5_embedded", "amdm200_embedded"),
+    *("amdm5_embedded", "amdm200_embedded", "lmm_feet"),
 )
 # A frame that is held and not polished would stay as it is for ever.
 _CHAIN = re.compile(r"polish(?!0_held)(\d+)_(draft|held)(\d+)(_frame)?$")
 _AMDM = ("amdm5", "amdm200", "amdm5_embedded", "amdm200_embedded")
-_BASELINES = dict.fromkeys(_AMDM, amdm) | {"lmm": lmm, "mvae": mvae}
+_LMM = ("lmm", "lmm_feet")
+_BASELINES = dict.fromkeys(_AMDM, amdm) | dict.fromkeys(_LMM, lmm) | {"mvae": mvae}
 # Frames of the windows that each baseline is trained on, and which is the first given.
-_WINDOWS = dict.fromkeys(_AMDM, (3, 1)) | {"lmm": (20, 0), "mvae": (8, 0)}
+_WINDOWS = (
+    dict.fromkeys(_AMDM, (3, 1)) | dict.fromkeys(_LMM, (20, 0)) | {"mvae": (8, 0)}
+)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -160,8 +165,9 @@ def _config(name: str, space: Space, sizes: Sizes) -> Any:
             schedule=sizes.schedule,
             predict=_predict(name),
         )
-    if name == "lmm":
-        return lmm.Config(**common | {"width": 512}, queries=12)
+    if name in _LMM:
+        own = 15 if name == "lmm_feet" else 0
+        return lmm.Config(**common | {"width": 512}, queries=12, own=own)
     if name == "mvae":
         # With the published weight 1 the latent dies: of 350 channels most are smooth.
         return mvae.Config(**common | {"width": 256}, weight_kl=0.01)
@@ -179,7 +185,7 @@ def _stage(name: str) -> str:
 def _baseline_loss(name: str, frames: jax.Array, space: Space, config: Any):
     """The loss `(params, key, windows)` of a baseline."""
     loss = functools.partial(_BASELINES[name].loss, config=config)
-    if name != "lmm":
+    if name not in _LMM:
         return loss
     return functools.partial(loss, change=space.change, database=frames[::4])
 
@@ -190,6 +196,9 @@ def train_baseline(
     """Trains a row that is not AAMDM."""
     config = _config(name, space, sizes)
     frames = aamdm_space.to_frames(space, run.train.poses, run.train.paths)
+    if name == "lmm_feet":
+        own = jax.jit(lmm.own_features)(run.train, run.skeleton)
+        frames = jnp.concatenate([frames, own], axis=-1)
     loss = _baseline_loss(name, frames, space, config)
     length, given = _WINDOWS[name]
     # AMDM's authors have none; with it joints jerk twice as much.
@@ -202,9 +211,9 @@ def train_baseline(
         key_windows, key_noise = jax.random.split(key)
         found = windows(key_windows, arrays)
         noise = aamdm_loss.random_noise(
-            key_noise, found[:, given].shape, largest=largest
+            key_noise, (len(found), space.num_features), largest=largest
         )
-        return found.at[:, given].add(noise)
+        return found.at[:, given, : space.num_features].add(noise)
 
     runs.minimize(
         _BASELINES[name].init(jax.random.key(budget.seed), config),
@@ -285,7 +294,7 @@ def load_row(
     params = runs.load_params(
         run.record, _stage(name), lambda: module.init(jax.random.key(0), config)
     )
-    if name == "lmm":
+    if name in _LMM:
         return lmm.stepper(params, config=config, change=space.change)
     if name == "mvae":
         return mvae.stepper(params, config=config)
