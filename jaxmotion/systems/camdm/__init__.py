@@ -81,7 +81,8 @@ margins, whose feet were planted by a second training (`--preset planted`). `--p
 paper` trains as the authors do (AdamW, 1e-4, batch 512; their 100 epochs are for
 `--steps` to say); every such option can still be given. In every preset all clips get a
 mirrored copy, where the release mirrors the symmetric styles only (`--no-mirror`), and
-the rate falls with every step, there with every epoch. The evaluator that scores
-styles has layer and group norms in place of batch norms (`evaluator.py import` takes
-the released one).
+the rate falls with every step, there with every epoch. Weights begin as Flax's do,
+there as PyTorch's, which are smaller (`jaxmotion/networks/blocks.py`). The evaluator
+that scores styles has layer and group norms in place of batch norms (`evaluator.py
+import` takes the released one).
 """

@@ -29,6 +29,7 @@ players). Ours, on in `experiments/emdm.py` because trainings here take minutes:
 * one forward pass for both losses of the generator: the same expected gradient, a pass
   less; published: two passes.
 * `norm="pre"` and no dropout: learn faster; published: post-norm, 0.1.
+* weights begin as Flax's do; published: as PyTorch's, which are smaller.
 * `mask_frames=True`: zeros after a motion's end are seen by nobody; each frame of a
   batch counts the same in the losses; published: `mask_frames=False`
   (`--no-mask-frames`): attention and discriminator see the zeros; losses are of each
