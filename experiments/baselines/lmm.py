@@ -92,7 +92,7 @@ def own_features(data: PoseData, skeleton: Skeleton) -> Float[Array, "frames 15"
     parts = [*jnp.swapaxes(points[:, :2], 0, 1), *jnp.swapaxes(moving, 0, 1)]
     weights = (0.75, 0.75, 1.0, 1.0, 1.0)
     scaled = [
-        weight * (x - jnp.mean(x, axis=0)) / jnp.mean(jnp.std(x, axis=0))
+        weight * (x - jnp.mean(x, axis=0, keepdims=True)) / jnp.mean(jnp.std(x, axis=0))
         for weight, x in zip(weights, parts, strict=True)
     ]
     return jnp.concatenate(scaled, axis=-1)
