@@ -116,7 +116,7 @@ class Evaluate:
       steps: Motion model of the tables "schedules" and "paths".
       schedules: Rows of table 4.
       windows: Held-out windows, at most.
-      replications: Random halves of them, each with noise of its own.
+      replications: Halves of them, of random pieces, each with noise of its own.
       starts: Starts of players of one replication (table "paths").
       repeats: Players of each start.
       rate: w_r of DSG.

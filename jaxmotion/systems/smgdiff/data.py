@@ -31,6 +31,15 @@ def _recording(name: str) -> str:
     return re.split("[@#]", original(name), maxsplit=1)[0]
 
 
+def pieces(data: BallClips) -> Int[np.ndarray, " clips"]:
+    """Number of each clip's piece of a recording.
+
+    It is the same for mirror images, and for the same motion beside other balls.
+    """
+    names = [original(name).split("#")[0] for name in data.clips.clip_names]
+    return np.unique(names, return_inverse=True)[1]
+
+
 def split(
     data: BallClips, *, fraction: float, seed: int = 0
 ) -> tuple[BallClips, BallClips]:

@@ -79,12 +79,23 @@ class Setting:
     @property
     def halves(self) -> list[Int[np.ndarray, " half"]]:
         """Windows of each replication."""
-        number = self.known.label.shape[0]
-        generator = np.random.default_rng(self.seed)
-        return [
-            generator.permutation(number)[: number // 2]
-            for _ in range(self.replications)
-        ]
+        pieces = np.asarray(self.known.piece)
+        return halves(pieces, number=self.replications, seed=self.seed)
+
+
+def halves(
+    pieces: Int[np.ndarray, " windows"], *, number: int, seed: int
+) -> list[Int[np.ndarray, " half"]]:
+    """Halves of the windows, shuffled: those of random pieces, of one not all.
+
+    Windows of one piece overlap, and are not independent.
+    """
+    generator, found = np.random.default_rng(seed), []
+    for _ in range(number):
+        place = generator.permutation(pieces.max() + 1)[pieces]
+        half = np.argsort(place, kind="stable")[: len(pieces) // 2]
+        found.append(generator.permutation(half))
+    return found
 
 
 def make_setting(
@@ -100,8 +111,8 @@ def make_setting(
 ) -> Setting:
     """Trains the evaluator and draws the windows.
 
-    There are at most `number` windows of either part; replications are sets of half of
-    the held-out ones. A frozen evaluator must fit (`ValueError`); None to train one.
+    There are at most `number` windows of either part; replications are `halves` of the
+    held-out ones. A frozen evaluator must fit (`ValueError`); None to train one.
     """
     frozen = evaluators.params_for(
         evaluator,

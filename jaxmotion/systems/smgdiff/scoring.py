@@ -198,12 +198,17 @@ class EvalWindows:
     """Moments of recordings: what is known, and what then happened.
 
     Frames before and after are in the frame of the plan.
+
+    Attributes:
+      piece: Number of the piece of a recording; its mirror image and other balls beside
+        it are the same.
     """
 
     condition: Condition
     future: Scene
     past: Scene
     label: Int[Array, "*batch"]
+    piece: Int[Array, "*batch"]
 
 
 def eval_windows(
@@ -220,16 +225,20 @@ def eval_windows(
         raise ValueError(f"{total} windows of {config.window} frames, expected 4")
     order = np.random.default_rng(seed).permutation(total)[:number]
     scenes, labels = smgdiff_data.all_scenes(arrays, jnp.asarray(order))
-    return _eval_windows(scenes, labels, model.representation, config)
+    clips = np.asarray(arrays.index.clips)[order]
+    pieces = jnp.asarray(smgdiff_data.pieces(data)[clips])
+    return _eval_windows(scenes, labels, pieces, model.representation, config)
 
 
 @functools.partial(jax.jit, static_argnames=("config",))
-def _eval_windows(scenes: Scene, labels: Array, representation, config) -> EvalWindows:
+def _eval_windows(
+    scenes: Scene, labels: Array, pieces: Array, representation, config
+) -> EvalWindows:
     matrix = trajectory.smoothing_matrices(config.window, (10.0,))[0]
     last, skeleton = config.past - 1, representation.skeleton
 
     @jax.vmap
-    def one(scene: Scene, label: Array) -> EvalWindows:
+    def one(scene: Scene, label: Array, piece: Array) -> EvalWindows:
         course = trajectory.root_trajectory(skeleton, scene.motion)
         path = trajectory.smooth(course.position, matrix)
         path = path + (course.position[last] - path[last])[None]
@@ -247,9 +256,10 @@ def _eval_windows(scenes: Scene, labels: Array, representation, config) -> EvalW
             future=jax.tree.map(lambda x: x[config.past :], local),
             past=jax.tree.map(lambda x: x[: config.past], local),
             label=label,
+            piece=piece,
         )
 
-    return one(scenes, labels)
+    return one(scenes, labels, pieces)
 
 
 def limits(data: BallClips) -> Thresholds:

@@ -252,6 +252,28 @@ def test_situations_hold_what_was_and_what_came(run):
     assert (start < 0.1).all()
     with pytest.raises(ValueError, match="expected 4"):
         smgdiff_scoring.eval_windows(run.held_out, model, number=2, seed=0)
+    names = run.held_out.clips.clip_names
+    assert set(np.asarray(known.piece)) <= set(range(len(names)))
+
+
+def test_halves_take_pieces_of_recordings_whole():
+    pieces = np.random.default_rng(1).integers(30, size=200)
+    found = smgdiff_evaluation.halves(pieces, number=4, seed=0)
+    assert len({tuple(sorted(half)) for half in found}) == 4
+    for half in found:
+        assert half.size == len({*half}) == 100
+        inside = np.isin(np.arange(200), half)
+        parted = [p for p in range(30) if len({*inside[pieces == p]}) > 1]
+        assert len(parted) <= 1
+        # Not one piece after the other: the first few are of several.
+        assert len({*pieces[half[:10]]}) > 4
+
+
+def test_images_and_other_balls_are_of_one_piece(run):
+    names = ("a@0+9", "a_mirrored@0+9", "a@0+9#2", "a@9+9", "b_mirrored@9+9#3")
+    clips = dataclasses.replace(run.train.clips, clip_names=names)
+    data = dataclasses.replace(run.train, clips=clips)
+    assert smgdiff_data.pieces(data).tolist() == [0, 0, 0, 1, 2]
 
 
 @pytest.mark.slow
