@@ -54,6 +54,7 @@ class Train:
       warmup: Steps in which the rate rises.
       max_norm: Norm to clip gradients to; 0: none.
       ema: Decay of the parameters' average; 0: none.
+      initial_scale: Factor on linear layers' first weights; .58 is about PyTorch's.
       chunk: Steps of one compiled call.
       save_every: Steps between checkpoints.
       network: Denoiser (two of table 3).
@@ -97,6 +98,7 @@ class Train:
     warmup: cli.Optional[int] = None
     max_norm: cli.Optional[float] = None
     ema: cli.Optional[float] = None
+    initial_scale: cli.Optional[float] = None
     chunk: int = 50
     save_every: int = 1000
     network: Literal["transformer", "mlp", "single_token"] = "transformer"

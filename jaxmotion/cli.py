@@ -83,6 +83,7 @@ LIMITS: dict[str, Range] = {
     "before": Range(1, 86400),
     "long_minutes": Range(0, 86400),
     "warmup": Range(0, 10**9),
+    "initial_scale": Range(0, 10),
     "draft_steps": Range(0, 10**9),
     **dict.fromkeys(("token_margin", "path_soon"), Range(0, 1000)),
     "channels": _SIZE,

@@ -300,6 +300,8 @@ class Budget:
       final: Rate at the end of the decay, as a fraction of the peak.
       max_norm: Gradients are clipped to this global norm; 0 for no clipping.
       ema: Decay per update of the parameters' moving average; 0 for no average.
+      initial_scale: Factor on the first weights of linear layers, which are Flax's; .58
+        for about PyTorch's.
       devices: Split each batch over so many; a run of several processes takes all.
       chunk: Updates of one compiled call, at most.
       save_every: Updates between checkpoints.
@@ -316,6 +318,7 @@ class Budget:
     final: float = 0.05
     max_norm: float = 0.0
     ema: float = 0.999
+    initial_scale: float = 1.0
     devices: int = 1
     chunk: int = 100
     save_every: int = 1000
@@ -337,6 +340,15 @@ class Budget:
 
 # What of a budget does not change what is trained.
 _FREE = ("devices", "chunk", "save_every", "override")
+
+
+def initial(params: Params, budget: Budget) -> Params:
+    """Random parameters as a training begins with them: scaled by the budget."""
+
+    def scaled(path: tuple, x: jax.Array) -> jax.Array:
+        return budget.initial_scale * x if path[-1].key == "kernel" else x
+
+    return jax.tree_util.tree_map_with_path(scaled, params)
 
 
 def make_optimizer(budget: Budget) -> training.Optimizer:
@@ -472,6 +484,8 @@ def fit(
     own = {k: v for k, v in dataclasses.asdict(budget).items() if k not in _FREE}
     if budget.constant is None:  # as checkpoints of before have it
         del own["constant"]
+    if budget.initial_scale == 1.0:
+        del own["initial_scale"]
     how = own | {"files": run.files} | (settings or {})
     if checkpoint.latest_step(run.checkpoints(stage)) is not None:
         _check_resumed(run, stage, model, how, budget)

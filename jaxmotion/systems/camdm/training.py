@@ -330,7 +330,7 @@ def train(run: runs.Run, budget: runs.Budget, *, init: Path | None = None) -> No
     data = training_windows(run, config)
     key_init, key_train = jax.random.split(jax.random.key(budget.seed))
     if init is None or checkpoint.latest_step(run.checkpoints(STAGE)) is not None:
-        params = camdm_model.init(key_init, config)
+        params = runs.initial(camdm_model.init(key_init, config), budget)
     else:
         _, params = continued(model, init)
     runs.minimize(
