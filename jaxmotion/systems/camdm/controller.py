@@ -474,8 +474,8 @@ def character(
         control = OWN_STARTS
         if model.config.seam_half_life:
             control = dataclasses.replace(control, seam=VELOCITY_SEAM)
-    if type(steps) is int:
-        steps = spread_steps(model.config.num_steps, steps)
+    if isinstance(steps, int | np.integer) and not isinstance(steps, bool):
+        steps = spread_steps(model.config.num_steps, int(steps))
     if steps is not None:
         steps = camdm_model.check_steps(steps, config=model.config)
 

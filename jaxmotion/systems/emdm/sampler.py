@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxmotion.control.sampling import Sampler
@@ -88,15 +89,28 @@ def _check(model: Model, where: str) -> None:
             )
 
 
-def load(path: Path, *, row: str = "emdm") -> tuple[Model, Params]:
+# What is loaded of a run folder.
+ROW = "emdm"
+
+
+def load(path: Path, *, row: str = ROW) -> tuple[Model, Params]:
     """Model and averaged parameters of a run folder or an exported file.
 
-    The row says which model of a folder that `experiments/emdm.py train` made.
+    The row says which model of a folder that `experiments/emdm.py train` made; a file
+    holds one.
 
     `CheckpointError` if the row was not trained or the file is damaged, `ValueError`
-    for another system, or one that makes no motions of actions.
+    for another system, one that makes no motions of actions, a row of a file, or one
+    that is another way to sample a row's weights.
     """
+    if row in emdm_training.SAMPLERS:
+        whose = emdm_training.SAMPLERS[row][0]
+        raise ValueError(
+            f"row is {row!r}, which samples {whose!r} otherwise: expected {whose!r}"
+        )
     if path.is_file():
+        if row != ROW:
+            raise ValueError(f"{path}: holds one model, expected no row {row!r}")
         params, value = checkpoint.import_params(path)
         model = from_json(value, where=str(path))
         like = jax.eval_shape(lambda: emdm_model.init(jax.random.key(0), model.config))
@@ -129,12 +143,12 @@ _FREE = (
 )
 
 
-def start_of(path: Path, model: Model, *, row: str = "emdm") -> Params:
+def start_of(path: Path, model: Model, *, row: str = ROW) -> Params:
     """Averaged parameters of a folder's row or an exported file, to train on from.
 
     A `ValueError` names sizes, skeleton, labels or units of features that differ.
     """
-    first, params = load(path, row=row)
+    first, params = load(path, row=ROW if path.is_file() else row)
     found, wanted = (to_json(dataclasses.replace(x, source="")) for x in (first, model))
     model_json.check_start(path, found, wanted, free=("discriminator_", *_FREE))
     return params
@@ -172,13 +186,17 @@ def load_sampler(
     *,
     step: chain.StepFactory = chain.ancestral_step,
     scale: float | None = None,
-    row: str = "emdm",
+    row: str = ROW,
 ) -> Sampler:
     """The sampler of a run folder or an exported file; see `load`.
 
     `step` makes the chain's step, and `scale` is that of classifier-free guidance; None
-    for none, as the paper has it for actions.
+    for none, as the paper has it for actions. A `ValueError` if it is no finite number.
     """
+    if scale is not None:
+        if isinstance(scale, str) or not np.isfinite(scale):
+            raise ValueError(f"scale is {scale!r}, expected a finite number")
+        scale = float(scale)
     model, params = load(path, row=row)
     return Sampler(
         skeleton=model.representation.skeleton,

@@ -106,6 +106,20 @@ def test_wrong_words_end_in_one_line(file):
     assert model.license is None and model.frames == 8
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (dict(row="no_gan"), "holds one model, expected no row 'no_gan'"),
+        (dict(row="ddim_10"), "samples 'ddpm_1000' otherwise: expected 'ddpm_1000'"),
+        (dict(scale=float("nan")), "scale is nan, expected a finite number"),
+    ],
+)
+def test_what_a_file_has_not_is_refused(file, options, message):
+    with pytest.raises(ValueError, match=message):
+        jm.load(file, **options)
+    assert jm.load(file, scale=2.0).method.scale == 2.0
+
+
 def test_a_training_starts_from_a_model_of_its_sizes(model, params, file):
     """Losses and noise may differ; what features mean may not."""
     other = dataclasses.replace(
