@@ -1,7 +1,7 @@
 """Held-out loss against updates and processor time, of one network by several optimizers.
 
-From the same parameters, on the same batches and noise, with updates made in turn: what
-else the machine does slows all alike. The loss is of the averaged parameters, on
+From the same parameters (but for a factor, if one is given), on the same batches and
+noise, with updates made in turn: what else the machine does slows all alike. The loss is of the averaged parameters, on
 windows and noise that are the same at all times.
 
 Examples:
@@ -41,7 +41,8 @@ class Config:
     Attributes:
       run: Run folder of `camdm.py train`, for its data and network: random parameters
         are trained here.
-      optimizers: Names with their peak rates; a row each.
+      optimizers: Names with their peak rates; a row each. After an "@" a factor on the
+        first weights of linear layers.
       out: Folder for metrics.json, table.md and curves.png.
       seeds: Trainings by each, of seeds 0, 1, ...
       steps: Updates of each; warm-up over a tenth of them, cosine to a tenth.
@@ -60,28 +61,29 @@ class Config:
     windows: int = 128
 
 
-def optimizer_of(text: str, steps: int) -> training.Optimizer:
-    """The optimizer of a row.
+def budget_of(text: str, steps: int) -> runs.Budget:
+    """How a row is trained.
 
     Raises:
       ValueError: if the text is no name with a rate.
     """
-    name, _, rate = text.partition("=")
+    name, _, numbers = text.partition("=")
+    rate, _, scale = numbers.partition("@")
     known: dict[str, training.OptimizerName] = {x: x for x in training.OPTIMIZERS}
     try:
-        budget = runs.Budget(
+        return runs.Budget(
             steps=steps,
             optimizer=known[name],
             learning_rate=float(rate),
             warmup=steps // 10,
             final=0.1,
             max_norm=1.0,
+            initial_scale=float(scale or 1.0),
         )
     except (KeyError, ValueError) as error:
         raise ValueError(
             f"--optimizers: {text!r}, expected name=rate, a name of {', '.join(known)}"
         ) from error
-    return runs.make_optimizer(budget)
 
 
 def crossing(spent: np.ndarray, losses: np.ndarray, level: float) -> float:
@@ -189,7 +191,8 @@ def main() -> None:
         raise ValueError(
             f"--steps is {args.steps}, expected a multiple of --chunk, {args.chunk}"
         )
-    chosen = {text: optimizer_of(text, args.steps) for text in args.optimizers}
+    chosen = {text: budget_of(text, args.steps) for text in args.optimizers}
+    optimizers = {text: runs.make_optimizer(own) for text, own in chosen.items()}
     run = runs.load(args.run, system=camdm_model.SYSTEM)
     model = camdm_model.from_json(run.model, where=str(run.config))
     config, field = model.config, run.settings["label"]
@@ -212,16 +215,16 @@ def main() -> None:
             sample,
             num_steps=args.chunk,
         )
-        for name, optimizer in chosen.items()
+        for name, optimizer in optimizers.items()
     }
     curves: dict[str, list[Curve]] = {name: [] for name in chosen}
     for seed in range(args.seeds):
         key_init, key = jax.random.split(jax.random.key(seed))
         params = camdm_model.init(key_init, config)
         states = {}
-        for name, optimizer in chosen.items():
+        for name, optimizer in optimizers.items():
             # A state is donated: each has parameters of its own; the call compiles.
-            own = jax.tree.map(jnp.copy, params)
+            own = jax.tree.map(jnp.copy, runs.initial(params, chosen[name]))
             begin = training.init_train_state(own, optimizer)
             states[name], _ = programs[name](begin, key, data, 0)
         found = train_in_turn(
