@@ -77,7 +77,13 @@ def test_rows_share_start_and_batches(script):
 @pytest.mark.parametrize("text", ["muon", "muon=fast", "sgd=1e-3"])
 def test_an_optimizer_that_is_none_is_named(script, text):
     with pytest.raises(ValueError, match=f"--optimizers: '{text}'.*muon, adamw"):
-        script.optimizer_of(text, 10)
+        script.budget_of(text, 10)
+
+
+def test_a_rate_may_have_a_scale_of_the_first_weights(script):
+    found = [script.budget_of(f"muon=1e-3{more}", 10) for more in ("", "@0.58")]
+    assert [x.initial_scale for x in found] == [1.0, 0.58]
+    assert {x.learning_rate for x in found} == {1e-3}
 
 
 def test_updates_come_in_whole_chunks(script, tmp_path, monkeypatch):

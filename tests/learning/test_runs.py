@@ -256,6 +256,7 @@ def test_other_settings_are_refused_and_named(trained):
         "learning_rate is .*, given 0.5": dict(learning_rate=0.5),
         "ema is 0.5, given 0.25": dict(ema=0.25),
         "optimizer is .*, given 'radam'": dict(optimizer="radam"),
+        "initial_scale is not recorded, given 0.5": dict(initial_scale=0.5),
         "steps is 4, given 6": dict(steps=6),
         "files.train.npz is '1', given '2'": dict(files="2"),
         "has 4 steps, expected at most the 3 to train": dict(steps=3),
@@ -283,6 +284,16 @@ def test_a_stage_is_not_taken_for_another(trained, tmp_path):
             read()
         for word in (str(tmp_path / "generator"), "'polisher'", "'generator'"):
             assert word in str(error.value)
+
+
+def test_linear_layers_may_begin_smaller():
+    """Not their biases, norms, or what labels are looked up in."""
+    layer = {"kernel": jnp.ones((2, 3)), "bias": jnp.ones(3)}
+    params = {"a": {"b": layer}, "norm": {"scale": jnp.ones(3)}, "e": jnp.ones((4, 3))}
+    found = runs.initial(params, dataclasses.replace(BUDGET, initial_scale=0.25))
+    wanted = params | {"a": {"b": layer | {"kernel": 0.25 * layer["kernel"]}}}
+    assert_same(found, wanted)
+    assert_same(runs.initial(params, BUDGET), params)
 
 
 def test_more_devices_than_there_are(tmp_path):
