@@ -9,7 +9,9 @@ size. Differs: by default the projector looks at the path alone, as AAMDM's pape
 of it, and its frame is taken up by half. With `own` channels it looks at feet and hips,
 too, as published, and its frame is taken up whole; there features are a part of a
 frame, here a network reads them of it, and poses are not blended by inertia. It is
-asked at random moments, on average every 0.2 s (there every 0.1 s).
+asked at random moments, on average every 0.2 s (there every 0.1 s). The stepper's
+error is squared (as AAMDM's paper has it; there absolute), the projector's absolute (as
+there) without one of distances, and queries have half of the noise.
 """
 
 import dataclasses
