@@ -80,8 +80,6 @@ class Train:
         2e-5).
       learning_rate: Peak rate of generators.
       ddpm_rate: Peak rate of rows without a discriminator (Muon).
-      initial_scale: Factor on the first weights of generators' linear layers; .58 is
-        about PyTorch's.
       discriminator_rate: Rate of the discriminator (Adam), which falls as the
         generator's does (published: constant, 6 times the generator's).
       init: Run folder or exported model to start from (actions); a folder's row of the
@@ -135,7 +133,6 @@ class Train:
     optimizer: Literal["muon", "adam"] = "muon"
     learning_rate: float = 2e-3
     ddpm_rate: float = 2e-3
-    initial_scale: float = 1.0
     discriminator_rate: float = 5e-4
     init: cli.Optional[Path] = None
     alone: float = 0.0

@@ -69,7 +69,6 @@ class Train:
       learning_rate: Peak of Muon's rate; cosine to a twentieth.
       warmup: Updates of its linear rise; None for a tenth, 100 at most.
       ema: Decay per update of the average that is kept.
-      initial_scale: Factor on linear layers' first weights; .58 is about PyTorch's.
       distributed: One of several processes: "auto", or address, number, index.
       override: Go on with these settings where a stage began with others.
     """  # noqa: E501
@@ -99,7 +98,6 @@ class Train:
     learning_rate: float = 2e-3
     warmup: int | None = None
     ema: float = 0.999
-    initial_scale: float = 1.0
     distributed: cli.Distributed = ()
     seed: int = 0
     override: bool = False

@@ -413,8 +413,7 @@ def _begin(
 ) -> dict[str, Params]:
     """Parameters that a chain's stage begins with."""
     params = aamdm_model.init(jax.random.key(budget.seed), config)
-    players = {x: runs.initial(params[x], budget) for x in ("polisher", "generator")}
-    return params | (init or players)
+    return params | init if init else params
 
 
 def train_polisher(
