@@ -223,6 +223,13 @@ def keep(job: Job, sources: list[Source]) -> list[Path]:
     return kept
 
 
+def shared(job: Job) -> set[Path]:
+    """What a training waits for that others wait for as well, and is not there."""
+    lines = map(shlex.split, job.commands)
+    found = {output_of(words) for words in lines if str(job.folder) not in words}
+    return {path for path in found if not path.exists()}
+
+
 def last_line(path: Path) -> str:
     """The last line of a log that says something."""
     lines = [x for x in path.read_text(errors="replace").splitlines() if x.strip()]
@@ -260,8 +267,9 @@ def work(args: Config, show: Callable[[str], None] = print) -> list[Job]:
         if args.minutes is not None and time.monotonic() - begun > 60 * args.minutes:
             return None
         busy = {x.job.folder for x in running.values()} | left.keys()
+        made = set().union(*(shared(x.job) for x in running.values()))
         waiting = (x for x in jobs() if not x.done and x.folder not in busy)
-        return next(waiting, None)
+        return next((x for x in waiting if not made & shared(x)), None)
 
     with tqdm.tqdm(unit="training", disable=None) as bar:
         while True:

@@ -246,6 +246,16 @@ def test_a_training_that_was_looked_at_before_its_end_is_not_done(load, tmp_path
         assert job.done == done
 
 
+def test_what_runs_share_is_waited_for(load, tmp_path):
+    queue, path = load("train_queue"), tmp_path / "evaluator.npz"
+    own = tmp_path / "run"
+    lines = f"python a.py train --out {path}", f"python b.py train --out {own}"
+    job = queue.Job("run", own, lines, {})
+    assert queue.shared(job) == {path}
+    path.touch()
+    assert not queue.shared(job)
+
+
 @pytest.mark.slow
 def test_what_is_stored_is_not_made_again_and_what_runs_share_is_made_once(
     queue, tmp_path
