@@ -367,6 +367,8 @@ def _fit(
         scenes, labels = smgdiff_data.sample_scenes(key, arrays, batch=budget.batch)
         return (scenes if is_motion else scenes.motion), labels
 
+    # A draft has batches and noise of its own: what follows it would repeat them.
+    key = jax.random.fold_in(jax.random.key(budget.seed), 2)
     state = runs.minimize(
         params,
         run.record,
@@ -377,6 +379,7 @@ def _fit(
         budget=budget,
         model=stage_json(model, stage),
         settings=settings,
+        key=key if stage.endswith("/draft") else None,
         show=("loss", "foot") if is_motion else ("loss",),
     )
     return state.ema_params
