@@ -8,9 +8,10 @@ epsilon 1e-5) and exact GELU:
 
 EMDM's has SELU in its place. Weights begin as Flax's do, not as PyTorch's: those of
 linear layers 1.7 times as large, of queries 1.4 and of keys and values 1.2 times, and
-biases at zero; so do all networks here. With norm="pre" the branches read normalized
-tokens and add to plain ones, which trains several times faster from scratch (Xiong et
-al. 2020, "On Layer Normalization in the Transformer Architecture"):
+biases at zero; so do all networks here (`runs.Budget(initial_scale=)` makes them
+smaller). With norm="pre" the branches read normalized tokens and add to plain ones,
+which trains several times faster from scratch (Xiong et al. 2020, "On Layer
+Normalization in the Transformer Architecture"):
 
     h = x + out(softmax(q k^T / sqrt(d)) v)                q, k, v of norm_1(x)
     y = h + W_2 gelu(W_1 norm_2(h))

@@ -51,6 +51,9 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
   steps of the walker.
 * `train --warmup 300 --max-norm 1 --ema 0.999`: a rate that rises first, clipped
   gradients, averaged parameters.
+* `train --initial-scale 0.3`: linear layers begin with a third of Flax's weights:
+  lower losses for as many updates; 0.577, in `--preset paper`, is about PyTorch's, and
+  1, Flax's, is what shipped models and the tables of claims began with.
 * `attention="prefix"`: condition tokens do not see the noisy frames, and are computed
   once per plan; `noise_levels=4`: a window is noised at four levels, its condition
   encoded once; `train --balance 0.5`: windows of rare speeds and turns are drawn more
@@ -75,14 +78,13 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
 * Locked feet (`jaxmotion/control/foot_lock.py`): what is displayed is the past of the
   next plan.
 
-`experiments/camdm.py train` starts from `--preset small`, which uses the first eight
+`experiments/camdm.py train` starts from `--preset small`, which uses the first nine
 and no dropout, since it is meant for a CPU; the shipped walker is such a model, without
 margins, whose feet were planted by a second training (`--preset planted`). `--preset
 paper` trains as the authors do (AdamW, 1e-4, batch 512; their 100 epochs are for
 `--steps` to say); every such option can still be given. In every preset all clips get a
 mirrored copy, where the release mirrors the symmetric styles only (`--no-mirror`), and
-the rate falls with every step, there with every epoch. Weights begin as Flax's do,
-there as PyTorch's, which are smaller (`jaxmotion/networks/blocks.py`). The evaluator
-that scores styles has layer and group norms in place of batch norms (`evaluator.py
-import` takes the released one).
+the rate falls with every step, there with every epoch. The evaluator that scores
+styles has layer and group norms in place of batch norms (`evaluator.py import` takes
+the released one).
 """

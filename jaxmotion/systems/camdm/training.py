@@ -64,7 +64,8 @@ PRESETS["planted"] = PRESETS["small"] | dict(
 # How the presets are trained, as fields of `runs.Budget`.
 FITTING: dict[str, dict[str, Any]] = {
     # The paper: as MDM, that is AdamW at 1e-4. The released code: the same, batch 512,
-    # a moving average that is never saved; neither clips, decays or warms up.
+    # a moving average that is never saved; neither clips, decays or warms up. First
+    # weights are PyTorch's, about.
     "paper": dict(
         optimizer="adamw",
         learning_rate=1e-4,
@@ -72,6 +73,7 @@ FITTING: dict[str, dict[str, Any]] = {
         warmup=0,
         max_norm=0.0,
         ema=0.0,
+        initial_scale=0.577,
     ),
     "small": dict(
         optimizer="muon",
@@ -80,6 +82,7 @@ FITTING: dict[str, dict[str, Any]] = {
         warmup=300,
         max_norm=1.0,
         ema=0.999,
+        initial_scale=0.3,
     ),
 }
 FITTING["planted"] = FITTING["small"]
