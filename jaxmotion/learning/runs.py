@@ -575,6 +575,6 @@ def restore_evaluator(
         if found.get(field) != expected:
             raise ValueError(
                 f"{folder}: field {field!r} is {found.get(field)!r}, expected "
-                f"{expected!r}"
+                f"{expected!r}; delete the folder to train another evaluator"
             )
     return checkpoint.restore(folder, {"params": jax.eval_shape(init)})["params"]
