@@ -8,6 +8,8 @@ the same thing at T = 1 and makes T >= 2 the same network.
 Source: SMGDiff, section 3.1; its sizes are in the missing supplement.
 """
 
+from typing import Literal
+
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -31,6 +33,9 @@ class TrajectoryGenerator(nn.Module):
     frames_per_token: int
     token_margin: int = 0
     token_window: blocks.Window = "hann"
+    norm: Literal["post", "pre"] = "pre"
+    dropout: float = 0.0
+    features: int = CHANNELS
 
     def setup(self):
         """Makes embeddings and layers."""
@@ -39,12 +44,7 @@ class TrajectoryGenerator(nn.Module):
         self.embed_target = nn.Dense(self.width)
         self.embed_past = nn.Dense(self.width)
         self.embed_noisy = nn.Dense(self.width)
-        self.layers = [
-            blocks.EncoderLayer(self.width, self.heads, self.hidden, 0.0, "pre")
-            for _ in range(self.depth)
-        ]
-        self.norm_out = nn.LayerNorm(epsilon=1e-5)
-        self.out = nn.Dense(CHANNELS * (self.frames_per_token + 2 * self.token_margin))
+        blocks.set_up_layers(self)
 
     def __call__(
         self,
@@ -78,9 +78,4 @@ class TrajectoryGenerator(nn.Module):
         for i, layer in enumerate(self.layers, start=1):
             outputs = self.future // n if i == self.depth else None
             tokens = layer(tokens, train=False, last=outputs)
-        return blocks.unfold_frames(
-            self.out(self.norm_out(tokens)),
-            n,
-            margin=self.token_margin,
-            window=self.token_window,
-        )
+        return blocks.frames_of(self, tokens)
