@@ -300,8 +300,8 @@ class Budget:
       final: Rate at the end of the decay, as a fraction of the peak.
       max_norm: Gradients are clipped to this global norm; 0 for no clipping.
       ema: Decay per update of the parameters' moving average; 0 for no average.
-      initial_scale: Factor on the first weights of linear layers, which are Flax's; .58
-        for about PyTorch's.
+      initial_scale: Factor on the first weights of a system's denoisers' linear layers,
+        which are Flax's; .58 for about PyTorch's.
       devices: Split each batch over so many; a run of several processes takes all.
       chunk: Updates of one compiled call, at most.
       save_every: Updates between checkpoints.
@@ -348,6 +348,8 @@ def initial(params: Params, budget: Budget) -> Params:
     def scaled(path: tuple, x: jax.Array) -> jax.Array:
         return budget.initial_scale * x if path[-1].key == "kernel" else x
 
+    if budget.initial_scale == 1.0:
+        return params
     return jax.tree_util.tree_map_with_path(scaled, params)
 
 

@@ -413,7 +413,8 @@ def _begin(
 ) -> dict[str, Params]:
     """Parameters that a chain's stage begins with."""
     params = aamdm_model.init(jax.random.key(budget.seed), config)
-    return params | init if init else params
+    networks = {x: runs.initial(params[x], budget) for x in ("polisher", "generator")}
+    return params | (init or networks)
 
 
 def train_polisher(

@@ -223,8 +223,9 @@ def train_row(
     is_flat = not any(getattr(config, name) for name in _FLAT)
     geometry = None if is_flat else task.geometry
     params = emdm_model.init(jax.random.key(generator.seed), config)
-    if start is not None:
-        params |= {"generator": start}
+    if start is None:
+        start = runs.initial(params["generator"], generator)
+    params |= {"generator": start}
     common: dict[str, Any] = dict(budget=generator, model=dataclasses.asdict(config))
     stage = _stage(row)
 

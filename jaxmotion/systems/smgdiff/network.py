@@ -8,8 +8,6 @@ the same thing at T = 1 and makes T >= 2 the same network.
 Source: SMGDiff, section 3.1; its sizes are in the missing supplement.
 """
 
-from typing import Literal
-
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -33,9 +31,8 @@ class TrajectoryGenerator(nn.Module):
     frames_per_token: int
     token_margin: int = 0
     token_window: blocks.Window = "hann"
-    norm: Literal["post", "pre"] = "pre"
-    dropout: float = 0.0
-    features: int = CHANNELS
+    # Not fields: what `blocks.set_up_layers` asks for.
+    norm, dropout, features = "pre", 0.0, CHANNELS
 
     def setup(self):
         """Makes embeddings and layers."""

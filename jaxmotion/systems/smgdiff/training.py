@@ -319,6 +319,7 @@ def train_stage(
     params = jax.jit(lambda key: init_stage(key, model, stage))(
         jax.random.key(budget.seed)
     )
+    params = runs.initial(params, budget)
     kind, _ = check_stage_name(stage)
     settings: dict[str, Any] = {"balance": balance} if balance else {}
     if init is not None:
