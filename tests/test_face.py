@@ -393,6 +393,7 @@ def test_shipped_models_lock_their_feet_unless_told_otherwise(model):
     assert moved[0] < 1e-4 < 2e-3 < moved[1], moved
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", sorted(face.SAVERS))
 def test_a_full_disk_leaves_the_file_that_was_there(
     model, frames, suffix, tmp_path, monkeypatch

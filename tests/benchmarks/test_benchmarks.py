@@ -105,6 +105,7 @@ def test_a_step_is_a_network_call(load, system):
         assert found.flops > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("system", ["camdm", "smgdiff"])
 def test_prefix_attention_is_less_work_from_the_second_step_on(load, system):
     workload = load("workload")

@@ -67,6 +67,7 @@ def test_gpu_names_what_failed_and_goes_on(load, monkeypatch, tmp_path, capsys):
     assert json.loads((tmp_path / "gpu.json").read_text())["rows"][0]["end"] == "late"
 
 
+@pytest.mark.slow
 def test_a_part_that_takes_too_long_keeps_the_rows_it_made(load, monkeypatch, tmp_path):
     gpu = load("gpu")
     report = {"metrics": [{"name": "m"}], "rows": [{"characters": 1}]}

@@ -446,6 +446,7 @@ def creeping(speed, *, knows):
     return made, start
 
 
+@pytest.mark.slow
 def test_plans_go_on_from_what_is_displayed():
     """So no offset outlives a plan: feet and body are where the next one has them."""
     offsets = {}
@@ -554,6 +555,7 @@ def test_offsets_are_those_of_the_normal_equations():
     np.testing.assert_allclose(found[:, 0], want, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_a_clip_is_cleaned():
     motion = drift(0.05)
     found = foot_lock.clean_motion(SKELETON, motion, lock=LOCK)

@@ -84,6 +84,7 @@ def test_who_is_beside_a_path_heads_for_it_as_far_ahead_as_he_looks(ahead, meter
     np.testing.assert_allclose(velocity, 2.0 * heading, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_path_is_pursued_from_where_a_walker_comes_to():
     """As by one who stands where he will be when it shows."""
     path = goals.Path(
@@ -188,6 +189,7 @@ def test_a_follower_keeps_his_distance():
     np.testing.assert_array_equal(still, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [2, 8])
 def test_walkers_who_change_places_do_not_touch(number):
     """In circles far from each other, since how one comes out hangs on last digits."""
@@ -272,6 +274,7 @@ def test_small_differences_are_not_told():
     np.testing.assert_array_equal(same(styled).label, [1])
 
 
+@pytest.mark.slow
 def test_numbers_of_goals_and_characters_agree():
     model = jm.load("walker")
     place = goals.Place(

@@ -184,6 +184,7 @@ def test_batches_and_zero_offsets_are_finite():
     assert all(np.isfinite(g).all() for g in grads)
 
 
+@pytest.mark.slow
 def test_batch_is_each_of_its_motions():
     pairs = [two_motions(30.0, 6) for _ in range(2)]
     other = jax.tree.map(lambda x: x[::-1], pairs[1][1])

@@ -87,6 +87,7 @@ def test_no_seam_where_ends_differ():
     assert roughest(cut) > 2.0 * roughest(part)
 
 
+@pytest.mark.slow
 def test_copies_go_at_their_rates_and_keep_labels():
     made = clips(run=runner(), walk=runner(speed=1.4))
     found = loops.with_loops(made, seconds=30.0)
@@ -104,6 +105,7 @@ def test_copies_go_at_their_rates_and_keep_labels():
         assert len({n for name, n in lengths[2:] if name.endswith(f"x{rate}")}) == 1
 
 
+@pytest.mark.slow
 def test_each_speed_is_learned_from_for_as_long():
     run, walk, jog = runner(20.0, speed=3.2), runner(speed=1.4), runner(speed=2.2)
     found = loops.with_loops(clips(run=run, walk=walk, jog=jog), seconds=12.0)
@@ -123,6 +125,7 @@ def test_each_speed_is_learned_from_for_as_long():
         loops.with_loops(clips(jog=runner(20.0, speed=2.1)), seconds=3.0)
 
 
+@pytest.mark.slow
 def test_what_training_holds_out_is_in_no_loop():
     motion = runner(12.0)
     root = np.array(motion.root_position)

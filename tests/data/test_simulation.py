@@ -236,6 +236,7 @@ def test_moving_and_turning_the_world_moves_and_turns_the_bone():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fps", [24.0, 30.0, 60.0])
 def test_shortest_clip_is_about_a_second(fps):
     least = simulation.least_frames(fps)

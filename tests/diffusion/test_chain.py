@@ -120,6 +120,7 @@ def test_ddim_step_is_the_published_update(eta):
         np.testing.assert_allclose(found, expected, atol=3e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [schedule.cosine_schedule, schedule.vp_schedule])
 def test_ddim_with_full_noise_is_ancestral(make):
     table = make(T)

@@ -69,6 +69,7 @@ def program(kind):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["chain", "consistency"])
 @pytest.mark.parametrize("make", [schedule.cosine_schedule, schedule.vp_schedule])
 def test_the_exact_consistency_function_has_nothing_to_learn(kind, make):
@@ -85,6 +86,7 @@ def test_the_exact_consistency_function_has_nothing_to_learn(kind, make):
         np.testing.assert_allclose(np.sort(off), [0.0] * (T - 1) + [0.1], atol=2e-5)
 
 
+@pytest.mark.slow
 def test_the_chain_ends_where_the_ode_does():
     """The ODE of Gaussian data maps deviations by the ratio of the deviations."""
     table = schedule.cosine_schedule(800)
@@ -137,6 +139,7 @@ def test_consistency_visits_each_step_once_and_anew():
     assert drawn == set(range(1, T + 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["chain", "consistency"])
 def test_targets_are_constants_of_the_gradient(kind):
     """With a student c x_t, the gradient is that of its prediction alone.

@@ -284,6 +284,7 @@ def test_conversions_round_trip():
         np.testing.assert_allclose(found, noise, atol=1e-6 * gain)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(6,), (6, 1), (1,), (6, 3)])
 def test_t_with_leading_axes_is_a_loop(shape):
     table = schedule.cosine_schedule(8)

@@ -77,6 +77,7 @@ def test_feet_side_by_side_do_not_cross_whichever_way_they_face():
     assert contact.leg_crossings(steps, -ahead, 30.0) == 60 * 30 / 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "frames"), [(1.0, 120), (1.6, 60), (2.5, 60), (1.0, 9000)]
 )

@@ -69,6 +69,7 @@ def embed(params, pairs):
     )
 
 
+@pytest.mark.slow
 def test_the_loss_is_the_loops():
     """Without dropout; the shift is one of 1..3, never 0."""
     config = dataclasses.replace(CONFIG, dropout=0.0)

@@ -79,6 +79,7 @@ def test_shipped_players_fetch_their_ball(load, fetches):
     assert back.all() == fetches, found
 
 
+@pytest.mark.slow
 def test_who_does_not_rest_at_his_place_is_counted(load, monkeypatch):
     """One stands, one creeps, one walks on, and one walks for half of that time."""
     script, model = load("goals"), jm.load("walker")

@@ -54,6 +54,7 @@ def test_pages_equal_what_their_results_make_of_them(pages):
     assert pages.stale() == []
 
 
+@pytest.mark.slow
 def test_a_changed_digit_is_noticed_wherever_it_is(pages, checkout):
     assert pages.stale(checkout) == []
     path = checkout / "experiments/results/camdm/bandai2_planted.json"
@@ -101,6 +102,7 @@ def test_a_picture_of_costs_joins_tables(pages, checkout):
     assert {x.name for x in pages.stale(checkout)} == {"steps.svg", "README.md"}
 
 
+@pytest.mark.slow
 def test_writing_is_idempotent_and_mends_what_was_edited(pages, checkout):
     page = checkout / "experiments/results/emdm.md"
     text = page.read_text()

@@ -582,6 +582,7 @@ def script(monkeypatch):
     gc.unfreeze()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_close_it(script, monkeypatch, capsys, number):
     seen = []

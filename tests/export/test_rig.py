@@ -177,6 +177,7 @@ def test_the_users_own_mesh_walks(hero, tmp_path):
     assert -0.01 < skinned(tmp_path / "walk.glb", 13)[:, 1].min() < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", mostly_slow([".bvh", ".npz", ".csv"], [".bvh"]))
 def test_other_formats_have_the_rigs_skeleton(hero, tmp_path, suffix):
     skeleton, motion = samples.person(seconds=0.3)
@@ -206,6 +207,7 @@ def test_a_gltf_with_a_buffer_beside_it_and_a_vrm_are_rigs(hero, tmp_path):
     np.testing.assert_array_equal(found.skeleton.offsets, plain.skeleton.offsets)
 
 
+@pytest.mark.slow
 def test_a_root_on_the_ground_goes_with_the_hips(tmp_path):
     """What engines take for the way of a character: level, smooth, facing ahead."""
     base = rigs.person("child", "Unreal")
@@ -284,6 +286,7 @@ def test_pictures_beside_a_gltf_are_packed_into_what_is_saved(hero, tmp_path):
         save()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", ["VRMC_vrm", "VRM"])
 @pytest.mark.parametrize("skin", mostly_slow([True, False], [False]))
 def test_a_vrm_says_which_joint_is_which(version, skin, hero, tmp_path):

@@ -315,6 +315,7 @@ for step in itertools.count(1):
 """
 
 
+@pytest.mark.slow
 def test_a_kill_in_the_midst_of_saving_leaves_a_whole_step(tmp_path):
     folder = tmp_path / "checkpoints"
     process = subprocess.Popen(

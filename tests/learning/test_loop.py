@@ -240,6 +240,7 @@ def test_a_chunk_in_pieces_is_the_whole_to_the_bit():
     jax.tree.map(close, scanned.params, whole.params)
 
 
+@pytest.mark.slow
 def test_compiling_is_announced_and_the_bar_moves_from_the_first_step(tmp_path, capsys):
     run, state, key, data = small_parts()
     counts, seen = [], []
@@ -291,6 +292,7 @@ def test_zero_is_refused_before_the_first_chunk(tmp_path, field):
         loop_of(tmp_path, **sizes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", ["5", "null", "[2]", "{}", '{"step": "2"}', "loss"])
 def test_a_row_of_the_log_that_is_none_is_named(tmp_path, line):
     run, state, key, data = small_parts()
@@ -343,6 +345,7 @@ cli.start(main)
 """
 
 
+@pytest.mark.slow
 def test_a_disk_that_takes_no_more_ends_in_one_line_and_keeps_the_checkpoint(tmp_path):
     """A limit on the size of files needs no rights to set."""
     command = [sys.executable, "-c", FILLED, str(tmp_path)]

@@ -159,6 +159,7 @@ def test_padding_changes_no_loss(average):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("levels", [1, 3])
 def test_samples_are_noised_at_levels_that_are_uniform_and_apart(levels):
     table, size = schedule.cosine_schedule(4), 1200

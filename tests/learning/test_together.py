@@ -87,6 +87,7 @@ def test_each_is_what_it_is_alone(tmp_path, shifts):
     assert found[0].params["w"] != found[2].params["w"]
 
 
+@pytest.mark.slow
 def test_what_is_equal_is_there_once(tmp_path, monkeypatch):
     """Data are not copied; what functions close over is, where it differs."""
     shapes, train_all = [], loop.train_all
@@ -125,6 +126,7 @@ def test_they_go_on_from_their_checkpoints(tmp_path):
         jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
+@pytest.mark.slow
 def test_two_players_are_trained_together(tmp_path):
     """An update with a branch by its count, which is the same for all."""
 

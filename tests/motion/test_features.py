@@ -98,6 +98,7 @@ HIPS = Skeleton(
 TO_FIRST = jax.jit(lambda world: features.to_first_pose(HIPS, world))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(5,), (2, 3, 5)])
 def test_motions_are_moved_to_their_own_first_pose(shape):
     world = motion(shape)

@@ -57,6 +57,7 @@ def test_22_joints_have_338_features_in_the_documented_order():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fps", [30.0, 60.0])
 def test_22_joints_agree_with_products_of_matrices(fps):
     generator = np.random.default_rng(3)

@@ -101,6 +101,7 @@ def test_written_gradient_of_rot6d_is_that_of_finite_differences():
             np.testing.assert_allclose(slopes[i], expected, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
 def test_written_gradient_of_columns_has_the_batch_behind(batch):
     rng = np.random.default_rng(10)

@@ -93,6 +93,7 @@ def test_default_sizes_are_those_of_the_released_text_tower():
     assert set(shapes["params"]) == names
 
 
+@pytest.mark.slow
 def test_initialized_output_is_finite(net):
     found, _ = jax.jit(net.init_with_output)(jax.random.key(1), jnp.array(IDS))
     assert found.shape == (3, 7)

@@ -112,6 +112,7 @@ def test_no_code_is_run(torch, tmp_path, is_new):
     assert not made.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_new", [True, False])
 def test_truncated_files(torch, tmp_path, is_new):
     path = tmp_path / "weights.pt"

@@ -77,6 +77,7 @@ def test_planted_feet_stay_planted_and_out_of_the_ground(body):
             np.testing.assert_allclose(np.linalg.norm(bone, axis=-1), length, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_there_and_back_is_where_it_was():
     skeleton, motion = walk()
     target = rigs.person("child")
@@ -89,6 +90,7 @@ def test_there_and_back_is_where_it_was():
     assert np.percentile(away, 95) < 0.01
 
 
+@pytest.mark.slow
 def test_other_rest_poses_and_axes_change_nothing_in_the_world():
     """An A-pose with joints of other axes moves as the T-pose does."""
     skeleton, motion = walk(1.0)
@@ -108,6 +110,7 @@ def test_other_rest_poses_and_axes_change_nothing_in_the_world():
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_source_whose_zero_pose_is_none_moves_a_person():
     """LaFAN1's convention: bones along x."""
     skeleton = along_x()
@@ -169,6 +172,7 @@ def test_it_is_jitted_and_mapped_over_characters_and_frames():
     np.testing.assert_allclose(one[1], whole.joint_rotation[7], atol=2e-5)
 
 
+@pytest.mark.slow
 def test_other_clips_and_rigs_read_again_compile_nothing(monkeypatch):
     traced = []
     many = transfer.Retarget._many
@@ -273,6 +277,7 @@ def test_a_root_above_the_hips_is_only_moved():
     np.testing.assert_allclose(made.joint_rotation[:, 0], expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_limbs_may_hang_on_joints_beside_the_spine():
     base, forked = rigs.forked()
     skeleton, motion = walk(0.5)

@@ -183,6 +183,7 @@ def test_ends_and_unknown_tokens_within_a_text_are_refused(written, text):
         clip.tokenize(clip.load_clip(written[0]), ["left", text])
 
 
+@pytest.mark.slow
 def test_fingerprint_changes_with_weights_and_tokenizer(written):
     folder, _ = written
     prints = {clip.load_clip(folder).fingerprint}

@@ -47,6 +47,7 @@ def test_against_the_package(model):
     assert found.std() > 0.1
 
 
+@pytest.mark.slow
 def test_neither_network_nor_cache_folder_nor_logging_is_touched(tmp_path):
     code = """
 import logging, socket

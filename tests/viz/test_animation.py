@@ -116,6 +116,7 @@ def test_a_ghost_is_pale_and_many_characters_are_set_apart(tmp_path):
 LONG = ("a title much longer than any picture is wide " * 5)[:200]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [100, 333, (480, 360)])
 def test_a_long_title_stays_in_one_line_on_the_picture(tmp_path, size):
     shown = stage.make_stage(*samples.person(seconds=0.1))

@@ -68,6 +68,7 @@ def test_plots_check_their_file_first(tmp_path):
         plots.plot_sweep(bad, {}, xlabel="", ylabel="")
 
 
+@pytest.mark.slow
 def test_a_notebook_keeps_its_backend():
     code = (
         "import matplotlib; matplotlib.use('svg');"

@@ -84,6 +84,7 @@ def winding(mesh, points):
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("detail", ["fine", "crowd"])
 @pytest.mark.parametrize("make", [*PEOPLE, tail, one_joint])
 def test_it_is_one_closed_surface_without_handles(make, detail):

@@ -279,6 +279,7 @@ def test_gradients_are_finite_and_reach_every_layer():
             assert np.abs(leaf).max() > 0
 
 
+@pytest.mark.slow
 def test_training_on_a_few_poses_lowers_the_loss():
     poses, paths = batch()
     statistics = fitted()[1]

@@ -70,6 +70,7 @@ def row_of(frames, groups=1, against=None):
 # --- the reference, and rows of real frames ----------------------------------------
 
 
+@pytest.mark.slow
 def test_the_reference_is_that_of_the_poses():
     positions, own = character_positions(), yardstick()
     flat = positions.reshape(len(positions), -1)
@@ -99,6 +100,7 @@ def test_windows_of_the_data_are_its_frames():
         real(1, 401)
 
 
+@pytest.mark.slow
 def test_the_data_are_at_no_distance_from_themselves():
     row = row_of(real(1, 400))
     assert row["diverged"] == table.Cell(value=0.0, samples=1)
@@ -138,6 +140,7 @@ def test_place_and_direction_in_the_world_do_not_count():
     assert abs(row_of(moved)["fid"].value) < 0.02
 
 
+@pytest.mark.slow
 def test_groups_must_divide_the_rollouts():
     with pytest.raises(ValueError, match="3 rollouts in 2 groups"):
         row_of(stiff(1.0, number=3), groups=2)

@@ -52,6 +52,7 @@ def silent():
     return jax.tree.map(jnp.zeros_like, params)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("predict", ["frame", "change"])
 def test_networks_that_say_nothing_are_at_the_mean_or_at_the_frame_before(
     frames, predict

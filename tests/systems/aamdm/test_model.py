@@ -51,6 +51,7 @@ def test_drafts_come_before_polishes(drafts, polishes):
     np.testing.assert_allclose(found, x, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("predict", ["frame", "change"])
 def test_a_held_frame_stands_for_the_drafts(predict):
     """The frame before, noised to the step where polishing begins; no generator."""
@@ -106,6 +107,7 @@ def test_guidance_lowers_its_objective():
     np.testing.assert_allclose(off, plain, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guided_steps", mostly_slow([None, 1, 3, 4], [1]))
 def test_only_the_last_steps_are_guided(guided_steps):
     """Each step, one by one, with the gradient of the objective or without."""
@@ -389,6 +391,7 @@ def test_the_generators_own_frames_are_constants_of_its_gradient(monkeypatch):
 # --- levels of noise ----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("levels", ["all", "own"])
 def test_networks_learn_the_steps_that_the_chain_asks_them_for(monkeypatch, levels):
     seen = []

@@ -138,6 +138,7 @@ def guided(skeleton, use):
     return find
 
 
+@pytest.mark.slow
 def test_it_plans_when_told_or_after_m_frames(guided):
     velocity, facing, label = steady(4, 17)
     velocity[1, 3:] = [0.5, 1.0]
@@ -236,6 +237,7 @@ def test_a_second_change_guides_again(guided):
 # What it is fed
 
 
+@pytest.mark.slow
 def test_displayed_poses_are_fed_back(skeleton, use):
     """Each plan stands 1 cm above the last displayed pose that it was given."""
     use(lambda condition, scale: condition.past[-1, -5] + 0.01)

@@ -42,6 +42,7 @@ def loss_of(walker, **options):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", mostly_slow(["chain", "consistency"], ["chain"]))
 def test_the_teacher_teaches_itself_nothing_at_the_last_step(walker, target):
     """A chain of one step ends in the teacher's prediction."""
@@ -164,6 +165,7 @@ def test_another_training_that_starts_from_a_student_visits_all_steps(student):
     assert found.steps is None
 
 
+@pytest.mark.slow
 def test_a_plan_of_one_step_is_one_prediction(student):
     """Of the noise that `chain.sample` draws."""
     model, params = camdm_model.load(student)

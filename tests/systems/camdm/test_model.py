@@ -107,6 +107,7 @@ def test_smoothing_is_scipys_filter_with_reflecting_borders(frames):
 # Examples
 
 
+@pytest.mark.slow
 @CONFIGS
 def test_the_last_past_pose_is_at_the_origin_and_heights_stay(walker, skeleton, config):
     window = window_of(walker, config)
@@ -368,6 +369,7 @@ def test_the_loss_weighs_its_terms(walker, skeleton, monkeypatch):
     assert len(condition) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keep", [True, False])
 def test_losses_reach_over_the_seam_as_far_as_the_past_is_kept(walker, skeleton, keep):
     """Displacements and feet are the oracle's, of two past frames and the future."""

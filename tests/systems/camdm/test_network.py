@@ -234,6 +234,7 @@ def test_encode_and_denoise_are_the_plain_network(name):
     np.testing.assert_allclose(forward(name)(*args), expected, atol=5e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["transformer", "mlp", "single token"])
 def test_dropout_only_in_training_and_by_its_key(name):
     net, args = KINDS[name], arguments()
@@ -330,6 +331,7 @@ def test_the_first_step_reads_the_first_position():
     np.testing.assert_array_equal(rows[0], rows[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attention", ["full", "prefix"])
 @pytest.mark.parametrize("moved", mostly_slow([0, 7], [7]))
 def test_plans_go_on_from_the_last_pose_where_the_past_is_kept(attention, moved):

@@ -175,6 +175,7 @@ def test_clips_are_listed_by_action(arrays):
     assert arrays.frames == FRAMES
 
 
+@pytest.mark.slow
 def test_all_windows_are_those_that_are_drawn(arrays):
     start, clip = emdm_data.all_windows(arrays)
     expected = [

@@ -144,6 +144,7 @@ def test_feet_and_channels(representation):
     assert geometry.fps == 30.0 and geometry.contact_speed == 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("relative", [True, False])
 def test_positions_have_the_gradient_of_finite_differences(representation, relative):
     geometry = emdm_features.geometry(representation, relative=relative)

@@ -182,6 +182,7 @@ def test_a_dropped_condition_is_a_zero_vector(name):
     assert np.abs(token(condition, keep) - dropped).max() > 0.1
 
 
+@pytest.mark.slow
 def test_actions_start_as_a_table_of_unit_normal_draws():
     net = dataclasses.replace(NET, width=512, depth=1)
     actions = jnp.eye(SIZE)[:2]
@@ -230,6 +231,7 @@ def test_a_folded_token_counts_if_one_of_its_frames_does():
     assert np.abs(run(changed, [3, 3]) - run(x_t, [3, 3]))[:, :2].max() > 1e-4
 
 
+@pytest.mark.slow
 def test_a_batch_is_its_samples_and_one_step_serves_all():
     params = parameters("action")
     x_t, t, condition, keep, mask, latent = given(NET)

@@ -329,6 +329,7 @@ def test_pairs_are_those_of_the_diffusion(watch):
         assert np.abs(np.mean(noise * (a - a.mean()) / a.std())) < 4.5 / np.sqrt(n)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mask_frames", [True, False])
 @pytest.mark.parametrize("conditional", mostly_slow([True, False], [True]))
 def test_the_discriminator_sees_motions_to_their_end(watch, mask_frames, conditional):

@@ -166,6 +166,7 @@ def test_sentences_are_embedded_as_released(run, published):
     close(np.asarray(found)[coded.index], released_text(published), 1e-5)
 
 
+@pytest.mark.slow
 def test_the_scorer_reads_the_evaluators_words(run, published):
     """MM-Dist is that of the released embeddings; with other words it is not."""
     x = np.random.default_rng(2).normal(size=(64, 48, WIDTH)).astype(np.float32)
