@@ -3,13 +3,14 @@
 import contextlib
 import dataclasses
 import datetime
+import itertools
 import json
 import math
 import os
 import platform
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,19 @@ def _write_ball(path: Path, ball: Ball, fps: float) -> None:
     files.write_text(path, "\n".join(lines) + "\n")
 
 
+def _keep_earlier(path: Path, rows: Collection[str]) -> None:
+    """Renames a table's file with rows that the new one lacks."""
+    try:
+        lost = json.loads(path.read_text(encoding="utf-8"))["rows"].keys() - rows
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
+        return  # nothing there, or nothing of ours
+    if lost:
+        names = (path.with_name(f"metrics.{i}.json") for i in itertools.count(1))
+        kept = next(name for name in names if not name.exists())
+        path.rename(kept)
+        print(f"rows of before ({', '.join(sorted(lost))}) are in {kept}")
+
+
 def write_table(
     folder: Path,
     rows: dict[str, dict[str, table.Cell]],
@@ -81,8 +95,10 @@ def write_table(
     """Writes metrics.json and table.md (folder made if missing), prints the table.
 
     The report is what belongs beside it: arguments, versions, hardware, bounds. Notes
-    are lines below the table, which also say what is not trained to its end.
+    are lines below the table, which also say what is not trained to its end. An earlier
+    table that has other rows stays, as metrics.1.json (or the next that is free).
     """
+    _keep_earlier(folder / "metrics.json", rows)
     for stage, how in report.get("training", {}).items():
         if "of" in how:
             notes += (f"{stage} has {how['steps']} of {how['of']} updates.",)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from jaxmotion import reporting
+from jaxmotion.evaluation import table
 from jaxmotion.learning import checkpoint
 
 
@@ -85,3 +86,27 @@ def test_a_run_folder_says_what_was_trained_on_what(tmp_path):
     assert found["minutes"] == {"motion": 2.0}
     reporting.write_table(tmp_path, {}, found)
     assert (tmp_path / "table.md").read_text().endswith("other has 4 of 9 updates.\n")
+
+
+def test_rows_that_a_new_table_lacks_stay(tmp_path, capsys):
+    def write(value, *names):
+        reporting.write_table(
+            tmp_path, {name: {"fid": table.Cell(value=value)} for name in names}, {}
+        )
+
+    def rows(name):
+        return json.loads((tmp_path / name).read_text())["rows"]
+
+    write(1.0, "long", "short")
+    write(2.0, "long", "short")
+    write(3.0, "short", "long", "other")  # all again
+    assert [path.name for path in tmp_path.glob("*.json")] == ["metrics.json"]
+    write(4.0, "short")
+    assert "rows of before (long, other) are in" in capsys.readouterr().out
+    write(5.0, "new")
+    assert {*rows("metrics.1.json")} == {"short", "long", "other"}
+    assert {*rows("metrics.2.json")} == {"short"}
+    assert {*rows("metrics.json")} == {"new"}
+    (tmp_path / "metrics.json").write_text("[1")
+    write(6.0, "short")
+    assert {*rows("metrics.json")} == {"short"}

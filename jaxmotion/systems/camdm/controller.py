@@ -549,7 +549,10 @@ def start_states(
     for label in labels:
         known = np.flatnonzero(owner == label)
         if known.size == 0:
-            raise ValueError(f"no clip of style {model.labels[label]!r} to start from")
+            raise ValueError(
+                f"no clip of style {model.labels[label]!r} to start from: expected one "
+                f"of {past} frames among those given (of a run, those held out)"
+            )
         starts.append(int(index.starts[generator.choice(known)]))
     cut = jax.vmap(lambda start: windows.cut(clips, start, past))
     return _states_of(model.skeleton, cut(jnp.asarray(starts)), config=model.config)

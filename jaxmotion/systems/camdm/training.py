@@ -242,6 +242,13 @@ def _splitter(settings: dict[str, Any]) -> Callable[[Path], tuple[Clips, Clips]]
 _FILES = ("train.npz", "held_out.npz")
 
 
+def _unmeasured(held_out: Clips, field: str) -> list[str]:
+    """Labels without a clip as long as the windows that are measured."""
+    long = np.diff(np.asarray(held_out.offsets)) >= windows.EVAL_WINDOW
+    known = np.unique(np.asarray(held_out.labels[field])[long])
+    return [x for i, x in enumerate(held_out.names(field)) if i not in known]
+
+
 def prepare(
     folder: Path,
     data: Path,
@@ -276,6 +283,11 @@ def prepare(
         parts = _splitter(chosen)(data)
         model = make(mirror.with_mirrored(parts[0]) if mirrored else parts[0])
         camdm_model.check_clips(model, parts[0], label)
+        if names := _unmeasured(parts[1], label):
+            print(
+                f"no held-out clip of {label} {', '.join(names)} has "
+                f"{windows.EVAL_WINDOW} frames: evaluations have none to compare with"
+            )
         return runs.Content(
             model=to_json(model),
             source=model.source,

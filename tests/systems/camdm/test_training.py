@@ -55,6 +55,15 @@ def test_a_run_comes_back_with_its_model_parameters_and_split(folder):
     assert not set(found.train.clip_names) & set(found.held_out.clip_names)
 
 
+def test_styles_that_cannot_be_evaluated_are_named(folder, tmp_path, capsys):
+    saved(tmp_path, held_out=0.3)
+    assert "no held-out clip" not in capsys.readouterr().out
+    clips = samples.clips()
+    held = [name for name in clips.clip_names if name.startswith("neutral")]
+    saved(tmp_path / "named", held_out_clips=tuple(held[:1]))
+    assert "no held-out clip of style zombie has 60 frames" in capsys.readouterr().out
+
+
 def test_other_clips_of_the_same_kind_may_be_given(folder, tmp_path):
     clips_io.save_clips(tmp_path / "more.npz", samples.clips(minutes=0.8))
     found = camdm_training.load_run(folder, tmp_path / "more.npz")
