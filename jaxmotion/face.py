@@ -359,7 +359,7 @@ def _go(
         goal,
         seconds=seconds,
         places=starts,
-        labels=jnp.asarray(steering.label_indices(character.labels, labels, number)),
+        labels=steering.label_array(character.labels, labels, number),
         circles=circles,
         commands=commands,
         avoiding=avoiding,
@@ -394,7 +394,7 @@ def sample(
     if not isinstance(model, Sampler):
         steering.steered(model)
         raise ValueError("this model is steered: expected `rollout`, not `sample`")
-    found = steering.label_indices(model.labels, labels, number)
+    found = steering.label_array(model.labels, labels, number)
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunks of {chunk} motions, expected 1 or more")
     if chunk is None:

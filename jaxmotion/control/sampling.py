@@ -11,10 +11,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Int
 
-from jaxmotion.control.steering import label_indices
+from jaxmotion.control.steering import label_array, label_indices
 from jaxmotion.motion.skeleton import Motion, Skeleton
 from jaxmotion.typing import Key, Params
 
@@ -50,7 +49,7 @@ class Sampler:
 
 
 def sample_motions(
-    model: Sampler, key: Key, labels: Int[np.ndarray, " motions"], *, chunk: int
+    model: Sampler, key: Key, labels: Int[Array, " motions"], *, chunk: int
 ) -> Motion:
     """Motions [motions, frames, ...] from the origin, facing +z; one compiled program.
 
@@ -60,11 +59,11 @@ def sample_motions(
     Raises:
       ValueError: if a label is none of the model's.
     """
-    found = label_indices(model.labels, labels)
+    found = label_array(model.labels, labels)
     return _motions(
         model.params,
         key,
-        jnp.asarray(found, jnp.int32),
+        found,
         method=model.method,
         chunk=min(chunk, len(found)),
     )

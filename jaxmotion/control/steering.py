@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.sharding import Mesh
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from jaxmotion.control import courses, rollout
 from jaxmotion.control.frame import Frame
@@ -222,6 +222,22 @@ def label_indices(
         found.append(int(label))
     check_labels(np.array(found, int), names)
     return np.array(found if names else np.zeros(len(found)), np.int32)
+
+
+def label_array(
+    names: tuple[str, ...], labels: Any = None, number: int | None = None
+) -> Int[Array, " labels"]:
+    """`label_indices`; indices within a caller's `jax.jit` pass as they are."""
+    if not isinstance(labels, Tracer):
+        return jnp.asarray(label_indices(names, labels, number), jnp.int32)
+    if labels.ndim > 1 or not jnp.issubdtype(labels.dtype, jnp.integer):
+        raise ValueError(
+            f"labels are {labels.dtype}{list(labels.shape)}, expected whole numbers"
+        )
+    if labels.ndim and number not in (None, len(labels)):
+        raise ValueError(f"{len(labels)} labels for {number} characters")
+    shape = labels.shape or (number or 1,)
+    return jnp.broadcast_to(labels if names else 0, shape).astype(jnp.int32)
 
 
 def check_labels(labels: np.ndarray | Array, names: tuple[str, ...]) -> None:

@@ -147,6 +147,23 @@ def test_labels_by_name_and_by_index():
             find(*args)
 
 
+def test_labels_within_compiled_code_pass_as_they_are():
+    def find(labels, number=None, names=("calm", "brisk")):
+        indices = functools.partial(steering.label_array, names, number=number)
+        return jax.jit(indices)(labels).tolist()
+
+    assert find(np.array([1, 0])) == find(np.array([1, 0]), 2) == [1, 0]
+    assert find(1) == [1] and find(1, 3) == [1, 1, 1]
+    assert find(np.array([1, 0]), names=()) == [0, 0]
+    for labels, number, message in (
+        (np.ones(2), None, r"labels are float32\[2\], expected whole numbers"),
+        (np.ones((1, 1), int), None, r"labels are int32\[1, 1\], expected whole"),
+        (np.array([1, 0]), 3, "2 labels for 3 characters"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            find(labels, number)
+
+
 @functools.cache
 def steered(chunk):
     run = samples.run()
