@@ -31,13 +31,24 @@ def _recording(name: str) -> str:
     return re.split("[@#]", original(name), maxsplit=1)[0]
 
 
-def pieces(data: BallClips) -> Int[np.ndarray, " clips"]:
-    """Number of each clip's piece of a recording.
+def pieces(
+    data: BallClips,
+    clips: Int[np.ndarray, " windows"],
+    starts: Int[np.ndarray, " windows"],
+) -> Int[np.ndarray, " windows"]:
+    """Number of the piece of a recording, of five seconds, that each window begins in.
 
-    It is the same for mirror images, and for the same motion beside other balls.
+    Its mirror image is of the same piece, as is the same motion beside another ball,
+    wherever its clip begins. Windows are given by clip and first frame of all.
     """
-    names = [original(name).split("#")[0] for name in data.clips.clip_names]
-    return np.unique(names, return_inverse=True)[1]
+    names = [original(name) for name in data.clips.clip_names]
+    begins = [re.search(r"@(\d+)\+", name) for name in names]
+    first = np.array([int(found[1]) if found else 0 for found in begins])
+    frames = first[clips] + starts - np.asarray(data.clips.offsets)[clips]
+    recordings = np.array([_recording(name) for name in names])
+    number = np.unique(recordings, return_inverse=True)[1][clips]
+    place = np.stack([number, frames // round(5.0 * data.clips.fps)])
+    return np.unique(place, axis=1, return_inverse=True)[1].reshape(-1)
 
 
 def split(

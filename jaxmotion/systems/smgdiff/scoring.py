@@ -35,7 +35,7 @@ class Thresholds:
 
     Attributes:
       acceleration: A ball that accelerates more is being pushed, meters per second
-        squared. Half of the weakest push of the synthetic dribble.
+        squared. A thirtieth of the synthetic dribble's pushes is weaker.
       distance: From a joint to the ball's center up to which it pushes, meters: the
         ball's radius, half a foot, and 2 cm.
       foot_height: Below it a foot joint should not move, meters.
@@ -90,30 +90,44 @@ def make_evaluator(
         num_joints=representation.skeleton.num_joints + 1,
         frames=scenes.ball.shape[-2],
     )
-    x = jax.jit(evaluator_input)(scenes, representation)
     params = frozen
     if params is None:
+        x = jax.jit(evaluator_input)(scenes, representation)
         params, _ = style_evaluator.train(
             key, x, labels, config=config, num_steps=num_steps
         )
-    features, _ = jax.jit(functools.partial(style_evaluator.classify, config=config))(
-        params, x
-    )
+    reference = moments(params, scenes, representation, config=config)
     return SkillEvaluator(
         params=params,
-        reference=frechet.moments(features),
+        reference=reference,
         representation=representation,
         config=config,
     )
 
 
+@functools.partial(jax.jit, static_argnames=("config",))
+def moments(
+    params: Params,
+    scenes: Scene,
+    representation: Representation,
+    *,
+    config: style_evaluator.Config,
+) -> frechet.Moments:
+    """Moments of an evaluator's features of windows."""
+    x = evaluator_input(scenes, representation)
+    return frechet.moments(style_evaluator.classify(params, x, config=config)[0])
+
+
 Score = Callable[..., dict[str, Float[Array, ""]]]
 
 
-def scorer(evaluator: SkillEvaluator, limits: Thresholds) -> Score:
+def scorer(
+    evaluator: SkillEvaluator, limits: Thresholds, happened: frechet.Moments
+) -> Score:
     """`score(scenes, wanted, labels) -> scores` of windows, one compiled program.
 
-    Wanted is a path, where the scenes are: world or frame of the plan.
+    Wanted is a path, where the scenes are: world or frame of the plan. `happened` is
+    of features of held-out recordings.
     """
     representation = evaluator.representation
     skeleton = representation.skeleton
@@ -126,7 +140,7 @@ def scorer(evaluator: SkillEvaluator, limits: Thresholds) -> Score:
         features, logits = style_evaluator.classify(
             evaluator.params, x, config=evaluator.config
         )
-        moments = frechet.moments(features)
+        found = frechet.moments(features)
         velocity = (
             jnp.asarray(jnp.gradient(wanted.position, axis=-2)) * representation.fps
         )
@@ -138,7 +152,8 @@ def scorer(evaluator: SkillEvaluator, limits: Thresholds) -> Score:
             contact_height=limits.foot_height,
         )
         return {
-            "fid": frechet.frechet_distance(moments, evaluator.reference),
+            "fid": frechet.frechet_distance(found, evaluator.reference),
+            "fid_held_out": frechet.frechet_distance(found, happened),
             "foot_slide": _weighted(body["slide_speed"], body["slide_seconds"]),
             "skate_ratio": jnp.mean(body["skate_ratio"]),
             "acceleration": jnp.mean(body["acceleration"]),
@@ -200,8 +215,7 @@ class EvalWindows:
     Frames before and after are in the frame of the plan.
 
     Attributes:
-      piece: Number of the piece of a recording; its mirror image and other balls beside
-        it are the same.
+      piece: Number of the piece of a recording (`smgdiff_data.pieces`).
     """
 
     condition: Condition
@@ -225,8 +239,10 @@ def eval_windows(
         raise ValueError(f"{total} windows of {config.window} frames, expected 4")
     order = np.random.default_rng(seed).permutation(total)[:number]
     scenes, labels = smgdiff_data.all_scenes(arrays, jnp.asarray(order))
-    clips = np.asarray(arrays.index.clips)[order]
-    pieces = jnp.asarray(smgdiff_data.pieces(data)[clips])
+    clips, starts = (
+        np.asarray(x)[order] for x in (arrays.index.clips, arrays.index.starts)
+    )
+    pieces = jnp.asarray(smgdiff_data.pieces(data, clips, starts))
     return _eval_windows(scenes, labels, pieces, model.representation, config)
 
 

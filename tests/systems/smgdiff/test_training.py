@@ -270,10 +270,19 @@ def test_halves_take_pieces_of_recordings_whole():
 
 
 def test_images_and_other_balls_are_of_one_piece(run):
-    names = ("a@0+9", "a_mirrored@0+9", "a@0+9#2", "a@9+9", "b_mirrored@9+9#3")
-    clips = dataclasses.replace(run.train.clips, clip_names=names)
+    names = ("a@10+200", "a_mirrored@0+150", "b@0+99#2", "b_mirrored@160+99#3", "c#2")
+    clips = dataclasses.replace(
+        run.train.clips,
+        clip_names=names,
+        offsets=jnp.array([0, 200, 350, 449, 548, 600]),
+        fps=30.0,
+    )
     data = dataclasses.replace(run.train, clips=clips)
-    assert smgdiff_data.pieces(data).tolist() == [0, 0, 0, 1, 2]
+    # a's frames 10, 149, 150, 0 and 149; b's frames 0, 160 and 258; c's first.
+    owner = np.array([0, 0, 0, 1, 1, 2, 3, 3, 4])
+    start = np.array([0, 139, 140, 200, 349, 350, 449, 547, 548])
+    found = smgdiff_data.pieces(data, owner, start)
+    assert found.tolist() == [0, 0, 1, 0, 0, 2, 3, 3, 4]
 
 
 @pytest.mark.slow
@@ -284,6 +293,24 @@ def test_what_really_happened_scores_well(run):
         assert float(one["ball_in_ground"]) == pytest.approx(0.0, abs=1e-3)
         assert float(one["trajectory_error"]) < 20
         assert float(one["skill_accuracy"]) > 0.9  # a ball at hand, or far away
+
+
+def test_what_is_spoiled_is_farther_from_what_happened(setting):
+    """Limbs that stand still, and the ball of somebody else."""
+    future = setting.known.future
+    joints = future.motion.joint_rotation
+    frozen = jnp.broadcast_to(joints[:, :1], joints.shape)
+    motion = dataclasses.replace(future.motion, joint_rotation=frozen)
+    away = future.ball - future.motion.root_position
+    ball = future.motion.root_position + jnp.roll(away, 1, axis=0)
+    spoiled = [
+        future,
+        dataclasses.replace(future, motion=motion),
+        dataclasses.replace(future, ball=ball),
+    ]
+    wanted, label = setting.known.condition.trajectory, setting.known.label
+    found = [float(setting.score(x, wanted, label)["fid_held_out"]) for x in spoiled]
+    assert found[0] == pytest.approx(0.0, abs=1e-3 * min(found[1:]))
 
 
 def test_planted_errors_are_measured(setting):
