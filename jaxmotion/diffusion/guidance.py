@@ -122,7 +122,8 @@ def dsg_step(
       objective: Of the prediction; its gradient is finite.
       last_sigma: sigma of the step from t = 1; None for that of t = 2, as the released
         code's clipped variance has it. It is a fifth of the data's deviation at T = 8,
-        all of it along one direction: smaller values disturb less.
+        all of it along one direction: smaller values disturb less. A chain of one step
+        has no t = 2, and is not guided then.
 
     Source: Yang et al. 2024 (DSG), eq. 13-15 of SMGDiff, and DSG's released code.
     """
