@@ -278,10 +278,9 @@ class Page:
         try:
             async for text in socket:
                 try:
-                    await self._obey(client, text)
+                    self._obey(client, text)
                 except (ValueError, OSError) as error:
-                    client.errors = [" ".join(str(error).split())]
-                    client.news.set()
+                    client.tell(error)
         except package.exceptions.ConnectionClosed:
             pass
         finally:
@@ -335,7 +334,7 @@ class Page:
         if engine > self._body[0]:  # not that of an engine which is gone by now
             self._body = engine, made
 
-    async def _obey(self, client: "_Client", text: str | bytes) -> None:
+    def _obey(self, client: "_Client", text: str | bytes) -> None:
         message, session = read_message(text), self.session
         if "inputs" in message:
             session.steer(client, message["inputs"])
@@ -345,11 +344,19 @@ class Page:
         elif message.get("do") in ("reset", "step", "record"):
             getattr(session, message["do"])()
         elif message.get("save") in SUFFIXES:
-            path = await asyncio.to_thread(self._write, message["save"])
-            client.saved = path.name
-            client.news.set()
+            if client.saving is not None and not client.saving.done():
+                raise ValueError("the take before is still being saved")
+            client.saving = asyncio.create_task(self._keep(client, message["save"]))
         else:
             raise ValueError("unknown message, expected held, set, do or save")
+
+    async def _keep(self, client: "_Client", suffix: str) -> None:
+        """Saves the take, which may take seconds; inputs are obeyed meanwhile."""
+        try:
+            client.saved = (await asyncio.to_thread(self._write, suffix)).name
+            client.news.set()
+        except (ValueError, OSError) as error:
+            client.tell(error)
 
     def _write(self, suffix: str) -> Path:
         """Saves the take under the next free name."""
@@ -370,4 +377,10 @@ class _Client:
         self.news, self.state_due = asyncio.Event(), True
         self.frame, self.saved = b"", ""
         self.errors: list[str] = []
+        self.saving: asyncio.Task | None = None
+        self.news.set()
+
+    def tell(self, error: Exception) -> None:
+        """Sends what was wrong, in one line."""
+        self.errors = [" ".join(str(error).split())]
         self.news.set()

@@ -1,5 +1,6 @@
 """What held keys ask for, the session's ticks, and what it records."""
 
+import asyncio
 import concurrent.futures
 import dataclasses
 import json
@@ -332,6 +333,37 @@ def test_people_who_save_at_once_get_a_file_each(tmp_path):
     assert sorted(found) == [f"take_00{i}.bvh" for i in (1, 2, 3)]
     assert {x.read_text() for x in tmp_path.iterdir()} == {"bones walk"}
     assert len([*tmp_path.iterdir()]) == 3
+
+
+def test_inputs_are_obeyed_while_a_take_is_saved(tmp_path):
+    may_end, done = threading.Event(), []
+
+    def save(path, skeleton, motion):
+        assert may_end.wait(10)
+        path.write_text("a take")
+
+    session = object.__new__(viewer.Session)
+    session.take, session.record = ("bones", "walk"), lambda: done.append("record")
+    served = page.Page(session, out=tmp_path, save=save, is_local=lambda host: True)
+
+    async def converse():
+        client = page._Client()
+        served._obey(client, '{"save": ".bvh"}')
+        await asyncio.sleep(0.05)
+        served._obey(client, '{"do": "record"}')
+        assert done == ["record"] and not client.saved
+        with pytest.raises(ValueError, match="still being saved"):
+            served._obey(client, '{"save": ".bvh"}')
+        may_end.set()
+        await client.saving
+        assert client.saved == "take_001.bvh" and not client.errors
+        session.take = None
+        served._obey(client, '{"save": ".bvh"}')
+        await client.saving
+        assert client.errors == ["nothing is recorded yet"]
+
+    asyncio.run(converse())
+    assert [x.name for x in tmp_path.iterdir()] == ["take_001.bvh"]
 
 
 @pytest.mark.slow
