@@ -17,11 +17,12 @@ Examples:
 """  # noqa: E501
 
 import dataclasses
+import math
 import os
 import signal
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,9 @@ TITLES = {
     "smgdiff": "SMGDiff, a plan of {} steps",
 }
 # Rounds after which a row may sit out.
-FEW = 3
+FEW = 7
+# Milliseconds of a round that a row takes at least: quick calls are repeated.
+LEAST = 10.0
 # Whose encoder PyTorch can fuse, if the batch comes first, and ours can divide.
 FUSED = ("camdm", "smgdiff")
 
@@ -112,7 +115,7 @@ class Config(suite.Settings):
       threads: Threads (and cores) of all.
       rounds: Timed rounds; each runs every row once.
       limit: Seconds of rounds of a system and a batch, at most, but one round.
-      sit_out: After three rounds rows of more than so many times our time sit out the
+      sit_out: After seven rounds rows of more than so many times our time sit out the
         rest; 0 for none.
       row_limit: Seconds of one call; a row that would take longer, judged by the batch
         before, is left out. 0 for no limit.
@@ -291,24 +294,34 @@ def largest_differences(
 def time_rows(
     calls: dict[str, Callable], args: Config, *, warmup: int
 ) -> dict[str, np.ndarray]:
-    """Times in turn; far slower rows sit out after some rounds, as `sit_out` says."""
+    """Times in turn; far slower rows sit out after some rounds, as `sit_out` says.
+
+    A row of a round is the mean of as many calls as take `LEAST`.
+    """
     begun = time.perf_counter()
     few = min(FEW, args.rounds) if args.sit_out else args.rounds
-    times = timing.time_in_turn(
-        calls, rounds=few, warmup=warmup, limit_s=args.limit, least=1
-    )
+    once = timing.time_in_turn(calls, rounds=1, warmup=warmup, least=1)
+    many = {name: math.ceil(LEAST / max(once[name].min(), 0.1)) for name in calls}
+
+    def repeated(call: Callable, number: int) -> Callable:
+        def run() -> None:
+            for _ in range(number):
+                jax.block_until_ready(call())
+
+        return run
+
+    def in_turn(names: Iterable[str], **options: Any) -> dict[str, np.ndarray]:
+        some = {name: repeated(calls[name], many[name]) for name in names}
+        found = timing.time_in_turn(some, least=1, **options)
+        return {name: values / many[name] for name, values in found.items()}
+
+    times = in_turn(calls, rounds=few, warmup=0, limit_s=args.limit)
     most = args.sit_out * np.median(times[OURS], axis=0)
-    stay = {
-        name: call
-        for name, call in calls.items()
-        if not np.all(np.median(times[name], axis=0) > most)
-    }
+    stay = [name for name in calls if not np.all(np.median(times[name], axis=0) > most)]
     left = args.limit - (time.perf_counter() - begun)
     if len(times[OURS]) < few or few == args.rounds or left <= 0:
         return times
-    more = timing.time_in_turn(
-        stay, rounds=args.rounds - few, warmup=0, limit_s=left, least=1
-    )
+    more = in_turn(stay, rounds=args.rounds - few, warmup=0, limit_s=left)
     return times | {name: np.concatenate([times[name], more[name]]) for name in more}
 
 

@@ -9,6 +9,7 @@ import dataclasses
 import datetime
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import sys
@@ -168,13 +169,13 @@ def compare(metrics: list[Metric], baseline: Path) -> list[str]:
     for metric in metrics:
         if metric.name not in known:
             continue
-        old = known[metric.name]
-        factor = (
-            metric.value / old if metric.direction == "lower" else old / metric.value
-        )
-        if factor > 1.0 + metric.tolerance:
+        old, new = known[metric.name], metric.value
+        better, other = (new, old) if metric.direction == "lower" else (old, new)
+        # Also true of what is not a number, and of anything but 0 where 0 was.
+        if not better <= other * (1.0 + metric.tolerance):
+            factor = better / other if other else math.inf
             worse.append(
-                f"{metric.name}: {metric.value:.4g} {metric.unit}, baseline {old:.4g} "
+                f"{metric.name}: {new:.4g} {metric.unit}, baseline {old:.4g} "
                 f"({factor:.2f} times worse, {1 + metric.tolerance:.2f} allowed)"
             )
     return worse
@@ -416,6 +417,7 @@ def append_history(
         {"benchmark": name, **dataclasses.asdict(metric), "commit": commit, **same}
         for metric in metrics
     ]
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a") as file:
         file.writelines(json.dumps(entry) + "\n" for entry in entries)
     values: dict[str, list[tuple[int, float]]] = {}
@@ -449,8 +451,9 @@ def busy() -> tuple[float, float, float] | None:
     """Where the clocks stand, for `other_load`.
 
     Returns:
-      Seconds of wall clock, of all cores' work, and of this process's work; None where
-      the system does not say (it is Linux that does).
+      Seconds of wall clock, of all cores' work, and of that of this process and of its
+      children that have ended; None where the system does not say (it is Linux that
+      does).
     """
     try:
         fields = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]
@@ -460,7 +463,7 @@ def busy() -> tuple[float, float, float] | None:
     idle = sum(ticks[3:5])
     # Guest time (after the eighth field) is counted as user time already.
     used = (sum(ticks[:8]) - idle) / os.sysconf("SC_CLK_TCK")
-    return time.perf_counter(), used, time.process_time()
+    return time.perf_counter(), used, sum(os.times()[:4])
 
 
 _BEGIN = busy()

@@ -79,8 +79,8 @@ def time_in_turn(
 ) -> dict[str, np.ndarray]:
     """Times several calls in one run, so that what disturbs one disturbs all.
 
-    Every round calls each once; the order moves on by one a round, so that none always
-    runs after the same other.
+    Every round calls each once, in an order of its own, so that none always runs after
+    the same other.
 
     Arguments are of the calls of round i, warm-up included; making them is not timed.
     Warm-up is shorter where it takes a quarter of the limit (seconds), after which only
@@ -91,9 +91,8 @@ def time_in_turn(
 
     def one_round() -> list[tuple[float, float]]:
         nonlocal made
-        turn = made % len(names)
         found = {}
-        for name in names[turn:] + names[:turn]:
+        for name in np.random.default_rng(made).permutation(names).tolist():
             given = arguments(made)
             start, start_cpu = time.perf_counter(), time.process_time()
             jax.block_until_ready(calls[name](*given))
