@@ -61,8 +61,8 @@ class Config(suite.Settings):
 
     Attributes:
       system: What to measure: camdm steers the procedural walker by plans of 45
-        frames; aamdm makes every frame, free, and is compared with a Python loop over
-        its jitted networks.
+        frames; aamdm makes every frame, free, and one character is compared with
+        Python loops over jitted frames, steps and networks.
       characters: Characters that are rolled out together.
       seconds: Length of a rollout.
       run: Name of a shipped model of any system, to be steered; or a trained model:
@@ -251,6 +251,34 @@ def case(
     }
 
 
+def python_loops(
+    args: Config, load: workload.Rollouts
+) -> dict[str, tuple[float, float]]:
+    """Python loops over the ticks of one character, timed in turn with the program.
+
+    Returns:
+      By name, frames per second and how many times as fast the program is: medians,
+      the latter of ratios within a round. Empty where the system has no loops.
+    """
+    program = fitting(args, load, 1, None)
+    if not (loops := load.loops(program.ticks)):
+        return {}
+    times = timing.time_in_turn(
+        {"": lambda: program.run(0), **loops},
+        rounds=args.runs,
+        limit_s=args.limit,
+        least=1,
+    )
+    wall = {name: values[:, 0] for name, values in times.items()}
+    return {
+        name: (
+            float(1000 * program.ticks / np.median(wall[name])),
+            float(np.median(wall[name] / wall[""])),
+        )
+        for name in loops
+    }
+
+
 def slope(rows: list[dict[str, Any]]) -> float | None:
     """Exponent e of time ~ characters^e, by least squares over the logarithms.
 
@@ -318,20 +346,17 @@ def main() -> None:
             xlabel="characters",
             ylabel=f"{args.seconds:g} s of motion, ms (p50)",
         )
-    alone = [row["frames_per_second"] for row in rows if row["characters"] == 1]
-    loops = {}
-    for name, rate in load.loops(args.limit).items():
-        loops[name] = rate
+    loops = python_loops(args, load) if 1 in args.characters else {}
+    for name, (rate, ratio) in loops.items():
         metrics.append(
             suite.Metric(
                 f"{args.system} Python loop, {name}", rate, "frames/s", "higher", 0.6
             )
         )
-        text = f"Python loop, {name}: {rate:,.1f} frames/s"
-        if alone:
-            loops[f"ratio, {name}"] = alone[0] / rate
-            text += f"; as one program {alone[0] / rate:.1f} times as many"
-        print(text)
+        print(
+            f"Python loop, {name}: {rate:,.1f} frames/s; one program is {ratio:.2f} "
+            "times as fast"
+        )
     more = {"slope": steep, "matmul_gflops": floor[0] / 1e9, "plan_flops": floor[1]}
     more |= {"python_loops": loops} if loops else {}
     suite.report("rollout_batch", metrics, args, rows=rows, **more)

@@ -8,7 +8,6 @@ given: their values do not change the time.
 import dataclasses
 import functools
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -158,8 +157,7 @@ class Rollouts:
       plans: How often networks made something, in all frames together.
       fps: Ticks per second.
       chunk: Characters at a time that was fastest on two cores; 0 for all.
-      loops: Frames per second of Python loops to compare with, by name, within a
-        number of seconds each.
+      loops: Python loops over a number of ticks of one character, by name.
     """
 
     params: Params
@@ -168,7 +166,7 @@ class Rollouts:
     plans: Callable[[Any], float]
     fps: float
     chunk: int
-    loops: Callable[[float], dict[str, float]] = lambda _: {}
+    loops: Callable[[int], dict[str, Callable[[], Any]]] = lambda _: {}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -554,17 +552,25 @@ def _aamdm_rollouts(
         label = jnp.zeros(facing.shape[:-1], jnp.int32)
         return states, trajectory.Command(velocity=facing, facing=facing, label=label)
 
-    def loops(limit_s: float) -> dict[str, float]:
+    def loops(ticks: int) -> dict[str, Callable[[], Any]]:
         state, command = jax.tree.map(lambda x: x[0], start(1))
         command = jax.tree.map(lambda x: x[0], command)
         driver = controller({"networks": params, "space": space})
+        parts = functools.partial(
+            _aamdm_frame, config, params, space, driver, joints, command
+        )
+
+        def tick(key: Key, state: Any) -> Any:
+            return rollout.tick(driver, key, state, command)[0]
+
+        whole = jax.jit(tick, compiler_options=timing.compiler_options())
+        frames = {
+            "networks jitted": parts(glue=False),
+            "whole steps jitted": parts(glue=True),
+            "whole frames jitted": whole,
+        }
         return {
-            name: _python_loop(
-                _aamdm_frame(config, params, space, driver, joints, command, glue),
-                state,
-                limit_s,
-            )
-            for name, glue in (("networks jitted", False), ("whole steps jitted", True))
+            name: _python_loop(frame, state, ticks) for name, frame in frames.items()
         }
 
     return Rollouts(
@@ -635,15 +641,17 @@ def _aamdm_frame(
     return frame
 
 
-def _python_loop(frame: Callable, state: Any, limit_s: float, most: int = 300) -> float:
-    """Frames per second of a Python loop, in at most so many seconds and frames."""
-    key, count = jax.random.key(0), 0
-    state = jax.block_until_ready(frame(key, state))
-    begun = time.perf_counter()
-    while count < most and time.perf_counter() - begun < limit_s:
-        state = jax.block_until_ready(frame(jax.random.fold_in(key, count), state))
-        count += 1
-    return count / (time.perf_counter() - begun)
+def _python_loop(frame: Callable, state: Any, ticks: int) -> Callable[[], Any]:
+    """Makes so many frames, one after the other; their keys are made beforehand."""
+    keys = [*jax.random.split(jax.random.key(0), ticks)]
+
+    def run() -> Any:
+        now = state
+        for key in keys:
+            now = jax.block_until_ready(frame(key, now))
+        return now
+
+    return run
 
 
 def _aamdm_training(sizes: Sizes, batch: int) -> Training:

@@ -61,11 +61,11 @@ def run_script(name, *arguments):
 
 @pytest.mark.slow
 def test_a_rollout_stands_beside_python_loops():
-    """Compiled alike; whole steps, or the networks alone, are jitted in them."""
+    """Compiled alike; frames, steps, or the networks alone, are jitted in them."""
     small = ["--width", "16", "--runs", "2", "--limit", "1", "--seconds", "0.1"]
     text = run_script("rollout_batch", "--system", "aamdm", "--characters", "1", *small)
     rates = re.findall(r"Python loop, ([a-z ]+) jitted: ([0-9.,]+) frames/s", text)
-    assert [name for name, _ in rates] == ["networks", "whole steps"]
+    assert [name for name, _ in rates] == ["networks", "whole steps", "whole frames"]
     assert all(float(rate.replace(",", "")) > 0 for _, rate in rates)
 
 
