@@ -526,7 +526,6 @@ def main() -> None:
         args,
         rows=rows,
         threads=threads,
-        torch=torch.__version__,
         systems=about,
     )
     for row in rows:

@@ -485,7 +485,8 @@ def other_load(since: tuple[float, float, float] | None = _BEGIN) -> float | Non
 def environment() -> dict[str, Any]:
     """Hardware, versions, command, date; "other_load" says how far to trust times."""
     versions = {}
-    for name in ("jax", "jaxlib", "flax", "numpy", "jaxmotion"):
+    peers = [name for name in ("torch", "onnxruntime") if name in sys.modules]
+    for name in ("jax", "jaxlib", "flax", "numpy", "jaxmotion", *peers):
         try:
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

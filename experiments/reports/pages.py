@@ -166,6 +166,8 @@ def _where_from(one: Stored, page: Path, folder: Path) -> list[str]:
     if "measured" in about:
         made = about["measured"]
         told += [f"commit {made['git_commit'][:8]}", f"`{made['command']}`"]
+        if (load := made.get("other_load") or 0.0) > 0.1:
+            told += [f"other processes kept {load:g} cores busy meanwhile"]
     else:
         told += [f"transcribed from {about['transcribed']}"]
         told += [f"`{about['command']}`"] if "command" in about else []

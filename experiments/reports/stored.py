@@ -28,7 +28,8 @@ FOLDER = Path(__file__).parents[1] / "results"
 # Of an evaluation's file: what made it, and what else is kept.
 _MEASURED = (
     *("command", "git_commit", "date", "cpu", "machine", "cores", "devices"),
-    *("python", "jax", "jaxlib", "flax", "numpy"),
+    *("python", "jax", "jaxlib", "flax", "numpy", "torch", "onnxruntime"),
+    "other_load",
 )
 _KEPT = (
     *("source", "arguments", "seeds", "data", "rounded"),

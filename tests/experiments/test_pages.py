@@ -229,6 +229,7 @@ def test_rows_are_added_to_those_of_the_same_kind(stored, tmp_path):
 
 def test_what_is_kept_of_a_benchmark(stored, tmp_path):
     made = dict(command="python b.py", git_commit="abc", cpu="a processor")
+    made |= dict(torch="2.13", other_load=1.5)
     names = {"emdm batch=1 p50": 2.0, "emdm batch=1 frames": 9.0}
     metrics_ = [dict(name=k, value=v, unit="", direction="") for k, v in names.items()]
     report = dict(benchmark="b", environment=made, metrics=metrics_, settings={})
@@ -239,6 +240,7 @@ def test_what_is_kept_of_a_benchmark(stored, tmp_path):
     assert [x.value for x in found.cells("emdm batch=1", "p50")] == [2.0]
     assert found.columns["frames"].title == "frames per second"
     assert found.columns["p50"].kind == "time"
+    assert found.measured.about["measured"] == made
 
 
 @pytest.mark.parametrize(
