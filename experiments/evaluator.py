@@ -5,30 +5,46 @@ Examples:
   python experiments/evaluator.py train --kind action --data data/bandai1.npz data/bandai2.npz --out evaluators/bandai_action.npz
   python experiments/evaluator.py train --kind ball --data data/dribble.npz --out evaluators/dribble_ball.npz
   python experiments/evaluator.py show evaluators/bandai2_style.npz
+  python experiments/evaluator.py doubt evaluators/bandai2_style.npz --data data/bandai2.npz
   python experiments/camdm.py evaluate --run runs/camdm --evaluator evaluators/bandai2_style.npz
 """  # noqa: E501
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import tyro
+from jaxtyping import Array, Float
 
-from jaxmotion import cli
-from jaxmotion.data import selection
-from jaxmotion.data.ball_clips import load_ball_clips
+from jaxmotion import cli, reporting
+from jaxmotion.data import resample, selection, windows
+from jaxmotion.data.ball_clips import BallClips, load_ball_clips
+from jaxmotion.data.clips import Clips
+from jaxmotion.data.clips_io import load_clips
+from jaxmotion.evaluation import faults, frechet, table
+from jaxmotion.evaluators import action as action_evaluator
 from jaxmotion.evaluators import frozen
-from jaxmotion.evaluators.frozen import Evaluator
+from jaxmotion.evaluators import style as style_evaluator
+from jaxmotion.evaluators.frozen import Evaluator, clips_fingerprint
 from jaxmotion.learning import loop
+from jaxmotion.motion import features
+from jaxmotion.motion.ball import Scene
+from jaxmotion.motion.skeleton import Motion, joint_positions
 from jaxmotion.systems.camdm import evaluation as camdm_evaluation
 from jaxmotion.systems.camdm import training as camdm_training
 from jaxmotion.systems.emdm import action_evaluation as emdm_action_evaluation
 from jaxmotion.systems.emdm import data as emdm_data
 from jaxmotion.systems.smgdiff import data as smgdiff_data
 from jaxmotion.systems.smgdiff import evaluation as smgdiff_evaluation
+from jaxmotion.systems.smgdiff import scoring as smgdiff_scoring
+from jaxmotion.systems.smgdiff import training as smgdiff_training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,9 +231,137 @@ def import_weights(args: Import) -> None:
     show(Show(file=args.out))
 
 
+@dataclasses.dataclass(frozen=True)
+class Doubt:
+    """Plant faults into recordings, and see how far the evaluator finds them off.
+
+    Random halves of windows with a fault are compared with the other halves as they were
+    recorded; the first row has no fault. A fault that adds nothing to it, nobody sees in
+    a Fréchet distance of this evaluator.
+
+    Example: python experiments/evaluator.py doubt evaluators/bandai2_style.npz --data data/bandai2.npz
+
+    Attributes:
+      data: Clips of its skeleton, with a ball for kind "ball".
+      out: Folder for metrics.json and table.md.
+      windows: Windows that do not overlap, at most.
+      replications: Random halves.
+      seed: Seeds windows, halves and faults.
+    """  # noqa: E501
+
+    file: tyro.conf.Positional[Path]
+    data: Path = Path("data/bandai2.npz")
+    out: Path = Path("runs/doubt")
+    windows: int = 600
+    replications: int = 10
+    seed: int = 0
+
+
+# Of windows [windows, frames, ...] and the balls in them, if the evaluator sees balls.
+Features = Callable[[Motion, Array | None], Float[Array, "windows features"]]
+
+
+def sees(args: Doubt, evaluator: Evaluator) -> tuple[Clips, BallClips | None, Features]:
+    """Clips at the evaluator's rate, their balls, and what it makes of windows."""
+    balls = load_ball_clips(args.data) if evaluator.kind == "ball" else None
+    clips = load_clips(args.data) if balls is None else balls.clips
+    skeleton, params, config = clips.skeleton, evaluator.params, evaluator.config
+    if evaluator.kind == "style_release" or skeleton.names != evaluator.joints:
+        raise ValueError(
+            f"{args.file} is of kind {evaluator.kind!r} and {len(evaluator.joints)} "
+            f"joints, expected one of the {skeleton.num_joints} joints of {args.data}"
+        )
+    if balls is None:
+        clips = resample.resample_clips(clips, evaluator.fps)
+    elif clips.fps != evaluator.fps:
+        raise ValueError(f"{args.data} has {clips.fps:g} fps, not {evaluator.fps:g}")
+    else:
+        representation = smgdiff_training.make_model(balls, sizes={}).representation
+
+    @jax.jit
+    def features_of(motion: Motion, ball: Array | None) -> Array:
+        if evaluator.kind == "action":
+            x = joint_positions(skeleton, features.to_first_pose(skeleton, motion))
+            x = x.reshape(*x.shape[:-2], -1)
+            key = jax.random.key(args.seed)
+            return action_evaluator.classify(params, key, x, config=config)[0]
+        if ball is None:
+            x = style_evaluator.window_input(skeleton, motion)
+        else:
+            scene = Scene(motion=motion, ball=ball, touch=ball[..., :0])  # unseen
+            x = smgdiff_scoring.evaluator_input(scene, representation)
+        return style_evaluator.classify(params, x, config=config)[0]
+
+    return clips, balls, features_of
+
+
+def spoiled(
+    motion: Motion, ball: Array | None, *, seed: int
+) -> dict[str, tuple[Motion, Array | None]]:
+    """Windows as recorded, and with faults; the ball stays where the root has it."""
+    found = {"as recorded": motion}
+    found |= faults.planted(jax.random.key(seed), motion)
+    if ball is None:
+        return {name: (one, None) for name, one in found.items()}
+    away = ball - motion.root_position
+    beside = {name: (one, one.root_position + away) for name, one in found.items()}
+    swapped = motion.root_position + away[faults.other(len(away))]
+    return beside | {"ball of another window": (motion, swapped)}
+
+
+def doubt(args: Doubt) -> None:
+    """Writes the table."""
+    loop.check_writable(args.out)
+    evaluator = frozen.load(args.file)
+    clips, balls, features_of = sees(args, evaluator)
+    length, generator = evaluator.frames, np.random.default_rng(args.seed)
+    index = windows.window_index(clips, length, stride=length, short="skip")
+    starts = generator.permutation(np.asarray(index.starts))
+    # Two and two, for faults that are of another window: both are in one half.
+    pairs = min(args.windows, starts.size) // 2
+    if pairs < 2:
+        raise ValueError(
+            f"{starts.size} windows of {length} frames, of which --windows takes "
+            f"{args.windows}: expected 4 or more"
+        )
+    starts = starts[: 2 * pairs]
+    rows = jnp.asarray(np.add.outer(starts, np.arange(length)))
+    motion = Motion(
+        root_position=clips.root_position[rows],
+        joint_rotation=clips.joint_rotation[rows],
+        fps=clips.fps,
+    )
+    ball = None if balls is None else balls.position[rows]
+    made = spoiled(motion, ball, seed=args.seed)
+    found = {name: features_of(*windows) for name, windows in made.items()}
+    orders = [generator.permutation(pairs) for _ in range(args.replications)]
+    orders = [np.stack([2 * x, 2 * x + 1], axis=1).reshape(-1) for x in orders]
+    parts = [np.split(x, [pairs // 2 * 2]) for x in orders]
+    distance = jax.jit(
+        lambda a, b: frechet.frechet_distance(frechet.moments(a), frechet.moments(b))
+    )
+    plain = found["as recorded"]
+    distances = {
+        name: jnp.stack([distance(own[a], plain[b]) for a, b in parts])
+        for name, own in found.items()
+    }
+    cells = functools.partial(table.cell, part=0.5)
+    added = {name: x - distances["as recorded"] for name, x in distances.items()}
+    table_rows = {
+        name: {"fid": cells(x), "fid_added": cells(added[name])}
+        for name, x in distances.items()
+    }
+    reference = clips_fingerprint(clips, evaluator.field)
+    described = frozen.describe(evaluator.params, evaluator, reference=reference)
+    report = {"source": clips.source, "evaluator": described}
+    report |= reporting.provenance(args)
+    reporting.write_table(args.out, table_rows, report, (frozen.note(described),))
+
+
 COMMANDS = {
     "train": (Train, train),
     "show": (Show, show),
+    "doubt": (Doubt, doubt),
     "import": (Import, import_weights),
 }
 

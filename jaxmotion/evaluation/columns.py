@@ -59,6 +59,7 @@ COLUMNS: dict[str, Column] = {
         _evaluated("fid", "FID"),
         _evaluated("fid_unbiased", "FID, unbiased"),
         _evaluated("fid_held_out", "FID to held-out clips"),
+        _evaluated("fid_added", "FID more than without the fault", "higher"),
         _evaluated("fid_uc", "FID under control"),
         _evaluated("accuracy", "accuracy", "higher", bounds=_SHARE),
         _evaluated("style_accuracy", "style accuracy", "higher", unit="%"),

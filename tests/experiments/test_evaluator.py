@@ -74,6 +74,26 @@ def test_training_writes_a_file_and_prints_its_fingerprint(
     assert shown(capsys.readouterr().out) == trained
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", TRAIN)
+def test_faults_are_measured_beside_recordings(invoke, frozen, data, tmp_path, kind):
+    path, out = frozen(kind), tmp_path / "doubt"
+    clips = data / ("ball.npz" if kind == "ball" else "clips.npz")
+    options = f"--data {clips} --out {out} --windows 8 --replications 2"
+    invoke("evaluator", f"doubt {path} {options}")
+    rows = json.loads((out / "metrics.json").read_text())["rows"]
+    assert ("ball of another window" in rows) == (kind == "ball")
+    fid = {name: row["fid"]["value"] for name, row in rows.items()}
+    assert rows["as recorded"]["fid_added"]["value"] == 0.0
+    for name, row in rows.items():
+        added = fid[name] - fid["as recorded"]
+        assert row["fid_added"]["value"] == pytest.approx(added, abs=1e-4)
+    assert fid["limbs stand still"] != fid["as recorded"]
+    # Actions are recognized by the path, too; styles and skills are not.
+    seen = fid["paths 1.3 times as long: feet slide"] - fid["as recorded"]
+    assert (abs(seen) > 1e-3) == (kind == "action")
+
+
 BAD = {
     "train --data {gone} --out {new}": "gone.npz",
     "train --data {clips} --out {new} --label mood": "field 'mood'",
