@@ -179,7 +179,8 @@ def contact_scores(
     """How well foot and ball go together.
 
     Touches and missed ones per minute, missed part of the touches, distance at touches,
-    penetration of the ground and of the ball, acceleration without a touch.
+    penetration of the ground and of the ball, acceleration without a touch. Part and
+    distance are NaN where there is no touch.
     """
     skeleton, fps = representation.skeleton, representation.fps
     joints = jnp.array(representation.joints)
@@ -195,7 +196,7 @@ def contact_scores(
     minutes, touches = jnp.sum(count.minutes), jnp.sum(count.touches)
     sunk = ball.ground_penetration(scenes.ball, radius=representation.radius)
     inside = ball.joint_penetration(scenes.ball, places, radius=representation.radius)
-    ratio = lambda a, b: jnp.sum(a) / jnp.maximum(jnp.sum(b), 1.0)  # noqa: E731
+    ratio = lambda a, b: jnp.sum(a) / jnp.sum(b)  # noqa: E731
     return {
         "touches": touches / minutes,
         "missed": jnp.sum(count.missed) / minutes,

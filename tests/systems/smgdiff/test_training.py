@@ -325,6 +325,11 @@ def test_planted_errors_are_measured(setting):
     found = score(sunk(known.future), wanted, known.label)
     assert float(found["ball_in_ground"]) == pytest.approx(13.0, abs=1e-3)
     plain = score(known.future, wanted, known.label)
+    # Nobody touches a ball that rests: no part of no touches, rather than the best.
+    rests = dataclasses.replace(known.future, ball=jnp.ones_like(known.future.ball))
+    resting = score(rests, wanted, known.label)
+    assert float(resting["touches"]) == float(resting["missed"]) == 0.0
+    assert np.isnan([resting["missed_part"], resting["touch_distance"]]).all()
     assert float(found["foot_slide"]) == float(plain["foot_slide"])
     wrong = score(known.future, wanted, 1 - known.label)
     total = float(wrong["skill_accuracy"]) + float(plain["skill_accuracy"])
