@@ -46,6 +46,7 @@ except ModuleNotFoundError as error:
     ) from None
 
 EAGER = "torch eager"
+ONEDNN = "torch eager, products by oneDNN"
 OURS = "ours, constants"
 PREFIX = "ours, prefix attention"
 COMPILED = "torch.compile"
@@ -70,6 +71,7 @@ STORED = {
     OURS: "ours",
     PREFIX: "prefix",
     EAGER: "eager",
+    ONEDNN: "onednn",
     COMPILED: "compile",
     ONNX: "onnx",
 }
@@ -92,9 +94,11 @@ class Config(suite.Settings):
     """Milliseconds of a batch of samples, and ratios to PyTorch in eager mode.
 
     Rows: ours with the parameters as arguments and as constants of the program; PyTorch
-    eager as the released code lays it out (tokens first), for CAMDM's network also with
-    the batch first (which lets PyTorch use its fused inference kernels), and through
-    torch.compile, which compiles the network for each batch; our graph in onnxruntime.
+    eager as the released code lays it out (tokens first), the same with its own oneDNN
+    in the place of MKL (half as fast as that on AMD's processors), for CAMDM's network
+    also with the batch first (which lets PyTorch use its fused inference kernels), and
+    through torch.compile, which compiles the network for each batch; our graph in
+    onnxruntime.
     "Prefix attention" has the same parameters and is another function: networks are
     trained for it, as the shipped `locomotion` was.
 
@@ -282,9 +286,13 @@ def largest_differences(
     tape = noise.draw_noise(sample, jax.random.key(2), first(conditions))
     ours = jax.jit(noise.with_noise(sample))(tape, first(conditions))
     tape = jax.tree.map(lambda x: x[None], tape)
-    with torch.inference_mode():
-        theirs = torch_peers.sample(peer, *torch_peers.from_tape(tape), given)
-    found = {EAGER: theirs.numpy()}
+
+    def theirs() -> torch.Tensor:
+        with torch.inference_mode():
+            return torch_peers.sample(peer, *torch_peers.from_tape(tape), given)
+
+    onednn = torch_peers.with_onednn(theirs)
+    found = {EAGER: theirs().numpy(), ONEDNN: onednn().numpy()}
     if player is not None:
         found[ONNX] = player.run(tape, conditions)
     difference = lambda x: float(np.abs(x[0] - np.asarray(ours)).max())  # noqa: E731
@@ -411,6 +419,8 @@ def calls_of(
     for name, peer in peers.items():
         if name not in skip and (name == EAGER or batch == 1):
             calls[name] = torch_call(peer, batch, given)
+    if ONEDNN not in skip:
+        calls[ONEDNN] = torch_peers.with_onednn(torch_call(peers[EAGER], batch, given))
     if compile_limit and COMPILED not in skip:
         call, note = compiled_call(peers[EAGER], batch, given, compile_limit)
         if call is not None:

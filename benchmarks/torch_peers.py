@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.nn import functional
 
 from jaxmotion.diffusion import schedule
 from jaxmotion.networks import blocks
@@ -493,6 +494,37 @@ def forward(peer: Peer, batch: int, given: tuple[torch.Tensor, ...]) -> None:
         for net, latent in set(zip(peer.nets, peer.latents, strict=True)):
             own = (torch.zeros(batch, latent),) if latent else ()
             net(torch.zeros(batch, *peer.shape), steps, *given, *own)
+
+
+def with_onednn(call: Callable[[], torch.Tensor]) -> Callable[[], torch.Tensor]:
+    """A call whose linear layers are multiplied by PyTorch's own oneDNN.
+
+    PyTorch's wheels multiply float32 by MKL, which on AMD's processors leaves half of
+    the vector unit unused; torch.compile knows oneDNN's packed products, eager mode has
+    no switch for them.
+    """
+    plain, packed = functional.linear, {}
+    reorder = torch.ops.mkldnn._reorder_linear_weight
+    multiply = torch.ops.mkldnn._linear_pointwise
+
+    def linear(
+        x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        if x.dim() < 2:
+            return plain(x, weight, bias)
+        key = weight.data_ptr(), *weight.shape
+        if key not in packed:
+            packed[key] = reorder(weight.detach(), x.shape[:-1].numel())
+        return multiply(x, packed[key], bias, "none", [], "")
+
+    def run() -> torch.Tensor:
+        functional.linear = linear
+        try:
+            return call()
+        finally:
+            functional.linear = plain
+
+    return run
 
 
 def plan_call(
