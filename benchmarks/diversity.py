@@ -165,7 +165,7 @@ def make_load(
       OSError: if the run or its clips cannot be read.
       ValueError: if the run is none, or has no such style or course.
     """
-    if not run.exists() and str(run) not in files.SHIPPED:
+    if not run.exists() and files.shipped(run) is None:
         raise ValueError(f"{run}: no such file or folder")
     clips, field = None, "style"
     if not run.is_dir():

@@ -312,7 +312,9 @@ def main() -> None:
     """Measures and writes the report."""
     args = suite.parse(Config, __doc__)
     suite.at_least(args, characters=1, runs=1)
-    shipped = str(args.run) in files.SHIPPED
+    shipped = args.run is not None and files.shipped(args.run) is not None
+    if args.run is not None and args.width is not None:
+        raise ValueError("--width is of random networks, expected none beside --run")
     if shipped:
         load = workload.shipped_rollouts(str(args.run), args.seconds, args.staggered)
     else:

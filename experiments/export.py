@@ -208,14 +208,17 @@ def export(args: Config) -> None:
     else:
         character = jm.load(source, foot_lock=args.foot_lock)
         functions, arguments, facts, starts = steered(character)
-    old, graphs = earlier(args.out), {}
+    # All of it into a folder of its own first: who stops keeps the export before.
+    old, graphs, new = earlier(args.out), {}, args.out / ".new"
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir(parents=True)
     for name, function in functions.items():
-        begun, path = time.perf_counter(), args.out / (name + writer.SUFFIX)
+        begun, path = time.perf_counter(), new / (name + writer.SUFFIX)
         made = graph.make(name, function, arguments)
         writer.write(path, made, batch=batch)
         graphs[name] = graph.to_json(made, path.name, batch=batch)
         size, seconds = path.stat().st_size / 1e6, time.perf_counter() - begun
-        print(f"{path}: {size:.2f} MB, {seconds:.0f} s", flush=True)
+        print(f"{args.out / path.name}: {size:.2f} MB, {seconds:.0f} s", flush=True)
     kind = next(name for name in CALLS if name in graphs)
     about = {
         "format": 1,
@@ -228,14 +231,18 @@ def export(args: Config) -> None:
         "graphs": graphs,
         "versions": runs.versions(),
     }
-    for path in old - {args.out / found["file"] for found in graphs.values()}:
-        path.unlink(missing_ok=True)
-    files.write_text(args.out / "character.json", json.dumps(about, indent=1) + "\n")
     if starts:
-        files.write_arrays(args.out / "start.npz", starts)
+        files.write_arrays(new / "start.npz", starts)
     if starts and args.format == "onnx" and batch is None:
         player = Path(jm.__file__).with_name("export") / "player.py"
-        shutil.copyfile(player, args.out / player.name)
+        shutil.copyfile(player, new / player.name)
+    listed = args.out / "character.json"
+    for path in {listed, *old}:
+        path.unlink(missing_ok=True)
+    for path in new.iterdir():
+        path.replace(args.out / path.name)
+    new.rmdir()
+    files.write_text(listed, json.dumps(about, indent=1) + "\n")
     print(f"{args.out / 'character.json'}: {', '.join(graphs)}")
 
 

@@ -77,15 +77,13 @@ def load(
         without such an option, an option is of another kind, or its skeleton has no
         legs whose feet could be locked.
     """
-    path = Path(source)
-    is_shipped = not path.exists()
-    if is_shipped:
-        if str(source) not in files.SHIPPED:
-            raise ValueError(
-                f"{source}: no such file or folder, and no shipped model "
-                f"({', '.join(files.SHIPPED)})"
-            )
-        path = files.SHIPPED[str(source)]
+    own = files.shipped(source)
+    path, is_shipped = own or Path(source), own is not None
+    if not path.exists():
+        raise ValueError(
+            f"{source}: no such file or folder, and no shipped model "
+            f"({', '.join(files.SHIPPED)})"
+        )
     found = registry.SYSTEMS.get(system_of(path))
     if found is None:
         raise ValueError(

@@ -31,6 +31,16 @@ CLIPS_MAKER = (
 )
 
 
+def shipped(source: str | os.PathLike) -> Path | None:
+    """File of the shipped model of that name; None for others, files and run folders.
+
+    A folder of that name that is no run, such as an exported page's, is not meant.
+    """
+    path = Path(source)
+    own = path.is_file() or (path / "config.json").exists()
+    return None if own else SHIPPED.get(str(source))
+
+
 def open_regular(path: str | os.PathLike) -> BinaryIO:
     """Opens a file for reading, unless it is a pipe or a device (`OSError`)."""
     path = os.fspath(path)

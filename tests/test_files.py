@@ -210,3 +210,17 @@ def test_no_warning_of_numpy_slips_through(tmp_path):
         for content, _ in ARRAYS.values():
             with pytest.raises(ValueError):
                 files.read_arrays(io.BytesIO(content), name="x.npz", what="clips")
+
+
+def test_a_folder_of_a_shipped_models_name_is_not_it_unless_it_is_a_run(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert files.shipped("walker") == files.SHIPPED["walker"]
+    assert files.shipped("nobody") is None
+    (tmp_path / "walker").mkdir()  # of an exported page
+    assert files.shipped("walker") == files.SHIPPED["walker"]
+    (tmp_path / "walker" / "config.json").write_text("{}")
+    assert files.shipped("walker") is None
+    (tmp_path / "dribble").write_text("a file")
+    assert files.shipped("dribble") is None

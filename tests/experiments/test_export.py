@@ -78,6 +78,20 @@ def test_graphs_of_the_export_before_are_taken_away(script, tmp_path, monkeypatc
         (tmp_path / name).write_text("of before")
     options = {"model": ("one",), "out": tmp_path}
     script.export(script.Config(**options, format="onnx", batch="4"))
+    before = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    functions["gone"] = None  # an export that ends at its last graph
+
+    def made(name, *given):
+        if name == "gone":
+            raise KeyboardInterrupt
+        return f"new {name}"
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(script.graph, "make", made)
+        script.export(script.Config(**options, format="onnx", batch="4"))
+    found = [path for path in tmp_path.iterdir() if path.is_file()]
+    assert {path.name: path.read_text() for path in found} == before
+    functions.pop("gone")
     functions.pop("plan")
     functions["tick"] = None
     script.export(script.Config(**options, format="stablehlo"))

@@ -464,9 +464,7 @@ def load(folder: str | Path) -> tuple[Model, Params]:
     `CheckpointError` if its checkpoint is missing, corrupt or foreign, `ValueError` if
     its JSON is not that of a CAMDM model.
     """
-    path = Path(folder)
-    if not path.exists():
-        path = files.SHIPPED.get(str(folder), path)
+    path = files.shipped(folder) or Path(folder)
     if path.is_file():
         params, value = checkpoint.import_params(path)
         model = from_json(value, where=str(path))
