@@ -170,6 +170,12 @@ class Table:
         """Where a row is measured."""
         return row.source or self.source
 
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """Files of its rows, and of those by our recipes."""
+        rows = [*self.rows, *self.ours.rows]
+        return tuple(dict.fromkeys(map(self.source_of, rows)))
+
     def stated(self, row: str, column: str) -> Stated:
         """What the paper prints."""
         place = [x.name for x in self.columns].index(column)

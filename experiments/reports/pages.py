@@ -277,9 +277,7 @@ def _claims(store: Store, name: str, options: dict[str, Any], page: Path) -> lis
 def found_of(store: Store, system: str) -> stored.Found:
     """Stored trainings of a paper's tables."""
     paper = next(x for x in writing.PAPERS if x.system.name == system)
-    sources = dict.fromkeys(
-        table.source_of(row) for table in paper.tables for row in table.rows
-    )
+    sources = dict.fromkeys(x for table in paper.tables for x in table.sources)
     return stored.found_for(store.folder, tuple(sources))
 
 

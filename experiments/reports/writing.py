@@ -20,14 +20,12 @@ PAPERS = tuple(
 TABLES = tuple(table for paper in PAPERS for table in paper.tables)
 ABSENT = tuple(what for paper in PAPERS for what in paper.absent)
 # Every file that a table needs, in the tables' order.
-SOURCES = tuple(
-    dict.fromkeys(table.source_of(row) for table in TABLES for row in table.rows)
-)
+SOURCES = tuple(dict.fromkeys(x for table in TABLES for x in table.sources))
 # Those with values of an evaluator.
 EVALUATED = {
-    table.source_of(row)
+    source
     for table in TABLES
-    for row in table.rows
+    for source in table.sources
     if any(column.evaluated for column in table.columns)
 }
 
