@@ -318,7 +318,7 @@ def costs_svg(panels: tuple[Costs, ...], *, title: str, description: str = "") -
     samplers = dict.fromkeys(name for panel in panels for name in panel.points)
     colors = dict(zip(samplers, _CYCLE, strict=False))
     peers = dict.fromkeys(name for panel in panels for name in panel.peers)
-    marks = dict(zip(peers, "o^sDX", strict=False))
+    marks = dict(zip(peers, "o^sDXvP*", strict=False))
     with matplotlib.rc_context({"svg.hashsalt": "jaxmotion", "svg.fonttype": "path"}):
         canvas = Figure(figsize=(9.0, 3.7 * down + 0.9), layout="constrained")
         canvas.suptitle(title, fontsize=11, parse_math=False)

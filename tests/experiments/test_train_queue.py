@@ -220,21 +220,21 @@ def test_a_job_has_the_commands_of_its_run_with_its_seed(load, tmp_path):
     module = load("train_queue")
     args = module.Config(runs=tmp_path, only=("smgdiff_long",))
     (sources,) = module.sources_of(args).values()
-    job = module.job_of(args, sources, 2)
-    folder = tmp_path / "smgdiff_long_seed2"
+    job = module.job_of(args, sources, 11)
+    folder = tmp_path / "smgdiff_long_seed11"
     assert (job.run, job.folder) == ("smgdiff_long", folder)
     # All seeds share one evaluator, which is made first, and once.
     evaluator, *own = job.commands
     assert "evaluator.py train --kind ball" in evaluator and "--seed" not in evaluator
     assert all(str(folder) in line for line in own)
-    assert all(("--seed 2" in x) == (" train " in x) for x in own)
+    assert all(("--seed 11" in x) == (" train " in x) for x in own)
     assert len(set(job.commands)) == len(job.commands) == 4
     assert {x.parents[2] for x in job.files.values()} == {folder} and not job.done
     assert set(job.files) == {
-        "smgdiff/smgdiff_schedules_seed2",
-        "smgdiff/smgdiff_tuned_schedules_seed2",
-        "smgdiff/smgdiff_paths_seed2",
-        "smgdiff/smgdiff_tuned_paths_seed2",
+        "smgdiff/smgdiff_schedules_seed11",
+        "smgdiff/smgdiff_tuned_schedules_seed11",
+        "smgdiff/smgdiff_paths_seed11",
+        "smgdiff/smgdiff_tuned_paths_seed11",
     }
     assert dataclasses.replace(job, files={}).done
 
