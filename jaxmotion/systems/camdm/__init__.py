@@ -83,9 +83,9 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
 and no dropout, since it is meant for a CPU; the shipped walker is such a model with
 prefix attention, whose feet were planted by a second training (`--preset planted`).
 `--preset paper` trains as the authors do (AdamW, 1e-4, batch 512; their 100 epochs are
-for `--steps` to say); every such option can still be given. In every preset all clips get a
-mirrored copy, where the release mirrors the symmetric styles only (`--no-mirror`), and
-the rate falls with every step, there with every epoch. The evaluator that scores
-styles has layer and group norms in place of batch norms (`evaluator.py import` takes
-the released one).
+for `--steps` to say); every such option can still be given. In every preset all clips
+get a mirrored copy, where the release mirrors the symmetric styles only
+(`--no-mirror`), and the rate falls with every step, there with every epoch. The
+evaluator that scores styles has layer and group norms in place of batch norms
+(`evaluator.py import` takes the released one).
 """
