@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Int
 
 from jaxmotion.control.steering import label_array, label_indices
@@ -49,7 +50,7 @@ class Sampler:
 
 
 def sample_motions(
-    model: Sampler, key: Key, labels: Int[Array, " motions"], *, chunk: int
+    model: Sampler, key: Key, labels: Int[Array | np.ndarray, " motions"], *, chunk: int
 ) -> Motion:
     """Motions [motions, frames, ...] from the origin, facing +z; one compiled program.
 
