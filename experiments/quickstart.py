@@ -69,7 +69,7 @@ class Config:
     seed: int = 0
     train: bool = False
     steps: int = 400
-    batch: int = 12
+    batch: int = 32
     minutes: float = 12.0
     seconds: float = 16.0
     styles: tuple[str, ...] = ("neutral", NEW_STYLE)

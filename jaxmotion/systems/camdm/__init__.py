@@ -53,12 +53,11 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
   gradients, averaged parameters.
 * `train --initial-scale 0.3`: linear layers begin with a third of Flax's weights:
   lower losses for as many updates; 0.577, in `--preset paper`, is about PyTorch's, and
-  1, Flax's, is what shipped models (but the walker) and the tables of claims began
-  with.
+  1, Flax's, is what shipped models and the tables of claims began with.
 * `attention="prefix"`: condition tokens do not see the noisy frames, and are computed
   once per plan; `noise_levels=4`: a window is noised at four levels, its condition
   encoded once; `train --balance 0.5`: windows of rare speeds and turns are drawn more
-  often. The shipped `locomotion` is trained so, `walker` but for the balance.
+  often. The shipped `locomotion` is trained so.
 * `seam_half_life=15`: predictions go on from the last past pose, which the network
   alone misses by 2 cm a joint, and losses reach over the seam; `own_levels=0.5`: half
   of the windows are noised, at lower levels, on the network's own predictions, as in
@@ -80,12 +79,12 @@ Options of our own, all off in `model.Config()` and in `train --preset paper`:
   next plan.
 
 `experiments/camdm.py train` starts from `--preset small`, which uses the first nine
-and no dropout, since it is meant for a CPU; the shipped walker is such a model with
-prefix attention, whose feet were planted by a second training (`--preset planted`).
-`--preset paper` trains as the authors do (AdamW, 1e-4, batch 512; their 100 epochs are
-for `--steps` to say); every such option can still be given. In every preset all clips
-get a mirrored copy, where the release mirrors the symmetric styles only
-(`--no-mirror`), and the rate falls with every step, there with every epoch. The
-evaluator that scores styles has layer and group norms in place of batch norms
-(`evaluator.py import` takes the released one).
+and no dropout, since it is meant for a CPU; the shipped walker is such a model, without
+margins, whose feet were planted by a second training (`--preset planted`). `--preset
+paper` trains as the authors do (AdamW, 1e-4, batch 512; their 100 epochs are for
+`--steps` to say); every such option can still be given. In every preset all clips get a
+mirrored copy, where the release mirrors the symmetric styles only (`--no-mirror`), and
+the rate falls with every step, there with every epoch. The evaluator that scores
+styles has layer and group norms in place of batch norms (`evaluator.py import` takes
+the released one).
 """
