@@ -291,8 +291,9 @@ def largest_differences(
         with torch.inference_mode():
             return torch_peers.sample(peer, *torch_peers.from_tape(tape), given)
 
-    onednn = torch_peers.with_onednn(theirs)
-    found = {EAGER: theirs().numpy(), ONEDNN: onednn().numpy()}
+    found = {EAGER: theirs().numpy()}
+    if torch_peers.HAS_ONEDNN:
+        found[ONEDNN] = torch_peers.with_onednn(theirs)().numpy()
     if player is not None:
         found[ONNX] = player.run(tape, conditions)
     difference = lambda x: float(np.abs(x[0] - np.asarray(ours)).max())  # noqa: E731
@@ -419,7 +420,7 @@ def calls_of(
     for name, peer in peers.items():
         if name not in skip and (name == EAGER or batch == 1):
             calls[name] = torch_call(peer, batch, given)
-    if ONEDNN not in skip:
+    if torch_peers.HAS_ONEDNN and ONEDNN not in skip:
         calls[ONEDNN] = torch_peers.with_onednn(torch_call(peers[EAGER], batch, given))
     if compile_limit and COMPILED not in skip:
         call, note = compiled_call(peers[EAGER], batch, given, compile_limit)

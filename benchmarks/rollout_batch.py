@@ -260,9 +260,10 @@ def python_loops(
       By name, frames per second and how many times as fast the program is: medians,
       the latter of ratios within a round. Empty where the system has no loops.
     """
-    program = fitting(args, load, 1, None)
-    if not (loops := load.loops(program.ticks)):
+    _, commands = load.start(1)
+    if not (loops := load.loops(commands.label.shape[1])):
         return {}
+    program = fitting(args, load, 1, None)
     times = timing.time_in_turn(
         {"": lambda: program.run(0), **loops},
         rounds=args.runs,

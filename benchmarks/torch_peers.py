@@ -26,6 +26,11 @@ from jaxmotion.systems.emdm import model as emdm_model
 from jaxmotion.systems.smgdiff import model as smgdiff_model
 
 State = dict[str, Any]
+# Builds for other processors have no packed products; the names are PyTorch's own.
+HAS_ONEDNN = torch.backends.mkldnn.is_available() and all(
+    hasattr(torch.ops.mkldnn, name)
+    for name in ("_reorder_linear_weight", "_linear_pointwise")
+)
 
 
 def _time_embedding(width: int) -> nn.Sequential:

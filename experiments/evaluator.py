@@ -333,16 +333,21 @@ def doubt(args: Doubt) -> None:
     )
     ball = None if balls is None else balls.position[rows]
     made = spoiled(motion, ball, seed=args.seed)
-    found = {name: features_of(*windows) for name, windows in made.items()}
+    found = {name: features_of(*given) for name, given in made.items()}
     orders = [generator.permutation(pairs) for _ in range(args.replications)]
     orders = [np.stack([2 * x, 2 * x + 1], axis=1).reshape(-1) for x in orders]
     parts = [np.split(x, [pairs // 2 * 2]) for x in orders]
+    plain = [frechet.moments(found["as recorded"][b]) for _, b in parts]
     distance = jax.jit(
-        lambda a, b: frechet.frechet_distance(frechet.moments(a), frechet.moments(b))
+        lambda own, other: frechet.frechet_distance(frechet.moments(own), other)
     )
-    plain = found["as recorded"]
     distances = {
-        name: jnp.stack([distance(own[a], plain[b]) for a, b in parts])
+        name: jnp.stack(
+            [
+                distance(own[a], other)
+                for (a, _), other in zip(parts, plain, strict=True)
+            ]
+        )
         for name, own in found.items()
     }
     cells = functools.partial(table.cell, part=0.5)

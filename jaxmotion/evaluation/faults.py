@@ -26,8 +26,9 @@ def planted(key: Key, motion: Motion) -> dict[str, Motion]:
     def taken(which: Array) -> Motion:
         return _with(motion, joints[:, which], root[:, which])
 
+    noise = jax.random.normal(key, joints.shape, joints.dtype)
+
     def shaken(size: float) -> Motion:
-        noise = jax.random.normal(key, joints.shape, joints.dtype)
         return _with(motion, joints + size * noise, root)
 
     first = root[:, :1]
